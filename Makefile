@@ -11,12 +11,20 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist 
 BENCH := $(if $(SMOKE),--smoke)
 export PYTHON
 
+# The eighth of the long tests that runs: 0 to 7 (tests/slices.py). Without it, `make test` takes that of the commit count
+# and `make soak` all. SHARD=none: `make test` runs only those that the change touches. BASE: what the change is compared with.
+SHARD ?= $(GSPLAT_EDU_SHARD)
+BASE ?= $(GSPLAT_EDU_BASE)
+PART ?= cases sanitize neon chapters
+export GSPLAT_EDU_SHARD := $(SHARD)
+export GSPLAT_EDU_BASE := $(BASE)
+
 .PHONY: help demo test soak check sanitize bench notebooks site wheels clean
 
 help:
 	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
-	@echo "make test        run all tests; of the sliced ones, the cases that the commit draws"
-	@echo "make soak        run every case of the sliced tests, large fuzzing runs and the full chapters: hours"
+	@echo "make test        run all tests; of the sliced ones, the cases that the change touches and an eighth of the others"
+	@echo "make soak        every case of the sliced tests, large fuzzing runs, the native tests under sanitizers and on ARM, the full chapters: hours (SHARD=0 to 7: an eighth)"
 	@echo "make check       lint, format, types, import layers and size limits"
 	@echo "make sanitize    run the native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
 	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
@@ -37,14 +45,22 @@ test:
 
 soak:
 	@tools/set_up.sh dev
-	@echo "== soak: every case of the sliced tests"
+ifneq ($(filter cases,$(PART)),)
+	@echo "== soak: the cases of the sliced tests, $(if $(SHARD),shard $(SHARD),all)"
 	@GSPLAT_EDU_SOAK=1 $(PYTEST) -m sliced
-	@echo "== soak: damaged checkpoints and configurations under sanitizers"
-	@GSPLAT_EDU_SOAK=1 tools/sanitize.sh
+endif
+ifneq ($(filter sanitize,$(PART)),)
+	@echo "== soak: the native tests, damaged checkpoints and configurations under sanitizers"
+	@GSPLAT_EDU_SOAK=1 GSPLAT_EDU_SPLIT=all tools/sanitize.sh
+endif
+ifneq ($(filter neon,$(PART)),)
 	@echo "== soak: the native tests on 64-bit ARM, emulated"
-	@tools/neon.sh
+	@GSPLAT_EDU_SPLIT=all tools/neon.sh
+endif
+ifneq ($(filter chapters,$(PART)),)
 	@echo "== soak: chapters on the full budget"
-	@$(BIN)/python tools/build_notebooks.py --out out/soak/notebooks
+	@$(BIN)/python tools/build_notebooks.py --out out/soak/notebooks $(if $(SHARD),--shard $(SHARD))
+endif
 
 check:
 	@tools/set_up.sh dev

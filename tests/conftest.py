@@ -36,7 +36,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in every run make failures reproducible. `make soak` tries more, and random ones.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=100)
-settings.register_profile("soak", deadline=None, max_examples=5_000, print_blob=True)
+EXAMPLES = slices.count("GSPLAT_EDU_EXAMPLES", 100, 5_000)
+settings.register_profile("soak", deadline=None, max_examples=EXAMPLES, print_blob=True)
 settings.load_profile("soak" if slices.SOAK else "repeatable")
 
 

@@ -1,39 +1,110 @@
-"""The slice of the long tests that one commit runs.
+"""The slice of the long tests that one run takes.
 
-A test marked `sliced(n)` has more cases than a change should wait for. A run draws n of them with the commit's hash as
-seed, so the choice varies between commits and is the same in all processes of a run. `sliced(n, by="is_named")` draws n
-for each value of that parameter, and tests marked `sliced(n, group="name")` share their n. With `together=True`, the
-tests of a file that are marked for a group count as one case, because they share an expensive fixture. Fuzzers also
-derive the seed of their first damaged file from the commit. With GSPLAT_EDU_SOAK=1 (`make soak`) every case runs.
-conftest.py imports the hooks from here.
+A test marked `sliced(n)` has more cases than a change should wait for. Each case belongs to one of eight shards, and
+the number of commits up to HEAD, modulo eight, chooses the shard that runs: over eight consecutive counts every case
+runs. A test keeps at least n cases in every run, those of the next shards if its own has fewer. `sliced(n,
+by="is_named")` keeps n for each value of that parameter, and tests marked `sliced(n, group="name")` share their n. With
+`together=True`, the tests of a file that are marked for a group are one case, because they share a fixture. `sliced(0)`
+runs in soaks and when a change touches it, and `sliced` without a number always: those tests choose their own inputs.
+
+All cases run in the test files that a change touches (touched.py says what that is), and of a test that the command
+line names with `::`. A case's shard depends on its own test only, and a change to that test's file runs all of it. So
+no case waits longer than eight commits, as long as each commit is tested and SECONDS stays the same.
+
+In a shallow clone and outside git, the count and the change are unknown. Then shard 0 runs, and the header says why.
+
+    GSPLAT_EDU_SLICE   the count, instead of that of HEAD; the seeds of the fuzzers follow from it too
+    GSPLAT_EDU_SHARD   0 to 7: this shard alone; none: only what the change touches
+    GSPLAT_EDU_BASE    the commit with which the working tree is compared (touched.py)
+    GSPLAT_EDU_SOAK    1: the soak's sizes and, without GSPLAT_EDU_SHARD, every case (`make soak`)
+    GSPLAT_EDU_SPLIT   all: the shard of GSPLAT_EDU_SHARD takes an eighth of every test's cases, sliced or not
+
+conftest.py imports the hooks from here. `python tests/slices.py` prints the shard of this commit.
 """
 
 import os
-import random
-import subprocess
-from collections.abc import Iterator
+import zlib
+from collections import defaultdict
+from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
 
 import pytest
 
-WITHOUT_GIT = 15
-"""The seed if there is no commit."""
+import touched
 
+SHARDS = 8
+NAMES = [str(shard) for shard in range(SHARDS)]
+ROOT = Path(__file__).parents[1]
 
-def commit_seed(folder: Path) -> int:
-    """Return the first 32 bits of the hash of the commit checked out in a folder."""
-    try:
-        command = ["git", "-C", str(folder), "rev-parse", "--verify", "HEAD"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError:
-        return WITHOUT_GIT
-    return int(done.stdout[:8], 16) if done.returncode == 0 else WITHOUT_GIT
-
-
-# Stored in the environment, so that the workers of pytest-xdist draw the same cases.
-SEED = int(os.environ.setdefault("GSPLAT_EDU_SLICE", str(commit_seed(Path(__file__).parent))))
 SOAK = os.environ.get("GSPLAT_EDU_SOAK", "") not in ("", "0")
-HOW_TO_REPEAT = f"set GSPLAT_EDU_SLICE={SEED} in the environment to run it again on any commit"
+CHOSEN = os.environ.get("GSPLAT_EDU_SHARD", "")
+if CHOSEN not in ("", "none", *NAMES):
+    raise pytest.UsageError(f"GSPLAT_EDU_SHARD is {CHOSEN!r}; give a number from 0 to {SHARDS - 1}, or none")
+EVERY_TEST = CHOSEN in NAMES and os.environ.get("GSPLAT_EDU_SPLIT", "") == "all"
+
+HISTORY = touched.history(ROOT)
+# Stored in the environment, so that the workers of pytest-xdist choose the same cases, whatever changes meanwhile.
+COUNT = int(os.environ.setdefault("GSPLAT_EDU_SLICE", str(HISTORY.count)))
+os.environ.setdefault("GSPLAT_EDU_TOUCHED", "\n".join(sorted(touched.tests_of(ROOT, HISTORY.changed))))
+TOUCHED = frozenset(os.environ["GSPLAT_EDU_TOUCHED"].split("\n")) - {""}
+
+SHARD = int(CHOSEN) if CHOSEN in NAMES else COUNT % SHARDS
+SEED = COUNT * 100_000
+"""The seed of a fuzzer's first damaged file. The seeds of two counts do not overlap."""
+
+HOW_TO_REPEAT = (
+    "name the test with :: to run it again; "
+    f"GSPLAT_EDU_SLICE={COUNT} repeats the slice and its seeds on any commit"
+)
+
+SECONDS: Mapping[str, tuple[int, int]] = {
+    "tests/golden/test_chapter_trajectory.py::test_the_first_iterations_give_the_numbers_of_the_chapter": (
+        40,
+        1,
+    ),
+    "tests/cli/test_train_3d.py::test_the_default_budget_trains_end_to_end": (51, 1),
+    "tests/repo/test_site.py": (38, 1),
+    "tests/sfm/test_panoramas.py": (37, 1),
+    "tests/studio/test_page.py::test_from_dropped_photos_to_a_downloaded_scene": (26, 1),
+    "tests/studio/test_page_intake.py::test_a_dropped_video_becomes_a_capture": (22, 1),
+    "tests/repo/test_wheels.py": (22, 1),
+    "tests/runs/test_processes.py::test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed": (16, 4),
+    "tests/sfm/test_video.py::test_frames_become_a_capture": (14, 1),
+    "tests/train/test_vignetting.py::test_dark_corners_come_back_and_the_held_out_quality_with_them": (14, 1),
+    "tests/repo/test_notebooks.py::test_chapters_execute_on_a_reduced_budget": (14, 13),
+    "tests/train/test_transients.py::test_most_of_what_true_masks_give_comes_back": (13, 1),
+    "tests/train/test_poses.py::test_wrong_poses_come_back_and_the_held_out_quality_with_them": (12, 1),
+    "tests/runs/test_pilot.py::test_poses_are_refined_if_they_are_wrong": (11, 2),
+    "tests/sfm/test_training.py::test_one_command": (10, 2),
+    "tests/studio/test_page_pictures.py::test_a_training_is_drawn_while_it_runs": (9, 1),
+    "tests/sfm/test_reconstruct.py::test_an_interrupted_run_resumes_after_the_last_completed_stage": (9, 1),
+    "tests/cli/test_view.py::test_the_browser_opens_for_a_user_at_a_screen": (7, 1),
+    "tests/gpu/test_training.py::test_a_training_is_reproducible": (7, 1),
+    "tests/train/test_exposure.py::test_exposures_come_back_and_the_held_out_quality_with_them": (7, 1),
+    "tests/train/test_exposure_alpha.py::test_exposures_of_transparent_photos_come_back": (7, 1),
+    "tests/sfm/test_wrong_poses.py": (7, 1),
+    "tests/sfm/test_phone_photos.py::test_photos_of_a_phone_become_an_upright_capture_in_srgb": (6, 1),
+    "tests/blocks/test_cluster.py::test_a_killed_worker_and_a_killed_scheduler_lose_nothing": (6, 1),
+    "tests/compat/test_rasterization.py::test_finite_differences": (6, 2),
+    "tests/sfm/test_lenses.py": (5, 1),
+    "tests/clean/test_judge.py::test_the_same_bits_on_any_number_of_threads": (5, 2),
+    "tests/runs/test_lod_refinement.py::test_refined_levels_match_the_photos_better": (5, 1),
+    "tests/budget/test_plan.py::test_a_training_stays_below_its_memory_limit_as_the_system_counts_it": (5, 1),
+    "tests/sfm/test_scale.py::test_gps_gives_scale_and_up_end_to_end": (5, 1),
+    "tests/runs/test_processes.py::test_a_mistake_is_reported_once": (5, 5),
+    "tests/train/test_trainer.py::test_two_runs_give_the_same_bits": (5, 2),
+    "tests/native/test_robustness.py::test_memory_does_not_grow": (5, 1),
+    "tests/cli/test_sky.py::test_a_killed_run_ends_with_the_same_bytes": (5, 1),
+    "tests/blocks/test_runs.py::test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all": (5, 1),
+    "tests/gpu/test_training.py::test_checkpoints_resume_on_either_backend": (5, 2),
+    "tests/sfm/test_reconstruct.py::test_focal_lengths_from_exif_separate_two_cameras": (4, 1),
+    "tests/gpu/test_compile.py::test_every_kernel_compiles_with_few_spills": (4, 12),
+    "tests/runs/test_transients.py::test_a_killed_and_resumed_run_writes_the_same_bytes": (4, 1),
+}
+"""Processor time of a case in seconds, and the number of cases, of the longest tests. A file that runs together is one.
+
+The first cases of these tests are spread over the shards by this time. Other tests begin at a shard by their name.
+"""
 
 FIRST = (
     "tests/repo/test_site.py",
@@ -76,16 +147,64 @@ FIRST = (
 
 
 def count(name: str, sliced: int, soak: int) -> int:
-    """Return how many damaged files a fuzzer reads: the variable `name` if set, else by the kind of run."""
-    return int(os.environ.get(name, soak if SOAK else sliced))
+    """Return how many damaged files a fuzzer reads.
+
+    Args:
+        name: The environment's variable that overrides the number.
+        sliced: The number in `make test`.
+        soak: The number in all of `make soak`. One shard reads an eighth.
+    """
+    whole = soak if CHOSEN not in NAMES else soak // SHARDS
+    return int(os.environ.get(name, whole if SOAK else sliced))
 
 
-def split(items: list[pytest.Item], seed: int) -> tuple[list[pytest.Item], list[pytest.Item]]:
-    """Split the tests into those to run and the cases that this seed leaves out.
+def balanced(seconds: Mapping[str, tuple[float, int]]) -> dict[str, int]:
+    """Choose the shard of the first case of each test, so that the shards take about as long.
+
+    Args:
+        seconds: By test, the processor time of a case and the number of cases.
+    """
+    loads, starts = [0.0] * SHARDS, {}
+    for name, (cost, cases) in sorted(seconds.items(), key=lambda entry: (-entry[1][0], entry[0])):
+        windows = [[(start + i) % SHARDS for i in range(cases)] for start in range(SHARDS)]
+        window = min(windows, key=lambda window: sum(loads[shard] for shard in window))
+        starts[name] = window[0]
+        for shard in window:
+            loads[shard] += cost
+    return starts
+
+
+STARTS = balanced(SECONDS)
+
+
+def numbered(items: Iterable[pytest.Item]) -> dict[pytest.Item, int]:
+    """Return the shard of each test that has one: its cases follow one another, from the first's."""
+    shards, sizes, together = {}, defaultdict(int), {}
+    for item in items:
+        marker = item.get_closest_marker("sliced")
+        if marker is None and not EVERY_TEST:
+            continue
+        name = item.nodeid.partition("[")[0]
+        if marker is not None and marker.kwargs.get("together"):
+            name = item.nodeid.partition("::")[0]
+            shards[item] = together.setdefault(name, STARTS.get(name, zlib.crc32(name.encode()) % SHARDS))
+            continue
+        start = STARTS.get(name, zlib.crc32(name.encode()) % SHARDS)
+        shards[item] = (start + sizes[name]) % SHARDS
+        sizes[name] += 1
+    return shards
+
+
+def split(
+    items: list[pytest.Item], shards: Mapping[pytest.Item, int], shard: int | None, soak: bool = False
+) -> tuple[list[pytest.Item], list[pytest.Item]]:
+    """Split the tests into those to run and the cases that this run leaves out.
 
     Args:
         items: The collected tests.
-        seed: The seed for drawing the cases.
+        shards: The shard of each test that has one, from `numbered`.
+        shard: The shard to run; None: no sliced case.
+        soak: Whether a shard holds the cases of `sliced(0)`, and no case of other shards fills it up.
 
     Returns:
         The tests to run, in their original order, and the others.
@@ -93,41 +212,82 @@ def split(items: list[pytest.Item], seed: int) -> tuple[list[pytest.Item], list[
     groups: dict[str, dict[str, list[pytest.Item]]] = {}
     sizes: dict[str, int] = {}
     for item in items:
-        if marker := item.get_closest_marker("sliced"):
-            kind = item.callspec.params[marker.kwargs["by"]] if "by" in marker.kwargs else ""
-            name = f"{marker.kwargs.get('group', item.nodeid.partition('[')[0])} {kind}"
-            case = item.nodeid.partition("::")[0] if marker.kwargs.get("together") else item.nodeid
-            groups.setdefault(name, {}).setdefault(case, []).append(item)
-            if marker.args:
-                sizes[name] = marker.args[0]
+        marker = item.get_closest_marker("sliced")
+        if item not in shards or (marker and not marker.args):
+            continue
+        words = marker.kwargs if marker else {}
+        kind = item.callspec.params[words["by"]] if "by" in words else ""
+        name = f"{words.get('group', item.nodeid.partition('[')[0])} {kind}"
+        case = item.nodeid.partition("::")[0] if words.get("together") else item.nodeid
+        groups.setdefault(name, {}).setdefault(case, []).append(item)
+        sizes[name] = 0 if soak or not marker else marker.args[0]
     left_out: set[pytest.Item] = set()
     for name, cases in groups.items():
-        drawn = random.Random(f"{seed} {name}").sample(
-            list(cases), min(sizes.get(name, len(cases)), len(cases))
-        )
-        left_out |= {item for case, tests in cases.items() if case not in drawn for item in tests}
+        if shard is None or (sizes[name] == 0 and not soak):
+            left_out.update(*cases.values())
+            continue
+        # Cases by the number of commits until their turn; sorting keeps the order of equal ones.
+        waits = [((shards[tests[0]] - shard) % SHARDS, tests) for tests in cases.values()]
+        for i, (wait, tests) in enumerate(sorted(waits, key=lambda entry: entry[0])):
+            if wait > 0 and i >= sizes[name]:
+                left_out.update(tests)
     return [item for item in items if item not in left_out], [item for item in items if item in left_out]
 
 
 def pytest_report_header() -> str:
     """Report which slice of the long tests runs."""
-    return "sliced tests: every case" if SOAK else f"sliced tests: GSPLAT_EDU_SLICE={SEED}"
+    repeat = f"GSPLAT_EDU_SLICE={COUNT}"
+    if SOAK:
+        return f"sliced tests: {f'shard {SHARD}' if CHOSEN in NAMES else 'every case'} of the soak, {repeat}"
+    shard = "no shard" if CHOSEN == "none" else f"shard {SHARD} of 0 to {SHARDS - 1}"
+    missing = f"; {HISTORY.missing}" if HISTORY.missing else ""
+    return (
+        f"sliced tests: {shard}, {repeat}; all cases of {len(TOUCHED)} files that the change touches{missing}"
+    )
 
 
-@pytest.hookimpl(trylast=True)  # after -k and -m
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def wanted(config: pytest.Config, item: pytest.Item) -> bool:
+    """Return whether the change touches a test, or the command line names it."""
+    path, _, name = item.nodeid.partition("::")
+    if path in TOUCHED or f"[{name.partition('[')[2]}" in TOUCHED:
+        return True
+    for argument in config.args:
+        file, found, asked = argument.partition("::")
+        there = os.path.relpath(config.invocation_params.dir / file, config.rootpath)
+        if found and there == path and (name == asked or name.startswith((f"{asked}[", f"{asked}::"))):
+            return True
+    return False
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)  # numbers before -k and -m choose, leaves out afterwards
+def pytest_collection_modifyitems(
+    config: pytest.Config, items: list[pytest.Item]
+) -> Generator[None, object, object]:
     """Leave out the cases outside this slice, and put the slowest files first."""
-    kept, left_out = (list(items), []) if SOAK else split(items, SEED)
+    shards = numbered(items)
+    result = yield
+    if not SOAK:
+        shards = {item: shard for item, shard in shards.items() if not wanted(config, item)}
+    left_out = []
+    if not (SOAK and CHOSEN == ""):
+        items[:], left_out = split(items, shards, None if CHOSEN == "none" else SHARD, SOAK or EVERY_TEST)
     if left_out:
         config.hook.pytest_deselected(items=left_out)
     ranks = {name: i for i, name in enumerate(FIRST)}
-    items[:] = sorted(kept, key=lambda item: ranks.get(item.nodeid.partition("::")[0], len(FIRST)))
+    items.sort(key=lambda item: ranks.get(item.nodeid.partition("::")[0], len(FIRST)))
+    return result
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Add instructions for repeating the slice to the report of a failed sliced test."""
     report = yield
-    if report.failed and item.get_closest_marker("sliced") and not SOAK:
+    if report.failed and item.get_closest_marker("sliced"):
         report.sections.append(("slice", HOW_TO_REPEAT))
     return report
+
+
+if __name__ == "__main__":
+    print(SHARD)

@@ -2,6 +2,7 @@
 
     python tools/build_notebooks.py                      every chapter, with the full budget
     python tools/build_notebooks.py 09 --out DIR         chapters whose names start with 09, into another folder
+    python tools/build_notebooks.py --shard 3            an eighth of the chapters
 
 GSPLAT_EDU_BUDGET=reduced in the environment shortens the trainings. A cell that raises, or a figure without titles and
 labels (tools/chapter_figures.py), stops the build with exit code 1 and leaves the existing notebook unchanged.
@@ -63,6 +64,7 @@ def main() -> int:
     """Build the requested chapters."""
     parser = argparse.ArgumentParser(description="Execute the chapters into notebooks.")
     parser.add_argument("names", nargs="*", help="beginnings of chapter names, for example 09 (default: all)")
+    parser.add_argument("--shard", type=int, choices=range(8), help="every eighth chapter, from this one on")
     parser.add_argument("--out", type=Path, default=ROOT / "notebooks", help="folder (default: notebooks)")
     arguments = parser.parse_args()
     chosen = tuple(arguments.names) or ("",)
@@ -72,6 +74,8 @@ def main() -> int:
             f"build_notebooks.py: no chapter of {SOURCES} starts with {' or '.join(chosen)}", file=sys.stderr
         )
         return 2
+    if arguments.shard is not None:
+        sources = sources[arguments.shard :: 8]
     for source in sources:
         start = time.perf_counter()
         print(f"{source.stem}: executing", flush=True)

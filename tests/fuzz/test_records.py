@@ -31,6 +31,8 @@ from gsplat_edu.studio.unpack import ZipLimits, unpack
 from gsplat_edu.train.config import recipe
 from studio.test_uploads import zipped
 
+pytestmark = pytest.mark.sliced  # a soak reads many more
+
 RECORDS = slices.count("GSPLAT_EDU_FUZZ_RECORDS", 60, 20_000)
 """Damaged records per reader."""
 

@@ -24,7 +24,6 @@ from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
-from slices import SOAK
 
 CHAPTER = {0: 0.2492, 20: 0.1827, 40: 0.1315, 60: 0.1152, 80: 0.1181, 100: 0.1346}
 TOLERANCE = {"torch": 2e-4, "cpu": 1e-3}
@@ -32,7 +31,9 @@ TOLERANCE = {"torch": 2e-4, "cpu": 1e-3}
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("backend", "iterations"), [("torch", 101 if SOAK else 1), ("cpu", 101)], ids=["torch", "cpu"]
+    ("backend", "iterations"),
+    [("torch", 1), ("cpu", 101), pytest.param("torch", 101, marks=pytest.mark.sliced(0))],
+    ids=["torch", "cpu", "torch, whole"],
 )
 def test_the_first_iterations_give_the_numbers_of_the_chapter(backend, iterations):
     """The dense backend takes a second for each iteration, so only `make soak` takes it beyond the first."""

@@ -2,6 +2,7 @@
 
 import math
 import os
+from pathlib import Path
 
 import pytest
 
@@ -118,10 +119,8 @@ def test_an_emitter_thins_progress_out_and_keeps_its_end(tmp_path):
     assert len(found) < 20  # a thousand steps take a few ms; half a second lies between two events
 
 
-def test_a_full_disk_does_not_end_the_command(tmp_path, capsys):
-    made = Emitter(tmp_path / "events.jsonl")
-    os.close(made._file)
-    made._file = os.open("/dev/full", os.O_WRONLY)
+def test_a_full_disk_does_not_end_the_command(capsys):
+    made = Emitter(Path("/dev/full"))
     for _ in range(3):
         made.emit(events.Stage("a"))
     assert (
@@ -131,10 +130,8 @@ def test_a_full_disk_does_not_end_the_command(tmp_path, capsys):
 
 def test_nothing_is_written_outside_of_a_job(monkeypatch):
     monkeypatch.delenv(events.EVENTS, raising=False)
-    before = emitter._emitter
     emitter.start_reporting()
     emitter.progress("a", 1, 2, lambda: pytest.fail("the forecast was computed for nobody"))
-    assert emitter._emitter is before is None
 
 
 def test_a_process_is_known_by_its_start(tmp_path):

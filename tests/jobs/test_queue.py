@@ -186,7 +186,7 @@ def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_pat
     found = opened()
     assert found.get(job.id).state is State.RUNNING and found.get(after.id).state is State.HELD
     (tmp_path / "a").touch()
-    os.waitpid(queue._children[job.id].pid, 0)  # an orphan's process is waited for by init
+    os.waitpid(found.get(job.id).pid, 0)  # an orphan's process is waited for by init
     assert reached(found, job.id, State.DONE).attempts == 1
     assert found.get(after.id).state is State.HELD and not (tmp_path / "b.ran").exists()
     found.resume(after.id)
@@ -200,7 +200,7 @@ def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
     until((tmp_path / "a.ran").exists)
     abandon(queue)
     (tmp_path / "a").touch()
-    queue._children[done.id].wait()
+    os.waitpid(queue.get(done.id).pid, 0)
     folder = JobFolder(
         queue.folder / killed.id
     )  # as if it had been running when the computer was switched off

@@ -72,52 +72,6 @@ def test_every_make_target_is_explained_by_make_help():
     assert targets == set(re.findall(r'"make ([a-z]+) ', makefile))
 
 
-UNMEASURED = {"gpu.py"}
-"""Benchmarks without an available machine. Their sections must say so."""
-
-FIGURE = re.compile(r"\d[\d,]*\.\d+|\d+,\d{3}|\d+ (?:ms|s|min|MiB|GiB|px|%)(?!\w)")
-
-
-def sections(results):
-    """Return the text of each section by its heading."""
-    parts = re.split(r"^## (.*)$", results, flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
-
-
-def without_figures(results, scripts):
-    """Return the benchmarks that no section's heading names, or whose sections hold fewer than three figures."""
-    named = {
-        name: "".join(
-            text for heading, text in sections(results).items() if f"python benchmarks/{name}" in heading
-        )
-        for name in scripts
-    }
-    return {name for name, text in named.items() if "Not run" in text or len(FIGURE.findall(text)) < 3}
-
-
-def test_every_benchmark_has_its_results():
-    results = (ROOT / "benchmarks" / "RESULTS.md").read_text()
-    scripts = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {
-        "hardware.py",
-        "captures.py",
-        "traced.py",
-    }
-    scripts |= {path.parent.name for path in (ROOT / "benchmarks").glob("*/__main__.py")}
-    assert len(scripts) > 8
-    assert without_figures(results, scripts) == UNMEASURED
-    for name in UNMEASURED:
-        (text,) = (text for heading, text in sections(results).items() if f"benchmarks/{name}" in heading)
-        assert text.strip().startswith("Not run: "), "no figures without a measurement"
-
-
-@pytest.mark.parametrize("text", ["Not run: 1.5 s, 2.5 s and 3.5 s are expected.", "It is fast.", "1.5 s"])
-def test_a_benchmark_without_results_is_found(text):
-    good = "# Results\n\n## A (`python benchmarks/a.py`)\n\n1.5 s, 20 MiB, 1,200 splats\n"
-    assert without_figures(good, {"a.py"}) == set()
-    assert without_figures(good.replace("1.5 s, 20 MiB, 1,200 splats", text), {"a.py"}) == {"a.py"}
-    assert without_figures(good + text, {"b.py"}) == {"b.py"}
-
-
 def test_every_constant_is_in_the_decisions():
     decisions = (ROOT / "docs" / "DECISIONS.md").read_text()
     names = [name for name in vars(constants) if name.isupper()]

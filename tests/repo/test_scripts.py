@@ -138,21 +138,36 @@ def test_make_bench_runs_its_benchmarks(setting, flags):
     assert {path for path, *_ in commands} == MADE
 
 
-def test_make_soak_runs_every_case_and_the_whole_budget():
-    done = run("make", "-n", "soak")
+def soak(*settings):
+    """Return the commands of `make soak` by its parts."""
+    done = run("make", "-n", "soak", *settings)
     assert done.returncode == 0, done.stderr
-    lines = [line for line in done.stdout.splitlines() if not line.startswith("echo")]
-    assert any("GSPLAT_EDU_SOAK=1" in line and "-m sliced" in line for line in lines)
-    assert any("GSPLAT_EDU_SOAK=1 tools/sanitize.sh" in line for line in lines)
-    (chapters,) = (line for line in lines if "build_notebooks.py" in line)
-    assert "reduced" not in chapters
-    assert re.search(r"^\*\*\d{4}-\d{2}-\d{2}\*\*", soak_results(), re.M), "the last soak is dated"
+    lines = [line for line in done.stdout.splitlines() if "GSPLAT_EDU" in line or "build_notebooks" in line]
+    parts = {
+        "cases": "-m sliced",
+        "sanitize": "sanitize.sh",
+        "neon": "neon.sh",
+        "chapters": "build_notebooks.py",
+    }
+    return {part: line for part, sign in parts.items() for line in lines if sign in line}
 
 
-def soak_results():
-    """Return the section of RESULTS.md about `make soak`."""
-    results = (ROOT / "benchmarks" / "RESULTS.md").read_text()
-    return re.split(r"^## ", re.split(r"^## .*make soak.*$", results, flags=re.M)[1], flags=re.M)[0]
+def test_make_soak_runs_every_case_and_the_whole_budget():
+    commands = soak()
+    assert set(commands) == {"cases", "sanitize", "neon", "chapters"}
+    assert "GSPLAT_EDU_SOAK=1" in commands["cases"] and "GSPLAT_EDU_SOAK=1" in commands["sanitize"]
+    assert "reduced" not in commands["chapters"] and "--shard" not in commands["chapters"]
+
+
+def test_make_soak_runs_one_shard_and_the_parts_that_are_named():
+    assert "--shard 3" in soak("SHARD=3")["chapters"]
+    assert set(soak("SHARD=3", "PART=cases sanitize")) == {"cases", "sanitize"}
+
+
+def test_ci_runs_the_soak_shard_of_the_commit_count_and_leaves_its_cases_out_of_make_test():
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert "\nmake test SHARD=none\n" in ci
+    assert '\nshard=$(.venv/bin/python tests/slices.py)\nmake soak SHARD="$shard" ' in ci
 
 
 def test_make_clean_keeps_the_source(tmp_path):
