@@ -9,8 +9,8 @@ GSPLAT_EDU_BASE names another base.
 - A helper of tests touches the test files that import it, also through other helpers.
 - src/gsplat_edu/PACKAGE touches tests/PACKAGE, tests/test_PACKAGE.py and what ELSEWHERE names.
 - A module of a package without a folder of tests (base, scene, ops, photos) touches tests/test_MODULE.py and the test
-  files that import it. If at most FEW packages import it, their tests are touched as well. With more users (errors.py),
-  the other tests wait their turn.
+  files that import it. If at most FEW packages import it, or no test does, the tests of these packages are touched as
+  well. With more users (errors.py), the other tests wait their turn.
 - A chapter or a benchmark touches the cases that carry its name; other files touch what ELSEWHERE names.
 """
 
@@ -161,8 +161,8 @@ def of_package(root: Path, parts: tuple[str, ...]) -> set[Path]:
         for path in package.rglob("*.py")
         if imports(path, module)
     } - {parts[0].removesuffix(".py"), "__init__"}
-    dependents = set().union(*map(own, needing)) if len(needing) <= FEW else set()
-    return own(module.rsplit(".", 1)[-1]) | users(root, module) | dependents
+    direct = own(module.rsplit(".", 1)[-1]) | users(root, module)
+    return direct.union(*map(own, needing)) if len(needing) <= FEW or not direct else direct
 
 
 def of_test_folder(root: Path, path: Path) -> set[Path]:
