@@ -8,6 +8,7 @@ import pytest
 
 from gsplat_edu import ArgumentError
 from gsplat_edu.base.files import check_writable, described, unreadable, written_aside
+from gsplat_edu.base.reading import stored_path
 from gsplat_edu.cli.arguments import run_command
 from systems import needs_posix
 
@@ -99,3 +100,19 @@ def test_unreadable_files_have_one_wording(number, advice):
     error = OSError(number, os.strerror(number), "elsewhere")
     assert unreadable(Path("a.bin"), error) == f"a.bin: cannot be read ({os.strerror(number)}); {advice}"
     assert "cannot be read (gone); check the file" in unreadable(Path("a.bin"), OSError("gone"))
+
+
+@pytest.mark.parametrize(
+    ("value", "names"),
+    [
+        ("a/b.jpg", True),
+        ("\udcff.jpg", True),
+        ("\ud800.jpg", False),
+        ("a\0b", False),
+        ("//server/share", False),
+        (7, False),
+    ],
+)
+def test_a_path_that_a_file_names_is_one_that_a_file_can_have(value, names):
+    """A byte of a name that is not UTF-8 is a lone surrogate from U+DC80 on; others name no file."""
+    assert (stored_path(value) is not None) == names

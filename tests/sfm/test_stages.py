@@ -40,6 +40,7 @@ def test_facts_of_a_completed_stage_are_read(tmp_path, name):
         ("faces", {"panoramas": [{"name": "a", "faces": ["../a.jpg"], "place": None}]}),
         ("faces", {"panoramas": [{"name": "a", "faces": ["b\\a.jpg"], "place": None}]}),
         ("faces", {"panoramas": [{"name": "a", "faces": [".."], "place": None}]}),
+        ("faces", {"panoramas": [{"name": "a", "faces": ["\ud800.jpg"], "place": None}]}),
         ("faces", {"panoramas": [{"name": "a", "faces": [], "place": None}]}),
         ("faces", {"panoramas": [{"name": "a", "faces": ["a.jpg"], "place": [1.0, 2.0]}]}),
         ("photos", {"names": {"a": 1}}),

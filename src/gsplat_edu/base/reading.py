@@ -14,6 +14,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any, BinaryIO
 
 from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.base.text import names_a_file
 
 TOO_LARGE = "close other programs, or read it on a machine with more memory"
 """Advice for a file that does not fit into memory."""
@@ -101,7 +102,7 @@ def stored_path(value: object) -> Path | None:
     Args:
         value: The value of a field.
     """
-    if not isinstance(value, str) or not value or "\0" in value:
+    if not isinstance(value, str) or not value or not names_a_file(value):
         return None
     return None if PureWindowsPath(value).drive.startswith("\\\\") else Path(value)
 

@@ -133,6 +133,18 @@ def decode_file_name(raw: bytes) -> str:
         return raw.decode("utf-8", "surrogateescape")
 
 
+def names_a_file(text: str) -> bool:
+    """Return whether a file can have this name or path: neither a null character nor an unpaired surrogate.
+
+    The lone surrogates that stand for bytes (PEP 383) count as bytes.
+    """
+    try:
+        text.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:
+        return False
+    return "\0" not in text
+
+
 def as_file_name(name: str) -> str:
     """Convert a file's text to a path for the system's functions, independent of the locale.
 

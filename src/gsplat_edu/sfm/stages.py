@@ -12,10 +12,11 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.json_fields import LARGEST_NUMBER
 from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.text import names_a_file
 
 
 def _text(value: object) -> bool:
-    return isinstance(value, str)
+    return isinstance(value, str) and names_a_file(value)
 
 
 def _whole(value: object) -> bool:
