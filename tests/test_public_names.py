@@ -2,6 +2,9 @@ import inspect
 import subprocess
 import sys
 
+import pytest
+import torch
+
 import gsplat_edu
 
 SIGNATURES = {
@@ -45,7 +48,32 @@ def test_all_lists_every_public_name_once_and_nothing_else():
         for name, value in vars(gsplat_edu).items()
         if not name.startswith("_") and not inspect.ismodule(value)
     }
-    assert sorted(public) == sorted(gsplat_edu.__all__)
+    assert sorted(public - {"LAZY", "TYPE_CHECKING", "annotations"} | set(gsplat_edu.LAZY)) == sorted(
+        set(gsplat_edu.__all__) - {"render"}
+    )
+
+
+def test_the_names_of_torchs_part_are_imported_on_first_use():
+    for name in gsplat_edu.LAZY:
+        assert getattr(gsplat_edu, name).__name__ == name
+        assert name in dir(gsplat_edu)
+    with pytest.raises(AttributeError, match="no attribute 'Gausians'"):
+        _ = gsplat_edu.Gausians
+
+
+def test_the_package_render_can_be_called():
+    from gsplat_edu.render.api import render
+
+    scene = gsplat_edu.Gaussians(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        log_scales=torch.full((1, 3), -1.0),
+        sh0=torch.ones(1, 1, 3),
+        sh_rest=torch.zeros(1, 0, 3),
+        logit_opacities=torch.zeros(1),
+    )
+    camera = gsplat_edu.Camera.looking_at((0, 0, -3), (0, 0, 0), 40, 40, 24, 32)
+    assert torch.equal(gsplat_edu.render(scene, camera).image, render(scene, camera).image)
 
 
 def test_every_public_object_has_a_docstring():

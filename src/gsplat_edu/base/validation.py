@@ -148,6 +148,24 @@ def of_type(name: str, value: object, kind: type) -> None:
         raise ArgumentError(f"{name}: is {quoted(value)}, but has to be of type {kind.__name__}")
 
 
+def offers(name: str, value: object, protocol: type) -> None:
+    """Check that a value has every method and attribute of a protocol.
+
+    Args:
+        name: The caller's name for the value.
+        value: The value.
+        protocol: A class derived from `typing.Protocol`.
+
+    Raises:
+        ArgumentError: it lacks some; the message names them.
+    """
+    wanted = {n for n in vars(protocol) if not n.startswith("_")} | set(
+        getattr(protocol, "__annotations__", {})
+    )
+    if lacking := sorted(member for member in wanted if not hasattr(value, member)):
+        raise ArgumentError(f"{name}: {quoted(value)} lacks {', '.join(lacking)}; see {protocol.__name__}")
+
+
 def quoted(value: object) -> str:
     """Return a scalar or a short word as Python writes it, of other values the type: a message is one line."""
     text = repr(value) if isinstance(value, bool | int | float | str | bytes | None) else ""

@@ -6,10 +6,13 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.validation import of_type
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.scene.gaussians import is_finite
+from gsplat_edu.scene.gaussians import Gaussians, is_finite
 
 
 @dataclass(frozen=True)
@@ -145,17 +148,21 @@ def read_scene(path: str | Path) -> Scene:
     return scene
 
 
-def write_scene(path: str | Path, scene: Scene) -> None:
+def write_scene(path: str | Path, scene: Scene | Gaussians) -> None:
     """Write a scene in the format that the file's name indicates; parent folders are created.
 
     Args:
         path: The file; for a SOG folder, its meta.json; for levels of detail, lod-meta.json.
-        scene: The scene, in this package's axes.
+        scene: The scene, or bare Gaussians, in this package's axes.
 
     Raises:
-        ArgumentError: the name has no suffix of a scene format, or a parameter is NaN or infinite.
+        ArgumentError: the name has no suffix of a scene format, the scene is neither, or a parameter is NaN or
+            infinite.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     found = format_of(path)
+    if isinstance(scene, Gaussians):
+        scene = Scene(scene.map(Tensor.detach))
+    of_type("scene", scene, Scene)
     scene.gaussians.check_finite()
     found.write(Path(path), scene)

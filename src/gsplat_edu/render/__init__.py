@@ -1,1 +1,23 @@
-"""Render Gaussians from a camera: projection, sorting and compositing, with one implementation per backend."""
+"""Render Gaussians from a camera: projection, sorting and compositing, with one implementation per backend.
+
+The package can be called: `gsplat_edu.render(gaussians, camera)` is `gsplat_edu.render.api.render`.
+"""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import Any
+
+
+class _CallableModule(ModuleType):
+    """The package as a function, so that `from gsplat_edu import render` gives what its name says."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:  # noqa: ANN401
+        """Render; see `gsplat_edu.render.api.render`."""
+        from gsplat_edu.render.api import render  # it imports torch
+
+        return render(*arguments, **options)
+
+
+sys.modules[__name__].__class__ = _CallableModule

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.headroom import require_memory
-from gsplat_edu.base.validation import of_type
+from gsplat_edu.base.validation import ArrayLike, Shape, float64_array, of_type
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
@@ -34,8 +34,8 @@ def render(
     camera: CameraLike | CameraTensors,
     *,
     settings: RenderSettings | None = None,
-    background: Tensor | None = None,
-    features: Tensor | None = None,
+    background: Tensor | ArrayLike | None = None,
+    features: Tensor | ArrayLike | None = None,
     backend: str | Backend = "auto",
 ) -> RenderOutput: ...
 
@@ -46,8 +46,8 @@ def render(
     camera: Sequence[CameraLike | CameraTensors],
     *,
     settings: RenderSettings | None = None,
-    background: Tensor | None = None,
-    features: Tensor | None = None,
+    background: Tensor | ArrayLike | None = None,
+    features: Tensor | ArrayLike | None = None,
     backend: str | Backend = "auto",
 ) -> RenderStack: ...
 
@@ -57,8 +57,8 @@ def render(
     camera: CameraLike | CameraTensors | Sequence[CameraLike | CameraTensors],
     *,
     settings: RenderSettings | None = None,
-    background: Tensor | None = None,
-    features: Tensor | None = None,
+    background: Tensor | ArrayLike | None = None,
+    features: Tensor | ArrayLike | None = None,
     backend: str | Backend = "auto",
 ) -> RenderOutput | RenderStack:
     """Render Gaussians from one camera, or from several of equal image size.
@@ -68,8 +68,9 @@ def render(
         camera: A `Camera` or any object with its members (`gsplat_edu.CameraLike`); `CameraTensors` for gradients of
             its pose and intrinsics; or a sequence of cameras of equal image size.
         settings: Background, SH degree, antialiasing, depths; None uses the defaults.
-        background: (3,) background as a tensor, for differentiation; None uses the settings' background.
-        features: (N, C) numbers to composite beside the colours, of the Gaussians' dtype and device; None for none.
+        background: (3,) background, as a tensor for differentiation; None uses the settings' background.
+        features: (N, C) numbers to composite beside the colours, as a tensor of the Gaussians' dtype and device for
+            differentiation; None for none.
             The backend cpu composites 32 at a time: every further 32 take another projection, sort and two passes.
         backend: "auto" for the fastest one on the Gaussians' device, or a backend by name (see
             `gsplat_edu.render.backends`), or a backend that is loaded already.
@@ -93,9 +94,11 @@ def render(
     if background is None:
         background = _background(settings.background, gaussians.means.dtype, gaussians.means.device)
     else:
+        background = _as_tensor("background", background, (3,), gaussians.means)
         check_tensor("background", background, (3,), {})
         background = background.to(gaussians.means)
     if features is not None:
+        features = _as_tensor("features", features, ("N", "C"), gaussians.means)
         check_features(features, gaussians.means)
     extra = Extra(background, features)
     if not isinstance(camera, Sequence):
@@ -106,6 +109,13 @@ def render(
             "camera: is an empty sequence or has different image sizes; render the cameras one by one"
         )
     return _stack(tuple(_render_one(chosen, gaussians, c, settings, extra) for c in cameras))
+
+
+def _as_tensor(name: str, value: Tensor | ArrayLike, shape: Shape, like: Tensor) -> Tensor:
+    """Return a tensor as it is, and an array or numbers as a tensor of this one's dtype and device."""
+    if isinstance(value, Tensor):
+        return value
+    return torch.from_numpy(float64_array(name, value, shape).copy()).to(like)
 
 
 def _stack(views: tuple[RenderOutput, ...]) -> RenderStack:

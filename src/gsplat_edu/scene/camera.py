@@ -172,6 +172,45 @@ class Camera:
         i = intrinsics
         return cls(R, eye, i.fx, i.fy, i.cx, i.cy, i.H, i.W)
 
+    @classmethod
+    def from_viewmat(
+        cls, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, *, first_pixel: float = 0.0
+    ) -> Camera:
+        """Make a camera from a world-to-camera matrix and an intrinsic matrix, as other libraries keep them.
+
+        viewmat = [R, -R eye; 0 1],  K = [fx 0 cx; 0 fy cy; 0 0 1]
+
+        Args:
+            viewmat: (4, 4) world to camera, OpenCV axes.
+            K: (3, 3) intrinsics, px.
+            width: Image width, px.
+            height: Image height, px.
+            first_pixel: Where K has the centre of the top-left pixel: 0 in this package, 0.5 in gsplat and COLMAP.
+
+        Raises:
+            ShapeError: viewmat is not (4, 4) or K not (3, 3).
+            ArgumentError: viewmat is no rigid motion, K has skew or another last row, or as for the constructor.
+        """
+        rigid = float64_array("viewmat", viewmat, (4, 4))
+        matrix = float64_array("K", K, (3, 3))
+        if np.abs(rigid[3] - (0, 0, 0, 1)).max() > ROTATION_TOLERANCE:
+            raise ArgumentError("viewmat: its last row has to be (0, 0, 0, 1); give world to camera")
+        fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+        if np.abs(matrix - [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]).max() > 0:
+            raise ArgumentError("K: has to be [fx 0 cx; 0 fy cy; 0 0 1]; a pinhole here has no skew")
+        R, shift = rigid[:3, :3], float(float64_array("first_pixel", first_pixel, ()))
+        error = np.abs(R @ R.T - np.eye(3)).max()
+        if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+            raise ArgumentError("viewmat: its (3, 3) part is not a rotation with rows (right, down, forward)")
+        return cls(R, -R.T @ rigid[:3, 3], fx, fy, cx - shift, cy - shift, height, width)
+
+    @property
+    def viewmat(self) -> Float64[np.ndarray, "4 4"]:
+        """World to camera, (4, 4): [R, -R eye; 0 1]."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.R, -self.R @ self.eye
+        return matrix
+
     @property
     def intrinsics(self) -> Intrinsics:
         """Focal lengths, principal point and image size as one value."""

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, ShapeError
-from gsplat_edu.base.validation import Shape, check_shape, first_index
+from gsplat_edu.base.validation import Shape, check_shape, first_index, quoted
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gaussians:
     """N Gaussians as raw parameters, which gradient descent may change freely.
 
@@ -67,6 +68,45 @@ class Gaussians:
     def __len__(self) -> int:
         """Return the number of Gaussians."""
         return self.means.shape[0]
+
+    def __repr__(self) -> str:
+        """Return one line: the number, the degree of the harmonics, dtype and device."""
+        dtype = str(self.means.dtype).removeprefix("torch.")
+        return f"Gaussians({len(self):,}, SH degree {self.sh_degree}, {dtype} on {self.means.device})"
+
+    def __getitem__(self, index: Any) -> Gaussians:  # noqa: ANN401
+        """Return some of the Gaussians.
+
+        Args:
+            index: (N,) mask, (M,) indices or a slice; a tensor, an array or a list.
+
+        Raises:
+            ArgumentError: the index is of another kind, a mask has another length, or an index is out of range.
+        """
+        if not isinstance(index, slice):
+            index = self._rows(index)
+        return self.map(lambda tensor: tensor[index])
+
+    def _rows(self, index: Any) -> Tensor:  # noqa: ANN401
+        """Check a mask or indices, and return the indices on the Gaussians' device."""
+        try:
+            rows = torch.as_tensor(index, device=self.means.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise ArgumentError(
+                f"index: is {quoted(index)}, but has to be a mask, indices or a slice"
+            ) from None
+        if rows.ndim != 1 or (rows.numel() and (rows.is_floating_point() or rows.is_complex())):
+            raise ArgumentError(
+                f"index: has dtype {rows.dtype} and shape {tuple(rows.shape)}, but has to be a mask, indices or a slice"
+            )
+        if rows.dtype == torch.bool:
+            if len(rows) != len(self):
+                raise ArgumentError(f"index: is a mask of {len(rows)}, but there are {len(self)} Gaussians")
+            return rows.nonzero()[:, 0]
+        rows = rows.long()
+        if len(rows) and not (-len(self) <= int(rows.min()) and int(rows.max()) < len(self)):
+            raise ArgumentError(f"index: names a Gaussian beyond the {len(self)} there are")
+        return rows
 
     @property
     def sh_degree(self) -> int:

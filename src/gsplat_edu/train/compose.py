@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import of_type, offers
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.scene.camera import scene_extent
@@ -107,6 +108,8 @@ def training(
         ArgumentError: there are no views or no points, or the configuration asks for what nothing here can give: mcmc
             without a cap, a sky without its splats in `start`, masks of things that move with too few views.
     """
+    of_type("config", config, TrainConfig)
+    offers("dataset", dataset, TrainingData)
     if not dataset.train:
         raise ArgumentError("dataset: has no training views; give at least one")
     config = _with_cap(config, dataset.train, 0 if start is None else len(start.gaussians))

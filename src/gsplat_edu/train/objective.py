@@ -89,9 +89,24 @@ class Objective:
 
     def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
         """Add the gradients of the sum to the `grad` of its leaves; return the value of every term, detached."""
-        values = {name: term(rendered) for name, term in self.terms.items()}
+        values = {name: self._value(name, rendered) for name in self.terms}
         sum_of_scalars(list(values.values())).backward()  # type: ignore[no-untyped-call]
         return {name: value.detach() for name, value in values.items()}
+
+    def _value(self, name: str, rendered: Rendered) -> Float[Tensor, ""]:
+        """Return a term's value.
+
+        Raises:
+            ArgumentError: the term uses the depth without saying so.
+        """
+        try:
+            return self.terms[name](rendered)
+        except (AttributeError, TypeError) as error:
+            if rendered.output.depth is not None or "NoneType" not in str(error):
+                raise
+            raise ArgumentError(
+                f"terms[{name!r}]: uses output.depth, which is rendered only for terms with needs_depth = True"
+            ) from error
 
 
 def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:

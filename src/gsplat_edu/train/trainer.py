@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsplat_edu.base.buffers import reused_buffers
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.validation import of_type, offers
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
@@ -96,6 +97,8 @@ class Trainer:
         callbacks: Sequence[Callback] = (),
         parts: StepParts | None = None,
     ) -> None:
+        parts = parts or StepParts()
+        _check_kinds(gaussians, config, backend, density, parts)
         if not views:
             raise ArgumentError("views: is empty; give at least one view to learn from")
         if not len(gaussians):
@@ -104,7 +107,6 @@ class Trainer:
             raise ArgumentError(
                 f"gaussians: are {len(gaussians)}, more than max_gaussians = {config.max_gaussians}; start with fewer"
             )
-        parts = parts or StepParts()
         _check_parts(config, density, parts)
         self.config, self.extent, self.density = config, extent, density
         self.iteration = 0
@@ -292,6 +294,28 @@ class Trainer:
             transients.load_state(parts["transients"])
         self._feed.load_state(given["feed"])
         self._backgrounds.bit_generator.state = given["backgrounds"]
+
+
+def _check_kinds(
+    gaussians: Gaussians,
+    config: TrainConfig,
+    backend: Backend,
+    density: DensityStrategy | None,
+    parts: StepParts,
+) -> None:
+    """Check that every part has the methods that a step calls, before the first step.
+
+    Raises:
+        ArgumentError: a part is of another kind; the message names the part, and what it lacks.
+    """
+    of_type("gaussians", gaussians, Gaussians)
+    of_type("config", config, TrainConfig)
+    if isinstance(backend, str):
+        raise ArgumentError(f"backend: is {backend!r}, but has to be a Backend: load_backend({backend!r})")
+    of_type("backend", backend, Backend)
+    offers("parts.view_model", parts.view_model, ViewModel)
+    if density is not None:
+        offers("density", density, DensityStrategy)
 
 
 def _check_parts(config: TrainConfig, density: DensityStrategy | None, parts: StepParts) -> None:
