@@ -39,7 +39,7 @@ def test_the_contracts_hold(copy):
 @pytest.mark.parametrize(
     ("file", "line"),
     [
-        ("scene/camera.py", "import gsplat_edu.scene.sphere_shell"),
+        ("scene/camera.py", "import gsplat_edu.ops.kernels"),
         ("train/trainer.py", "import gsplat_edu.data.synthetic"),
         ("train/trainer.py", "import gsplat_edu.cli.main"),
         ("train/density/surgery.py", "import gsplat_edu.render.torch_reference"),

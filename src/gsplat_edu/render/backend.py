@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import torch
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import of_type
 from gsplat_edu.ops.adam import AdamKernel
 from gsplat_edu.ops.losses import LossKernel
 from gsplat_edu.ops.noise import NoiseKernel
@@ -70,3 +71,14 @@ class Backend:
             raise ArgumentError(
                 f"{what} needs a backend that {FEATURES[feature]}, which {self.name} does not; use the backend cpu"
             )
+
+
+def check_backend_value(backend: object) -> None:
+    """Check that a backend is one, and not its name.
+
+    Raises:
+        ArgumentError: it is something else; says what to write.
+    """
+    if isinstance(backend, str):
+        raise ArgumentError(f"backend: is {backend!r}, but has to be a Backend: load_backend({backend!r})")
+    of_type("backend", backend, Backend)

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import of_type, offers
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backend import Backend, check_backend_value
 from gsplat_edu.scene.camera import scene_extent
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
@@ -109,6 +109,7 @@ def training(
             without a cap, a sky without its splats in `start`, masks of things that move with too few views.
     """
     of_type("config", config, TrainConfig)
+    check_backend_value(backend)
     offers("dataset", dataset, TrainingData)
     if not dataset.train:
         raise ArgumentError("dataset: has no training views; give at least one")

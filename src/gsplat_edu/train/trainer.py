@@ -17,7 +17,7 @@ from torch import Tensor
 from gsplat_edu.base.buffers import reused_buffers
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import of_type, offers
-from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backend import Backend, check_backend_value
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
@@ -310,9 +310,7 @@ def _check_kinds(
     """
     of_type("gaussians", gaussians, Gaussians)
     of_type("config", config, TrainConfig)
-    if isinstance(backend, str):
-        raise ArgumentError(f"backend: is {backend!r}, but has to be a Backend: load_backend({backend!r})")
-    of_type("backend", backend, Backend)
+    check_backend_value(backend)
     offers("parts.view_model", parts.view_model, ViewModel)
     if density is not None:
         offers("density", density, DensityStrategy)
