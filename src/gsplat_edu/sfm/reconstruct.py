@@ -318,6 +318,11 @@ class _Run:
                 f"{candidates.sequence}; {len(chosen):,} pairs are matched instead of all {math.comb(count, 2):,}; "
                 "for all, run gsplat-edu sfm with --matcher exhaustive"
             )
+        elif self.options.matcher == "auto" and kind == "nearest" and not self.video:
+            self._say(
+                f"each photo is matched with those that follow it, look alike or were taken nearby: {len(chosen):,} "
+                f"pairs instead of all {math.comb(count, 2):,}; for all, run gsplat-edu sfm with --matcher exhaustive"
+            )
         verified = self._match_pairs(chosen)
         part = self._connected(verified)
         if len(part) < count and self.options.matcher == "auto" and kind != "exhaustive":
