@@ -4,7 +4,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from gsplat_edu.views import View
 
 import slices
 from damage import damaged_bytes, damaged_json, damaged_text
@@ -13,6 +12,7 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.scale import Scale, write_scale
 from gsplat_edu.data.writers import write_blender, write_colmap, write_transforms
+from gsplat_edu.scene.views import View
 
 CAPTURES = slices.count("GSPLAT_EDU_FUZZ_CAPTURES", 40, 3_000)
 """Damaged captures per file."""
