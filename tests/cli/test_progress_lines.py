@@ -85,6 +85,21 @@ def test_stages_of_unknown_speed_show_the_elapsed_time_only():
     assert lines(log) == ["mapping: 7 of 120, 0:40 elapsed", "mapping: 7 of 120, 1:15 elapsed"]
 
 
+def test_stages_of_steady_speed_show_the_time_left():
+    time = Time()
+    log = Console(file=io.StringIO(), width=80, get_time=time)
+    with stage_bars(log) as progress:
+        for stage in ("features", "matches"):
+            progress(stage, 0, 120)
+            for done in (10, 20, 30, 40):
+                time.now += 10.0
+                progress(stage, done, 120)
+    assert lines(log) == [
+        "features: 30 of 120, 0:30 elapsed, 1:30 left",
+        "matches: 30 of 120, 0:30 elapsed, 1:30 left",
+    ]
+
+
 def test_a_terminal_gets_no_lines():
     time = Time()
     console = Console(file=io.StringIO(), width=80, force_terminal=True)

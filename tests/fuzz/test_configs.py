@@ -2,13 +2,12 @@
 
 import contextlib
 import io
-import json
 
 import numpy as np
 import pytest
 
 import slices
-from checkpoints import changed_json, spelled
+from damage import damaged_json
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
@@ -20,15 +19,6 @@ MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CONFIGS", 25, 1_000)
 """Number of damaged files."""
 
 SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
-
-
-def damaged(data, rng):
-    if rng.random() < 0.3:
-        raw = bytearray(data)
-        for at in rng.integers(0, len(raw), rng.integers(1, 4)):
-            raw[at] = int(rng.choice([rng.integers(0, 256), *b'0123456789"[]{},:-']))
-        return bytes(raw[: int(rng.integers(0, len(raw)))] if rng.random() < 0.1 else raw)
-    return spelled(changed_json(json.loads(data), rng), rng).encode("utf-8", "replace")
 
 
 def resumed(words):
@@ -48,7 +38,7 @@ def test_damaged_configs(tmp_path):
     assert main(words) == 0
     whole = (out / "config.json").read_bytes()
     for seed in SEEDS:
-        (out / "config.json").write_bytes(damaged(whole, np.random.default_rng(seed)))
+        (out / "config.json").write_bytes(damaged_json(whole, np.random.default_rng(seed)))
         code, said = resumed(words)
         assert code in (0, 2), seed
         assert code == 0 or (said.count("\n") == 1 and said.startswith("gsplat-edu")), (seed, said)

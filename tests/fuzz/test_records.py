@@ -13,7 +13,7 @@ import pytest
 
 import slices
 from blocks.test_plan import flight, under
-from checkpoints import changed_json, spelled
+from damage import damaged_json
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.blocks.layout import BlocksFolder, Done
 from gsplat_edu.blocks.plan import Block, BlockPlan, Cell, measured_area
@@ -39,19 +39,9 @@ RECORDS = slices.count("GSPLAT_EDU_FUZZ_RECORDS", 60, 20_000)
 SEEDS = range(slices.SEED, slices.SEED + RECORDS)
 
 
-def damaged(data, rng):
-    """Damage bytes, or values of the JSON."""
-    if rng.random() < 0.3:
-        raw = bytearray(data)
-        for at in rng.integers(0, len(raw), rng.integers(1, 4)):
-            raw[at] = int(rng.choice([rng.integers(0, 256), *b'0123456789"[]{},:-./\\']))
-        return bytes(raw[: int(rng.integers(0, len(raw)))] if rng.random() < 0.1 else raw)
-    return spelled(changed_json(json.loads(data), rng), rng).encode("utf-8", "replace")
-
-
 def each_damage(data):
     for seed in SEEDS:
-        yield seed, damaged(data, np.random.default_rng(seed))
+        yield seed, damaged_json(data, np.random.default_rng(seed))
 
 
 def refused(read):

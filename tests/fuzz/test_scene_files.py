@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import slices
+from damage import damaged_bytes
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.formats import FORMATS, read_scene
 from scene_files import small_file, small_levels
@@ -18,36 +19,6 @@ SEEDS = range(slices.SEED, slices.SEED + FILES)
 
 MOST_MEMORY = 24 << 20
 """Bytes. Files here have at most 32 KiB; they are allowed 1 MiB of contents, plus float32 copies of those."""
-
-
-def mutated(data, rng):
-    """Damage some bytes: flip bits, change numbers, or delete, repeat, randomise or truncate pieces."""
-    damaged = bytearray(data)
-    for _ in range(int(rng.integers(1, 5))):
-        # Half of the damage goes to the region of the headers.
-        reach = len(damaged) if rng.random() < 0.5 else min(len(damaged), 400)
-        if reach < 2:
-            break
-        at = int(rng.integers(0, reach))
-        span = min(int(rng.integers(1, 65)), len(damaged) - at)
-        match int(rng.integers(0, 7)):
-            case 0:
-                damaged[at] ^= 1 << int(rng.integers(0, 8))
-            case 1:
-                damaged[at] = int(rng.integers(0, 256))
-            case 2:
-                damaged[at : at + 4] = rng.choice(
-                    [b"\xff" * 4, b"\0" * 4, b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f"]
-                )
-            case 3:
-                del damaged[at : at + span]
-            case 4:
-                damaged[at:at] = damaged[at : at + span]
-            case 5:
-                damaged[at : at + span] = rng.bytes(span)
-            case 6:
-                del damaged[at:]
-    return bytes(damaged)
 
 
 def check(path, seed):
@@ -71,7 +42,7 @@ def test_damaged_files(tmp_path, suffix):
     data = small_file(tmp_path, suffix).read_bytes()
     path = tmp_path / f"damaged{suffix}"
     for seed in SEEDS:
-        path.write_bytes(mutated(data, np.random.default_rng(seed)))
+        path.write_bytes(damaged_bytes(data, np.random.default_rng(seed)))
         check(path, seed)
 
 
@@ -89,7 +60,7 @@ def test_damage_inside_a_sog(tmp_path):
         victim = names[int(rng.integers(0, len(names)))] if rng.random() < 0.5 else "meta.json"
         with zipfile.ZipFile(path, "w") as bundle:
             for name, content in parts.items():
-                bundle.writestr(name, mutated(content, rng) if name == victim else content)
+                bundle.writestr(name, damaged_bytes(content, rng) if name == victim else content)
         check(path, seed)
 
 
@@ -102,6 +73,6 @@ def test_damage_inside_levels_of_detail(tmp_path):
         rng = np.random.default_rng(seed)
         victim = files[int(rng.integers(0, len(files)))] if rng.random() < 0.5 else whole
         content = victim.read_bytes()
-        victim.write_bytes(mutated(content, rng))
+        victim.write_bytes(damaged_bytes(content, rng))
         check(whole, seed)
         victim.write_bytes(content)

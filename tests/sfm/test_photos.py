@@ -125,7 +125,10 @@ def test_the_focal_length_comes_from_exif(tmp_path):
     details[0xA002] = 80  # the photo was halved after it was taken
     np.testing.assert_allclose(facts(tmp_path, exif).focal, 12.5, rtol=1e-4)
 
-    details[0x920A] = 500.0
+    details[0xA20E] = "0"
+    assert facts(tmp_path, exif).focal is None, "no resolution, written as text"
+
+    details[0x920A], details[0xA20E] = 500.0, 50.0
     assert facts(tmp_path, exif).focal is None, "more than twenty times the width is implausible"
 
 

@@ -186,6 +186,22 @@ def test_many_photos_without_an_order_get_those_nearby(lap_of):
     )
 
 
+def test_the_reason_for_fewer_pairs_is_told(lap_of):
+    in_order = lap_of(turns_by_name(90, 1))
+    assert in_order.reason("sequence").startswith("the photos were taken in sequence: sorted by name")
+    assert in_order.reason("exhaustive") == ""
+    assert in_order.reason("nearest") == "each photo is matched with those that follow it or look alike"
+
+
+def test_positions_are_a_reason_for_fewer_pairs(lap_of):
+    places = [(47.0 + 0.001 * i, 8.0, 0.0) for i in range(20)]
+    assert lap_of(laps(20, 1), places).reason("nearest").endswith("look alike or were taken nearby")
+
+
+def test_frames_of_a_video_need_no_reason(lap_of):
+    assert lap_of(laps(20, 1), video=True).reason("nearest") == ""
+
+
 def test_a_chosen_matcher_follows_natural_order(lap_of):
     order = natural_order(sorted(names(20)))
     pairs = lap_of(turns_by_name(20, 1)).of("sequential")

@@ -12,9 +12,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 
 from gsplat_edu.base.locks import locked
 from gsplat_edu.cli.options.sfm import options_from
-from gsplat_edu.cli.terminal import Bar, Terminal
+from gsplat_edu.cli.terminal import Bar, Terminal, TimeLeft
 from gsplat_edu.jobs import emitter
 from gsplat_edu.sfm.reconstruct import reconstruct
+
+UNSTEADY = "mapping"
+"""The stage whose speed forecasts nothing: each photo takes longer than the last, and it may start over."""
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -51,6 +54,7 @@ def stage_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        TimeLeft(compact=True),
     )
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         tasks: dict[str, TaskID] = {}
@@ -59,7 +63,7 @@ def stage_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
             if stage not in tasks:
                 for task in tasks.values():
                     bar.update(task, visible=False)
-                tasks[stage] = bar.add_task(stage, total=total)
+                tasks[stage] = bar.add_task(stage, total=total, steady=stage != UNSTEADY)
             bar.update(tasks[stage], completed=done, total=total)
 
         yield show

@@ -78,11 +78,14 @@ class Bar(Progress):
         return elapsed - self._told.get(task_id, 0.0) >= max(LINE_SECONDS, LINE_SHARE * elapsed)
 
     def times(self, task_id: TaskID) -> str:
-        """Return for how long a task has run, and how long it will, unless no column of the bars forecasts that."""
+        """Return for how long a task has run, and how long it will.
+
+        The time left is missing if no column of the bars forecasts it, or if the task's field "steady" is false.
+        """
         task = self._tasks[task_id]
         self._told[task_id] = task.elapsed or 0.0
         said = f"{clock(task.elapsed or 0.0)} elapsed"
-        if any(isinstance(column, TimeRemainingColumn) for column in self.columns):
+        if task.fields.get("steady", True) and any(isinstance(c, TimeRemainingColumn) for c in self.columns):
             remaining = task.time_remaining
             said += "" if remaining is None else f", {clock(remaining)} left"
         return said
@@ -97,6 +100,14 @@ class Bar(Progress):
             line = f"{task.description}: {task.completed:,.0f}{total}, {self.times(task_id)}"
             # not Terminal.print: a job has reported this as progress, and needs no message
             Console.print(self.console, printable(line), markup=False, emoji=False, soft_wrap=True)
+
+
+class TimeLeft(TimeRemainingColumn):
+    """The time left; empty for tasks whose field "steady" is false, because their speed changes too much."""
+
+    def render(self, task: Task) -> Text:
+        """Return the time left, or nothing."""
+        return super().render(task) if task.fields.get("steady", True) else Text()
 
 
 def clock(seconds: float) -> str:

@@ -274,7 +274,7 @@ class CaptureRun:
         gaussians = from_points(dataset.points, dataset.colors, config)
         if len(gaussians) < len(dataset.points) and not self.folder.exists():
             self._say(
-                f"the capture has {len(dataset.points)} start points; {len(gaussians)} of them are used (the cap)"
+                f"the capture has {len(dataset.points):,} start points; {len(gaussians):,} of them are used (the cap)"
             )
         return gaussians if sky is None else Gaussians.concatenated([gaussians, sky]), None
 

@@ -61,6 +61,19 @@ class Candidates:
             return "sequence"
         return "exhaustive" if len(self.photos) <= EXHAUSTIVE and not self.video else "nearest"
 
+    def reason(self, kind: str) -> str:
+        """Return why a matcher tries fewer than all pairs of photos; empty for frames, or if it tries all.
+
+        Args:
+            kind: The matcher, as `automatic` returns it.
+        """
+        if kind == "sequence":
+            return str(self.sequence)
+        if kind == "exhaustive" or self.video:
+            return ""
+        nearby = " or were taken nearby" if all(photo.place is not None for photo in self.photos) else ""
+        return f"each photo is matched with those that follow it or look alike{nearby}"
+
     def farther(self, kind: str) -> set[pairs.Pair]:
         """Return more pairs, for photos that those of the automatic matcher `kind` did not connect."""
         return self.of("exhaustive") if len(self.photos) <= EXHAUSTIVE else self.of(kind, 3)

@@ -398,10 +398,10 @@ def _focal(details: dict[int, object], W: int, H: int) -> float | None:
     focal = equivalent / FULL_FRAME * math.hypot(W, H)
     if not focal > 0:  # NaN, too
         unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(details.get(ExifTags.Base.FocalPlaneResolutionUnit, 2), 25.4)  # type: ignore[call-overload]
-        pitch = unit / _number(details.get(ExifTags.Base.FocalPlaneXResolution) or math.nan)  # mm
+        per_mm = _number(details.get(ExifTags.Base.FocalPlaneXResolution)) / unit
         stored = _number(details.get(ExifTags.Base.ExifImageWidth))
         shrunk = W / stored if stored > 0 else 1.0
-        focal = _number(details.get(ExifTags.Base.FocalLength)) / pitch * shrunk
+        focal = _number(details.get(ExifTags.Base.FocalLength)) * per_mm * shrunk
     return float(focal) if 0.3 * max(W, H) < focal < 20.0 * max(W, H) else None
 
 

@@ -313,9 +313,9 @@ class _Run:
         if kind == "auto":
             kind = candidates.automatic()
         chosen = candidates.of(kind)
-        if kind == "sequence":
+        if kind != self.options.matcher and (reason := candidates.reason(kind)):
             self._say(
-                f"{candidates.sequence}; {len(chosen):,} pairs are matched instead of all {math.comb(count, 2):,}; "
+                f"{reason}; {len(chosen):,} pairs are matched instead of all {math.comb(count, 2):,}; "
                 "for all, run gsplat-edu sfm with --matcher exhaustive"
             )
         verified = self._match_pairs(chosen)
