@@ -128,7 +128,7 @@ def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: AN
         costs["unsplit"] = measured(*words)
     words = ["--blocks", given.blocks, "--iterations", each, "--coarse-iterations", coarse]
     words += ["--min-views", given.min_views, *recipe]
-    costs["coarse and split"] = measured("split", data, "--out", parts.path, *words)
+    costs["coarse and split"] = measured("train", data, "--out", parts.path, "--until", "split", *words)
     plan = BlockPlan.read(parts.path)
     found = len(plan.blocks)
     for number in range(found):

@@ -17,8 +17,8 @@ import torch
 
 from gsplat_edu import Camera
 from gsplat_edu.data.synthetic import sphere_cameras
+from gsplat_edu.render import torch_reference
 from gsplat_edu.render.api import render
-from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.initialize import random_ball
 
@@ -30,7 +30,8 @@ NUM_GAUSSIANS, SIZE, ROUNDS = 1600, 128, 7
 def seconds(gaussians: Gaussians, camera: Camera, chunk: int) -> tuple[float, float]:
     """Time one forward and one backward pass."""
     start = time.perf_counter()
-    output = render(gaussians, camera, settings=RenderSettings(dense_chunk=chunk), backend="torch")
+    torch_reference.CHUNK = chunk
+    output = render(gaussians, camera, backend="torch")
     middle = time.perf_counter()
     output.image.mean().backward()
     return middle - start, time.perf_counter() - middle

@@ -20,6 +20,7 @@ import torch
 from gsplat_edu import Camera
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.ops.losses import l1
+from gsplat_edu.render import torch_reference
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
@@ -41,7 +42,8 @@ def dense(chunk: int) -> Backend:
     def rasterize(
         gaussians: Gaussians, camera: Camera, settings: RenderSettings, extra: Extra
     ) -> RenderOutput:
-        return backend.rasterize(gaussians, camera, dataclasses.replace(settings, dense_chunk=chunk), extra)
+        torch_reference.CHUNK = chunk
+        return backend.rasterize(gaussians, camera, settings, extra)
 
     return dataclasses.replace(backend, rasterize=rasterize)
 

@@ -288,7 +288,6 @@ REJECTED_TENSORS = [
     (RenderSettings, {"sh_degree": 9}, ArgumentError, "sh_degree"),
     (RenderSettings, {"background": (0, 0)}, ShapeError, "background"),
     (RenderSettings, {"sh_degree": -1}, ArgumentError, "sh_degree"),
-    (RenderSettings, {"dense_chunk": 0}, ArgumentError, "dense_chunk"),
 ]
 
 

@@ -21,7 +21,7 @@ def city(tmp_path_factory) -> Path:
 def split(city, tmp_path_factory) -> Path:
     """The capture, split into four blocks that are not trained yet."""
     folder = tmp_path_factory.mktemp("split") / "run"
-    assert main(["split", str(city), "--out", str(folder), "--blocks", "4", *RECIPE]) == 0
+    assert main(["train", str(city), "--out", str(folder), "--blocks", "4", "--until", "split", *RECIPE]) == 0
     return folder
 
 

@@ -217,6 +217,15 @@ def test_what_was_changed_or_damaged_is_named(serial, tmp_path, capsys):
         (["--blocks", "0"], "--blocks: is 0, but has to be auto or a number from 1 to 256"),
         (["--blocks", "some"], "--blocks: is some, but has to be"),
         (["--workers", "2"], "--workers: has an effect only with --blocks"),
+        (["--until", "split"], "--until: has an effect only with --blocks"),
+        (
+            ["--blocks", "2", "--until", "split", "--export", "a.spz"],
+            "--export: does not go with --until split; give it to",
+        ),
+        (
+            ["--blocks", "2", "--until", "split", "--workers", "2"],
+            "--workers: does not go with --until split",
+        ),
         (["--blocks", "2", "--time-limit", "1h"], "--time-limit: does not go with --blocks"),
         (["--blocks", "2", "--view"], "--view: does not go with --blocks"),
         (["--blocks", "2", "--workers", "0"], "--workers: is 0"),
@@ -244,7 +253,7 @@ def test_other_options_are_refused_on_resuming(city, run, capsys):
 
 
 def test_blocks_with_few_views_join(city, serial, tmp_path, capsys):
-    words = ["split", str(city), "--out", str(tmp_path / "run"), "--from", str(serial)]
+    words = ["train", str(city), "--out", str(tmp_path / "run"), "--from", str(serial), "--until", "split"]
     arguments = [*words, "--strategy", "adc", "--iterations", "10", "--blocks", "6", "--min-views", "25"]
     assert main(arguments) == 0
     plan = BlockPlan.read(tmp_path / "run")

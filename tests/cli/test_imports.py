@@ -24,7 +24,6 @@ for line in sys.stdin.read().splitlines():
 
 NEEDED = {
     "train": "CAPTURE --out RUN",
-    "split": "CAPTURE --out RUN",
     "block": "a 0",
     "merge": "a",
     "sfm": "a b",
@@ -49,7 +48,7 @@ OUT_OF_RANGE = [
     "train nowhere --out RUN",
     "train CAPTURE --out RUN --blocks 0",
     "train CAPTURE --out RUN --workers 2",
-    "split CAPTURE --out RUN --blocks 3 --time-limit 5m",
+    "train CAPTURE --out RUN --blocks 3 --until split --time-limit 5m",
     "block nowhere 0",
     "merge nowhere",
     "eval nowhere",

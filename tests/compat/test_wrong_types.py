@@ -135,7 +135,6 @@ TAKEN = {
     # Whole numbers without an upper limit that have no effect on the image.
     "tile_size": {"a large number"},
     "channel_chunk": {"a large number"},
-    "dense_chunk": {"a large number"},
     "binoms": {"booleans"},  # a table of 0 and 1
     # No Gaussians: then the other arguments are the wrong ones.
     "compute_relocation opacities": {"an empty tensor"},

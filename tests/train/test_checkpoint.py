@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import pytest
 import torch
@@ -64,22 +63,6 @@ def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, name, at):
     for key, tensor in tensors.items():
         assert torch.equal(tensor, resumed[key]), key
     assert len(whole.gaussians) != len(capture[1]), "densification changed the count"
-
-
-@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
-def test_a_checkpoint_from_before_parameter_groups_is_resumed(strategy):
-    """Code from before Adam had named groups wrote these files, after 5 steps of the same trainers."""
-    path = Path(__file__).parent / "old_checkpoints" / f"{strategy}.safetensors"
-    stored, metadata = read(path)
-    run = Maker(strategy)()
-    load_checkpoint(path, run)
-    tensors, numbers = run.state()
-    assert run.iteration == 5 and numbers == json.loads(metadata["state"])
-    assert tensors.keys() == stored.keys()
-    for name, tensor in stored.items():
-        assert torch.equal(tensors[name], tensor), name
-    steps(run, 3)
-    assert not torch.equal(run.state()[0]["first.means"], stored["first.means"])
 
 
 def test_the_last_two_checkpoints_and_the_training_time_are_kept(capture, tmp_path):

@@ -205,7 +205,7 @@ class BlockPlan:
         path = folder / PLAN
         if not path.is_file():
             raise CheckpointError(
-                f"{folder}: has no {PLAN}; make one with `gsplat-edu split CAPTURE --out {folder}`"
+                f"{folder}: has no {PLAN}; `train CAPTURE --out {folder} --blocks auto --until split` makes it"
             )
         try:
             found = parse_json(read_text(path))

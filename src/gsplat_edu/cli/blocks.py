@@ -23,7 +23,7 @@ from gsplat_edu.cli.block_table import BlockTable
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.block_parts import parts_of_blocks
-from gsplat_edu.cli.options.blocks import LEAST_VIEWS, block_count
+from gsplat_edu.cli.options.blocks import LEAST_VIEWS, SPLIT, block_count
 from gsplat_edu.cli.options.train import OPEN, left_open, options_from
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train import (
@@ -43,7 +43,7 @@ Say = Callable[[str], None]
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Split, train every block, merge and report."""
+    """Split, train every block, merge and report; or only split."""
     console = Terminal()
 
     def say(sentence: str) -> None:
@@ -55,8 +55,15 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.scheduler is not None or (arguments.workers or 1) > 1:
         cluster = ClusterOptions(arguments.scheduler, arguments.workers or 1)
     with locked("--out", arguments.out, "gsplat-edu train --blocks", say):
-        planned = prepared(arguments, console, say)
+        planned = _prepared(arguments, console, say)
         folder = BlocksFolder(arguments.out)
+        if arguments.until == SPLIT:
+            last = len(planned.blocks) - 1
+            say(
+                f"wrote {arguments.out}: train blocks 0 to {last} with `gsplat-edu block {arguments.out} K`, on any"
+                f" machine that sees it; then `gsplat-edu merge {arguments.out}`"
+            )
+            return
         with BlockTable(console, folder, planned) as table:
             if cluster is None:
                 _train_here(folder, planned, table)
@@ -68,7 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
         merge_and_report(arguments.out, arguments.export, console, say)
 
 
-def prepared(arguments: argparse.Namespace, console: Console, say: Say) -> BlockPlan:
+def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> BlockPlan:
     """Return the plan of a run in blocks; train the coarse model and split the capture if there is none yet.
 
     Raises:

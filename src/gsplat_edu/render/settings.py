@@ -52,8 +52,6 @@ class RenderSettings:
             of their transmittances are below 1e-4. "pixel": for each pixel, before the first Gaussian that would take
             its transmittance to 1e-4 or below, as in Kerbl et al.'s code and gsplat; only the backend cpu offers it.
         z_near: Gaussians whose means are at this camera depth or nearer are not drawn, world units.
-        dense_chunk: Number of splats that the dense torch backend evaluates at once. It affects speed, not the image
-            (except for rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
 
     Raises:
         ShapeError: the background is not of shape (3,).
@@ -70,7 +68,6 @@ class RenderSettings:
     alpha_max: float = ALPHA_MAX
     stop: str = "tile"
     z_near: float = Z_NEAR
-    dense_chunk: int = 16
 
     def __post_init__(self) -> None:
         """Check the ranges, and convert NumPy scalars and arrays to plain Python values for the kernels."""
@@ -86,7 +83,6 @@ class RenderSettings:
             "jacobian_limit": None if limit is None else in_range("jacobian_limit", limit, 1.0),
             "alpha_max": in_range("alpha_max", self.alpha_max, ALPHA_MIN, 0.9999),
             "z_near": in_range("z_near", self.z_near, 0.0),
-            "dense_chunk": whole_number("dense_chunk", self.dense_chunk, 1),
         }
         for name, value in plain.items():
             object.__setattr__(self, name, value)

@@ -26,6 +26,10 @@ from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import Gaussians, check_tensor, quat_to_R_t
 from gsplat_edu.scene.sh import basis_terms, num_coefficients
 
+CHUNK = 16
+"""Number of splats that are evaluated at once. It affects speed and rounding only; with 16, a chunk fits a core's cache
+at 128 px (`benchmarks/dense.py`)."""
+
 
 class DenseRender(NamedTuple):
     """The result of `render_t`."""
@@ -169,14 +173,8 @@ def render_dense(
     if extra.features is not None:
         channels.append(extra.features[screen.visible])
     thresholds = _Thresholds(ALPHA_MIN, settings.alpha_max)
-    mixed, T = _composite(
-        screen, torch.cat(channels, dim=1), opacities, camera, thresholds, settings.dense_chunk
-    )
-    median = (
-        _median(screen, opacities, camera, thresholds, settings.dense_chunk)
-        if settings.median_depth
-        else None
-    )
+    mixed, T = _composite(screen, torch.cat(channels, dim=1), opacities, camera, thresholds, CHUNK)
+    median = _median(screen, opacities, camera, thresholds, CHUNK) if settings.median_depth else None
     return RenderOutput(
         image=mixed[..., :3] + T[..., None] * extra.background,
         transmittance=T,

@@ -14,19 +14,13 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.train.config import ONLY_FOR, SETTINGS
+from gsplat_edu.train.config import ONLY_FOR
 
 SAME = ("train", "render", "data")
 """Sections of config.json that must be equal in a resumed run."""
 
 MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
 """Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
-
-ADDED = ("batch", "appearance", "sky", "refine", "pose_spread", "lens_rate", "transients", "outside_masks")
-"""Settings of the training that came after the first version. A run without them was trained with their defaults."""
-
-RETIRED = {"pose_rate": ("poses", "both")}
-"""Settings that are gone, and the values of `refine` for which they mattered: other runs resume without them."""
 
 MOVED = 1e-9
 """Tolerance of camera coordinates, relative and absolute: subtracting an origin and adding it back rounds."""
@@ -35,8 +29,7 @@ MOVED = 1e-9
 def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     """Compare the options of a resumed run with those it was started with.
 
-    Settings of strategies that the run does not use may differ. A setting that the version which started the run did
-    not have counts as its default.
+    Settings of strategies that the run does not use may differ.
 
     Raises:
         CheckpointError: an option differs, or config.json is damaged; the message names the option.
@@ -54,9 +47,6 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     idle = {name for strategy, names in ONLY_FOR.items() if strategy != used for name in names}
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
-        if section == "train":
-            before = {setting.name: setting.default for setting in SETTINGS if setting.name in ADDED} | before
-            idle |= {name for name, users in RETIRED.items() if before["refine"] not in users}
         names = {*before, *now} - idle - set(MAY_DIFFER.get(section, ()))
         # The strategy first: it explains other differences.
         for key in sorted(names, key=lambda name: (name != "strategy", name)):

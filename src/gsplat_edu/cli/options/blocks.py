@@ -1,4 +1,4 @@
-"""Options of runs in blocks, which `train` and `split` share."""
+"""Options of runs in blocks, of `train` and of the commands that train and merge blocks."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ COARSE_SHARE = 0.5
 COARSE_FACTOR = 2.0
 """The coarse training sees photos whose sides are divided by this, in addition to --resolution."""
 
+SPLIT, MERGE = UNTIL = ("split", "merge")
+"""Steps of a run in blocks after which --until ends it."""
+
 UNUSED = {
     "points": "the coarse model starts from the capture's points",
     "time_limit": "give --iterations or --quality",
@@ -28,13 +31,8 @@ UNUSED = {
 """Options of train that do not go with --blocks, and what to do instead."""
 
 
-def add_blocks(parser: argparse.ArgumentParser, default: str | None = None) -> None:
-    """Add the options that split a capture.
-
-    Args:
-        parser: The parser.
-        default: Default of --blocks.
-    """
+def add_blocks(parser: argparse.ArgumentParser) -> None:
+    """Add the options that split a capture."""
     group = parser.add_argument_group(
         "blocks",
         "For captures too large for one machine or its memory; docs/SCALE.md explains them. --iterations and --quality"
@@ -43,9 +41,14 @@ def add_blocks(parser: argparse.ArgumentParser, default: str | None = None) -> N
     group.add_argument(
         "--blocks",
         metavar="N|auto",
-        default=default,
         help="split the ground into this many blocks, train each as a run of its own, and merge them; auto makes one"
-        f" for every 200 training views (default: {default or 'train the capture as a whole'})",
+        " for every 200 training views (default: train the capture as a whole)",
+    )
+    group.add_argument(
+        "--until",
+        choices=UNTIL,
+        help="end after this step: split trains the coarse model and makes the blocks, which `gsplat-edu block` trains"
+        " on any machine and `gsplat-edu merge` merges (default: merge)",
     )
     for flag, text in (
         ("--min-views", f"blocks with fewer training views join a neighbour (default: {LEAST_VIEWS})"),
@@ -73,7 +76,9 @@ def add_cluster(parser: argparse.ArgumentParser) -> None:
 
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Add the folder of a run in blocks, and where its capture is."""
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder that `gsplat-edu split` wrote")
+    parser.add_argument(
+        "run_folder", type=Path, metavar="RUN", help="folder that `gsplat-edu train --blocks` made"
+    )
     parser.add_argument(
         "--data",
         type=Path,
@@ -92,7 +97,7 @@ def check_run(arguments: argparse.Namespace) -> None:
     folder = arguments.run_folder
     if not (folder / PLAN).is_file():
         raise CheckpointError(
-            f"{folder}: has no {PLAN}; make one with `gsplat-edu split CAPTURE --out {folder}`"
+            f"{folder}: has no {PLAN}; `train CAPTURE --out {folder} --blocks auto --until split` makes it"
         )
     if arguments.data is not None and not arguments.data.exists():
         raise DatasetError(f"--data: {arguments.data} does not exist; give the folder of the capture")
@@ -124,12 +129,20 @@ def check_blocks(arguments: argparse.Namespace) -> None:
         ArgumentError: one is out of range, or does not go with the others.
     """
     if arguments.blocks is None:
-        for name in ("min_views", "coarse_iterations", "workers", "scheduler"):
+        for name in ("min_views", "coarse_iterations", "until", "workers", "scheduler"):
             if getattr(arguments, name, None) is not None:
                 flag = f"--{name.replace('_', '-')}"
                 raise ArgumentError(f"{flag}: has an effect only with --blocks; add --blocks, or omit {flag}")
         return
     block_count(arguments)
+    if arguments.until == SPLIT:
+        for name, advice in (
+            ("export", "give it to `gsplat-edu merge`"),
+            ("workers", "blocks are not trained"),
+            ("scheduler", "blocks are not trained"),
+        ):
+            if getattr(arguments, name):
+                raise ArgumentError(f"--{name}: does not go with --until split; {advice}")
     for name, advice in UNUSED.items():
         if getattr(arguments, name) not in (None, "none"):
             raise ArgumentError(f"--{name.replace('_', '-')}: does not go with --blocks; {advice}")
