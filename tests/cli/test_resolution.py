@@ -46,11 +46,8 @@ def test_train_chooses_and_says_so_and_doctor_advises_it(tmp_path, capsys, monke
     assert 40 <= side < 100
     assert f"--resolution {side}: the planned Gaussians do not resolve more" in capsys.readouterr().out
     assert main([*words, str(tmp_path / "small"), "--resume"]) == 0
-    (found,) = [
-        one
-        for one in examine(prepare(CaptureReader(tmp_path / "capture"))).findings
-        if one.name == "resolution"
-    ]
+    survey = prepare(CaptureReader(tmp_path / "capture"))
+    (found,) = [one for one in examine(survey).findings if one.name == "resolution"]
     assert "--resolution auto" in found.advice
     assert "--resolution auto --out" in examine(survey).otherwise[0], "the next command"
     given = examine(survey, ("--resolution", "2")).otherwise[0]

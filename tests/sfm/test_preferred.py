@@ -151,12 +151,8 @@ def test_the_sound_model_is_chosen_over_one_with_more_poses(models, tmp_path, mo
 
 
 def test_doctor_names_the_wrong_poses_of_the_global_model(models):
-    doubtful = [
-        f
-        for f in examine(prepare(CaptureReader(models.root / "global"))).findings
-        if f.name == "doubtful poses"
-    ]
-    (finding,) = doubtful
+    findings = examine(prepare(CaptureReader(models.root / "global"))).findings
+    (finding,) = [f for f in findings if f.name == "doubtful poses"]
     assert finding.severity is Severity.WARNING
     assert list(finding.images) == models.weak
     far = [label for label in finding.labels if "times as far as the others" in label]
