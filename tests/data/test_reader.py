@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.procedural import procedural_capture
@@ -31,7 +32,7 @@ def capture(tmp_path_factory):
 def test_a_derived_dataset_is_that_of_a_capture_read_anew(capture, tmp_path, with_points):
     points = tmp_path / "points.ply" if with_points else None
     if points is not None:
-        write_points_ply(points, np.eye(3), np.full((3, 3), 0.5))
+        write_points_ply(points, Cloud(np.eye(3), np.full((3, 3), 0.5)))
     reader = CaptureReader(capture)
     for settings in (*SETTINGS, SETTINGS[0]):
         a = Dataset.of(reader, settings, points=points)
