@@ -31,6 +31,7 @@ from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.outdoors import outdoor_capture, photograph
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.remedies import remedies_for
 from gsplat_edu.evaluate.metrics import psnr
@@ -146,7 +147,7 @@ def measure(arguments: argparse.Namespace) -> None:
             write_colmap(folder, made.views, made.points, made.colors)
             every = list(zip(made.views, made.sky, strict=True))
             groups = {"held out": every[::8], "outside": outside(width, height)}
-        remedy = remedies_for(folder, ["sky"])["sky"]
+        remedy = remedies_for(CaptureReader(folder), ["sky"])["sky"]
         print(f"--sky auto: {remedy.value}{remedy.reason and ': '}{remedy.reason}")
         asked = ("none", "shell") if arguments.capture is None else ("none", remedy.value)
         result = compare(folder, arguments, groups, tuple(dict.fromkeys(asked)))

@@ -44,6 +44,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from gsplat_edu import Z_NEAR, Camera, _native
 from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.textured_box import align_cameras, box_camera, photograph_box
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.before import examine
@@ -264,7 +265,7 @@ plt.show()
 
 # %%
 for expected in ((shaken,), None):
-    diagnosis = examine(prepare(WORK / "capture"))
+    diagnosis = examine(prepare(CaptureReader(WORK / "capture")))
     for line in (*diagnosis_lines(diagnosis), *advice_lines(diagnosis)):
         print(line.replace(f"{WORK}/", ""))
     assert {finding.name: finding.images for finding in diagnosis.findings}.get("blurred") == expected

@@ -268,7 +268,7 @@ def test_a_probe_of_a_capture_gives_numbers_and_changes_nothing(capture, strateg
     assert measured.read > 0.0 and measured.score > 0.0 and measured.picture > 0.0
     assert measured.process >= measured.resident > 2**20
     np.testing.assert_array_equal(dataset.points, before)
-    assert forecast(dataset, config, measured).total > 0.0
+    assert forecast(dataset, dataset, config, measured).total > 0.0
 
 
 def test_the_dense_backend_is_not_probed(capture):

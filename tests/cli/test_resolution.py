@@ -7,6 +7,7 @@ import pytest
 from gsplat_edu.budget.costs import wanted_gaussians
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.survey import prepare
@@ -45,12 +46,11 @@ def test_train_chooses_and_says_so_and_doctor_advises_it(tmp_path, capsys, monke
     assert 40 <= side < 100
     assert f"--resolution {side}: the planned Gaussians do not resolve more" in capsys.readouterr().out
     assert main([*words, str(tmp_path / "small"), "--resume"]) == 0
-    (found,) = [one for one in examine(prepare(tmp_path / "capture")).findings if one.name == "resolution"]
+    survey = prepare(CaptureReader(tmp_path / "capture"))
+    (found,) = [one for one in examine(survey).findings if one.name == "resolution"]
     assert "--resolution auto" in found.advice
-    assert "--resolution auto --out" in examine(prepare(tmp_path / "capture")).otherwise[0], (
-        "the next command"
-    )
-    given = examine(prepare(tmp_path / "capture"), ("--resolution", "2")).otherwise[0]
+    assert "--resolution auto --out" in examine(survey).otherwise[0], "the next command"
+    given = examine(survey, ("--resolution", "2")).otherwise[0]
     assert "--resolution 2 --out" in given and "auto" not in given
     assert main([*words, str(tmp_path / "blocks"), "--blocks", "2"]) == 2
     assert "--resolution auto: is for trainings in one piece" in capsys.readouterr().err

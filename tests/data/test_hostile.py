@@ -208,11 +208,11 @@ def test_many_frames_without_a_photo_need_few_system_calls(tmp_path, monkeypatch
 
 
 def test_many_frames_of_one_photo_read_its_header_once(tmp_path, monkeypatch):
-    from gsplat_edu.data import dataset
+    from gsplat_edu.data import images
 
     read = []
     header = ImageHeader((16, 12), "")
-    monkeypatch.setattr(dataset, "image_header", lambda path: read.append(path) or header)
+    monkeypatch.setattr(images, "image_header", lambda path: read.append(path) or header)
     assert len(load_dataset(transforms(tmp_path, ["images/a.png"] * 300), EVERYTHING).train) == 300
     assert len(read) == 1
 

@@ -10,6 +10,7 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import decode, decode_mask, image_orientation, image_size, turned, upright_size
 from gsplat_edu.data.orientation import QUARTER_TURNS
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.survey import prepare
 from phone_photos import ORIENTATIONS, as_stored, exif_bytes, quarters, save
 
@@ -72,8 +73,8 @@ def test_poses_of_upright_pixels_turn_the_photo(tmp_path, orientation):
         np.testing.assert_array_equal(image, quarters())
     (note,) = [note for note in load_dataset(folder, EVERYTHING).notes if "EXIF" in note]
     assert note.startswith("1 of 2 photos are turned as EXIF says") and note.endswith("first images/a.png")
-    assert [shot.size for shot in prepare(folder).shots] == [(64, 48), (64, 48)]
-    np.testing.assert_array_equal(prepare(folder).shots[0].stats.thumbnail, quarters())
+    assert [shot.size for shot in prepare(CaptureReader(folder)).shots] == [(64, 48), (64, 48)]
+    np.testing.assert_array_equal(prepare(CaptureReader(folder)).shots[0].stats.thumbnail, quarters())
 
 
 def test_what_the_size_leaves_open_follows_the_others(tmp_path):

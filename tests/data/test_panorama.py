@@ -20,6 +20,7 @@ from gsplat_edu.data.panorama import (
     face_side,
     is_panorama_size,
 )
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.cameras import check_sizes
 from gsplat_edu.doctor.photos import measure_photo
 from gsplat_edu.doctor.survey import prepare
@@ -169,7 +170,7 @@ def test_a_capture_of_colmaps_panoramas_is_read_as_faces(tmp_path, resolution, s
         "distortion" in note or "cropped" in note for note in dataset.notes
     )
     assert "16 of 16 views are faces of panoramas, cut on loading" in dataset.notes
-    assert not check_sizes(prepare(tmp_path))
+    assert not check_sizes(prepare(CaptureReader(tmp_path)))
     for view in dataset.test:
         camera, photo = view.camera, view.read()
         assert (side, side) == (camera.W, camera.H) and camera.fx == pytest.approx(side / 2)

@@ -15,6 +15,7 @@ from gsplat_edu.budget.costs import Facts
 from gsplat_edu.data.colors import make_profile
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import decode, decode_mask, image_header, image_orientation, image_size
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.photos.image_files import is_image
 from phone_photos import ORIENTATIONS, P3, as_stored, p3_as_srgb, p3_range, quarters, save
@@ -333,7 +334,7 @@ def test_a_broken_profile_is_noted_once_and_the_pixels_taken_as_srgb(one_photo, 
     (note,) = [note for note in dataset.notes if "sRGB" in note]
     assert note == f"1 of 1 photos are taken as sRGB, first images/a.png: {problem}"
     np.testing.assert_array_equal(dataset.train[0].image, NOISE)
-    assert [str(note) for note in prepare(folder).notes] == [note]
+    assert [str(note) for note in prepare(CaptureReader(folder)).notes] == [note]
 
 
 def test_a_capture_with_heic_photos_loads(one_photo):
@@ -346,7 +347,7 @@ def test_a_capture_with_heic_photos_loads(one_photo):
     image = load_dataset(folder, DataSettings(resolution=2.0)).train[0].image
     expected = p3_as_srgb(quarters()[::2, ::2])
     np.testing.assert_allclose(image, expected, atol=3)
-    (shot,) = prepare(folder).shots
+    (shot,) = prepare(CaptureReader(folder)).shots
     assert shot.size == (64, 48) and np.abs(shot.stats.thumbnail - p3_as_srgb(quarters())).max() < 3
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Diagnosis, Severity
@@ -23,7 +24,7 @@ def diagnosed(tmp_path) -> Callable[..., Diagnosis]:
             write_colmap(folder, views, points, np.full((len(points), 3), 0.5))
         if spoil is not None:
             spoil(folder)
-        return examine(prepare(folder))
+        return examine(prepare(CaptureReader(folder)))
 
     return examined
 

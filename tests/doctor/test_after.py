@@ -11,6 +11,7 @@ import torch
 from gsplat_edu.cli.doctor import _exposure_beforehand
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.finding import Finding, Severity, diagnosis_lines
 from gsplat_edu.doctor.residuals import residuals
@@ -362,7 +363,7 @@ def test_an_unexplained_photo_is_not_also_reported_as_fitted(scene):
 
 def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     gaussians, views = scene
-    findings, why = _exposure_beforehand(tmp_path / "gone", Terminal())
+    findings, why = _exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
     assert findings == [] and "gone" in why
     said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
     (line,) = [line for line in said if line.startswith("exposure ")]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from doctor.rooms import replaced, room, turned, with_camera
-from gsplat_edu.data.dataset import read_capture
+from gsplat_edu.data.reader import read_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.cameras import check_away
 from gsplat_edu.doctor.finding import Severity

@@ -6,6 +6,7 @@ import pytest
 
 from doctor.rooms import room
 from gsplat_edu.data import procedural
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_blender
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Severity
@@ -42,7 +43,7 @@ def test_blenders_layout_gets_no_warning(tmp_path):
     views, _, _ = procedural_capture(64, 24)
     write_blender(tmp_path, views[3:], views[:3])
     (tmp_path / "test" / "view_000_depth.png").write_bytes((tmp_path / "test" / "view_000.png").read_bytes())
-    diagnosis = examine(prepare(tmp_path))
+    diagnosis = examine(prepare(CaptureReader(tmp_path)))
     assert [f for f in diagnosis.findings if f.severity > Severity.NOTE] == []
 
 

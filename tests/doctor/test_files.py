@@ -8,6 +8,7 @@ import pytest
 
 from doctor.rooms import room
 from gsplat_edu.data.notes import MissingPhotos
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Severity, advice_lines
@@ -64,7 +65,7 @@ def test_a_truncated_jpeg_is_named_too(tmp_path, orbit):
         frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
     (tmp_path / "transforms.json").write_text(json.dumps(contents))
     cut(tmp_path / "images" / "view_004.jpg", 0.8)
-    survey = prepare(tmp_path)
+    survey = prepare(CaptureReader(tmp_path))
     (refused,) = survey.refused
     assert refused.name == "images/view_004.jpg" and refused.reason.startswith("image file is truncated")
     assert {max(shot.stats.thumbnail.shape) for shot in survey.shots} == {128}
@@ -107,7 +108,7 @@ def test_photos_without_a_pose_are_reported(tmp_path, orbit, count, severity):
         photo = tmp_path / "images" / views[-1].name
         (tmp_path / "images" / f"extra_{i}.JPG").write_bytes(photo.read_bytes())
     (tmp_path / "images" / "Thumbs.db").write_bytes(b"no photo")
-    (found,) = [f for f in examine(prepare(tmp_path)).findings if f.name == "no pose"]
+    (found,) = [f for f in examine(prepare(CaptureReader(tmp_path))).findings if f.name == "no pose"]
     assert found.severity is severity
     assert found.images == tuple(f"extra_{i}.JPG" for i in range(count))
 
@@ -143,7 +144,7 @@ def test_names_that_read_like_messages_do_not_change_the_findings(tmp_path, orbi
     path = str(tmp_path / "images" / f"{odd} a.png")
     cv2.imwrite(path, cv2.imread(path)[:40])
     (tmp_path / "images" / f"{odd} b.png").unlink()
-    survey = prepare(tmp_path)
+    survey = prepare(CaptureReader(tmp_path))
     assert survey.notes == (MissingPhotos(1, 24, f"images/{odd} b.png"),)
     found = {finding.name: finding for finding in examine(survey).findings}
     assert found["missing"].sentence == f"1 missing image of 24 listed, first images/{odd} b.png"

@@ -5,6 +5,7 @@ import pytest
 
 from doctor.rooms import replaced, room, with_photo
 from gsplat_edu.data.outdoors import outdoor_capture
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.doctor.remedies import remedies_for, transients_for
 from gsplat_edu.scene.views import View
@@ -16,7 +17,7 @@ def written(folder, views, points):
 
 
 def appearance_for(path):
-    return remedies_for(path, ["appearance"])["appearance"]
+    return remedies_for(CaptureReader(path), ["appearance"])["appearance"]
 
 
 def brighter(view, stops):
@@ -73,7 +74,9 @@ def test_things_that_move_are_looked_for_where_there_are_enough_photos(count, va
 def test_a_sky_gets_a_shell_and_its_colours_on_a_dome_do_not(tmp_path):
     for name, dome in (("sky", np.inf), ("dome", 10.0)):
         made = outdoor_capture(96, 72, 16, points=800, dome=dome)
-        remedies = remedies_for(written(tmp_path / name, made.views, made.points), ["appearance", "sky"])
+        remedies = remedies_for(
+            CaptureReader(written(tmp_path / name, made.views, made.points)), ["appearance", "sky"]
+        )
         assert remedies["appearance"].value == "none"
         assert remedies["sky"].value == {"sky": "shell", "dome": "none"}[name]
         assert ("lie at infinity" in remedies["sky"].reason) == (name == "sky")
@@ -81,5 +84,5 @@ def test_a_sky_gets_a_shell_and_its_colours_on_a_dome_do_not(tmp_path):
 
 def test_a_plain_white_sky_says_so(tmp_path):
     made = outdoor_capture(96, 72, 16, points=800, clouds=0.0)
-    remedy = remedies_for(written(tmp_path, made.views, made.points), ["sky"])["sky"]
+    remedy = remedies_for(CaptureReader(written(tmp_path, made.views, made.points)), ["sky"])["sky"]
     assert remedy.value == "shell" and remedy.reason.endswith("are one white above the horizon")

@@ -5,6 +5,7 @@ import pytest
 
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Severity
@@ -45,7 +46,7 @@ def test_the_background_is_named_and_the_usual_one(tmp_path, cut_out):
     assert "on white, as with --white-background" in black
     assert said("blender", WHITE).endswith("behind them is white")
     assert said("colmap", (0.0, 0.0, 0.0)).endswith("behind them is black")
-    facts = dict.fromkeys(value for _, value in examine(prepare(tmp_path / "blender")).facts)
+    facts = dict.fromkeys(value for _, value in examine(prepare(CaptureReader(tmp_path / "blender"))).facts)
     assert black in facts
 
 
@@ -53,8 +54,10 @@ def test_photos_alike_are_a_note_for_rendered_captures(tmp_path, cut_out):
     views, points, colors = cut_out
     write_blender(tmp_path / "blender", views[:4], views[4:])
     write_colmap(tmp_path / "colmap", views, points, colors)
-    found = examine(prepare(tmp_path / "blender"))
+    found = examine(prepare(CaptureReader(tmp_path / "blender")))
     alike = [finding for finding in found.findings if finding.name in ("duplicates", "same photo")]
     assert [finding.severity for finding in alike] == [Severity.NOTE]
     assert not any("remove one photo" in advice for advice in found.advice)
-    assert any("remove one photo" in advice for advice in examine(prepare(tmp_path / "colmap")).advice)
+    assert any(
+        "remove one photo" in advice for advice in examine(prepare(CaptureReader(tmp_path / "colmap"))).advice
+    )

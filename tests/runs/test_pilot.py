@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.render.camera_tensors import CameraTensors
@@ -36,7 +37,8 @@ def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
     views = [shaken(view, rng) for view in views] if wrong else views
     write_colmap(tmp_path / "capture", views, points, colors)
     steps = []
-    chosen, reason = refinement_for(options(tmp_path / "capture", tmp_path), lambda: steps.append(1))
+    reader = CaptureReader(tmp_path / "capture")
+    chosen, reason = refinement_for(options(reader.path, tmp_path), reader, lambda: steps.append(1))
     assert len(steps) == 3 * 250
     assert (chosen != "none") == wrong, reason
     assert "dB with none" in reason and "dB with both" in reason
@@ -56,7 +58,8 @@ def test_the_least_that_none_beats_clearly_is_chosen():
 
 def test_without_held_out_photos_nothing_is_refined(tmp_path):
     write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=60))
-    assert refinement_for(options(tmp_path / "capture", tmp_path, test_every=0)) == (
+    reader = CaptureReader(tmp_path / "capture")
+    assert refinement_for(options(reader.path, tmp_path, test_every=0), reader) == (
         "none",
         "no photos are held out to judge by",
     )

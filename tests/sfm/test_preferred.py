@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.data.colmap import read_images
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Severity
 from gsplat_edu.doctor.survey import prepare
@@ -150,11 +151,11 @@ def test_the_sound_model_is_chosen_over_one_with_more_poses(models, tmp_path, mo
 
 
 def test_doctor_names_the_wrong_poses_of_the_global_model(models):
-    doubtful = [f for f in examine(prepare(models.root / "global")).findings if f.name == "doubtful poses"]
-    (finding,) = doubtful
+    findings = examine(prepare(CaptureReader(models.root / "global"))).findings
+    (finding,) = [f for f in findings if f.name == "doubtful poses"]
     assert finding.severity is Severity.WARNING
     assert list(finding.images) == models.weak
     far = [label for label in finding.labels if "times as far as the others" in label]
     assert len(far) == 7
-    sound = examine(prepare(models.root / "incremental")).findings
+    sound = examine(prepare(CaptureReader(models.root / "incremental"))).findings
     assert not [f for f in sound if f.name in ("doubtful poses", "facing away")]

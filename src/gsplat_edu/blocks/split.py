@@ -19,10 +19,12 @@ from gsplat_edu.blocks.plan import Block, BlockPlan, automatic_count, measured_a
 from gsplat_edu.blocks.same import write_views
 from gsplat_edu.blocks.views import LEAST_VIEWS, assigned, in_any_view, seen_shares
 from gsplat_edu.budget.costs import wanted_gaussians
-from gsplat_edu.data.dataset import Dataset, load_dataset
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.start import scene_file, scene_start
 from gsplat_edu.scene.camera import Camera
@@ -77,7 +79,9 @@ def check_recipe(folder: Path, plan: BlockPlan, options: RunOptions) -> None:
             )
 
 
-def split_capture(options: RunOptions, coarse: Path, split: SplitOptions, say: Say) -> BlockPlan:
+def split_capture(
+    options: RunOptions, coarse: Path, split: SplitOptions, say: Say, reader: CaptureReader | None = None
+) -> BlockPlan:
     """Split a capture into blocks, and write the plan and what each block starts from.
 
     Args:
@@ -85,6 +89,7 @@ def split_capture(options: RunOptions, coarse: Path, split: SplitOptions, say: S
         coarse: The coarse model: a scene file or a run.
         split: How to split.
         say: Receives sentences for the user.
+        reader: Has read the capture already; None to read it.
 
     Raises:
         DatasetError: the capture cannot be read.
@@ -92,7 +97,7 @@ def split_capture(options: RunOptions, coarse: Path, split: SplitOptions, say: S
         OSError: a file cannot be written.
     """
     folder, config = BlocksFolder(options.out), options.config
-    dataset = load_dataset(options.data, options.data_settings)
+    dataset = Dataset.of(reader_for(options.data, reader), options.data_settings)
     for note in dataset.notes:
         say(note)
     gaussians, notes = scene_start(coarse, config.changed(max_gaussians=None), dataset.origin)

@@ -16,7 +16,7 @@ from gsplat_edu.budget.costs import (
     reduced_bytes,
 )
 from gsplat_edu.budget.probe import probe
-from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
+from gsplat_edu.data.dataset import Dataset, DataSettings
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.schedule import photo_factor
@@ -161,6 +161,7 @@ def saving_seconds(gaussians: float, sh_degree: int) -> float:
 
 def forecast(
     dataset: Dataset,
+    full: Dataset,
     config: TrainConfig,
     measured: Measurements | None = None,
     *,
@@ -171,7 +172,8 @@ def forecast(
     """Forecast a run on this machine.
 
     Args:
-        dataset: The capture.
+        dataset: The capture at training size.
+        full: The capture at the size of its files; the same dataset if that is the training size.
         config: The run.
         measured: Measurements of `probe`; None to measure now.
         backend: The rendering backend, by its own name.
@@ -182,6 +184,6 @@ def forecast(
         ArgumentError: the backend is the dense one.
         DatasetError: a photo cannot be read.
     """
-    facts = Facts.of(dataset, load_dataset(dataset.path))
+    facts = Facts.of(dataset, full)
     found = measured or probe(dataset, config, backend)
     return predict(facts, found, config, dataset.images.budget, eval_every, save_every)

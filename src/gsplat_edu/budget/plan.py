@@ -8,6 +8,7 @@ Given as options, they reproduce the training bit for bit. A new plan may choose
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -18,7 +19,9 @@ from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, reduc
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import probe, resident_bytes
-from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.start import scene_start
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
@@ -182,7 +185,14 @@ class _Choice:
     cap: int | None
 
 
-def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, rescale: bool = True) -> Plan:
+def plan(
+    options: RunOptions,
+    limits: Limits,
+    given: Collection[str] = (),
+    *,
+    rescale: bool = True,
+    reader: CaptureReader | None = None,
+) -> Plan:
     """Choose the settings that the user did not give so that the limits hold. The probe takes a few seconds.
 
     Nothing is chosen if there is no memory limit and either no time limit or a given number of iterations; a training
@@ -193,6 +203,7 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
         limits: The limits.
         given: Names of `PLANNED` that the user gave.
         rescale: Whether milestones that are not given stretch with the iterations.
+        reader: Has read the capture already; None to read it.
 
     Raises:
         ArgumentError: even the smallest settings exceed a limit (the message names a sufficient one), or the backend is
@@ -205,16 +216,15 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
         said = f"{limits}: a resumed run keeps the values of its config.json; memory is not planned again"
         return Plan(taken_up(options, given), sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
-        return _with_planned_count(options)
+        return _with_planned_count(options, reader)
     if options.backend == "torch":
         raise ArgumentError(f"{limits}: cannot be planned for --backend torch; choose cpu or cuda")
     settings = options.data_settings
     chosen = {"resolution": settings.resolution, "max_gaussians": options.config.max_gaussians}
     fixed = frozenset(given) | {name for name, value in chosen.items() if value is not None}
-    files = load_dataset(options.data, dataclasses.replace(settings, resolution=None), points=options.points)
-    dataset = files
-    if settings.resolution is not None:
-        dataset = load_dataset(options.data, settings, points=options.points)
+    dataset_at = functools.partial(Dataset.of, reader_for(options.data, reader), points=options.points)
+    files = dataset_at(dataclasses.replace(settings, resolution=None))
+    dataset = files if settings.resolution is None else dataset_at(settings)
     factors: tuple[float, ...] = (1.0,)
     if "resolution" not in fixed:
         side = min(min(view.camera.W, view.camera.H) for view in (*files.train, *files.test))
@@ -227,19 +237,20 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
     length = options.config.iterations
     first = _within_memory(request, resident_bytes() + LATER, START_PAIRS * facts.points, length, factors)
     reduced = dataclasses.replace(settings, resolution=_resolution(request, first.factor), image_memory=0)
-    dataset = load_dataset(options.data, reduced, points=options.points)
-    measured = probe(dataset, request.config(length, first.factor, first.cap), options.backend, scene)
+    measured = probe(
+        dataset_at(reduced), request.config(length, first.factor, first.cap), options.backend, scene
+    )
     probed = tuple(factor for factor in factors if factor >= first.factor)
     spent = 0.0 if limits.time is None else limits.time.spent
     return choose(dataclasses.replace(request, factors=probed), measured, spent)
 
 
-def _with_planned_count(options: RunOptions) -> Plan:
+def _with_planned_count(options: RunOptions, reader: CaptureReader | None) -> Plan:
     """Choose the number of Gaussians that the fast recipe grows to, unless it is given."""
     config = options.config
     if config.strategy != "fast" or config.max_gaussians is not None:
         return Plan(options)
-    dataset = load_dataset(options.data, options.data_settings, points=options.points)
+    dataset = Dataset.of(reader_for(options.data, reader), options.data_settings, points=options.points)
     facts = Facts.of(dataset)
     if options.scene is not None:
         facts = dataclasses.replace(facts, points=len(scene_start(options.scene, config, dataset.origin)[0]))

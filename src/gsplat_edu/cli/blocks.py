@@ -34,6 +34,7 @@ from gsplat_edu.cli.train import (
     with_choices,
     with_poses,
 )
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.metrics import ImageScore
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun, is_finished
@@ -98,19 +99,20 @@ def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> Bloc
     if folder.merged.exists():
         raise CheckpointError(f"--out: {folder.path} holds a run that is not in blocks; give another folder")
     options = with_poses(options, arguments, console, say)
+    reader = CaptureReader(options.data)
     if of_coarse is not None:
         coarse = replace(options_from(of_coarse), data=options.data)
         if not coarse.resume:
             names = left_open(of_coarse)
-            coarse = with_choices(coarse, names, console, say)
+            coarse = with_choices(coarse, reader, names, console, say)
             shared = {name: getattr(coarse.config, name) for name in names if name != "sky"}
             options = replace(options, config=options.config.changed(**shared))
         else:
             options = replace(options, config=options.config.changed(**_chosen_before(coarse, of_block)))
-        _train_coarse(coarse, console, say)
+        _train_coarse(coarse, reader, console, say)
     split = SplitOptions(block_count(arguments), arguments.min_views or LEAST_VIEWS)
     scene = coarse_scene(replace(options, scene=arguments.scene))
-    return split_capture(replace(options, scene=None), scene, split, say)
+    return split_capture(replace(options, scene=None), scene, split, say, reader)
 
 
 def _chosen_before(coarse: RunOptions, of_block: argparse.Namespace) -> dict[str, object]:
@@ -120,16 +122,16 @@ def _chosen_before(coarse: RunOptions, of_block: argparse.Namespace) -> dict[str
     return {name: stored[name] for name in names if name in stored}
 
 
-def _train_coarse(options: RunOptions, console: Console, say: Say) -> None:
+def _train_coarse(options: RunOptions, reader: CaptureReader, console: Console, say: Say) -> None:
     """Train the coarse model of the whole capture, in a run folder of its own."""
     say(f"training a coarse model of the whole: {options.config.iterations} iterations, {options.out}")
-    chosen = plan(options, Limits(), ["max_gaussians"] if options.config.max_gaussians is not None else [])
-    options = chosen.options
+    given = ["max_gaussians"] if options.config.max_gaussians is not None else []
+    options = plan(options, Limits(), given, reader=reader).options
     if is_finished(options):
         return
     with interruptible() as interrupted:
         with progress_bar(console, "") as bar:
-            capture = CaptureRun(options, say, photos_read(bar, interrupted))
+            capture = CaptureRun(options, say, photos_read(bar, interrupted), reader=reader)
         with progress_bar(console, "{task.fields[state]}") as bar:
             train_with_bar(capture, bar, interrupted, [])
         if interrupted():

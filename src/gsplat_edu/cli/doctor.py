@@ -14,7 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.cli.terminal import Bar, Terminal
-from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.appearance import check_exposure
 from gsplat_edu.doctor.before import examine
@@ -28,7 +29,7 @@ from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed, Found
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
-from gsplat_edu.runs.dataset import appearance_of, run_dataset
+from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.train.config import DEFAULT_QUALITY, DEFAULT_STRATEGY, QUALITIES, TrainConfig, recipe
 
@@ -69,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
-    settings = DataSettings(resolution=arguments.resolution)
+    settings, reader = DataSettings(resolution=arguments.resolution), CaptureReader(arguments.path)
     config = recipe(arguments.iterations, strategy=DEFAULT_STRATEGY)
     backend = resolve_backend(arguments.backend)
     if backend == "torch" and not arguments.no_forecast:
@@ -78,7 +79,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         )
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
-        survey = prepare(arguments.path, lambda done, total: bar.update(task, completed=done, total=total))
+        survey = prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))
         bar.add_task("comparing", total=None)
         diagnosis = examine(survey, _forecast_options(arguments))
     if arguments.no_forecast or diagnosis.hopeless:
@@ -89,11 +90,11 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
     if arguments.resolution is None and (side := side_for_training(survey)) is not None:
         settings = DataSettings(resolution=float(side))  # as the command in the advice trains
     try:
-        dataset = load_dataset(arguments.path, settings)
+        dataset, full = Dataset.of(reader, settings), Dataset.of(reader)
         facts = Facts.of(dataset)
         cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         config = dataclasses.replace(config, max_gaussians=cap)
-        said = forecast(dataset, config, backend=backend).lines()
+        said = forecast(dataset, full, config, backend=backend).lines()
     except DatasetError as error:
         said = [f"none, because training would fail: {error}"]
     return diagnosis, table_lines(zip(("forecast", *[""] * len(said)), said, strict=False))
@@ -115,7 +116,8 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     config = folder.read_config()
     settings = dataclasses.replace(render_settings(config), depth=True)
     scene, reached = folder.latest_scene()
-    dataset = run_dataset(config, arguments.dataset)
+    reader = run_reader(config, arguments.dataset)
+    dataset = Dataset.of(reader, data_settings(config))
     gaussians = load_ply(scene, dataset.origin).to(
         device_of(backend)
     )  # in the coordinate frame of the cameras
@@ -137,8 +139,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     extent = scene_extent([view.camera for view in dataset.train])
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
-    capture = arguments.dataset or Path(config["data"]["path"])  # run_dataset has checked it
-    beforehand, uncompared = ([], "") if appearance != "none" else _exposure_beforehand(capture, console)
+    beforehand, uncompared = ([], "") if appearance != "none" else _exposure_beforehand(reader, console)
     trained = Trained(
         folder.path,
         gaussians,
@@ -148,7 +149,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         reached,
         planned,
         log=folder.log(),
-        capture=capture,
+        capture=reader.path,
         options=_options(config),
         beforehand=beforehand,
         uncompared=uncompared,
@@ -192,7 +193,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
     return (*words, *(flag for flag, key in flags.items() if train.get(key)))
 
 
-def _exposure_beforehand(capture: Path, console: Console) -> tuple[list[Finding], str]:
+def _exposure_beforehand(reader: CaptureReader, console: Console) -> tuple[list[Finding], str]:
     """Check the photos' exposure as before training.
 
     Returns:
@@ -201,7 +202,7 @@ def _exposure_beforehand(capture: Path, console: Console) -> tuple[list[Finding]
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         try:
-            survey = prepare(capture, lambda done, total: bar.update(task, completed=done, total=total))
+            survey = prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))
         except DatasetError as error:
             return [], str(error)
         if len(survey.shots) < 2:

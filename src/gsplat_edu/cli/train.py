@@ -27,8 +27,9 @@ from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.data.colmap import find_model
-from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.points import read_points_ply
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.finding import Remedy
 from gsplat_edu.doctor.moving import moved_line
@@ -121,7 +122,9 @@ def _run(
 ) -> None:
     seconds = arguments.time_limit
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
-    chosen = _planned(arguments, deadline, console, say)
+    options = with_poses(options_from(arguments), arguments, console, say)
+    reader = CaptureReader(options.data)
+    chosen = _planned(arguments, options, reader, deadline, console, say)
     with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:
         options = chosen.options
         if _is_over(options, team, say):
@@ -131,7 +134,7 @@ def _run(
             port = PORT if port is None else port
             free_port(host, port, NAMES)  # before the run writes anything
         with progress_bar(console, "") as bar:
-            capture = CaptureRun(options, say, photos_read(bar, interrupted), team)
+            capture = CaptureRun(options, say, photos_read(bar, interrupted), team, reader=reader)
         callbacks: list[Callback] = []
         ends = interrupted
         if deadline is not None:
@@ -237,25 +240,29 @@ def with_poses(
 
 
 def _planned(
-    arguments: argparse.Namespace, deadline: Deadline | None, console: Console, say: Callable[[str], None]
+    arguments: argparse.Namespace,
+    options: RunOptions,
+    reader: CaptureReader,
+    deadline: Deadline | None,
+    console: Console,
+    say: Callable[[str], None],
 ) -> Plan:
-    """Find poses if necessary, and choose the options that the limits leave open."""
-    options = with_poses(options_from(arguments), arguments, console, say)
+    """Choose the options that are auto, and those that the limits leave open."""
     if arguments.resolution == AUTO and not (arguments.resume and options.folder.exists()):
-        options = _with_resolution(options, say)
-    options = with_choices(options, left_open(arguments), console, say)
+        options = _with_resolution(options, reader, say)
+    options = with_choices(options, reader, left_open(arguments), console, say)
     limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
     given += ["iterations"] if arguments.quality is not None else []
-    chosen = plan(options, limits, given, rescale=not arguments.no_rescale)
+    chosen = plan(options, limits, given, rescale=not arguments.no_rescale, reader=reader)
     for sentence in chosen.sentences:
         say(sentence)
     return chosen
 
 
-def _with_resolution(options: RunOptions, say: Callable[[str], None]) -> RunOptions:
+def _with_resolution(options: RunOptions, reader: CaptureReader, say: Callable[[str], None]) -> RunOptions:
     """Choose the size of the photos that the planned Gaussians resolve, and say so."""
-    dataset = load_dataset(options.data, options.data_settings)
+    dataset = Dataset.of(reader, options.data_settings, points=options.points)
     sizes = [(view.camera.W, view.camera.H) for view in (*dataset.train, *dataset.test)]
     W, H = max(sizes, key=max)
     side = advised_side(sizes, len(dataset.train))
@@ -267,7 +274,11 @@ def _with_resolution(options: RunOptions, say: Callable[[str], None]) -> RunOpti
 
 
 def with_choices(
-    options: RunOptions, names: tuple[str, ...], console: Console, say: Callable[[str], None]
+    options: RunOptions,
+    reader: CaptureReader,
+    names: tuple[str, ...],
+    console: Console,
+    say: Callable[[str], None],
 ) -> RunOptions:
     """Choose the settings whose option is auto, and say which were chosen and why."""
 
@@ -278,16 +289,16 @@ def with_choices(
 
     if by_photos := [name for name in names if name in CHOICES]:
         with progress_bar(console, "") as bar:
-            remedies = remedies_for(options.data, by_photos, photos_read(bar, lambda: False))
+            remedies = remedies_for(reader, by_photos, photos_read(bar, lambda: False))
         for name, remedy in remedies.items():
             options = take(options, name, remedy)
     if "transients" in names:
-        count = len(load_dataset(options.data, options.data_settings).train)
+        count = len(Dataset.of(reader, options.data_settings, points=options.points).train)
         options = take(options, "transients", transients_for(count))
     if "refine" in names:
         with progress_bar(console, "") as bar:
             task = bar.add_task("short trainings", total=len(ORDER) * PILOT_STEPS)
-            chosen = refinement_for(options, progress=lambda: bar.advance(task))
+            chosen = refinement_for(options, reader, progress=lambda: bar.advance(task))
         options = take(options, "refine", Remedy(*chosen))
     return options
 

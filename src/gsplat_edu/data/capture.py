@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -14,7 +13,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable
-from gsplat_edu.data.images import UPRIGHT, PhotoFile, image_orientation, image_size, upright_size
+from gsplat_edu.data.images import UPRIGHT, PhotoFile, PhotoHeaders, upright_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
 from gsplat_edu.data.panorama import FaceLens, face_rotations
@@ -255,7 +254,7 @@ def photo_file(
     frame: Frame,
     resolution: float | None,
     background: tuple[float, float, float] | None,
-    size_of: Callable[[Path], tuple[int, int]] = image_size,
+    headers: PhotoHeaders,
 ) -> tuple[PhotoFile, Camera, bool]:
     """Determine a view's image file, how to load it, and the resulting camera.
 
@@ -263,7 +262,7 @@ def photo_file(
         frame: The frame.
         resolution: Below `FACTOR_BELOW`, the divisor of the size; else the longest side, px; None keeps the size.
         background: As for `PhotoFile`.
-        size_of: Reads the size of an image file; a caching one saves time if frames share files.
+        headers: Reads the files' headers.
 
     Returns:
         The photo; its camera, a pinhole of the final size; and whether the file's size differs from the frame's, in
@@ -274,10 +273,10 @@ def photo_file(
             be undistorted.
     """
     path, orientation = frame.image, frame.orientation
-    size = upright_size(size_of(path), orientation)
+    size = upright_size(headers.size(path), orientation)
     rescaled = size != (frame.lens.W, frame.lens.H)
     lens = _fitted(frame, path, size)
-    if frame.mask is not None and (mask_size := size_of(frame.mask)) != size:
+    if frame.mask is not None and (mask_size := headers.size(frame.mask)) != size:
         reason = f"the mask is {_spelled(mask_size)} but its photo {_spelled(size)}"
         raise DatasetError(f"{frame.mask}: {reason}; make them one size", reason)
     W, H = _target(*size, resolution)
@@ -285,8 +284,8 @@ def photo_file(
     smaller = _smaller_copy(path, resolution) if frame.mask is None else None
     if smaller is not None:
         # A copy may be turned already, or have the photo's EXIF.
-        path, orientation = smaller, UPRIGHT if orientation == UPRIGHT else image_orientation(smaller)
-        W, H = upright_size(size_of(path), orientation)
+        path, orientation = smaller, UPRIGHT if orientation == UPRIGHT else headers.orientation(smaller)
+        W, H = upright_size(headers.size(path), orientation)
         lens = _fitted(frame, path, (W, H))
     try:
         pinhole = lens.undistorted()

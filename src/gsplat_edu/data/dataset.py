@@ -1,12 +1,11 @@
-"""Load captures: from a folder on disk to views with cameras and photos, and an initial point cloud."""
+"""A capture ready for training: views with cameras and photos, split, and an initial point cloud."""
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -15,28 +14,16 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.data.blender import TRAIN_FILE, read_blender
-from gsplat_edu.data.capture import (
-    PHOTO_ENDINGS,
-    PHOTO_FOLDERS,
-    Capture,
-    Cloud,
-    Frame,
-    entries,
-    is_file,
-    is_folder,
-    photo_file,
-)
-from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
-from gsplat_edu.data.images import UPRIGHT, ImageHeader, ImageStore, PhotoFile, image_header
+from gsplat_edu.data.capture import Capture, Cloud, Frame, photo_file
+from gsplat_edu.data.images import UPRIGHT, ImageStore, PhotoFile, PhotoHeaders
 from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
-from gsplat_edu.data.notes import Background, TwoLayouts, UnreadColors
+from gsplat_edu.data.notes import Background, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.panorama import FaceLens
-from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
-from gsplat_edu.data.scale import Scale, read_scale
+from gsplat_edu.data.points import random_cloud
+from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
-from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.scene.camera import Camera, point_nearest_axes
 from gsplat_edu.scene.camera import scene_extent as scene_extent
 from gsplat_edu.scene.views import View
@@ -46,9 +33,6 @@ TEST_EVERY = 8
 
 ONE_PLACE = 1e-5
 """Largest distance of two centres that count as one, as a fraction of the cameras' spread."""
-
-FAR = 1e4
-"""Camera coordinates beyond which the origin is moved, world units; float32 would resolve them only to 1e-3."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +66,61 @@ class Dataset:
     files: tuple[tuple[str, PhotoFile], ...] = ()
     scale: Scale | None = None
     measured: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        reader: CaptureReader,
+        settings: DataSettings = DataSettings(),  # noqa: B008 - it is frozen
+        *,
+        points: Path | None = None,
+    ) -> Dataset:
+        """Derive a dataset from a capture. What the reader has read already is not read again.
+
+        Args:
+            reader: The capture.
+            settings: Resolution, split, background and memory.
+            points: A PLY that replaces the capture's initial points, in the capture's coordinates.
+
+        Raises:
+            DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.
+        """
+        path, capture, headers, placed = reader.path, reader.capture, reader.headers, reader.placed(points)
+        notes = list(placed.notes)
+        frames = oriented(_listed(path, placed.frames, settings), headers)
+        made = [photo_file(frame, settings.resolution, settings.background, headers) for frame in frames]
+        sources = [source for source, *_ in made]
+        decoding = max(headers.of(source.path).decoding for source in sources)
+        store = ImageStore(settings.image_memory, sources, decoding, reader.watch)
+        views = [
+            View.stored(camera, partial(store.read, source), frame.name)
+            for frame, (source, camera, _) in zip(frames, made, strict=True)
+        ]
+        notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
+        notes += _file_notes(frames, sources, headers) + _alpha_notes(capture, sources, settings, headers)
+        if store.needed > store.budget:
+            notes.append(
+                f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} are kept: the "
+                "others are decoded again whenever they are used; raise --image-memory, or load smaller photos with "
+                "--resolution"
+            )
+        train, test = _split(path, views, [frame.part for frame in frames], settings, notes)
+        cameras = [view.camera for view in views]
+        start = placed.cloud or _random_start(capture, cameras, notes, placed.origin)
+        return cls(
+            path,
+            capture.layout,
+            train,
+            test,
+            start.points,
+            start.colors,
+            placed.origin,
+            tuple(notes),
+            store,
+            tuple((frame.name, source) for frame, source in zip(frames, sources, strict=True)),
+            capture.scale,
+            placed.cloud is not None,
+        )
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Decode every photo once, several in parallel, and keep those within the budget.
@@ -117,6 +156,8 @@ def load_dataset(
 ) -> Dataset:
     """Load a capture. Only the photos' headers are read; pixels are decoded when needed.
 
+    For several datasets of one capture, make a `gsplat_edu.data.reader.CaptureReader` and call `Dataset.of`.
+
     Args:
         path: A capture folder of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
         settings: Resolution, split, background and memory.
@@ -125,100 +166,10 @@ def load_dataset(
     Raises:
         DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.
     """
-    path = Path(path)
-    capture = read_capture(path)
-    notes = [str(note) for note in capture.notes]
-    given = read_points_ply(points) if points else capture.cloud
-    frames, cloud, origin = _near_origin(capture.frames, given, notes)
-    header_of = functools.cache(image_header)
-
-    def size_of(path: Path) -> tuple[int, int]:
-        return header_of(path).size
-
-    frames = oriented(_listed(path, frames, settings), size_of)
-    made = [photo_file(frame, settings.resolution, settings.background, size_of) for frame in frames]
-    sources = [source for source, *_ in made]
-    decoding = max(header_of(source.path).decoding for source in sources)
-    store = ImageStore(settings.image_memory, sources, decoding)
-    views = [
-        View.stored(camera, partial(store.read, source), frame.name)
-        for frame, (source, camera, _) in zip(frames, made, strict=True)
-    ]
-    notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
-    notes += _file_notes(frames, sources, header_of) + _alpha_notes(capture, sources, settings, header_of)
-    if store.needed > store.budget:
-        notes.append(
-            f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} are kept: the "
-            "others are decoded again whenever they are used; raise --image-memory, or load smaller photos with "
-            "--resolution"
-        )
-    train, test = _split(path, views, [frame.part for frame in frames], settings, notes)
-    start = cloud or _random_start(capture, [view.camera for view in views], notes, origin)
-    files = tuple((frame.name, source) for frame, (source, _, _) in zip(frames, made, strict=True))
-    return Dataset(
-        path,
-        capture.layout,
-        train,
-        test,
-        start.points,
-        start.colors,
-        origin,
-        tuple(notes),
-        store,
-        files,
-        capture.scale,
-        cloud is not None,
-    )
+    return Dataset.of(CaptureReader(path), settings, points=points)
 
 
-def read_capture(path: Path) -> Capture:
-    """Detect the layout of a path and read its poses and names, without photos.
-
-    Raises:
-        DatasetError: it holds no capture, or a damaged one.
-    """
-    if path.suffix.lower() == ".json" and is_file(path):
-        return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
-    if not is_folder(path):
-        raise DatasetError(f"{path}: is neither a folder nor a .json file; give the folder of a capture")
-    if is_file(path / TRAIN_FILE):
-        return read_blender(path)
-    model = find_model(path)
-    if is_file(path / "transforms.json"):
-        capture = read_transforms(path / "transforms.json")
-        return capture if model is None else replace(capture, notes=(TwoLayouts(path), *capture.notes))
-    if model is not None:
-        return replace(read_colmap(path, model), scale=read_scale(path))
-    places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
-    looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
-    folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
-    if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in entries(folder)):
-        raise DatasetError(
-            f"{path}: holds photos but no camera poses; find the poses with "
-            f"`gsplat-edu sfm {path} OUT` (looked for {looked})"
-        )
-    raise DatasetError(f"{path}: is not a capture; looked for {looked}")
-
-
-def _near_origin(
-    found: Sequence[Frame], cloud: Cloud | None, notes: list[str]
-) -> tuple[list[Frame], Cloud | None, Float64[np.ndarray, "3"]]:
-    """Sort frames by name, and move a scene whose coordinates are too large for float32, as on a map, to the origin."""
-    frames = sorted(found, key=lambda frame: frame.name)
-    eyes = np.stack([frame.eye for frame in frames])
-    if cloud is not None:
-        cloud, note = finite_cloud(cloud)
-        notes += [note] if note else []
-        cloud = cloud if len(cloud.points) else None
-    if np.abs(eyes).max() <= FAR:
-        return frames, cloud, np.zeros(3)
-    origin = np.round(eyes.mean(axis=0))
-    notes.append(f"coordinates are large: {tuple(origin.tolist())} was subtracted from all of them")
-    frames = [replace(frame, eye=frame.eye - origin) for frame in frames]
-    return frames, None if cloud is None else replace(cloud, points=cloud.points - origin), origin
-
-
-def _listed(path: Path, frames: list[Frame], settings: DataSettings) -> list[Frame]:
+def _listed(path: Path, frames: Sequence[Frame], settings: DataSettings) -> Sequence[Frame]:
     """Return the frames that the settings name, all if they name none; refuse a capture that lacks one."""
     if settings.train_views is None:
         return frames
@@ -270,10 +221,10 @@ def _alpha_notes(
     capture: Capture,
     sources: Sequence[PhotoFile],
     settings: DataSettings,
-    header_of: Callable[[Path], ImageHeader],
+    headers: PhotoHeaders,
 ) -> list[str]:
     """Report what lies behind transparent photos."""
-    count = sum(header_of(source.path).alpha for source in sources)
+    count = sum(headers.of(source.path).alpha for source in sources)
     return (
         [str(Background(count, len(sources), settings.background, capture.layout == "Blender"))]
         if count
@@ -281,12 +232,10 @@ def _alpha_notes(
     )
 
 
-def _file_notes(
-    frames: Sequence[Frame], sources: Sequence[PhotoFile], header_of: Callable[[Path], ImageHeader]
-) -> list[str]:
+def _file_notes(frames: Sequence[Frame], sources: Sequence[PhotoFile], headers: PhotoHeaders) -> list[str]:
     """Report colours that are not converted, and photos that are turned."""
     problems = [
-        (frame.name, header_of(source.path).problem) for frame, source in zip(frames, sources, strict=True)
+        (frame.name, headers.of(source.path).problem) for frame, source in zip(frames, sources, strict=True)
     ]
     notes = [str(note) for note in UnreadColors.of(problems)]
     turned = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 import warnings
@@ -135,6 +136,23 @@ def image_orientation(path: Path) -> int:
                 return stored_orientation(file)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
+
+
+class PhotoHeaders:
+    """What the headers of image files tell; each file is opened once for its header and once for its orientation.
+
+    Attributes:
+        of: `image_header`, cached.
+        orientation: `image_orientation`, cached.
+    """
+
+    def __init__(self) -> None:
+        self.of = functools.cache(image_header)
+        self.orientation = functools.cache(image_orientation)
+
+    def size(self, path: Path) -> tuple[int, int]:
+        """Return width and height as stored, px; see `image_header`."""
+        return self.of(path).size
 
 
 def stored_size(file: Image.Image) -> tuple[int, int]:
@@ -279,9 +297,16 @@ class ImageStore:
         budget: Bytes of decoded photos to keep.
         sources: The photos that will be read.
         decoding: Largest `ImageHeader.decoding` of them.
+        watch: Digests of the files that were read; stores of one capture share them.
     """
 
-    def __init__(self, budget: int, sources: Sequence[PhotoFile], decoding: int = BYTES_PER_PIXEL) -> None:
+    def __init__(
+        self,
+        budget: int,
+        sources: Sequence[PhotoFile],
+        decoding: int = BYTES_PER_PIXEL,
+        watch: FileWatch | None = None,
+    ) -> None:
         self.budget = budget
         self.decoding = decoding
         self.needed = sum(source.W * source.H * _planes(source) for source in sources)
@@ -289,7 +314,7 @@ class ImageStore:
         largest = max((source.lens.W * source.lens.H for source in sources), default=1)
         self.workers = max(1, min(os.cpu_count() or 1, AT_ONCE // largest))
         """Number of photos to decode at once."""
-        self.watch = FileWatch()
+        self.watch = FileWatch() if watch is None else watch
         self._kept: dict[PhotoFile, Photo] = {}
         self._nbytes = 0
         self._lock = threading.Lock()

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import Frame, fits_camera
-from gsplat_edu.data.images import UPRIGHT, image_orientation
+from gsplat_edu.data.images import UPRIGHT, PhotoHeaders
 
 QUARTER_TURNS = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 
 
-def oriented(frames: Sequence[Frame], size_of: Callable[[Path], tuple[int, int]]) -> list[Frame]:
+def oriented(frames: Sequence[Frame], headers: PhotoHeaders) -> list[Frame]:
     """Mark the photos to be turned. The sizes of the cameras decide, because poses refer to the pixels that were used.
 
     COLMAP ignores EXIF, so photos are read as stored if that fits their camera. A photo is turned if only its upright
@@ -23,12 +23,12 @@ def oriented(frames: Sequence[Frame], size_of: Callable[[Path], tuple[int, int]]
 
     Args:
         frames: The frames of a capture.
-        size_of: Reads the size of an image file as stored. Files that it cannot read are left to their reader.
+        headers: Reads the files' headers. Files that cannot be read are left to their reader.
     """
     sizes: dict[Path, tuple[int, int]] = {}
     for frame in frames:
         try:
-            sizes[frame.image] = size_of(frame.image)
+            sizes[frame.image] = headers.size(frame.image)
         except DatasetError:
             continue
     turned = {
@@ -36,12 +36,12 @@ def oriented(frames: Sequence[Frame], size_of: Callable[[Path], tuple[int, int]]
         for frame in frames
         if frame.image in sizes and not fits_camera(frame.lens, sizes[frame.image])
         if fits_camera(frame.lens, sizes[frame.image][::-1])
-        if (orientation := image_orientation(frame.image)) in QUARTER_TURNS
+        if (orientation := headers.orientation(frame.image)) in QUARTER_TURNS
     }
     if not turned:
         return list(frames)
     others = {frame.image: frame for frame in frames if frame.image in sizes and frame.image not in turned}
-    unclear = {path: orientation for path in others if (orientation := image_orientation(path)) != UPRIGHT}
+    unclear = {path: orientation for path in others if (orientation := headers.orientation(path)) != UPRIGHT}
     if all(
         orientation not in QUARTER_TURNS or fits_camera(others[path].lens, sizes[path][::-1])
         for path, orientation in unclear.items()

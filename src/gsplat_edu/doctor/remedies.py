@@ -7,10 +7,10 @@ training should correct all photos, and whether it should start with a sky.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.appearance import Gains
 from gsplat_edu.doctor.cut_out import outside_masks_of
 from gsplat_edu.doctor.finding import Finding, Remedy, Severity
@@ -29,18 +29,20 @@ ENOUGH = 12
 show most places, which is too little to compare a photo with."""
 
 
-def remedies_for(path: Path, names: Sequence[str], progress: Progress | None = None) -> dict[str, Remedy]:
+def remedies_for(
+    reader: CaptureReader, names: Sequence[str], progress: Progress | None = None
+) -> dict[str, Remedy]:
     """Choose settings for a capture from its photos, which are read once.
 
     Args:
-        path: Folder or transforms.json of the capture.
+        reader: The capture.
         names: Of `CHOICES`.
         progress: Called with (photos done, total) in the calling thread.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
-    survey = prepare(path, progress, sharpness=False)
+    survey = prepare(reader, progress, sharpness=False)
     return {name: CHOICES[name](survey) for name in names}
 
 

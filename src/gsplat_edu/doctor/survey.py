@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,12 +14,12 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
-from gsplat_edu.data.dataset import read_capture
-from gsplat_edu.data.images import image_header, image_size
+from gsplat_edu.data.images import PhotoHeaders
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.photos import PhotoStats, measure_photo
 from gsplat_edu.doctor.support import observed_points
@@ -97,24 +97,23 @@ class Survey:
         return Geometry([shot.camera for shot in self.shots], self.points)
 
 
-def prepare(path: Path, progress: Progress | None = None, sharpness: bool = True) -> Survey:
+def prepare(reader: CaptureReader, progress: Progress | None = None, sharpness: bool = True) -> Survey:
     """Read a capture and measure its photos, a few at a time.
 
     Args:
-        path: Folder or transforms.json, as for `gsplat_edu.data.dataset.load_dataset`.
+        reader: The capture.
         progress: Called with (photos done, total) in the calling thread.
         sharpness: Measure the photos' sharpness too, which takes most of the time.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
-    capture = read_capture(path)
-    size_of = cache(image_size)
-    frames = oriented(sorted(capture.frames, key=lambda frame: frame.name), size_of)
+    capture, headers = reader.capture, reader.headers
+    frames = oriented(sorted(capture.frames, key=lambda frame: frame.name), headers)
     shots, refused = list[Shot](), list[Refused]()
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
-            for done, found in enumerate(pool.map(partial(_shot, size_of, sharpness), frames), 1):
+            for done, found in enumerate(pool.map(partial(_shot, headers, sharpness), frames), 1):
                 if isinstance(found, Shot):
                     shots.append(found)
                 else:
@@ -125,22 +124,22 @@ def prepare(path: Path, progress: Progress | None = None, sharpness: bool = True
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return Survey(
-        path,
+        reader.path,
         capture.layout,
         tuple(shots),
         tuple(refused),
         _unposed(capture),
         _points(capture),
         (*capture.notes, *UnreadColors.of([(shot.name, shot.colors) for shot in shots])),
-        observed_points(path) if capture.layout == "COLMAP" else {},
+        observed_points(reader.path) if capture.layout == "COLMAP" else {},
     )
 
 
-def _shot(size_of: Callable[[Path], tuple[int, int]], sharpness: bool, frame: Frame) -> Shot | Refused:
+def _shot(headers: PhotoHeaders, sharpness: bool, frame: Frame) -> Shot | Refused:
     """Measure a photo, or return the reason why it cannot be used."""
     try:
-        source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0), size_of)
-        colors = image_header(source.path).problem
+        source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0), headers)
+        colors = headers.of(source.path).problem
         stats = measure_photo(source, sharpness)
     except DatasetError as error:
         return Refused(frame.name, error.reason)

@@ -9,7 +9,8 @@ from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.reading import stored_path
-from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
+from gsplat_edu.data.dataset import Dataset, DataSettings
+from gsplat_edu.data.reader import CaptureReader
 
 KEYS = ("resolution", "test_every", "background", "image_memory", "train_views", "test_views")
 """Keys of the section "data" that are data settings."""
@@ -51,13 +52,26 @@ def run_dataset(config: dict[str, Any], path: Path | None = None) -> Dataset:
 
     Args:
         config: The run's config.json.
+        path: As for `run_reader`.
+
+    Raises:
+        CheckpointError: as for `run_reader`.
+        DatasetError: the dataset cannot be read.
+    """
+    return Dataset.of(run_reader(config, path), data_settings(config))
+
+
+def run_reader(config: dict[str, Any], path: Path | None = None) -> CaptureReader:
+    """Return the reader of a run's capture.
+
+    Args:
+        config: The run's config.json.
         path: Current path of the dataset; the one in config.json if None.
 
     Raises:
         CheckpointError: config.json does not name the dataset by a path of this computer, or its settings are damaged.
-        DatasetError: the dataset cannot be read.
     """
-    settings = data_settings(config)
+    data_settings(config)  # checks the section
     if path is None:
         named = config["data"].get("path")
         path = stored_path(named)
@@ -69,4 +83,21 @@ def run_dataset(config: dict[str, Any], path: Path | None = None) -> Dataset:
             raise CheckpointError(
                 f"{named}: the run's dataset no longer exists; give its folder with --dataset PATH"
             )
-    return load_dataset(path, settings)
+    return CaptureReader(path)
+
+
+def reader_for(path: Path, given: CaptureReader | None) -> CaptureReader:
+    """Return the reader that a caller was given, or make one if there is none.
+
+    Args:
+        path: The capture.
+        given: Its reader, or None.
+
+    Raises:
+        ArgumentError: the reader is that of another capture.
+    """
+    if given is None:
+        return CaptureReader(path)
+    if given.path != path:
+        raise ArgumentError(f"reader: reads {given.path}, but the run's capture is {path}; make one for that")
+    return given

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from gsplat_edu.data.dataset import Dataset, load_dataset
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained
@@ -34,11 +35,14 @@ CLEARLY = 0.3
 ORDER = ("none", "poses", "both")
 
 
-def refinement_for(options: RunOptions, progress: Callable[[], None] = lambda: None) -> tuple[str, str]:
+def refinement_for(
+    options: RunOptions, reader: CaptureReader, progress: Callable[[], None] = lambda: None
+) -> tuple[str, str]:
     """Choose `--refine` for a run by pilots.
 
     Args:
         options: Options of the run; its strategy does not matter, since pilots use the recipe fast.
+        reader: The run's capture.
         progress: Called after every iteration.
 
     Returns:
@@ -51,7 +55,7 @@ def refinement_for(options: RunOptions, progress: Callable[[], None] = lambda: N
     size = options.data_settings.resolution
     small = SIDE if size is None or not 32 <= size <= SIDE else size
     settings = as_trained(replace(options.data_settings, resolution=small), options.config.appearance)
-    dataset = load_dataset(options.data, settings, points=options.points)
+    dataset = Dataset.of(reader, settings, points=options.points)
     if not dataset.test:
         return "none", "no photos are held out to judge by"
     dataset.preload()

@@ -18,12 +18,13 @@ from typing import Any
 from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.files import check_folder, remove_leftovers
 from gsplat_edu.base.reading import stored_path
-from gsplat_edu.data.dataset import Dataset, load_dataset
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.runs.dataset import as_trained
+from gsplat_edu.runs.dataset import as_trained, reader_for
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
@@ -148,6 +149,7 @@ class CaptureRun:
         team: The processes that share the training; each makes this object and calls `train`. Only the first uses the
             folder, so the others may run on machines that do not have it.
         check: Called with the capture before anything is written; it raises an error for one that must not be trained.
+        reader: Has read the capture already; None to read it.
 
     Raises:
         CheckpointError: the folder contains a different run, or one that the options do not resume.
@@ -170,6 +172,7 @@ class CaptureRun:
         progress: Callable[[int, int], None] | None = None,
         team: Member = ALONE,
         check: Callable[[Dataset], None] = lambda dataset: None,
+        reader: CaptureReader | None = None,
     ) -> None:
         self._team, self._leads = team, team.rank == 0
         options = _checked_folder(options) if self._leads else options
@@ -181,7 +184,7 @@ class CaptureRun:
         self.seconds = 0.0
         self._began: float | None = None  # during training: when the count of seconds started
         settings = as_trained(options.data_settings, options.config.appearance)
-        self.dataset = load_dataset(options.data, settings, points=options.points)
+        self.dataset = Dataset.of(reader_for(options.data, reader), settings, points=options.points)
         for note in self.dataset.notes:
             say(note)
         check(self.dataset)

@@ -182,19 +182,21 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     from gsplat_edu.budget.costs import Facts, wanted_gaussians
     from gsplat_edu.budget.forecast import predict
     from gsplat_edu.budget.probe import probe
-    from gsplat_edu.data.dataset import load_dataset
+    from gsplat_edu.data.dataset import Dataset
+    from gsplat_edu.data.reader import CaptureReader
     from gsplat_edu.data.settings import DataSettings
     from gsplat_edu.render.backends import resolve_backend
     from gsplat_edu.train.capacity import advised_side
     from gsplat_edu.train.config import DEFAULT_STRATEGY, QUALITIES, recipe
 
+    reader = CaptureReader(capture)
+    whole = Dataset.of(reader)
     if isinstance(resolution, str):
-        whole = load_dataset(Path(capture))
         sizes = [(view.camera.W, view.camera.H) for view in (*whole.train, *whole.test)]
         side = advised_side(sizes, len(whole.train))
         resolution = None if side is None else float(side)
-    dataset = load_dataset(Path(capture), DataSettings(resolution=resolution))
-    facts = Facts.of(dataset, load_dataset(dataset.path))
+    dataset = Dataset.of(reader, DataSettings(resolution=resolution))
+    facts = Facts.of(dataset, whole)
     measured, found = None, {}
     for name, iterations in sorted(QUALITIES.items(), key=lambda entry: -entry[1]):
         config = recipe(iterations, strategy=DEFAULT_STRATEGY)

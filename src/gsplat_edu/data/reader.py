@@ -1,0 +1,139 @@
+"""Reads a capture once, for all datasets that are derived from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.data.blender import TRAIN_FILE, read_blender
+from gsplat_edu.data.capture import (
+    PHOTO_ENDINGS,
+    PHOTO_FOLDERS,
+    Capture,
+    Cloud,
+    Frame,
+    entries,
+    is_file,
+    is_folder,
+)
+from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
+from gsplat_edu.data.images import PhotoHeaders
+from gsplat_edu.data.notes import TwoLayouts
+from gsplat_edu.data.points import finite_cloud, read_points_ply
+from gsplat_edu.data.scale import read_scale
+from gsplat_edu.data.transforms import read_transforms
+from gsplat_edu.data.watch import FileWatch
+
+FAR = 1e4
+"""Camera coordinates beyond which the origin is moved, world units; float32 would resolve them only to 1e-3."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCapture:
+    """Frames and start points of a capture, moved to the origin if their coordinates are too large for float32.
+
+    Args:
+        frames: Sorted by name.
+        cloud: Start points; None if there are none.
+        origin: (3,) offset that was subtracted from all coordinates, world units.
+        notes: Notes for the user: those of the capture's reader, and what was left out or moved.
+    """
+
+    frames: tuple[Frame, ...]
+    cloud: Cloud | None
+    origin: Float64[np.ndarray, "3"]
+    notes: tuple[str, ...]
+
+
+class CaptureReader:
+    """Reads a capture once, when it is first needed: poses, names and points, and each photo's header.
+
+    `gsplat_edu.data.dataset.Dataset.of` derives datasets from it, of any resolution, split, background and memory.
+    They share the digests of the photos' files, so that a photo which changes between two of them is noticed.
+
+    Args:
+        path: A capture folder of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
+
+    Attributes:
+        path: The capture's path.
+        headers: Headers of its photos and masks.
+        watch: Digests of its photos and masks.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.headers, self.watch = PhotoHeaders(), FileWatch()
+        self._placed: dict[Path | None, PlacedCapture] = {}
+
+    @cached_property
+    def capture(self) -> Capture:
+        """What the reader of its layout found; see `read_capture`."""
+        return read_capture(self.path)
+
+    def placed(self, points: Path | None = None) -> PlacedCapture:
+        """Return the sorted frames and the start points, near the origin.
+
+        Args:
+            points: A PLY that replaces the capture's start points, in the capture's coordinates; it is read once.
+
+        Raises:
+            DatasetError: the capture or the PLY cannot be read.
+        """
+        if points not in self._placed:
+            capture = self.capture
+            given = read_points_ply(points) if points else capture.cloud
+            notes = [str(note) for note in capture.notes]
+            self._placed[points] = _near_origin(capture.frames, given, notes)
+        return self._placed[points]
+
+
+def read_capture(path: Path) -> Capture:
+    """Detect the layout of a path and read its poses and names, without photos.
+
+    Raises:
+        DatasetError: it holds no capture, or a damaged one.
+    """
+    if path.suffix.lower() == ".json" and is_file(path):
+        return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
+    if not is_folder(path):
+        raise DatasetError(f"{path}: is neither a folder nor a .json file; give the folder of a capture")
+    if is_file(path / TRAIN_FILE):
+        return read_blender(path)
+    model = find_model(path)
+    if is_file(path / "transforms.json"):
+        capture = read_transforms(path / "transforms.json")
+        return capture if model is None else replace(capture, notes=(TwoLayouts(path), *capture.notes))
+    if model is not None:
+        return replace(read_colmap(path, model), scale=read_scale(path))
+    places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
+    looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
+    folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
+    if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in entries(folder)):
+        raise DatasetError(
+            f"{path}: holds photos but no camera poses; find the poses with "
+            f"`gsplat-edu sfm {path} OUT` (looked for {looked})"
+        )
+    raise DatasetError(f"{path}: is not a capture; looked for {looked}")
+
+
+def _near_origin(found: Sequence[Frame], cloud: Cloud | None, notes: list[str]) -> PlacedCapture:
+    """Sort frames by name, and move a scene whose coordinates are too large for float32, as on a map, to the origin."""
+    frames = sorted(found, key=lambda frame: frame.name)
+    eyes = np.stack([frame.eye for frame in frames])
+    if cloud is not None:
+        cloud, note = finite_cloud(cloud)
+        notes += [note] if note else []
+        cloud = cloud if len(cloud.points) else None
+    if np.abs(eyes).max() <= FAR:
+        return PlacedCapture(tuple(frames), cloud, np.zeros(3), tuple(notes))
+    origin = np.round(eyes.mean(axis=0))
+    notes.append(f"coordinates are large: {tuple(origin.tolist())} was subtracted from all of them")
+    moved = tuple(replace(frame, eye=frame.eye - origin) for frame in frames)
+    cloud = None if cloud is None else replace(cloud, points=cloud.points - origin)
+    return PlacedCapture(moved, cloud, origin, tuple(notes))
