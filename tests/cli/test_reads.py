@@ -78,6 +78,6 @@ def test_split(tmp_path, reads):
     folder = tmp_path / "city"
     write_city(folder, City(photos=36, width=32, points=40))
     words = ["--blocks", "2", "--iterations", "12", "--coarse-iterations", "12"]
-    assert main(["split", str(folder), "--out", str(tmp_path / "run"), *words]) == 0
+    assert main(["train", str(folder), "--out", str(tmp_path / "run"), "--until", "split", *words]) == 0
     assert [count for (name, _), count in reads.items() if name == "read_capture"] == [1]
     assert set(reads.values()) == {1}
