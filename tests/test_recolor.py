@@ -7,7 +7,7 @@ import torch
 from gsplat_edu import ArgumentError
 from gsplat_edu.base.errors import ShapeError
 from gsplat_edu.ops import kernels
-from gsplat_edu.ops.recolor import Behind, recolored, recolored_in_torch, recolored_natively
+from gsplat_edu.ops.recolor import Backdrop, recolored, recolored_in_torch, recolored_natively
 
 BACKGROUND = (0.3, 0.9, 0.6)
 
@@ -24,10 +24,10 @@ def scene(dtype, size=(9, 15), seed=0):
     return image.to(dtype), matrix.to(dtype), photo
 
 
-def behind(dtype, size=(9, 15)):
+def backdrop(dtype, size=(9, 15)):
     """What shows through: anything from nothing to all of the background."""
     generator = torch.Generator().manual_seed(9)
-    return Behind(torch.rand(*size, generator=generator, dtype=torch.float64).to(dtype), BACKGROUND)
+    return Backdrop(torch.rand(*size, generator=generator, dtype=torch.float64).to(dtype), BACKGROUND)
 
 
 def corners(dtype, size=(9, 15)):
@@ -46,7 +46,7 @@ def test_the_kernel_is_torchs_formula_in_value_and_gradients(size, with_photo, w
     weights, results = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(image.shape), []
     for native in (True, False):
         x, m = image.clone().requires_grad_(), matrix.clone().requires_grad_()
-        given = behind(torch.float64, size) if with_background else None
+        given = backdrop(torch.float64, size) if with_background else None
         t = given.transmittance.requires_grad_() if given else torch.ones((), requires_grad=True)
         plane = corners(torch.float64, size) if with_falloff else None
         arguments = (x, m, photo if with_photo else None, given, plane)
@@ -72,12 +72,12 @@ def test_gradients_are_proven_by_finite_differences():
 def test_gradients_before_a_background_are_proven_by_finite_differences(with_falloff):
     """As above; linear in image and transmittance, bilinear with the matrix."""
     image, matrix, photo = scene(torch.float64, (8, 11))
-    given, plane = behind(torch.float64, (8, 11)), corners(torch.float64, (8, 11)) if with_falloff else None
+    given, plane = backdrop(torch.float64, (8, 11)), corners(torch.float64, (8, 11)) if with_falloff else None
     cut = recolored(image, matrix, None, given, plane)[photo == 255]
     assert (cut > 1).any() and (cut < 1).any() and ((cut - 1).abs() > 1e-3).all()
     tensors = [tensor.requires_grad_() for tensor in (image, matrix, given.transmittance)]
     assert torch.autograd.gradcheck(
-        lambda a, b, t: recolored(a, b, photo, Behind(t, BACKGROUND), plane), tensors
+        lambda a, b, t: recolored(a, b, photo, Backdrop(t, BACKGROUND), plane), tensors
     )
     if with_falloff:
         assert torch.autograd.gradcheck(lambda a, b: recolored(a, b, photo, None, plane), tensors[:2])
@@ -94,7 +94,7 @@ def test_the_object_is_recoloured_and_the_background_stays():
     straight = colors @ matrix[:, :3].T + matrix[:, 3]
     falloff = rng.uniform(0.5, 1.2, size=(7, 9))
     darker = falloff[..., None] * (straight + 0.055) - 0.055
-    given = Behind(torch.from_numpy(1 - opacity), BACKGROUND)
+    given = Backdrop(torch.from_numpy(1 - opacity), BACKGROUND)
     for corrected, plane in ((straight, None), (darker, torch.from_numpy(falloff))):
         expected = corrected * opacity[..., None] + background * (1 - opacity)[..., None]
         found = recolored(torch.from_numpy(image), torch.from_numpy(matrix), None, given, plane)
@@ -122,8 +122,8 @@ def test_the_bits_do_not_depend_on_the_threads(with_background):
         for threads in (1, 2, 5):
             torch.set_num_threads(threads)
             x, m = image.clone().requires_grad_(), matrix.clone().requires_grad_()
-            t = behind(torch.float32, (211, 157)).transmittance.requires_grad_()
-            given = Behind(t, BACKGROUND) if with_background else None
+            t = backdrop(torch.float32, (211, 157)).transmittance.requires_grad_()
+            given = Backdrop(t, BACKGROUND) if with_background else None
             out = recolored(x, m, photo, given, corners(torch.float32, (211, 157)))
             out.backward(torch.linspace(0, 1, out.numel()).reshape(out.shape))
             found.append((out.detach(), x.grad, m.grad, *([t.grad] if with_background else [])))
@@ -143,9 +143,9 @@ def test_wrong_arguments_are_named():
     with pytest.raises(ArgumentError, match="^matrix: is torch.float64"):
         recolored(image, matrix.double())
     with pytest.raises(ShapeError, match="^transmittance"):
-        recolored(image, matrix, None, Behind(torch.zeros(3, 3), BACKGROUND))
+        recolored(image, matrix, None, Backdrop(torch.zeros(3, 3), BACKGROUND))
     with pytest.raises(ArgumentError, match="^transmittance: is torch.float64"):
-        recolored(image, matrix, None, behind(torch.float64))
+        recolored(image, matrix, None, backdrop(torch.float64))
     with pytest.raises(ShapeError, match="^falloff"):
         recolored(image, matrix, falloff=torch.ones(9, 14))
     with pytest.raises(ArgumentError, match="^falloff: is torch.float64"):

@@ -5,7 +5,7 @@ import pytest
 
 from gsplat_edu import Camera
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.tracks import MOST_SEEN, seen_by
+from gsplat_edu.data.tracks import MOST_SEEN, visible_points
 from gsplat_edu.data.writers import write_colmap, write_model
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed (extra dev)")
@@ -39,7 +39,7 @@ def test_hidden_points_are_not_seen():
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 31), np.linspace(-1, 1, 31)))
     front, rear = np.stack([x, y, x * 0 + 2], 1), np.stack([4 * x, 4 * y, x * 0 + 4], 1)
     camera = Camera(np.eye(3), np.zeros(3), 50.0, 50.0, 49.5, 49.5, 100, 100)
-    seen = seen_by(camera, np.concatenate([front, rear]))
+    seen = visible_points(camera, np.concatenate([front, rear]))
     assert set(range(961)) <= set(seen.points.tolist())
     behind = seen.points[seen.points >= 961] - 961
     assert len(behind) > 0 and np.all(np.abs(rear[behind, :2]).max(axis=1) > 1.9)
@@ -48,7 +48,7 @@ def test_hidden_points_are_not_seen():
 def test_a_photo_sees_a_bounded_number(tmp_path):
     points = np.random.default_rng(0).uniform(-1, 1, (9_000, 3)) * (1, 1, 0.01) + (0, 0, 3)
     camera = Camera(np.eye(3), np.zeros(3), 50.0, 50.0, 49.5, 49.5, 100, 100)
-    seen = seen_by(camera, points)
+    seen = visible_points(camera, points)
     assert len(seen.points) == MOST_SEEN == len(np.unique(seen.points))
     write_model(tmp_path, [("a.png", camera)], np.zeros((0, 3)), np.zeros((0, 3)))
     assert pycolmap.Reconstruction(str(tmp_path / "sparse" / "0")).num_points3D() == 0

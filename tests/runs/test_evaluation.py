@@ -9,7 +9,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.evaluation import Judged, evaluate_run
+from gsplat_edu.runs.evaluation import ScoredViews, evaluate_run
 from gsplat_edu.runs.folder import RunFolder
 from splats import splats_on
 
@@ -34,7 +34,7 @@ def test_a_run_is_evaluated_and_everything_is_written(capture, folder):
     gaussians = splats_on(points, colors)
     folder.write_metrics({"seconds": 12.5, "num_gaussians": 1, "mine": "kept"})
     progress = []
-    judged = Judged(views[:2], views[2:], notes=["a note"])
+    judged = ScoredViews(views[:2], views[2:], notes=["a note"])
     result = evaluate_run(
         folder,
         judged,
@@ -69,7 +69,7 @@ def test_a_run_is_evaluated_and_everything_is_written(capture, folder):
 
 def test_a_run_without_test_views_is_evaluated(capture, folder):
     views, points, colors = capture
-    result = evaluate_run(folder, Judged([], views[:1]), splats_on(points, colors), RENDER)
+    result = evaluate_run(folder, ScoredViews([], views[:1]), splats_on(points, colors), RENDER)
     assert result.metrics["test"] == {
         "psnr": None,
         "psnr_8bit": None,

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsplat_edu.data import procedural
-from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views, seen_through, summarize
+from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views, summarize, transparency_of
 from gsplat_edu.ops.exposure import stops
 from gsplat_edu.ops.recolor import recolored_natively
 from gsplat_edu.render.api import render
@@ -132,13 +132,13 @@ def darker_render(scale):
 def test_scores_fit_the_object_and_leave_the_background():
     photo, output = darker_render(1.6)
     truth = photo.over(GREY)
-    given = seen_through(photo, output, GREY)
+    given = transparency_of(photo, output, GREY)
     # Rounded to bytes twice, by the camera and by compositing: 1/255 at most, so 48 dB at least.
     assert psnr_fitted(output.image, truth, None, given) > 48
     assert psnr_fitted(output.image, truth) < 30, "the background changes with the object"
     found = at_exposure_of(truth, output.image, None, given)
     np.testing.assert_allclose(found.numpy(), truth / 255.0, atol=1.5 / 255)
-    assert seen_through(Photo(truth), output, GREY) is None
+    assert transparency_of(Photo(truth), output, GREY) is None
 
 
 def test_the_scene_is_judged_by_photos_of_its_exposure_with_their_alpha(tmp_path):

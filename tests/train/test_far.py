@@ -62,11 +62,11 @@ def test_splits_do_not_let_the_shell_outgrow_the_scene():
     means[:3, 0] = 400.0
     selected = torch.ones(10, dtype=torch.bool)
     scores = torch.tensor([1.0, 3.0, 2.0, *[0.5] * 7])
-    assert SHELL.spared(selected, scores, means).tolist() == [False, True, False, *[True] * 7]
+    assert SHELL.within_quota(selected, scores, means).tolist() == [False, True, False, *[True] * 7]
     means[3, 0] = 400.0  # four of ten
-    assert SHELL.spared(selected, scores, means).tolist() == [False] * 4 + [True] * 6
+    assert SHELL.within_quota(selected, scores, means).tolist() == [False] * 4 + [True] * 6
     means[:4, 0] = 0.0
-    assert SHELL.spared(selected, scores, means) is selected
+    assert SHELL.within_quota(selected, scores, means) is selected
 
 
 def test_noise_of_mcmc_leaves_the_shell_in_place():

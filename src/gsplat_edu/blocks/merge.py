@@ -20,7 +20,7 @@ from gsplat_edu.blocks.task import block_options
 from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
-from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
+from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import fingerprint
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.source import open_source
@@ -125,7 +125,7 @@ def merge_blocks(
         facts["seams"] = {"width": width, "psnr": strips, "psnr_elsewhere": rest}
     if export is not None:
         facts["exports"] = export(open_source(scene))
-    judged = Judged(dataset.test, (), options.config.background, dataset.notes)
+    judged = ScoredViews(dataset.test, (), options.config.background, dataset.notes)
     return evaluate_run(run, judged, gaussians, options.renderer, facts, progress)
 
 

@@ -18,7 +18,7 @@ from gsplat_edu.io.ply import load_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
-from gsplat_edu.runs.evaluation import EVALUATED, Judged, evaluate_run
+from gsplat_edu.runs.evaluation import EVALUATED, ScoredViews, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.identity import capture_difference
 
@@ -72,7 +72,7 @@ def _evaluate(
     gaussians = load_ply(scene, dataset.origin).to(
         device_of(backend)
     )  # in the coordinate frame of the cameras
-    judged = Judged(dataset.test, dataset.train, settings.background, dataset.notes)
+    judged = ScoredViews(dataset.test, dataset.train, settings.background, dataset.notes)
     with Bar(
         TextColumn("{task.description}"),
         BarColumn(),

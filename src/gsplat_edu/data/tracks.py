@@ -30,7 +30,7 @@ DEPTH_SLACK = 0.05
 are seen at a grazing angle lose points by it, which is harmless."""
 
 
-class Seen(NamedTuple):
+class VisiblePoints(NamedTuple):
     """What a photo sees."""
 
     points: Int64[np.ndarray, " M"]
@@ -48,7 +48,7 @@ class Track(NamedTuple):
     """Rows in what those cameras see."""
 
 
-def seen_by(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> Seen:
+def visible_points(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> VisiblePoints:
     """Return the points that a camera sees, as far as the points themselves tell."""
     at = camera.world_to_cam(points)
     before = np.flatnonzero(at[:, 2] > 0)
@@ -63,10 +63,10 @@ def seen_by(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> Seen:
     shown = np.flatnonzero(depth <= (1 + DEPTH_SLACK) * nearest[cells])
     if len(shown) > MOST_SEEN:
         shown = shown[np.linspace(0, len(shown) - 1, MOST_SEEN).round().astype(np.int64)]
-    return Seen(rows[shown], np.stack([u, v], axis=-1)[shown] + 0.5)
+    return VisiblePoints(rows[shown], np.stack([u, v], axis=-1)[shown] + 0.5)
 
 
-def tracks_of(seen: Sequence[Seen], count: int) -> list[Track]:
+def tracks_of(seen: Sequence[VisiblePoints], count: int) -> list[Track]:
     """Return the track of each of `count` points: by image, then by place."""
     points = np.concatenate([each.points for each in seen] or [np.empty(0, np.int64)])
     images = np.repeat(np.arange(len(seen)), [len(each.points) for each in seen])

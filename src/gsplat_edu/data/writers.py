@@ -17,7 +17,7 @@ from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import write_points_ply
-from gsplat_edu.data.tracks import UNMEASURED, Seen, seen_by, tracks_of
+from gsplat_edu.data.tracks import UNMEASURED, VisiblePoints, tracks_of, visible_points
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import Photo, View
 
@@ -80,7 +80,7 @@ def write_model(
         for i, (name, camera) in enumerate(cameras, 1)
     ]
     rgb = np.round(255.0 * np.clip(cloud.colors, 0.0, 1.0)).astype(int)
-    seen = [seen_by(camera, cloud.points) for _, camera in cameras]
+    seen = [visible_points(camera, cloud.points) for _, camera in cameras]
     if binary:
         _write_bin(model, lenses, poses, seen, (cloud.points, rgb))
     else:
@@ -214,7 +214,7 @@ def _write_bin(
     model: Path,
     cameras: dict[tuple[float, ...], int],
     poses: Sequence[_Pose],
-    seen: Sequence[Seen],
+    seen: Sequence[VisiblePoints],
     cloud: tuple[np.ndarray, np.ndarray],
 ) -> None:
     data = struct.pack("<Q", len(cameras))
@@ -240,7 +240,7 @@ def _write_txt(
     model: Path,
     cameras: dict[tuple[float, ...], int],
     poses: Sequence[_Pose],
-    seen: Sequence[Seen],
+    seen: Sequence[VisiblePoints],
     cloud: tuple[np.ndarray, np.ndarray],
 ) -> None:
     def line(*values: Any) -> str:  # noqa: ANN401

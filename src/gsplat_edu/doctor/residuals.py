@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
-from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, psnr, seen_through
+from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, psnr, transparency_of
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
@@ -86,7 +86,7 @@ def residuals(
             pixels = truth / 255.0 if truth.dtype == np.uint8 else np.asarray(truth, dtype=np.float64)
             image = output.image
             if appearance != "none":
-                shown, vignetting = seen_through(photo, output, background), appearance == "vignetting"
+                shown, vignetting = transparency_of(photo, output, background), appearance == "vignetting"
                 image = at_exposure_of(truth, image, photo.mask, shown, vignetting=vignetting)
             stops = _stops(pixels, image.double().numpy(force=True), photo.mask)
             found.append(Residual(view.name, psnr(image, truth, photo.mask), stops, veiled))

@@ -18,7 +18,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gsplat_edu.base.validation import ArrayLike
-from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, seen_through
+from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, transparency_of
 from gsplat_edu.ops.adam import adam_in_torch
 from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.ops.moments import AdamNumbers
@@ -85,7 +85,7 @@ def aligned_psnr(
         output = render(fixed, camera)
         if not colors:
             return output.image
-        return at_exposure_of(truth, output.image, fitted, seen_through(photo, output, background))
+        return at_exposure_of(truth, output.image, fitted, transparency_of(photo, output, background))
 
     start = CameraTensors.of(view.camera)
     twist = torch.zeros(6, dtype=torch.float64)

@@ -29,7 +29,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.ops.losses import l1_ssim
-from gsplat_edu.ops.recolor import Behind, recolored
+from gsplat_edu.ops.recolor import Backdrop, recolored
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
@@ -42,15 +42,15 @@ Renderer = Callable[[Gaussians, Camera], RenderOutput]
 """Renders Gaussians from a camera."""
 
 
-class Through(NamedTuple):
-    """What a fit of colours has to know where the background shows through; see `seen_through`.
+class Transparency(NamedTuple):
+    """What a fit of colours has to know where the background shows through; see `transparency_of`.
 
     Args:
-        behind: Transmittance of the render, and the background of render and photo.
+        backdrop: Transmittance of the render, and the background of render and photo.
         opaque: (H, W) `Photo.opaque`, which is where colours are fitted.
     """
 
-    behind: Behind
+    backdrop: Backdrop
     opaque: Bool[np.ndarray, "H W"]
 
 
@@ -110,7 +110,10 @@ def psnr_8bit(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None)
 
 
 def psnr_fitted(
-    image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None, through: Through | None = None
+    image: ArrayLike,
+    truth: ArrayLike,
+    mask: ArrayLike | None = None,
+    transparency: Transparency | None = None,
 ) -> float | None:
     """Return the PSNR of the right half of an image after a fit of its colours on the left half.
 
@@ -124,15 +127,15 @@ def psnr_fitted(
         image: As for `psnr`.
         truth: As for `psnr`.
         mask: As for `psnr`.
-        through: What `seen_through` returns for the photo; None if it is opaque.
+        transparency: What `transparency_of` returns for the photo; None if it is opaque.
 
     Returns:
         dB; None if no pixel of the right half counts.
     """
-    return _Pair(image, truth, mask, through).psnr_fitted()
+    return _Pair(image, truth, mask, transparency).psnr_fitted()
 
 
-def seen_through(photo: Photo, output: RenderOutput, background: ArrayLike) -> Through | None:
+def transparency_of(photo: Photo, output: RenderOutput, background: ArrayLike) -> Transparency | None:
     """Return what shows through a photo and its render; None if the photo is opaque.
 
     Args:
@@ -143,14 +146,14 @@ def seen_through(photo: Photo, output: RenderOutput, background: ArrayLike) -> T
     if photo.opaque is None:
         return None
     red, green, blue = float64_array("background", background, (3,)).tolist()
-    return Through(Behind(output.transmittance, (red, green, blue)), photo.opaque)
+    return Transparency(Backdrop(output.transmittance, (red, green, blue)), photo.opaque)
 
 
 def at_exposure_of(
     photo: UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W 3"],
     image: Float[torch.Tensor, "H W 3"],
     mask: Bool[np.ndarray, "H W"] | None = None,
-    through: Through | None = None,
+    transparency: Transparency | None = None,
     *,
     vignetting: bool = False,
 ) -> Float[torch.Tensor, "H W 3"]:
@@ -160,21 +163,21 @@ def at_exposure_of(
         photo: (H, W, 3) uint8, or float from 0 to 1.
         image: (H, W, 3) render.
         mask: (H, W) true for pixels that the gains are measured on; None for all.
-        through: What `seen_through` returns for the photo; None if it is opaque.
+        transparency: What `transparency_of` returns for the photo; None if it is opaque.
         vignetting: Give it the photo's vignetting too.
 
     Returns:
         (H, W, 3), differentiable in the image; what is measured counts as constant.
     """
     truth = torch.from_numpy(np.ascontiguousarray(photo)).to(image.device)
-    if through is not None:
-        mask = through.opaque if mask is None else mask & through.opaque
+    if transparency is not None:
+        mask = transparency.opaque if mask is None else mask & transparency.opaque
     counts = None if mask is None else torch.from_numpy(mask).to(image.device)
     found = (measured_vignetting if vignetting else measured_gains)(image, truth, counts)
     plane = falloff(found[3], *image.shape[:2]) if vignetting else None
-    behind = None if through is None else through.behind
+    backdrop = None if transparency is None else transparency.backdrop
     compared = truth if truth.dtype == torch.uint8 else None
-    return recolored(image, color_matrix(found[:3]), compared, behind, plane)
+    return recolored(image, color_matrix(found[:3]), compared, backdrop, plane)
 
 
 def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -224,7 +227,7 @@ def score_image(
     image: ArrayLike,
     truth: ArrayLike,
     mask: ArrayLike | None = None,
-    through: Through | None = None,
+    transparency: Transparency | None = None,
 ) -> ImageScore:
     """Compute all metrics of one image.
 
@@ -233,13 +236,13 @@ def score_image(
         image: As for `psnr`.
         truth: As for `psnr`.
         mask: As for `psnr`.
-        through: As for `psnr_fitted`.
+        transparency: As for `psnr_fitted`.
 
     Raises:
         ShapeError, ArgumentError: as for `psnr`.
         BackendUnavailableError: as for `ssim`.
     """
-    pair = _Pair(image, truth, mask, through)
+    pair = _Pair(image, truth, mask, transparency)
     return ImageScore(name, pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1(), pair.psnr_fitted())
 
 
@@ -270,7 +273,7 @@ def score_views(
         with torch.no_grad():
             output = render(gaussians, view.camera)
         image, truth = output.image, photo.over(background)
-        score = score_image(view.name, image, truth, photo.mask, seen_through(photo, output, background))
+        score = score_image(view.name, image, truth, photo.mask, transparency_of(photo, output, background))
         scores.append(score)
         if on_image is not None:
             on_image(view, score, to_bytes(image), to_bytes(truth))
@@ -323,9 +326,9 @@ class _Pair:
         image: ArrayLike,
         truth: ArrayLike,
         mask: ArrayLike | None,
-        through: Through | None = None,
+        transparency: Transparency | None = None,
     ) -> None:
-        self.through = through
+        self.transparency = transparency
         sizes: dict[str, int] = {}
         self.render = np.clip(float64_array("image", _as_array(image), ("H", "W", 3), sizes), 0.0, 1.0)
         given = _as_array(truth)
@@ -359,14 +362,14 @@ class _Pair:
         tested = counts[:, middle:]
         if not tested.any():
             return None
-        shown, behind = counts[:, :middle], None
-        if self.through is not None:
-            shown = shown & self.through.opaque[:, :middle]
-            transmittance = self.through.behind.transmittance.detach().cpu().double()
-            behind = Behind(transmittance[:, middle:], self.through.behind.background)
+        shown, backdrop = counts[:, :middle], None
+        if self.transparency is not None:
+            shown = shown & self.transparency.opaque[:, :middle]
+            transmittance = self.transparency.backdrop.transmittance.detach().cpu().double()
+            backdrop = Backdrop(transmittance[:, middle:], self.transparency.backdrop.background)
         image, photo = torch.from_numpy(self.render), torch.from_numpy(self.photo)
         gains = measured_gains(image[:, :middle], photo[:, :middle], torch.from_numpy(shown))
-        fitted = recolored(image[:, middle:], color_matrix(gains), None, behind)
+        fitted = recolored(image[:, middle:], color_matrix(gains), None, backdrop)
         return _Pair(fitted.numpy(), self.photo[:, middle:], tested).psnr()
 
     def l1(self) -> float:

@@ -30,7 +30,7 @@ from gsplat_edu.ops import kernels
 Color = tuple[float, float, float]
 
 
-class Behind(NamedTuple):
+class Backdrop(NamedTuple):
     """What shows through an image.
 
     Args:
@@ -46,7 +46,7 @@ def recolored(
     image: Float[Tensor, "H W 3"],
     matrix: Float[Tensor, "3 4"],
     photo: UInt8[Tensor, "H W 3"] | None = None,
-    behind: Behind | None = None,
+    backdrop: Backdrop | None = None,
     falloff: Float[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """Return the image with the colours A x + b, or its object with them.
@@ -59,7 +59,7 @@ def recolored(
         photo: (H, W, 3) the photo that the result is compared with. Where it is saturated (255), a result above 1
             becomes 1 and has no gradient: the photo does not tell how bright the scene is there. None if it is not
             stored in bytes.
-        behind: What shows through; None recolours every pixel completely. The transmittance has the image's dtype and
+        backdrop: What shows through; None recolours every pixel completely. The transmittance has the image's dtype and
             device.
         falloff: (H, W) v, of the image's dtype and device; it counts as constant. None for 1.
 
@@ -71,18 +71,18 @@ def recolored(
         ArgumentError: matrix, transmittance or falloff has another dtype or device than the image.
     """
     native = kernels.REASON is None and image.device.type == "cpu" and image.dtype in kernels.SUFFIXES
-    return (recolored_natively if native else recolored_in_torch)(image, matrix, photo, behind, falloff)
+    return (recolored_natively if native else recolored_in_torch)(image, matrix, photo, backdrop, falloff)
 
 
 def recolored_natively(
     image: Float[Tensor, "H W 3"],
     matrix: Float[Tensor, "3 4"],
     photo: UInt8[Tensor, "H W 3"] | None = None,
-    behind: Behind | None = None,
+    backdrop: Backdrop | None = None,
     falloff: Float[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """Compute `recolored` in one native pass, for images on the CPU; the same bits on any number of threads."""
-    through, background = _checked(image, matrix, photo, behind, falloff)
+    through, background = _checked(image, matrix, photo, backdrop, falloff)
     constants = _Constants(photo, falloff, background)
     found: Tensor = _Recolored.apply(image, matrix, through, constants)  # type: ignore[no-untyped-call]
     return found
@@ -92,11 +92,11 @@ def recolored_in_torch(
     image: Float[Tensor, "H W 3"],
     matrix: Float[Tensor, "3 4"],
     photo: UInt8[Tensor, "H W 3"] | None = None,
-    behind: Behind | None = None,
+    backdrop: Backdrop | None = None,
     falloff: Float[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """Compute `recolored` by torch's operations, on any device."""
-    through, background = _checked(image, matrix, photo, behind, falloff)
+    through, background = _checked(image, matrix, photo, backdrop, falloff)
     corrected = image @ matrix[:, :3].T + matrix[:, 3]
     color = image.new_tensor(background)
     if through is not None:
@@ -110,14 +110,14 @@ def recolored_in_torch(
 
 
 def _checked(
-    image: Tensor, matrix: Tensor, photo: Tensor | None, behind: Behind | None, falloff: Tensor | None
+    image: Tensor, matrix: Tensor, photo: Tensor | None, backdrop: Backdrop | None, falloff: Tensor | None
 ) -> tuple[Tensor | None, Color]:
     """Check the arguments of `recolored`; return the transmittance, None for an opaque image, and the background."""
     check_shape("image", image.shape, ("H", "W", 3), {})
     check_shape("matrix", matrix.shape, (3, 4), {})
     if photo is not None:
         check_shape("photo", photo.shape, image.shape, {})
-    through, background = behind or (None, (0.0, 0.0, 0.0))
+    through, background = backdrop or (None, (0.0, 0.0, 0.0))
     for name, tensor in {"transmittance": through, "falloff": falloff}.items():
         if tensor is not None:
             check_shape(name, tensor.shape, image.shape[:2], {})

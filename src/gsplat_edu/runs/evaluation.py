@@ -30,7 +30,7 @@ Progress = Callable[[str, ImageScore], None]
 
 
 @dataclass(frozen=True)
-class Judged:
+class ScoredViews:
     """The views that a scene is scored on.
 
     Args:
@@ -63,7 +63,7 @@ class Evaluation:
 
 def evaluate_run(
     folder: RunFolder,
-    judged: Judged,
+    judged: ScoredViews,
     gaussians: Gaussians,
     render: Renderer,
     facts: Mapping[str, Any] | None = None,

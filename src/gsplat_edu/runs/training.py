@@ -25,7 +25,7 @@ from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, reader_for
-from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
+from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
@@ -411,7 +411,9 @@ class CaptureRun:
             facts |= aligned_score(refined.test, gaussians, self.options, trainer.extent, self._say)
         return evaluate_run(
             self.folder,
-            Judged(dataset.test, (refined or dataset).train, self.options.config.background, dataset.notes),
+            ScoredViews(
+                dataset.test, (refined or dataset).train, self.options.config.background, dataset.notes
+            ),
             gaussians,
             self.options.renderer,
             facts,

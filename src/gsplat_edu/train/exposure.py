@@ -27,7 +27,7 @@ from torch import Tensor
 
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
-from gsplat_edu.ops.recolor import Behind, RecolorKernel
+from gsplat_edu.ops.recolor import Backdrop, RecolorKernel
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
 from gsplat_edu.train.view_model import Identity, Rows, ViewRender
@@ -92,9 +92,9 @@ class Exposure(Identity):
         state[index] = rows[NAME]
         matrix = color_matrix(_log_gains(state)[index])
         photo = target.image if target.image.dtype == torch.uint8 else None
-        behind = None if target.opaque is None else Behind(render.transmittance, render.background)
+        backdrop = None if target.opaque is None else Backdrop(render.transmittance, render.background)
         plane = falloff(_vignetting(state)[index], *render.image.shape[:2]) if self._vignetting else None
-        return self._recolor(render.image, matrix, photo, behind, plane)
+        return self._recolor(render.image, matrix, photo, backdrop, plane)
 
     def log_gains(self) -> Float[Tensor, "views 3"]:
         """Return the natural logarithm of every view's gains; their mean over the views is 0."""

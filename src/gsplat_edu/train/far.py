@@ -39,7 +39,7 @@ class Shell:
         x, y, z = away.unbind(dim=1)
         return x * x + y * y + z * z > (self.radius / 2) ** 2
 
-    def spared(
+    def within_quota(
         self, selected: Bool[Tensor, " N"], scores: Float[Tensor, " N"], means: Float[Tensor, "N 3"]
     ) -> Bool[Tensor, " N"]:
         """Leave out the splats of the shell with the lowest scores, so that it does not outgrow the scene.

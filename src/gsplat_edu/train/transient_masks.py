@@ -25,7 +25,7 @@ from torch import Tensor
 
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.exposure import color_matrix, measured_gains
-from gsplat_edu.ops.recolor import Behind, recolored
+from gsplat_edu.ops.recolor import Backdrop, recolored
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
@@ -225,13 +225,13 @@ def _residual(
         )
     assert output.features is not None, "features were given"
     image = output.image.detach()
-    counts, behind = photo.mask, None
+    counts, backdrop = photo.mask, None
     if photo.opaque is not None:
         counts = photo.opaque if counts is None else counts & photo.opaque
-        behind = Behind(output.transmittance.detach(), how.settings.background)
+        backdrop = Backdrop(output.transmittance.detach(), how.settings.background)
     mask = None if counts is None else torch.from_numpy(counts).to(image.device)
     gains = measured_gains(image, torch.from_numpy(truth).to(image.device), mask)
-    image = recolored(image, color_matrix(gains), None, behind)
+    image = recolored(image, color_matrix(gains), None, backdrop)
     pixels = truth.astype(np.float32) / (255.0 if truth.dtype == np.uint8 else 1.0)
     error = smoothed_difference(image.clamp(0.0, 1.0).float().numpy(force=True), pixels, photo.mask)
     known = np.isfinite(error)

@@ -46,7 +46,7 @@ ROUNDS = 3
 """Rounds of registration: photos that overlap only with other photos of this kind follow in a later round."""
 
 
-class Seen(NamedTuple):
+class MatchedPoints(NamedTuple):
     """The points of the model that a photo sees by its verified matches: places (n, 2) px, points (n, 3)."""
 
     places: np.ndarray
@@ -149,7 +149,11 @@ def _apart(a: float, b: float) -> bool:
 
 
 def _explained(
-    lens: pycolmap.Camera, main: pycolmap.Camera, seen: dict[int, Seen], before: Kin | None, seed: int
+    lens: pycolmap.Camera,
+    main: pycolmap.Camera,
+    seen: dict[int, MatchedPoints],
+    before: Kin | None,
+    seed: int,
 ) -> tuple[float | None, list[int]]:
     """Return the focal length that explains the photos, px (None if several do), and the photos it explains."""
     related = [factor * main.mean_focal_length() for factor in _factors(lens, main)]
@@ -185,7 +189,9 @@ def _chosen(related: list[float], scores: dict[float, np.ndarray]) -> float | No
     return good[0] if len(good) == 1 else None
 
 
-def _score(lens: pycolmap.Camera, main: pycolmap.Camera, focal: float, one: Seen, seed: int) -> float:
+def _score(
+    lens: pycolmap.Camera, main: pycolmap.Camera, focal: float, one: MatchedPoints, seed: int
+) -> float:
     """Score how well a focal length explains a photo: about the number of points with a small reprojection error."""
     trial = copy.deepcopy(lens)
     _set_lens(trial, main, focal)
@@ -208,7 +214,7 @@ def _estimation(seed: int) -> pycolmap.AbsolutePoseEstimationOptions:
     return options
 
 
-def _pose(lens: pycolmap.Camera, one: Seen, seed: int) -> tuple[pycolmap.Rigid3d | None, int]:
+def _pose(lens: pycolmap.Camera, one: MatchedPoints, seed: int) -> tuple[pycolmap.Rigid3d | None, int]:
     """Register a photo with a known lens; return its pose and the number of inliers."""
     found = pycolmap.estimate_and_refine_absolute_pose(
         one.places, one.points, copy.deepcopy(lens), _estimation(seed)
@@ -218,7 +224,7 @@ def _pose(lens: pycolmap.Camera, one: Seen, seed: int) -> tuple[pycolmap.Rigid3d
     return found["cam_from_world"], int((_errors(lens, found["cam_from_world"], one) < INLIER).sum())
 
 
-def _own_focal(lens: pycolmap.Camera, one: Seen, seed: int) -> float | None:
+def _own_focal(lens: pycolmap.Camera, one: MatchedPoints, seed: int) -> float | None:
     """Return the focal length that fits one photo best, px."""
     trial, estimation = copy.deepcopy(lens), _estimation(seed)
     refinement = pycolmap.AbsolutePoseRefinementOptions()
@@ -227,7 +233,7 @@ def _own_focal(lens: pycolmap.Camera, one: Seen, seed: int) -> float | None:
     return None if found is None or trial.has_bogus_params(0.1, 10.0, 1.0) else trial.mean_focal_length()
 
 
-def _errors(lens: pycolmap.Camera, pose: pycolmap.Rigid3d, one: Seen) -> np.ndarray:
+def _errors(lens: pycolmap.Camera, pose: pycolmap.Rigid3d, one: MatchedPoints) -> np.ndarray:
     """Return the reprojection errors, px; large for points behind the camera."""
     local = one.points @ pose.rotation.matrix().T + pose.translation
     ahead = local[:, 2] > 0
@@ -236,7 +242,7 @@ def _errors(lens: pycolmap.Camera, pose: pycolmap.Rigid3d, one: Seen) -> np.ndar
     return np.asarray(np.where(ahead, errors, 1e9))
 
 
-def _seen(model: pycolmap.Reconstruction, database: str, number: int) -> Seen:
+def _seen(model: pycolmap.Reconstruction, database: str, number: int) -> MatchedPoints:
     """Collect the points of the model that a photo's matches refer to; each feature gets its most frequent point."""
     votes = dict[int, Counter[int]]()
     with opened(database) as reader:
@@ -255,7 +261,7 @@ def _seen(model: pycolmap.Reconstruction, database: str, number: int) -> Seen:
                     votes.setdefault(int(match[mine]), Counter())[there.point3D_id] += 1
     chosen = {feature: max(sorted(count), key=lambda p: count[p]) for feature, count in sorted(votes.items())}
     points = np.array([model.point3D(point).xyz for point in chosen.values()]).reshape(-1, 3)
-    return Seen(keypoints[list(chosen)].reshape(-1, 2), points)
+    return MatchedPoints(keypoints[list(chosen)].reshape(-1, 2), points)
 
 
 def _triangulated(

@@ -106,7 +106,7 @@ class AdaptiveDensityControl:
             keep &= right if self.shell is None else right | self.shell.holds(gaussians.means)
         selected = keep & (mean_norms > config.adc.grad_threshold)
         if self.shell is not None:
-            selected = self.shell.spared(selected, mean_norms, gaussians.means)
+            selected = self.shell.within_quota(selected, mean_norms, gaussians.means)
         if config.adc.over_cap == "strongest":
             selected = self._within_cap(mean_norms, selected, int(keep.sum()))
         large = size > config.adc.percent_dense * self.extent

@@ -85,7 +85,7 @@ class PlannedDensity:
         keep = gaussians.finite_rows() & (gaussians.opacities >= least)
         planned = int(planned_counts(config, self.start_count, self.cap, np.array([due]))[0])
         room = planned - int(keep.sum()) if growing else 0
-        may = keep if self.shell is None else self.shell.spared(keep, self._score(), gaussians.means)
+        may = keep if self.shell is None else self.shell.within_quota(keep, self._score(), gaussians.means)
         split = self._highest(may, room)
         children = long_axis_children(gaussians.map(lambda tensor: tensor[split]))
         replaced = replace(gaussians, optimizer, keep & ~split, children)
