@@ -54,8 +54,9 @@ def _live(studio: Studio, request: Request) -> tuple[Job, LiveFolder]:
         RefusedError: no job trains it.
     """
     entry = studio.library.place("runs", request.path_params["name"])
+    name = studio.library.name(entry)
     for job in studio.queue.jobs():
-        if job.state in ACTIVE and job.argv[0] == "train" and job.subject == f"runs/{entry.name}":
+        if job.state in ACTIVE and job.work.command == "train" and job.work.outputs == (name,):
             folder = LiveFolder(entry)
             if (entry / "config.json").is_file():
                 folder.ask()

@@ -16,6 +16,7 @@ from gsplat_edu.jobs.events import Event
 from gsplat_edu.jobs.following import Follower
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job
+from gsplat_edu.studio.commands import subject_of, title_of
 
 KEPT = 4_000
 """Events that a browser may have missed and still gets; after more it reads the list of jobs again."""
@@ -34,8 +35,9 @@ def job_document(job: Job) -> dict[str, Any]:
     """Return a job as the API shows it."""
     return {
         "id": job.id,
-        "title": job.title,
-        "subject": job.subject,
+        "title": title_of(job.work),
+        "subject": subject_of(job.work),
+        "work": job.work.document(),
         "state": job.state.value,
         "command": job.command,
         "argv": list(job.argv),
@@ -44,7 +46,7 @@ def job_document(job: Job) -> dict[str, Any]:
         "ended": job.ended,
         "attempts": job.attempts,
         "line": job.line,
-        "outputs": list(job.outputs),
+        "waits_for": [{"job": name, "place": place} for name, place in job.waits_for],
         "resumable": job.resumable,
         "cancelling": job.cancelled and job.state in ACTIVE,
     }
