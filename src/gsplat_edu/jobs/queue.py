@@ -25,6 +25,7 @@ from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import described, remove_leftovers
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.jobs.events import EVENTS, Failed, Finished, Interrupted
 from gsplat_edu.jobs.following import LAST, last_start, last_word
 from gsplat_edu.jobs.process import SIGNALS, carries, identity, is_running, send
@@ -40,9 +41,6 @@ from gsplat_edu.jobs.record import (
     collision,
     one_line,
 )
-
-POLL = 0.1
-"""Seconds between two looks at the processes."""
 
 PATIENCE = {"interrupt": 60.0, "terminate": 10.0}
 """Seconds after a signal of a cancellation until the next one: a checkpoint of millions of Gaussians takes a while."""

@@ -18,19 +18,14 @@ from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.jobs.record import ACTIVE, Job, State
 from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.studio.replies import Json, act, answered
 from gsplat_edu.studio.scene_routes import BINARY, page_answer
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.viewer.live_folder import LiveFolder, header_of
-
-WAIT = 2.0
-"""Seconds that a request waits for something new."""
-
-POLL = 0.1
-"""Seconds between two looks at the files."""
+from gsplat_edu.viewer.live_folder import WAIT, LiveFolder, header_of
 
 PAGE_WAIT = 5.0
 """Seconds that the page waits for the training to write its facts."""

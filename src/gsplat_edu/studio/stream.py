@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import AsyncIterator
 from typing import Any
 
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.text import whole_of
 from gsplat_edu.jobs.events import Event
 from gsplat_edu.jobs.following import Follower
@@ -20,9 +21,6 @@ from gsplat_edu.studio.commands import subject_of, title_of
 
 KEPT = 4_000
 """Events that a browser may have missed and still gets; after more it reads the list of jobs again."""
-
-POLL = 0.2
-"""Seconds between two looks at the files of running jobs."""
 
 HEARTBEAT = 15.0
 """Seconds of silence after which a comment tells whether the browser is still there."""
