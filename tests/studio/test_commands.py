@@ -111,6 +111,10 @@ def test_inputs_and_outputs_are_entries_and_files_of_the_library(library):
 
     assert places(command="sfm", subject="photos/film") == (("photos/film",), ("captures/film",))
     assert places(command="doctor", subject="runs/a") == (("runs/a",), ())
+    assert places(command="train", subject="captures/e\u0301", to="o\u0302") == (
+        ("captures/\u00e9",),
+        ("runs/\u00f4",),
+    )
     found = places(command="convert", subject="runs/a", format="compressed.ply", to="x", edits=True)
     assert found == (("runs/a", "runs/a/edits.json"), ("runs/a/exports/x.compressed.ply",))
 

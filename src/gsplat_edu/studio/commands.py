@@ -258,17 +258,26 @@ class _Asked:
         return ["--edits", entry / EDITS]
 
 
-def _entry_at(library: Library, what: str, place: str, kinds: tuple[str, ...]) -> tuple[str, Path]:
+def _place_of(library: Library, what: str, given: str, kinds: tuple[str, ...]) -> tuple[str, Path]:
     """Return kind and path of the entry that a text like "runs/toy" names.
 
     Raises:
-        RefusedError: it names none of these kinds, or names it in another way than the library does.
+        RefusedError: it names none of these kinds.
     """
-    kind, _, name = place.partition("/")
+    kind, _, name = given.partition("/")
     if kind not in kinds:
-        raise RefusedError(f"{what}: is {shortened(place)!r}, but has to be of {' or '.join(kinds)}")
-    path = library.place(kind, name)
-    if legible(path.name) != name:
+        raise RefusedError(f"{what}: is {shortened(given)!r}, but has to be of {' or '.join(kinds)}")
+    return kind, library.place(kind, name)
+
+
+def _entry_at(library: Library, what: str, place: str, kinds: tuple[str, ...]) -> tuple[str, Path]:
+    """Return kind and path of an input or output.
+
+    Raises:
+        RefusedError: it is not of these kinds, or named in another way than the library does: places are compared.
+    """
+    kind, path = _place_of(library, what, place, kinds)
+    if library.name(path) != place:
         raise RefusedError(f"{what}: {shortened(place)!r} is not in Unicode's composed form; rename it")
     return kind, path
 
@@ -384,8 +393,8 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
     known = {"command", "subject", "to", "options", "format", "edits", "resume"}
     if unknown := sorted(set(request) - known):
         raise RefusedError(f"{shortened(unknown[0])}: is not known; see docs/STUDIO.md")
-    kind, path = _entry_at(library, "subject", str(request.get("subject")), command.reads)
-    subject, entry, to = f"{kind}/{legible(path.name)}", path.name, request.get("to")
+    _, path = _place_of(library, "subject", str(request.get("subject")), command.reads)
+    subject, entry, to = library.name(path), path.name, request.get("to")
     options = request.get("options", {})
     if not isinstance(options, dict):
         raise RefusedError("options: has to be an object")
