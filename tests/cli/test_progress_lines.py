@@ -127,7 +127,7 @@ def test_the_time_left_survives_80_columns():
 
 def test_a_mapper_that_reports_nothing_for_long_is_followed(monkeypatch):
     """COLMAP's mapper adjusts all poses for minutes between two photos, and after the last one."""
-    monkeypatch.setattr("gsplat_edu.sfm.colmap.POLL", 0.001)
+    monkeypatch.setattr("gsplat_edu.sfm.colmap.PROGRESS_EVERY", 0.001)
     monkeypatch.setattr("gsplat_edu.sfm.colmap.BEAT", 0.0)
     answers, seen = SimpleQueue(), []
 

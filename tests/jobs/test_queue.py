@@ -1,5 +1,6 @@
 """The queue runs real processes: small programs that write events as commands do."""
 
+import itertools
 import json
 import os
 import shutil
@@ -9,13 +10,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.jobs import queue as queue_module
 from gsplat_edu.jobs.process import carries, identity, is_running
 from gsplat_edu.jobs.queue import JobQueue
-from gsplat_edu.jobs.record import Job, JobFolder, Purpose, State, Work
+from gsplat_edu.jobs.record import Job, JobFolder, Rendered, State, Work, collision
 
 PROGRAM = """
 import json, os, signal, sys, time
@@ -45,15 +47,16 @@ emit("finished", outputs=[sys.argv[2]])
 """
 
 
-def asked(argv, title="", subject=""):
-    """The work of a request that is a command line already."""
-    return rebuild({"argv": list(argv), "title": title, "subject": subject}, Purpose.BEGIN)
+def asked(*words, reads=(), writes=()):
+    """Work that is a command line already."""
+    return Work(words[0], tuple(reads), tuple(writes), {"words": list(words[1:])})
 
 
-def rebuild(request, purpose):
-    if not isinstance(request.get("argv"), list) or "refused" in request["argv"]:
-        raise ArgumentError("argv: is not allowed")
-    return Work(request, tuple(request["argv"]), request["title"], request["subject"])
+def render(work, purpose):
+    words = work.options.get("words")
+    if not isinstance(words, list) or "refused" in words:
+        raise ArgumentError("words: are not allowed")
+    return Rendered(work, (work.command, *words))
 
 
 @pytest.fixture
@@ -63,7 +66,7 @@ def opened(tmp_path):
 
     def open_queue(**options):
         program = (sys.executable, "-S", "-c", PROGRAM)
-        made.append(JobQueue(tmp_path / "jobs", rebuild, program=program, **options))
+        made.append(JobQueue(tmp_path / "jobs", render, program=program, **options))
         return made[-1]
 
     yield open_queue
@@ -96,15 +99,15 @@ def abandon(queue):
 def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_path):
     changes = []
     queue = opened(changed=lambda name, job: changes.append((name, job and job.state)))
-    first = queue.submit(asked(["run", str(tmp_path / "a"), "waits"], "first", "runs/a"))
-    second = queue.submit(asked(["run", str(tmp_path / "b")]))
-    third = queue.submit(asked(["run", str(tmp_path / "c"), "fails"]))
-    fourth = queue.submit(asked(["run", str(tmp_path / "d"), "crashes"]))
+    first = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
+    second = queue.submit(asked("run", str(tmp_path / "b")))
+    third = queue.submit(asked("run", str(tmp_path / "c"), "fails"))
+    fourth = queue.submit(asked("run", str(tmp_path / "d"), "crashes"))
     reached(queue, first.id, State.RUNNING)
     assert {queue.get(job.id).state for job in (second, third, fourth)} == {State.QUEUED}
     (tmp_path / "a").touch()
     done = reached(queue, first.id, State.DONE)
-    assert done.outputs == (str(tmp_path / "a"),) and done.ended >= done.started >= done.created
+    assert done.ended >= done.started >= done.created
     assert reached(queue, second.id, State.DONE).line == ""
     assert reached(queue, third.id, State.FAILED).line == "it failed"
     assert reached(queue, fourth.id, State.FAILED).line == "Traceback and all"
@@ -118,7 +121,7 @@ def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_pat
 
 def test_two_run_at_once_if_told_so(opened, tmp_path):
     queue = opened(at_once=2)
-    jobs = [queue.submit(asked(["run", str(tmp_path / name), "waits"])) for name in "abc"]
+    jobs = [queue.submit(asked("run", str(tmp_path / name), "waits")) for name in "abc"]
     for job in jobs[:2]:
         reached(queue, job.id, State.RUNNING)
     assert queue.get(jobs[2].id).state is State.QUEUED
@@ -126,8 +129,8 @@ def test_two_run_at_once_if_told_so(opened, tmp_path):
 
 def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
     queue = opened()
-    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
-    waiting = queue.submit(asked(["run", str(tmp_path / "b")]))
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
+    waiting = queue.submit(asked("run", str(tmp_path / "b")))
     assert queue.cancel(waiting.id).state is State.CANCELLED
     until((tmp_path / "a.ran").exists)
     queue.cancel(job.id)
@@ -146,7 +149,7 @@ def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
 
 def test_a_job_that_does_not_listen_is_killed(opened, tmp_path):
     queue = opened(patience={"interrupt": 0.2, "terminate": 0.2})
-    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits", "stubborn"]))
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits", "stubborn"))
     until((tmp_path / "a.ran").exists)
     queue.cancel(job.id)
     assert reached(queue, job.id, State.CANCELLED).line == "it was ended"
@@ -154,7 +157,7 @@ def test_a_job_that_does_not_listen_is_killed(opened, tmp_path):
 
 def test_a_paused_job_stands_still(opened, tmp_path):
     queue = opened()
-    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     with pytest.raises(ArgumentError):
         queue.pause("000099")
     until((tmp_path / "a.ran").exists)
@@ -179,8 +182,8 @@ def _is_stopped(pid):
 
 def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_path):
     queue = opened()
-    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
-    after = queue.submit(asked(["run", str(tmp_path / "b")]))
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
+    after = queue.submit(asked("run", str(tmp_path / "b")))
     until((tmp_path / "a.ran").exists)
     abandon(queue)
     found = opened()
@@ -196,7 +199,7 @@ def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_pat
 
 def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
     queue = opened()
-    done, killed = (queue.submit(asked(["run", str(tmp_path / name), "waits"])) for name in "ab")
+    done, killed = (queue.submit(asked("run", str(tmp_path / name), "waits")) for name in "ab")
     until((tmp_path / "a.ran").exists)
     abandon(queue)
     (tmp_path / "a").touch()
@@ -219,7 +222,7 @@ def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
 
 def test_a_queue_killed_before_it_noted_the_process_finds_it_by_its_first_event(opened, tmp_path):
     queue = opened()
-    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     until((tmp_path / "a.ran").exists)
     abandon(queue)
     pid = queue.get(job.id).pid
@@ -232,8 +235,8 @@ def test_a_queue_killed_before_it_noted_the_process_finds_it_by_its_first_event(
 
 def test_closing_interrupts_what_runs_and_keeps_what_waits(opened, tmp_path):
     queue = opened()
-    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
-    waiting = queue.submit(asked(["run", str(tmp_path / "b"), "waits"]))
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
+    waiting = queue.submit(asked("run", str(tmp_path / "b"), "waits"))
     until((tmp_path / "a.ran").exists)
     queue.close()
     assert queue.get(job.id).state is State.INTERRUPTED and queue.get(waiting.id).state is State.QUEUED
@@ -247,11 +250,11 @@ def test_closing_interrupts_what_runs_and_keeps_what_waits(opened, tmp_path):
 def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(queue_module, "MOST_QUEUED", 2)
     queue = opened()
-    queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
+    queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     until((tmp_path / "a.ran").exists)
-    kept = [queue.submit(asked(["run", str(tmp_path / name)])) for name in "bc"]
+    kept = [queue.submit(asked("run", str(tmp_path / name))) for name in "bc"]
     with pytest.raises(ArgumentError, match=r"^jobs: 2 are waiting; cancel some"):
-        queue.submit(asked(["run", "d"]))
+        queue.submit(asked("run", "d"))
     with pytest.raises(ArgumentError, match="cancel it first"):
         queue.remove(queue.jobs()[0].id)
     abandon(queue)
@@ -259,7 +262,7 @@ def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path, monkey
     shutil.copytree(queue.folder / kept[1].id, queue.folder / "000077")
     found = opened()
     assert len(found.damaged) == 2 and all(line.count("\n") == 0 for line in found.damaged.values())
-    assert found.submit(asked(["run", str(tmp_path / "e")])).id == "000078"  # no id is used twice
+    assert found.submit(asked("run", str(tmp_path / "e"))).id == "000078"  # no id is used twice
 
 
 def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch):
@@ -273,7 +276,7 @@ def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch)
         write(self, job)
 
     monkeypatch.setattr(JobFolder, "write", failing)
-    job = queue.submit(asked(["run", str(tmp_path / "a")]))
+    job = queue.submit(asked("run", str(tmp_path / "a")))
     until(lambda: queue.trouble)
     assert "no space left on device" in queue.trouble and queue.get(job.id).state is State.QUEUED
     full[0] = False
@@ -281,56 +284,147 @@ def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch)
     assert (tmp_path / "a.ran").read_text().count("\n") == 1
 
 
-def test_jobs_name_a_folder_where_it_was_moved(opened, tmp_path):
+def test_jobs_name_a_place_by_its_new_name(opened, tmp_path):
     queue = opened()
     place, other = tmp_path / "runs" / "a", tmp_path / "runs" / "ab"
     place.mkdir(parents=True)
-    job = queue.submit(asked(["run", str(place / "x"), "fails"], "training of a", "runs/a"))
-    near = queue.submit(asked(["run", str(other), "--note", "runs/a"], "doctor of a", "runs/ab"))
+
+    def in_place(work, purpose):
+        return Rendered(work, ("run", str(tmp_path / work.outputs[0]), *work.options["words"]))
+
+    queue._render = in_place
+    job = queue.submit(Work("run", ("captures/a",), ("runs/a/x",), {"words": ["fails"]}))
+    near = queue.submit(Work("run", ("runs/ab",), ("runs/ab/y",), {"words": []}))
+    other.mkdir()
     reached(queue, job.id, State.FAILED)
     before = reached(queue, near.id, State.DONE)
     moved = place.with_name("b")
-
-    def renamed(request):
-        if request["subject"] != "runs/a":
-            return request
-        return {
-            **request,
-            "argv": ["run", str(moved / "x"), "fails"],
-            "title": "training of b",
-            "subject": "runs/b",
-        }
-
-    queue.move(place, moved, renamed, lambda: place.rename(moved))
+    queue.rename("runs/a", "runs/b", lambda: place.rename(moved))
     now = queue.get(job.id)
-    assert (now.argv, now.subject, now.title) == (
-        ("run", str(moved / "x"), "fails"),
-        "runs/b",
-        "training of b",
-    )
-    assert queue.get(near.id) == before  # a name that begins alike is another folder
-    assert JobFolder(queue.folder / job.id).read(rebuild) == now
+    assert now.work == Work("run", ("captures/a",), ("runs/b/x",), {"words": ["fails"]})
+    assert now.argv == ("run", str(moved / "x"), "fails")
+    assert queue.get(near.id) == before  # a name that begins alike is another place
+    assert JobFolder(queue.folder / job.id).read(in_place) == now
 
     def refused():
         raise OSError(28, "No space left on device", str(moved))
 
     with pytest.raises(OSError, match="No space"):
-        queue.move(moved, place, renamed, refused)
+        queue.rename("runs/b", "runs/a", refused)
     assert queue.get(job.id) == now
     queue.resume(job.id)
     reached(queue, job.id, State.FAILED)
     assert (moved / "x.ran").read_text().count("\n") == 2 and not place.exists()
 
 
-def test_a_request_is_checked_again_before_its_job_is_started_again(opened, tmp_path):
+def test_work_is_checked_again_before_its_job_is_started_again(opened, tmp_path):
     queue = opened()
-    job = queue.submit(asked(["run", str(tmp_path / "a"), "fails"]))
+    job = queue.submit(asked("run", str(tmp_path / "a"), "fails"))
     failed = reached(queue, job.id, State.FAILED)
-    request = {**failed.work.request, "argv": ["refused"]}
-    queue._jobs[job.id] = replace(failed, work=replace(failed.work, request=request))
-    with pytest.raises(ArgumentError, match="is not allowed"):
+    queue._jobs[job.id] = replace(failed, work=asked("run", "refused"))
+    with pytest.raises(ArgumentError, match="are not allowed"):
         queue.resume(job.id)
     assert queue.get(job.id).state is State.FAILED
+
+
+def test_work_is_checked_when_its_job_starts(opened, tmp_path):
+    queue = opened(at_once=0)
+    job = queue.submit(asked("run", str(tmp_path / "a")))
+    queue._render = lambda work, purpose: render(asked("refused", "refused"), purpose)
+    queue.at_once = 1
+    assert reached(queue, job.id, State.FAILED).line == "words: are not allowed"
+    assert queue.get(job.id).attempts == 0 and not (tmp_path / "a.ran").exists()
+
+
+def started(folder, *names):
+    until(lambda: all((folder / f"{name}.ran").exists() for name in names))
+
+
+def test_a_writer_waits_for_readers_and_readers_for_a_writer(opened, tmp_path):
+    queue = opened(at_once=4)
+
+    def add(name, **places):
+        return queue.submit(asked("run", str(tmp_path / name), "waits", **places)).id
+
+    readers = [add(name, reads=["runs/a"], writes=[f"scenes/{name}"]) for name in ("r1", "r2")]
+    started(tmp_path, "r1", "r2")  # readers run together
+    writer = add("w", reads=["captures/a"], writes=["runs/a"])
+    late = add("r3", reads=["runs/a"])
+    apart = add("o", reads=["runs/ab"], writes=["runs/a/exports/x"])
+    started(tmp_path, "o")  # a job of other places passes them
+    assert queue.get(writer).waits_for == tuple((name, "runs/a") for name in readers)
+    assert queue.get(late).waits_for == ((writer, "runs/a"),)  # it may not pass the writer
+    (tmp_path / "r1").touch()
+    until(lambda: queue.get(writer).waits_for == ((readers[1], "runs/a"),))
+    assert queue.get(writer).state is queue.get(late).state is State.QUEUED
+    (tmp_path / "r2").touch()
+    started(tmp_path, "w")
+    until(lambda: queue.get(late).waits_for == ((writer, "runs/a"),))
+    assert queue.get(writer).waits_for == () and not (tmp_path / "r3.ran").exists()
+    queue.pause(writer)
+    assert queue.get(late).state is State.QUEUED
+    queue.cancel(writer)
+    started(tmp_path, "r3")
+    assert queue.get(apart).state is State.RUNNING and queue.get(late).waits_for == ()
+
+
+def test_a_job_that_is_resumed_waits_behind_those_that_came_meanwhile(opened, tmp_path):
+    queue = opened(at_once=4)
+    work = {name: asked("run", str(tmp_path / name), "waits", writes=["runs/a"]) for name in "abc"}
+    jobs = {name: queue.submit(work[name]).id for name in "abc"}
+    started(tmp_path, "a")
+    queue.cancel(jobs["b"])
+    queue.resume(jobs["b"])
+    (tmp_path / "a").touch()
+    started(tmp_path, "c")
+    until(lambda: queue.get(jobs["b"]).waits_for == ((jobs["c"], "runs/a"),))
+    (tmp_path / "c").touch()
+    started(tmp_path, "b")
+
+
+def test_a_job_found_running_still_keeps_others_from_its_place(opened, tmp_path):
+    queue = opened()
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits", writes=["runs/a"]))
+    started(tmp_path, "a")
+    abandon(queue)
+    found = opened(at_once=2)
+    late = found.submit(asked("run", str(tmp_path / "b"), reads=["runs/a"]))
+    until(lambda: found.get(late.id).waits_for == ((job.id, "runs/a"),))
+    (tmp_path / "a").touch()
+    os.waitpid(queue._children[job.id].pid, 0)
+    reached(found, late.id, State.DONE)
+
+
+def test_two_names_of_a_place_are_one(opened, tmp_path):
+    queue = opened(at_once=2, identify=str.lower)
+    job = queue.submit(asked("run", str(tmp_path / "a"), "waits", writes=["runs/A"]))
+    late = queue.submit(asked("run", str(tmp_path / "b"), reads=["runs/a"]))
+    started(tmp_path, "a")
+    until(lambda: queue.get(late.id).waits_for == ((job.id, "runs/a"),))
+    assert queue.get(late.id).state is State.QUEUED
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_jobs_all_end_and_never_collide(opened, tmp_path, seed):
+    """Each program notes when it began and ended; no writer of a place overlaps another job of it."""
+    random, queue = np.random.default_rng(seed), opened(at_once=3)
+    begun, ended, works = {}, {}, {}
+
+    def changed(name, job):
+        if job.state is State.RUNNING and job.pid is None:
+            begun[name] = len(begun) + len(ended)
+        elif job.state is State.DONE:
+            ended[name] = len(begun) + len(ended)
+
+    queue.changed = changed
+    for number in range(12):
+        reads, writes = ([f"p{i}" for i in range(3) if random.random() < share] for share in (0.4, 0.25))
+        work = asked("run", str(tmp_path / str(number)), reads=reads, writes=writes)
+        works[queue.submit(work).id] = work
+    until(lambda: len(ended) == len(works), 60)
+    for one, other in itertools.combinations(works, 2):
+        if collision(works[one], works[other], str):
+            assert ended[one] < begun[other]  # and they keep their order
 
 
 def test_a_process_proves_by_its_environment_that_a_job_started_it():

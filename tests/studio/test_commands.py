@@ -1,11 +1,12 @@
 """Requests become the command lines that the command line accepts, and nothing else does."""
 
 import argparse
+import time
 
 import pytest
 
 from gsplat_edu.cli.main import build_parser
-from gsplat_edu.jobs.record import Purpose
+from gsplat_edu.jobs.record import Purpose, Work
 from gsplat_edu.studio.commands import (
     CLEAN_OPTIONS,
     CONVERT_OPTIONS,
@@ -13,7 +14,9 @@ from gsplat_edu.studio.commands import (
     RENDER_OPTIONS,
     SFM_OPTIONS,
     TRAIN_OPTIONS,
-    renamed,
+    rendered,
+    subject_of,
+    title_of,
     work_of,
 )
 from gsplat_edu.studio.library import Library
@@ -40,13 +43,18 @@ def library(tmp_path):
     return made
 
 
-def parsed(work):
-    return build_parser(work.argv).parse_args(work.argv)
+def begun(library, request):
+    """The command line of a request."""
+    return rendered(library, work_of(library, request), Purpose.BEGIN).argv
+
+
+def parsed(argv):
+    return build_parser(argv).parse_args(argv)
 
 
 def test_the_commands_and_their_defaults(library):
     def words(**request):
-        return [word.replace(f"{library.root}/", "") for word in work_of(library, request).argv]
+        return [word.replace(f"{library.root}/", "") for word in begun(library, request)]
 
     assert words(command="sfm", subject="photos/a b") == ["sfm", "photos/a b", "captures/a b"]
     assert words(command="sfm", subject="photos/film", to="x") == ["sfm", "photos/film/x.mp4", "captures/x"]
@@ -74,49 +82,76 @@ def test_the_commands_and_their_defaults(library):
     ]
 
 
-def test_a_request_with_its_choices_makes_the_same_command_again(library):
-    for request in (
-        {"command": "sfm", "subject": "photos/a b"},
+REQUESTS = (
+    ({"command": "sfm", "subject": "photos/a b"}, "poses of a b", "photos/a b"),
+    (
         {"command": "train", "subject": "captures/a", "options": {"quality": "draft"}},
-        {"command": "clean", "subject": "runs/a"},
-        {"command": "convert", "subject": "scenes/a", "format": "spz"},
-        {"command": "render", "subject": "runs/a", "to": "film"},
-        {"command": "doctor", "subject": "captures/a"},
-    ):
+        "training of a-2",
+        "runs/a-2",
+    ),
+    ({"command": "clean", "subject": "runs/a"}, "cleaning of a", "runs/a"),
+    ({"command": "convert", "subject": "scenes/a", "format": "spz"}, "export of a.spz", "scenes/a"),
+    ({"command": "render", "subject": "runs/a", "to": "film"}, "video of a", "runs/a"),
+    ({"command": "doctor", "subject": "captures/a"}, "doctor of a", "captures/a"),
+)
+
+
+@pytest.mark.parametrize(("request_", "title", "subject"), REQUESTS, ids=lambda value: str(value)[:30])
+def test_work_makes_the_same_command_for_every_purpose(library, request_, title, subject):
+    work = work_of(library, request_)
+    assert (title_of(work), subject_of(work)) == (title, subject)
+    assert {rendered(library, work, purpose).argv for purpose in Purpose} == {begun(library, request_)}
+    assert {rendered(library, work, purpose).work == work for purpose in Purpose} == {True}
+
+
+def test_inputs_and_outputs_are_entries_and_files_of_the_library(library):
+    def places(**request):
         work = work_of(library, request)
-        for purpose in Purpose:
-            assert work_of(library, work.request, purpose) == work
+        return work.inputs, work.outputs
+
+    assert places(command="sfm", subject="photos/film") == (("photos/film",), ("captures/film",))
+    assert places(command="doctor", subject="runs/a") == (("runs/a",), ())
+    assert places(command="train", subject="captures/e\u0301", to="o\u0302") == (
+        ("captures/\u00e9",),
+        ("runs/\u00f4",),
+    )
+    found = places(command="convert", subject="runs/a", format="compressed.ply", to="x", edits=True)
+    assert found == (("runs/a", "runs/a/edits.json"), ("runs/a/exports/x.compressed.ply",))
 
 
 def test_a_training_resumes_once_its_run_has_begun(library):
     work = work_of(library, {"command": "train", "subject": "captures/a"})
+    argv = rendered(library, work, Purpose.BEGIN).argv
     out = library.root / "runs" / "a-2"
     out.mkdir()
-    assert work_of(library, work.request, Purpose.CONTINUE).argv == work.argv
+    assert rendered(library, work, Purpose.CONTINUE).argv == argv
     (out / "config.json").touch()
-    resumed = work_of(library, work.request, Purpose.CONTINUE)
-    assert resumed.argv == (*work.argv, "--resume")
-    assert {work_of(library, resumed.request, purpose) == resumed for purpose in Purpose} == {True}
+    resumed = rendered(library, work, Purpose.CONTINUE)
+    assert resumed.argv == (*argv, "--resume")
+    assert {rendered(library, resumed.work, purpose) == resumed for purpose in Purpose} == {True}
     with pytest.raises(RefusedError, match="exists already"):
-        work_of(library, work.request, Purpose.BEGIN)
+        rendered(library, work, Purpose.BEGIN)
 
 
 def test_what_is_gone_can_be_shown_but_not_started(library):
     work = work_of(library, {"command": "train", "subject": "captures/a"})
+    argv = rendered(library, work, Purpose.BEGIN).argv
     (library.root / "captures" / "a").rmdir()
-    assert work_of(library, work.request, Purpose.SHOW) == work
+    assert rendered(library, work, Purpose.SHOW).argv == argv
     for purpose in (Purpose.BEGIN, Purpose.CONTINUE):
         with pytest.raises(RefusedError, match="captures/a: does not exist"):
-            work_of(library, work.request, purpose)
+            rendered(library, work, purpose)
 
 
-def test_requests_follow_a_rename(library):
-    request = work_of(library, {"command": "train", "subject": "captures/a", "to": "x"}).request
-    assert renamed(request, "captures", "a", "b") == {**request, "subject": "captures/b"}
-    assert renamed(request, "runs", "x", "y") == {**request, "to": "y"}
-    assert renamed(request, "scenes", "x", "y") == renamed(request, "runs", "a", "y") == request
-    export = work_of(library, {"command": "convert", "subject": "runs/a", "format": "ply"}).request
-    assert renamed(export, "runs", "a", "b") == {**export, "subject": "runs/b"}  # its file keeps its name
+def test_work_follows_a_rename(library):
+    work = work_of(library, {"command": "train", "subject": "captures/a", "to": "x"})
+    assert work.renamed("captures/a", "captures/b") == Work("train", ("captures/b",), ("runs/x",))
+    assert work.renamed("runs/x", "runs/y") == Work("train", ("captures/a",), ("runs/y",))
+    assert work.renamed("scenes/x", "scenes/y") == work.renamed("runs/a", "runs/y") == work
+    export = work_of(library, {"command": "convert", "subject": "runs/a", "format": "ply"}).renamed(
+        "runs/a", "runs/b"
+    )
+    assert export == Work("convert", ("runs/b",), ("runs/b/exports/a.ply",))  # its file keeps its name
 
 
 SAMPLES = {
@@ -159,17 +194,17 @@ def test_every_option_is_one_of_the_command_line(library, command, options):
 
 def test_the_resolution_may_be_chosen_by_the_command(library):
     options = {"resolution": "auto", "outside_masks": "empty"}
-    found = parsed(work_of(library, {"command": "train", "subject": "captures/a", "options": options}))
+    found = parsed(begun(library, {"command": "train", "subject": "captures/a", "options": options}))
     assert found.resolution == "auto" and found.outside_masks == "empty"
     with pytest.raises(RefusedError, match="resolution: is big, but has to be a number"):
-        work_of(library, {"command": "train", "subject": "captures/a", "options": {"resolution": "big"}})
+        begun(library, {"command": "train", "subject": "captures/a", "options": {"resolution": "big"}})
 
 
 @pytest.mark.parametrize("command", SAMPLES)
 def test_values_reach_the_command(library, command):
     options = SAMPLES[command]
     found = vars(
-        parsed(work_of(library, {"command": command, "subject": SUBJECTS[command], "options": options}))
+        parsed(begun(library, {"command": command, "subject": SUBJECTS[command], "options": options}))
     )
     for name, value in options.items():
         expected = {"20m": 1200.0, "4GiB": 4 << 30}.get(value, value)
@@ -214,8 +249,71 @@ def test_values_reach_the_command(library, command):
 )
 def test_other_requests_are_refused_in_one_line(library, request_):
     with pytest.raises(RefusedError) as caught:
-        work_of(library, request_)
+        begun(library, request_)
     assert "\n" not in str(caught.value) and str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        Work("train", ("captures/a",), ("captures/b",)),
+        Work("train", ("captures/a",), ("runs/b", "runs/c")),
+        Work("train", ("captures/a",), ()),
+        Work("train", (), ("runs/b",)),
+        Work("train", ("captures/a", "captures/a/edits.json"), ("runs/b",)),
+        Work("train", ("captures/a",), ("/runs/b",)),
+        Work("train", ("captures/a",), ("runs/b/c",)),
+        Work("train", ("captures/a",), ("runs/../x",)),
+        Work("train", ("captures//a",), ("runs/b",)),
+        Work("train", ("captures/a",), ("runs/e\u0301",)),  # composed, it would be another name for one place
+        Work("doctor", ("captures/a",), ("runs/b",)),
+        Work("doctor", ("runs/a",), (), {"resolution": 2.0}),
+        Work("clean", ("runs/a",), ("scenes/b/b.ply",)),
+        Work("convert", ("runs/a",), ("runs/b/exports/x.ply",)),
+        Work("convert", ("runs/a",), ("runs/a/x.ply",)),
+        Work("convert", ("runs/a",), ("runs/a/exports/../x.ply",)),
+        Work("convert", ("runs/a",), ("runs/a/exports/x.exe",)),
+        Work("convert", ("runs/a",), ("runs/a/exports/.ply",)),
+        Work("convert", ("runs/a",), ("runs/a/exports/e\u0301.ply",)),
+        Work("convert", ("runs/a", "scenes/a/edits.json"), ("runs/a/exports/x.ply",)),
+        Work("convert", ("runs/a", "runs/a/config.json"), ("runs/a/exports/x.ply",)),
+        Work("render", ("runs/a",), ("runs/a/exports/x.ply",)),
+        Work("render", ("runs/a",), ("runs/a/exports/x.mp4",), {"resume": True}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("purpose", Purpose)
+def test_a_record_names_no_other_place_than_a_request_could(library, work, purpose):
+    (library.root / "scenes" / "a" / "edits.json").touch()
+    with pytest.raises(RefusedError) as caught:
+        rendered(library, work, purpose)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
+
+
+def test_a_training_and_what_reads_its_run_wait_for_each_other(page, studio):
+    (studio.library.root / "captures" / "a").mkdir()
+    (studio.library.root / "runs" / "r").mkdir()
+    (studio.library.root / "runs" / "r" / "config.json").touch()
+    (studio.library.root / "runs" / "same").symlink_to(studio.library.root / "runs" / "r")
+    requests = (
+        {"command": "clean", "subject": "runs/same"},
+        {"command": "train", "subject": "captures/a", "to": "r", "resume": True},
+        {"command": "convert", "subject": "runs/r", "format": "spz"},
+        {"command": "render", "subject": "runs/r"},
+        {"command": "doctor", "subject": "captures/a"},
+    )
+    for request in requests:
+        assert page.post("/api/jobs", json=request).status_code == 200
+
+    def waits():
+        found = page.get("/api/jobs").json()["jobs"]
+        return [[(other["job"], other["place"]) for other in job["waits_for"]] for job in found]
+
+    expected = [[], [("000001", "runs/r")], [("000002", "runs/r")], [("000002", "runs/r")], []]
+    end = time.monotonic() + 20
+    while waits() != expected:
+        assert time.monotonic() < end, waits()
+        time.sleep(0.02)
 
 
 def test_two_jobs_do_not_write_to_one_place(page, studio):

@@ -26,15 +26,20 @@ from studio.test_server import Server
 LONG = "x" * 5_000
 
 
+def work(command, inputs, outputs=(), **options):
+    """What a record says of a job's work."""
+    return {"command": command, "inputs": list(inputs), "outputs": list(outputs), "options": options}
+
+
 def record(library, name, *, events=None, **changes):
     """Write a record of a job that asks for something harmless, with changes; returns its folder."""
     folder = library / ".studio" / "jobs" / name
     folder.mkdir(parents=True)
-    harmless = {"command": "doctor", "subject": "captures/box", "options": {}}
+    harmless = work("doctor", ["captures/box"])
     entry = {
         "version": VERSION,
         "id": name,
-        "request": harmless,
+        "work": harmless,
         "state": "queued",
         "created": 1.0,
         "started": None,
@@ -43,7 +48,6 @@ def record(library, name, *, events=None, **changes):
         "pid": None,
         "identity": "",
         "line": "",
-        "outputs": [],
         "cancelled": False,
         **changes,
     }
@@ -128,7 +132,7 @@ def hostile_folders(library, outside):
     (library / ".studio" / "trash" / "00000000000000000001").symlink_to(outside / "trash")
 
 
-def forbidden_requests(library, outside, victim, port):
+def forbidden_work(library, outside, victim, port):
     """Write records that ask for what no request may."""
     old = {"version": 1, "title": "t", "subject": "runs/inner", "request": None}
     scheduler = f"tcp://127.0.0.1:{port}"
@@ -146,19 +150,17 @@ def forbidden_requests(library, outside, victim, port):
     ]
     record(library, "000002", **old, argv=blocks)
     record(library, "000003", argv=convert)
-    train = {"command": "train", "subject": "captures/box", "to": "new"}
-    record(library, "000004", request={**train, "options": {"scheduler": scheduler}})
-    record(library, "000005", request={**train, "to": "../../outside/run"})
-    record(library, "000006", request={**train, "subject": "captures/../../outside"})
-    record(library, "000007", request={**train, "to": str(outside / "new")})
-    record(library, "000008", request={**train, "options": {"time_limit": f"--scheduler={scheduler}"}})
-    record(
-        library, "000009", request={"command": "convert", "subject": "scenes/s", "to": "s", "format": "spz"}
-    )
-    linked = {"command": "convert", "subject": "runs/linked", "to": "x", "format": "spz"}
-    record(library, "000010", request=linked, state="interrupted", attempts=1)
-    paused = {"command": "train", "subject": "captures/box", "to": "linked"}
-    record(library, "000011", request=paused, state="paused", attempts=1, pid=victim.pid, identity="")
+    box, new = ["captures/box"], ["runs/new"]
+    record(library, "000004", work=work("train", box, new, scheduler=scheduler))
+    record(library, "000005", work=work("train", box, ["runs/../../outside/run"]))
+    record(library, "000006", work=work("train", ["captures/../../outside"], new))
+    record(library, "000007", work=work("train", box, [str(outside / "new")]))
+    record(library, "000008", work=work("train", box, new, time_limit=f"--scheduler={scheduler}"))
+    record(library, "000009", work=work("convert", ["scenes/s"], ["scenes/s/exports/s.spz"]))
+    linked = work("convert", ["runs/linked"], ["runs/linked/exports/x.spz"])
+    record(library, "000010", work=linked, state="interrupted", attempts=1)
+    paused = work("train", box, ["runs/linked"])
+    record(library, "000011", work=paused, state="paused", attempts=1, pid=victim.pid, identity="")
     (library / ".studio" / "jobs" / "000012").symlink_to(outside / "job")
     (record(library, "000013") / "events.jsonl").symlink_to(outside / "events.jsonl")
     os.mkfifo(record(library, "000014") / "output.txt")
@@ -166,20 +168,22 @@ def forbidden_requests(library, outside, victim, port):
 
 def impossible_values(library):
     """Write records whose fields hold what no record has."""
-    train = {"command": "train", "subject": "captures/box", "to": "new"}
-    record(library, "000015", request={**train, "to": LONG})
+    record(library, "000015", work=work("train", ["captures/box"], [f"runs/{LONG}"]))
     record(library, "000016", line=LONG)
     record(library, "000017", created=1e400)
     record(library, "000018", pid=1, state="running")
-    record(library, "000019", outputs="abc")
+    record(library, "000019", work={**work("doctor", ["captures/box"]), "outputs": "abc"})
     record(library, "000020", attempts=True)
     record(library, "000021", line="\x1b[2J")
     record(library, "000022", id="000023")
-    record(library, "000024", request=[["doctor"]])
+    record(library, "000024", work=[["doctor"]])
+    record(library, "000025", work={**work("doctor", ["captures/box"]), "argv": ["demo"]})
+    record(library, "000026", work=work("doctor", ["captures/box"] * 101))
+    record(library, "000027", work={**work("doctor", ["captures/box"]), "options": [["resolution", 2]]})
 
 
 def others_processes(library, victim):
-    """Write records whose requests are allowed, with a process that is not theirs; returns their states once opened."""
+    """Write records whose work is allowed, with a process that is not theirs; returns their states once opened."""
     proof = identity(victim.pid)
     started = json.dumps({"event": "started", "time": 1, "pid": victim.pid, "identity": proof}) + "\n"
     record(library, "000031")
@@ -187,8 +191,8 @@ def others_processes(library, victim):
     record(library, "000033", state="paused", attempts=1, pid=victim.pid, identity=proof)
     record(library, "000034", state="running", attempts=1, events=started)
     record(library, "000035", state="running", attempts=1, pid=victim.pid, identity="", cancelled=True)
-    inner = {"command": "train", "subject": "captures/box", "to": "inner", "options": {}}
-    record(library, "000036", request=inner, state="interrupted", attempts=1)
+    inner = work("train", ["captures/box"], ["runs/inner"])
+    record(library, "000036", work=inner, state="interrupted", attempts=1)
     return {
         "000031": "held",
         **dict.fromkeys(("000032", "000033", "000034"), "interrupted"),
@@ -202,7 +206,7 @@ def test_a_strangers_library_runs_nothing_until_a_click_that_shows_what(tmp_path
     with socket.create_server(("127.0.0.1", 0)) as trap:
         trap.setblocking(False)
         hostile_folders(library, outside)
-        forbidden_requests(library, outside, victim, trap.getsockname()[1])
+        forbidden_work(library, outside, victim, trap.getsockname()[1])
         impossible_values(library)
         allowed = others_processes(library, victim)
         before, entries = snapshot(outside), snapshot(library / "runs")
@@ -236,7 +240,7 @@ def check_hostile(server, allowed, library, victim):
     found = server.get("jobs")
     assert {job["id"]: job["state"] for job in found["jobs"]} == allowed
     damaged = {entry["id"]: entry["line"] for entry in found["damaged"]}
-    assert sorted(damaged) == [f"{number:06d}" for number in (*range(1, 23), 24)]
+    assert sorted(damaged) == [f"{number:06d}" for number in (*range(1, 23), *range(24, 28))]
     assert all("\n" not in line and len(line) < 400 for line in damaged.values()), damaged
     held = found["jobs"][0]
     assert held["command"] == f"gsplat-edu doctor {library}/captures/box --no-forecast" and held["resumable"]
@@ -316,7 +320,7 @@ def test_the_page_shows_what_a_held_job_will_run_and_removes_damaged_ones(browse
     library = tmp_path / "library"
     (library / "captures" / "box").mkdir(parents=True)
     record(library, "000001")
-    record(library, "000002", request={"command": "demo"})
+    record(library, "000002", work=work("demo", []))
     with served(library, Inline()) as (studio, url):
         context = browser.new_context()
         person = Visitor(context, url)

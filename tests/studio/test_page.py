@@ -86,6 +86,33 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     assert tab.locator(".exports li").inner_text() == second.locator(".exports li").inner_text() == shown
 
 
+def test_a_waiting_job_says_what_it_waits_for(visitor, library):
+    studio, _ = library
+    for name in ("captures/waiting", "runs/waiting"):
+        (studio.library.root / name).mkdir()
+    (studio.library.root / "runs" / "waiting" / "config.json").touch()
+    tab = visitor().tab
+    jobs, studio.queue.at_once = [], 0
+    requests = (
+        {"command": "train", "subject": "captures/waiting", "to": "waiting", "resume": True},
+        {"command": "convert", "subject": "runs/waiting", "format": "spz"},
+        {"command": "doctor", "subject": "captures/waiting"},
+    )
+    try:
+        jobs = [studio.start(request).id for request in requests]
+        tab.goto(f"{tab.url.split('#')[0]}#/jobs")
+        card = tab.get_by_role("article", name="export of waiting.spz")
+        line = card.locator(".waits")
+        line.get_by_text("Waits until “training of waiting” has ended: it uses runs/waiting too.").wait_for()
+        assert not tab.get_by_role("article", name="doctor of waiting").locator(".waits").is_visible()
+        studio.queue.cancel(jobs[0])
+        line.wait_for(state="hidden")
+    finally:
+        for job in jobs:
+            studio.queue.remove(job)
+        studio.queue.at_once = 1
+
+
 def test_hostile_names_are_text_and_refused_files_say_why(visitor):
     person = visitor()
     tab = person.tab

@@ -232,7 +232,7 @@ def test_exports_are_listed_with_their_figures(page, studio, run):
     (run.path / "exports").mkdir()
     path = run.path / "exports" / "<b>r.compressed.ply"
     path.write_bytes(b"scene")
-    job = studio.queue.submit(Work({}, ("convert", str(run.path), str(path))))
+    job = studio.queue.submit(Work("convert", ("runs/r",), (f"runs/r/exports/{path.name}",)))
     lines = [events.Metric("psnr", 31.5, "dB", str(path)), events.Finished((str(path),))]
     studio.queue.files(job.id).events.write_text("".join(events.line_of(event, 1.0) for event in lines))
     studio.queue._ended(studio.queue.get(job.id), 0)

@@ -112,11 +112,22 @@ def logged(folder):
     return 0
 
 
+def check_that_an_export_waits(server, training):
+    """An export of the run that is being trained waits, although another job could run; it is cancelled then."""
+    end = time.monotonic() + PATIENCE
+    late = server.start(command="convert", subject="runs/box", format="ply")
+    while not (found := server.get(f"jobs/{late}"))["waits_for"]:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert (found["state"], found["waits_for"]) == ("queued", [{"job": training, "place": "runs/box"}])
+    assert server.client.post(f"/api/jobs/{late}/cancel").json()["attempts"] == 0
+
+
 def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, capture, tmp_path):
     """Upload, train, kill the server, find the job, kill both, rename, resume, export: the bytes of the commands."""
     folder, zipped = capture
     library, run = tmp_path / "library", tmp_path / "library" / "runs" / "box"
-    server = served()
+    server = served("--jobs", "2")
     assert server.client.put("/api/captures/box/zip", content=zipped).json()["files"] > 14
     options = {"iterations": 400, "save_every": 50, "seed": 3}
     job = server.start(command="train", subject="captures/box", to="box", options=options)
@@ -125,6 +136,7 @@ def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, captu
         assert time.monotonic() < end
         time.sleep(0.01)
     assert server.client.post(f"/api/jobs/{job}/pause").json()["state"] == "paused"
+    check_that_an_export_waits(server, job)
     pid = _pid(library, job)
     server.kill()
 

@@ -59,7 +59,8 @@ def test_streams_are_limited(monkeypatch):
 
 def test_the_events_of_jobs_are_published_once_and_in_order(studio):
     studio.queue.at_once = 0
-    job = studio.queue.submit(Work({}, ("train", "x")))
+    (studio.library.root / "captures" / "x").mkdir()
+    job = studio.queue.submit(Work("train", ("captures/x",), ("runs/x",)))
     path = studio.queue.files(job.id).events
     studio.queue._jobs[job.id] = running = type(job)(
         **{**vars(job), "state": stream_module.ACTIVE[0], "pid": 1}

@@ -22,8 +22,8 @@ LOCK = ".lock"
 _FAR = 1 << 30
 """Offset of the locked byte on Windows, far beyond the contents, because a locked byte cannot be read."""
 
-_POLL = 0.2
-"""Seconds between two attempts to take a lock."""
+POLL = 0.1
+"""Seconds between two looks at what another process or thread does: a lock, a file, whether it runs."""
 
 _held: set[int] = set()
 
@@ -87,7 +87,7 @@ def _acquired(name: str, path: Path, until: float) -> int | None:
             holder = _holder(handle)
             os.close(handle)
             if time.monotonic() < until:
-                time.sleep(_POLL)
+                time.sleep(POLL)
                 continue
             raise ArgumentError(
                 f"{name}: {path.parent} is in use by {holder}; wait until it ends, or choose another folder"

@@ -33,7 +33,7 @@ FAILURES = 20
 PATIENCE = 60.0
 """Seconds without a worker or a scheduler after which the command ends."""
 
-POLL = 0.5
+WATCH_EVERY = 0.5
 """Seconds between two looks at the cluster."""
 
 AGAIN = "finished blocks and checkpoints are kept: run the same command with --resume to continue"
@@ -239,7 +239,7 @@ def _watch(client: Any, futures: Sequence[Any], options: ClusterOptions, watch: 
     place = options.scheduler or "the local cluster"
     alone = time.monotonic()
     while not all(future.status in ("finished", "error") for future in futures):
-        time.sleep(POLL)
+        time.sleep(WATCH_EVERY)
         watch()
         # A future whose worker took its answer along is "lost" until another worker gives the answer again.
         if client.status != "running" or any(future.status == "cancelled" for future in futures):

@@ -1,5 +1,9 @@
 """A queue of jobs on disk: it starts them in their order, follows their processes and survives its own end.
 
+A job that writes a place never runs beside one that reads or writes it. Each job waits for running jobs, and for jobs
+that were queued before it, as far as their places collide with its own. So jobs of one place keep their order, a writer
+is not passed over for ever by readers, and no two jobs wait for each other.
+
 A thread looks at the processes several times a second. Nothing here waits for one: a cancelled job gets its signals in
 turn, and the end of every process is read from what it wrote, or else from its exit code.
 """
@@ -14,31 +18,29 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import described, remove_leftovers
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.jobs.events import EVENTS, Failed, Finished, Interrupted
 from gsplat_edu.jobs.following import LAST, last_start, last_word
 from gsplat_edu.jobs.process import SIGNALS, carries, identity, is_running, send
 from gsplat_edu.jobs.record import (
     ACTIVE,
     ID,
-    MOST_OUTPUTS,
     Job,
     JobFolder,
     Purpose,
-    Rebuild,
+    Render,
     State,
     Work,
+    collision,
     one_line,
 )
-
-POLL = 0.1
-"""Seconds between two looks at the processes."""
 
 PATIENCE = {"interrupt": 60.0, "terminate": 10.0}
 """Seconds after a signal of a cancellation until the next one: a checkpoint of millions of Gaussians takes a while."""
@@ -57,25 +59,27 @@ class JobQueue:
 
     Args:
         folder: One folder per job; created if missing.
-        rebuild: Validates the request of a record again; see `Rebuild`.
-        at_once: Jobs that run at the same time.
+        render: Validates what a job does and renders its command line; see `Render`.
+        at_once: Most jobs that run at the same time.
         changed: Called with every new state of a job, from any thread and while the queue is locked; with None for a
             job that was removed.
         patience: See `PATIENCE`.
         hold: Called to let a job wait (true) or continue; returns whether it does so by itself. Otherwise its
             processes are stopped.
         program: What runs a command line.
+        identify: Returns equal values for two names of the same place.
     """
 
     def __init__(
         self,
         folder: Path,
-        rebuild: Rebuild,
+        render: Render,
         at_once: int = 1,
         changed: Callable[[str, Job | None], None] = lambda name, job: None,
         patience: dict[str, float] | None = None,
         hold: Callable[[Job, bool], bool] = lambda job, wait: False,
         program: Sequence[str] = PROGRAM,
+        identify: Callable[[str], Hashable] = str,
     ) -> None:
         self.folder, self.at_once = folder, at_once
         self.changed, self.hold = changed, hold
@@ -83,12 +87,14 @@ class JobQueue:
         """A line for each record that could not be read or asks for what is not allowed, by id."""
         self.trouble = ""
         """Why records cannot be written; empty if they can."""
-        self._rebuild, self._program = rebuild, tuple(program)
+        self._render, self._program, self._identify = render, tuple(program), identify
         self._patience = PATIENCE if patience is None else patience
         self._lock = threading.RLock()
         self._jobs: dict[str, Job] = {}
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._endings: dict[str, tuple[str, float]] = {}  # the last signal of each cancellation, and when
+        self._turns: dict[str, int] = {}  # when each job was queued, counted from 1
+        self._settled: object = None  # the states that `_start_waiting` saw last
         self._closed = threading.Event()
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
@@ -123,7 +129,7 @@ class JobQueue:
             work: What it does.
 
         Raises:
-            ArgumentError: too many jobs are waiting.
+            ArgumentError: it is not allowed, or too many jobs are waiting.
             OSError: its record cannot be written; there is then no job.
         """
         with self._lock:
@@ -132,7 +138,8 @@ class JobQueue:
                 raise ArgumentError(f"jobs: {waiting} are waiting; cancel some, or wait until they are done")
             known = [int(name) for name in os.listdir(self.folder) if ID.fullmatch(name)]  # noqa: PTH208
             name = f"{max(known, default=0) + 1:06d}"
-            job = Job(name, work, State.QUEUED, time.time())
+            rendered = self._render(work, Purpose.BEGIN)
+            job = Job(name, rendered.work, rendered.argv, State.QUEUED, time.time())
             folder = JobFolder(self.folder / name)
             folder.path.mkdir()
             try:
@@ -180,7 +187,7 @@ class JobQueue:
             return self._put(job, state=State.PAUSED)
 
     def resume(self, name: str) -> Job:
-        """Continue a paused job, or queue one that was held, failed, was cancelled or was interrupted.
+        """Continue a paused job, or put one that was held or ended without a result at the end of the queue.
 
         Raises:
             ArgumentError: there is none of this id, it is waiting, running or done, or it is not allowed any more.
@@ -194,8 +201,8 @@ class JobQueue:
                 return self._put(job, state=State.RUNNING)
             if not job.resumable:
                 raise ArgumentError(f"job {name}: is {job.state}; it cannot be resumed")
-            work = self._rebuild(job.work.request, Purpose.CONTINUE if job.attempts else Purpose.BEGIN)
-            job = replace(job, work=work, ended=None, line="", cancelled=False, pid=None, identity="")
+            job = self._rendered(job)
+            job = replace(job, ended=None, line="", cancelled=False, pid=None, identity="")
             return self._put(job, state=State.QUEUED)
 
     def remove(self, name: str) -> None:
@@ -217,31 +224,22 @@ class JobQueue:
             self.damaged.pop(name, None)
             self.changed(name, None)
 
-    def move(
-        self,
-        old: Path,
-        new: Path,
-        renamed: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-        rename: Callable[[], object],
-    ) -> None:
-        """Move a folder that jobs name; those that have ended then name the new place.
+    def rename(self, old: str, new: str, move: Callable[[], object]) -> None:
+        """Rename a place that jobs name; those that have ended then name the new one.
 
         Args:
-            old: The folder.
-            new: Its new place.
-            renamed: Returns a request as it is after the move.
-            rename: Moves the folder; no job starts meanwhile. If it fails, the jobs are unchanged.
+            old: The place.
+            new: Its new name.
+            move: Renames the folder; no job starts meanwhile. If it fails, the jobs are unchanged.
 
         Raises:
             OSError: a record cannot be written.
         """
         with self._lock:
-            rename()
+            move()
             for job in self.jobs():
-                outputs = tuple(_moved(word, old, new) for word in job.outputs)
-                request = renamed(job.work.request)
-                if (request, outputs) != (job.work.request, job.outputs):
-                    self._put(job, work=self._rebuild(request, Purpose.SHOW), outputs=outputs)
+                if (work := job.work.renamed(old, new)) != job.work:
+                    self._put(job, work=work, argv=self._render(work, Purpose.SHOW).argv)
 
     def close(self, interrupt: bool = True) -> None:
         """End the queue; waiting jobs wait for the next one.
@@ -270,12 +268,27 @@ class JobQueue:
                 self.trouble = described(error)
 
     def _start_waiting(self) -> None:
-        """Start waiting jobs while there is room."""
+        """Start waiting jobs while there is room, unless their places collide with those of jobs that come first."""
         with self._lock:
-            busy = sum(job.state in ACTIVE for job in self._jobs.values())
             waiting = [job for job in self.jobs() if job.state is State.QUEUED]
-            for job in waiting[: max(self.at_once - busy, 0)]:
-                self._start(job)
+            first = [job for job in self.jobs() if job.state in ACTIVE]
+            states = [
+                self.at_once,
+                *((job.id, job.state, self._turns.get(job.id)) for job in (*first, *waiting)),
+            ]
+            if states == self._settled:
+                return
+            room = self.at_once - len(first)
+            for job in sorted(waiting, key=lambda job: self._turns[job.id]):
+                before = [(other.id, collision(job.work, other.work, self._identify)) for other in first]
+                waits_for = tuple((name, place) for name, place in before if place is not None)
+                if waits_for != job.waits_for:
+                    self._note(replace(job, waits_for=waits_for))
+                if room > 0 and not waits_for:
+                    self._start(self._jobs[job.id])
+                    room -= 1
+                first.append(job)
+            self._settled = states
 
     def _look(self) -> None:
         """Note which processes have ended, and send the next signal of cancellations."""
@@ -290,8 +303,22 @@ class JobQueue:
                 else:
                     self._ended(job, code)
 
+    def _rendered(self, job: Job) -> Job:
+        """Return a job with the command line that its next attempt runs.
+
+        Raises:
+            ArgumentError: its work is not allowed any more.
+        """
+        rendered = self._render(job.work, Purpose.CONTINUE if job.attempts else Purpose.BEGIN)
+        return replace(job, work=rendered.work, argv=rendered.argv)
+
     def _start(self, job: Job) -> None:
         folder = JobFolder(self.folder / job.id)
+        try:
+            job = self._rendered(job)
+        except ArgumentError as error:
+            self._put(job, state=State.FAILED, ended=time.time(), line=one_line(str(error)))
+            return
         job = self._put(job, state=State.RUNNING, started=time.time(), attempts=job.attempts + 1, pid=None)
         try:
             with folder.output.open("ab") as output:
@@ -341,7 +368,7 @@ class JobQueue:
         said = last_word(JobFolder(self.folder / job.id).events)
         changes: dict[str, Any] = {"state": State.INTERRUPTED, "line": "", "pid": None, "identity": ""}
         if isinstance(said, Finished):
-            changes |= {"state": State.DONE, "outputs": tuple(map(one_line, said.outputs[:MOST_OUTPUTS]))}
+            changes["state"] = State.DONE
         elif isinstance(said, Failed):
             changes |= {"state": State.FAILED, "line": one_line(said.line)}
         elif isinstance(said, Interrupted):
@@ -371,7 +398,7 @@ class JobQueue:
                 continue
             folder = JobFolder(path)
             try:
-                job = folder.read(self._rebuild)
+                job = folder.read(self._render)
             except ArgumentError as error:
                 self.damaged[path.name] = str(error)
                 continue
@@ -391,6 +418,11 @@ class JobQueue:
         return job
 
     def _note(self, job: Job) -> None:
+        if job.state is State.QUEUED:
+            self._turns.setdefault(job.id, max(self._turns.values(), default=0) + 1)
+        else:
+            self._turns.pop(job.id, None)
+            job = replace(job, waits_for=())
         self._jobs[job.id] = job
         self.changed(job.id, job)
 
@@ -407,9 +439,3 @@ def _is_of(job: Job, folder: JobFolder) -> bool:
         and is_running(job.pid, job.identity)
         and carries(job.pid, EVENTS, _marker(folder))
     )
-
-
-def _moved(word: str, old: Path, new: Path) -> str:
-    """Return a word of a command line, a path at or below a folder as it is after a move."""
-    path = Path(word)
-    return str(new / path.relative_to(old)) if path.is_absolute() and path.is_relative_to(old) else word

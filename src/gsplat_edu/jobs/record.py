@@ -1,7 +1,7 @@
 """A job on disk: what was asked for, its state, and the files of its output.
 
-A record has no command line. Its request is validated again, and the command line made of it again, whenever the record
-is read: a folder that somebody else made cannot name a program, a path or an address.
+A record has no command line. Its work is validated, and its command line rendered, whenever the record is read and
+again when the job starts: a folder that somebody else made cannot name a program, a path or an address.
 
 job.json        the record below
 events.jsonl    its events (`gsplat_edu.jobs.events`), of all its attempts
@@ -13,8 +13,8 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import open_file, parse_json
 from gsplat_edu.base.text import printable, shortened
 
-VERSION = 2
+VERSION = 3
 
 ID = re.compile(r"[0-9]{6}")
 """Ids of jobs: numbers in the order of their creation."""
@@ -33,10 +33,10 @@ MOST_BYTES = 1 << 20
 """Bytes of a record."""
 
 LONGEST_LINE = 2_000
-"""Characters of a record's line and of each of its outputs and texts."""
+"""Characters of each text of a record."""
 
-MOST_OUTPUTS = 1_000
-"""Outputs of a job."""
+MOST_PLACES = 100
+"""Inputs of a job, and outputs."""
 
 LATEST = 1e11
 """Seconds since 1970 of the latest date that a record may have, in the year 5138."""
@@ -70,7 +70,7 @@ RESUMABLE = (State.HELD, State.FAILED, State.CANCELLED, State.INTERRUPTED)
 
 
 class Purpose(StrEnum):
-    """What a request is turned into a command line for."""
+    """What a command line is rendered for."""
 
     SHOW = "show"
     """To show it; what it names may be gone."""
@@ -82,32 +82,94 @@ class Purpose(StrEnum):
 
 @dataclass(frozen=True)
 class Work:
-    """A validated request and the command line made of it.
+    """What a job does.
+
+    A place is a text with slashes. Two places are independent unless they are equal: a file below an entry counts as
+    part of the entry only where the entry is renamed or asked whether it is in use.
 
     Args:
-        request: The request with everything that it had left open; the same request makes the same command line.
-        argv: Words after `gsplat-edu`.
-        title: A few words for people.
-        subject: What it works on: "runs/toy", for example; empty for nothing in particular.
+        command: Name of the command.
+        inputs: Places that it reads.
+        outputs: Places that it writes.
+        options: Values of the command's options.
     """
 
-    request: Mapping[str, Any]
+    command: str
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """All inputs and outputs."""
+        return (*self.inputs, *self.outputs)
+
+    def uses(self, place: str) -> bool:
+        """Return whether a place, or one below it, is an input or an output."""
+        return any(own == place or own.startswith(f"{place}/") for own in self.places)
+
+    def renamed(self, old: str, new: str) -> Work:
+        """Return the work after a place got another name; places below it move along."""
+        return replace(
+            self,
+            inputs=tuple(_renamed(own, old, new) for own in self.inputs),
+            outputs=tuple(_renamed(own, old, new) for own in self.outputs),
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the work as JSON has it."""
+        return {
+            "command": self.command,
+            "inputs": list(self.inputs),
+            "outputs": list(self.outputs),
+            "options": dict(self.options),
+        }
+
+
+def _renamed(own: str, old: str, new: str) -> str:
+    return new + own[len(old) :] if own == old or own.startswith(f"{old}/") else own
+
+
+def collision(one: Work, other: Work, identify: Callable[[str], Hashable]) -> str | None:
+    """Return a place that one of two jobs writes and the other one reads or writes; None if there is none.
+
+    Args:
+        one: Work of a job; the place is named as it names it.
+        other: Work of another job.
+        identify: Returns equal values for two names of the same place.
+    """
+    read, written = ({identify(place) for place in places} for places in (other.places, other.outputs))
+    for place in one.places:
+        if identify(place) in (read if place in one.outputs else written):
+            return place
+    return None
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Work that is allowed, with its command line.
+
+    Args:
+        work: The work, with what rendering has decided.
+        argv: Words after `gsplat-edu`.
+    """
+
+    work: Work
     argv: tuple[str, ...]
-    title: str = ""
-    subject: str = ""
 
 
-Rebuild = Callable[[Mapping[str, Any], Purpose], Work]
-"""Validates a request and turns it into a command line; raises ArgumentError if it is not allowed."""
+Render = Callable[[Work, Purpose], Rendered]
+"""Validates a work and renders its command line; raises ArgumentError if it is not allowed."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A command line and what became of it.
+    """Work and what became of it.
 
     Args:
         id: Its name, that of its folder; later jobs have greater ones.
         work: What it does.
+        argv: Its command line, words after `gsplat-edu`; rendered again when the job starts, and not in the record.
         state: Where it stands.
         created: When it was made, seconds since 1970.
         started: When its last attempt began; None before the first.
@@ -116,12 +178,13 @@ class Job:
         pid: Process id of the last attempt; None if it is not known.
         identity: `gsplat_edu.jobs.process.identity` of that process.
         line: Why it failed or was interrupted, in one line.
-        outputs: Files and folders that it wrote.
         cancelled: Whether the user asked for its end.
+        waits_for: Jobs that have to end before this one may start, and a place that both use; not in the record.
     """
 
     id: str
     work: Work
+    argv: tuple[str, ...]
     state: State
     created: float
     started: float | None = None
@@ -130,23 +193,8 @@ class Job:
     pid: int | None = None
     identity: str = ""
     line: str = ""
-    outputs: tuple[str, ...] = ()
     cancelled: bool = False
-
-    @property
-    def argv(self) -> tuple[str, ...]:
-        """Words after `gsplat-edu`."""
-        return self.work.argv
-
-    @property
-    def title(self) -> str:
-        """A few words for people."""
-        return self.work.title
-
-    @property
-    def subject(self) -> str:
-        """What it works on."""
-        return self.work.subject
+    waits_for: tuple[tuple[str, str], ...] = ()
 
     @property
     def command(self) -> str:
@@ -159,13 +207,17 @@ class Job:
         return self.state in RESUMABLE
 
     def document(self) -> dict[str, Any]:
-        """Return the record as JSON has it: the request, and no command line."""
+        """Return the record as JSON has it: the work, and no command line."""
         facts = {name: getattr(self, name) for name in RECORD_FIELDS}
-        return {"version": VERSION, "id": self.id, "request": dict(self.work.request), **facts}
+        return {"version": VERSION, "id": self.id, "work": self.work.document(), **facts}
 
 
 def _text(value: Any) -> bool:  # noqa: ANN401
     return isinstance(value, str) and len(value) <= LONGEST_LINE and printable(value) == value
+
+
+def _texts(value: Any) -> bool:  # noqa: ANN401
+    return isinstance(value, list) and len(value) <= MOST_PLACES and all(map(_text, value))
 
 
 def _time(value: Any) -> bool:  # noqa: ANN401
@@ -189,12 +241,18 @@ RECORD_FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "pid": _or_none(_whole(2)),  # 1 starts the system, and 0 means the own process group
     "identity": _text,
     "line": _text,
-    "outputs": lambda value: (
-        isinstance(value, list | tuple) and len(value) <= MOST_OUTPUTS and all(map(_text, value))
-    ),
     "cancelled": lambda value: isinstance(value, bool),
 }
 """The other fields of a record, and what each may hold."""
+
+
+WORK_FIELDS: Mapping[str, Callable[[Any], bool]] = {
+    "command": _text,
+    "inputs": _texts,
+    "outputs": _texts,
+    "options": lambda value: isinstance(value, dict),
+}
+"""The fields of a work in a record, and what each may hold; what its command allows is for `Render` to say."""
 
 
 def one_line(text: str) -> str:
@@ -236,11 +294,11 @@ class JobFolder:
         with written_aside(self.record) as aside:
             aside.write_text(json.dumps(job.document(), indent=1) + "\n", encoding="utf-8")
 
-    def read(self, rebuild: Rebuild) -> Job:
+    def read(self, render: Render) -> Job:
         """Read the record.
 
         Args:
-            rebuild: Turns its request into a command line.
+            render: Validates its work.
 
         Raises:
             ArgumentError: it is damaged, or asks for what is not allowed.
@@ -252,24 +310,25 @@ class JobFolder:
             entry = parse_json(data) if len(data) <= MOST_BYTES else None
             if not isinstance(entry, dict) or entry.get("version") != VERSION:
                 raise ValueError("it is no record of this version")
-            if set(entry) != {"version", "id", "request", *RECORD_FIELDS}:
+            if set(entry) != {"version", "id", "work", *RECORD_FIELDS}:
                 raise ValueError("it has other fields")
             if entry["id"] != self.path.name:
                 raise ValueError("it belongs to another job")
-            for name, is_allowed in RECORD_FIELDS.items():
-                if not is_allowed(entry[name]):
-                    raise ValueError(f"{name} has an impossible value")
-            if not isinstance(entry["request"], dict):
-                raise ValueError("it has no request")
-            work = rebuild(entry["request"], Purpose.SHOW)
+            _check_fields(entry, RECORD_FIELDS)
+            work = entry["work"]
+            if not isinstance(work, dict) or set(work) != set(WORK_FIELDS):
+                raise ValueError("it has no work")
+            _check_fields(work, WORK_FIELDS)
+            places = {name: tuple(work[name]) for name in ("inputs", "outputs")}
+            shown = render(Work(work["command"], **places, options=work["options"]), Purpose.SHOW)
         except OSError as error:
             raise ArgumentError(f"job {self.path.name}: is damaged ({error.strerror}); remove it") from None
         except ValueError as error:
             why = shortened(printable(str(error)))
             raise ArgumentError(f"job {self.path.name}: is damaged ({why}); remove it") from None
         facts = {name: entry[name] for name in RECORD_FIELDS}
-        facts |= {"state": State(entry["state"]), "outputs": tuple(entry["outputs"])}
-        return Job(self.path.name, work, **facts)
+        facts["state"] = State(entry["state"])
+        return Job(self.path.name, shown.work, shown.argv, **facts)
 
     def _check_files(self) -> None:
         """Check that nothing here leads elsewhere.
@@ -282,3 +341,14 @@ class JobFolder:
         for path in (self.record, self.events, self.output):
             if path.is_symlink() or (path.exists() and not path.is_file()):
                 raise ValueError(f"{path.name} is a link or no file")
+
+
+def _check_fields(entry: Mapping[str, Any], fields: Mapping[str, Callable[[Any], bool]]) -> None:
+    """Check the values of a record's fields.
+
+    Raises:
+        ValueError: one has an impossible value.
+    """
+    for name, is_allowed in fields.items():
+        if not is_allowed(entry[name]):
+            raise ValueError(f"{name} has an impossible value")

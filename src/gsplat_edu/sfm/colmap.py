@@ -21,7 +21,7 @@ import numpy as np
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import install_command
 
-POLL = 0.25
+PROGRESS_EVERY = 0.25
 """Seconds between two queries of a job's progress."""
 
 BEAT = 10.0
@@ -113,7 +113,7 @@ def _await_result(
     done, told = 0, time.monotonic()
     while True:
         try:
-            answer = answers.get(timeout=POLL)
+            answer = answers.get(timeout=PROGRESS_EVERY)
         except queue.Empty:
             if rows is not None:
                 progress(rows())

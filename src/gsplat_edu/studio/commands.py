@@ -1,18 +1,21 @@
-"""Requests for work become command lines: a checked subset of each command's options."""
+"""Requests become work, and work becomes a command line: a checked subset of each command's options.
+
+`rendered` is the only way to a command line, for work from a request as for work from a record on disk.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.base.text import shortened
-from gsplat_edu.jobs.record import Purpose, Work
+from gsplat_edu.base.text import legible, shortened
+from gsplat_edu.jobs.record import Purpose, Rendered, Work
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import Library, files_within, scene_file
-from gsplat_edu.studio.names import checked_name
+from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.train.config import APPEARANCES, QUALITIES, REFINEMENTS, SKIES, STRATEGIES
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
@@ -26,13 +29,13 @@ EDITS = "edits.json"
 FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html")
 """Endings of exported files."""
 
-MADE = {"sfm": "captures", "train": "runs", "clean": "scenes"}
-"""Kinds of the entries that commands make; the others write into the entry that they work on."""
-
 LONGEST_TEXT = 200
 """Characters of an option's text."""
 
 Words = list[str]
+Line = list[str | Path]
+"""Words of a command line; every path of the library is a Path, and is checked before it becomes a word."""
+
 Option = Callable[[str, Any], Words]
 """Turns name and value of an option into words of the command line."""
 
@@ -137,6 +140,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "white_background": _switch,
     "random_background": _switch,
     "clean": _switch,
+    "resume": _switch,
 }
 
 DOCTOR_OPTIONS: Mapping[str, Option] = {"resolution": _number(0.1, 100_000.0)}
@@ -157,131 +161,125 @@ RENDER_OPTIONS: Mapping[str, Option] = {
 }
 
 
-def work_of(library: Library, request: Mapping[str, Any], purpose: Purpose = Purpose.BEGIN) -> Work:
-    """Turn a request into a command line, whose paths all lie in the library or in what it has adopted.
-
-    Args:
-        library: Where the entries are.
-        request: command, subject ("captures/toy"), to (the name of what is made), options, and for each command
-            what docs/STUDIO.md lists.
-        purpose: What for; only `BEGIN` chooses a name where `to` is missing.
-
-    Raises:
-        RefusedError: the command is unknown, an option is not allowed, an entry does not exist or exists already, or
-            a path leads out of the library.
-    """
-    command = request.get("command")
-    makers = {
-        "sfm": _sfm,
-        "train": _train,
-        "doctor": _doctor,
-        "clean": _clean,
-        "convert": _convert,
-        "render": _render,
-    }
-    maker = makers.get(command) if isinstance(command, str) else None
-    if maker is None:
-        raise RefusedError(f"command: is {str(command)[:40]!r}, but has to be one of {', '.join(makers)}")
-    known = {"command", "subject", "to", "options", "format", "edits", "resume"}
-    if unknown := sorted(set(request) - known):
-        raise RefusedError(f"{shortened(unknown[0])}: is not known; see docs/STUDIO.md")
-    work = maker(_Asked(library, request, purpose))
-    for word in work.argv:
-        if word.startswith("/"):
-            library.check_within(Path(word))
-    return work
-
-
-def renamed(request: Mapping[str, Any], kind: str, old: str, new: str) -> Mapping[str, Any]:
-    """Return a request as it is after an entry that it may name got another name.
-
-    Args:
-        request: A request of a `Work`.
-        kind: The entry's kind.
-        old: Its name.
-        new: Its new name.
-    """
-    changes = {}
-    if request.get("subject") == f"{kind}/{old}":
-        changes["subject"] = f"{kind}/{new}"
-    if MADE.get(request["command"]) == kind and request.get("to") == old:
-        changes["to"] = new
-    return {**request, **changes}
-
-
 @dataclass(frozen=True)
 class _Asked:
-    """A request on its way to a command line.
+    """Work on its way to a command line.
 
     Args:
         library: Where the entries are.
-        request: The request.
+        work: The work.
         purpose: What the command line is for.
     """
 
     library: Library
-    request: Mapping[str, Any]
+    work: Work
     purpose: Purpose
 
-    def subject(self, *kinds: str) -> tuple[str, Path]:
-        """Return kind and path of the entry that is worked on."""
-        given = self.request.get("subject")
-        kind, _, name = given.partition("/") if isinstance(given, str) else ("", "", "")
-        if kind not in kinds:
-            raise RefusedError(
-                f"subject: is {shortened(str(given))!r}, but has to be of {' or '.join(kinds)}"
-            )
+    @property
+    def command(self) -> _Command:
+        """What the command reads, writes and accepts."""
+        return COMMANDS[self.work.command]
+
+    def source(self) -> tuple[str, Path]:
+        """Return kind and path of the entry that is read."""
+        inputs, work = self.work.inputs, self.work
+        edits = inputs[1:]
+        if not inputs or (edits and not (self.command.edits and edits == (f"{inputs[0]}/{EDITS}",))):
+            raise RefusedError(f"inputs: are not what {work.command} reads: an entry, and perhaps its edits")
+        kind, place = _entry_at(self.library, "inputs", inputs[0], self.command.reads)
         if self.purpose is Purpose.SHOW:
-            return kind, self.library.place(kind, name)
-        entry = self.library.entry(kind, name)
+            return kind, place
+        entry = self.library.entry(kind, place.name)
         if kind == "photos" and not any(True for _ in files_within(entry)):
-            raise conflict(f"photos/{entry.name}: is empty; add photos first")
+            raise conflict(f"{inputs[0]}: is empty; add photos first")
         return kind, entry
 
-    def made(self, kind: str, name: str) -> Path:
-        """Return the entry that is made, and that a job which is continued has made in part."""
-        given = self.request.get("to")
-        if self.purpose is Purpose.BEGIN:
-            return self.library.fresh(kind, given or self.library.free_name(kind, name))
-        place = self.library.place(kind, given)
-        if self.purpose is Purpose.CONTINUE and place.exists():
-            self.library.check_tree(place)
-        return place
-
-    def options(self, known: Mapping[str, Option]) -> Words:
-        """Return the words of the options."""
-        given = self.request.get("options", {})
-        if not isinstance(given, dict):
-            raise RefusedError("options: has to be an object")
-        words: Words = []
-        for name, value in given.items():
-            if name not in known:
-                raise RefusedError(
-                    f"options.{shortened(str(name))}: is not one of {', '.join(known) or 'none'}"
-                )
-            if value is not None:
-                words += known[name](name, value)
-        return words
-
-    def edits(self, kind: str, entry: Path) -> Words:
-        """Return the words that apply the edits of the entry that is worked on."""
-        if self.request.get("edits") is not True:
-            return []
-        if self.purpose is not Purpose.SHOW and not (entry / EDITS).is_file():
-            raise RefusedError(
-                f"edits: {kind}/{entry.name} has none; edit the scene first, or leave them out"
-            )
-        return ["--edits", str(entry / EDITS)]
-
-    def scene(self, kind: str, entry: Path) -> Path:
+    def scene(self) -> Path:
         """Return what convert and render read."""
+        kind, entry = self.source()
         if self.purpose is Purpose.SHOW and not entry.is_dir():
             return entry
         return scene_of(entry, kind)
 
-    def work(self, argv: Words, title: str, subject: str, **chosen: object) -> Work:
-        """Return the work, whose request has what was chosen."""
-        return Work({**self.request, **chosen}, tuple(argv), title, subject)
+    def made(self) -> Path:
+        """Return the entry that is made, and that a job which is started again has made in part."""
+        outputs, makes = self.work.outputs, self.command.makes
+        if len(outputs) != 1:
+            raise RefusedError(f"outputs: are not what {self.work.command} writes: one of {makes}")
+        kind, place = _entry_at(self.library, "outputs", outputs[0], (makes,))
+        if self.purpose is Purpose.SHOW:
+            return place
+        if self.work.options.get("resume") is True:
+            place = self.library.entry(kind, place.name)
+        elif self.purpose is Purpose.BEGIN:
+            return self.library.fresh(kind, place.name)
+        if place.exists():
+            self.library.check_tree(place)
+        return place
+
+    def exported(self) -> Path:
+        """Return the file that is written beside the entry that is read."""
+        _, entry = self.source()
+        folder = f"{self.work.inputs[0]}/{EXPORTS}/"
+        name = self.work.outputs[0].removeprefix(folder) if len(self.work.outputs) == 1 else ""
+        endings = tuple(f".{form}" for form in self.command.forms)
+        if self.work.outputs != (f"{folder}{name}",) or not name.endswith(endings) or name in endings:
+            raise RefusedError(
+                f"outputs: are not what {self.work.command} writes: a file in {folder}"
+                f" that ends in {', '.join(self.command.forms)}"
+            )
+        path = checked_name("outputs", name, LONGEST_FILE)
+        if legible(path) != name:
+            raise RefusedError(f"outputs: {shortened(name)!r} is not in Unicode's composed form; rename it")
+        return entry / EXPORTS / path
+
+    def options(self) -> Words:
+        """Return the words of the options."""
+        kind = self.work.inputs[0].partition("/")[0]
+        known = self.command.options if kind not in self.command.without_options else {}
+        words: Words = []
+        for name, value in self.work.options.items():
+            if name not in known:
+                raise RefusedError(
+                    f"options.{shortened(str(name))}: is not one of {', '.join(known) or 'none'}"
+                )
+            words += known[name](name, value)
+        return words
+
+    def edits(self) -> Line:
+        """Return the words that apply the edits of the entry that is read."""
+        if len(self.work.inputs) == 1:
+            return []
+        kind, entry = self.source()
+        if self.purpose is not Purpose.SHOW and not (entry / EDITS).is_file():
+            raise RefusedError(
+                f"edits: {kind}/{entry.name} has none; edit the scene first, or leave them out"
+            )
+        return ["--edits", entry / EDITS]
+
+
+def _place_of(library: Library, what: str, given: str, kinds: tuple[str, ...]) -> tuple[str, Path]:
+    """Return kind and path of the entry that a text like "runs/toy" names.
+
+    Raises:
+        RefusedError: it names none of these kinds.
+    """
+    kind, _, name = given.partition("/")
+    if kind not in kinds:
+        raise RefusedError(f"{what}: is {shortened(given)!r}, but has to be of {' or '.join(kinds)}")
+    return kind, library.place(kind, name)
+
+
+def _entry_at(library: Library, what: str, place: str, kinds: tuple[str, ...]) -> tuple[str, Path]:
+    """Return kind and path of an input or output.
+
+    Raises:
+        RefusedError: it is not of these kinds, or named in another way than the library does: places are compared.
+    """
+    kind, path = _place_of(library, what, place, kinds)
+    if library.name(path) != place:
+        raise RefusedError(f"{what}: {shortened(place)!r} is not in Unicode's composed form; rename it")
+    return kind, path
 
 
 def photos_source(entry: Path) -> Path:
@@ -305,58 +303,164 @@ def scene_of(entry: Path, kind: str) -> Path:
     raise RefusedError(f"{kind}/{entry.name}: holds no scene; choose a run or a scene")
 
 
-def _sfm(asked: _Asked) -> Work:
-    kind, entry = asked.subject("photos")
-    out = asked.made("captures", entry.name)
-    argv = ["sfm", str(photos_source(entry)), str(out), *asked.options(SFM_OPTIONS)]
-    return asked.work(argv, f"poses of {entry.name}", f"{kind}/{entry.name}", to=out.name)
+def _sfm(asked: _Asked) -> Line:
+    _, entry = asked.source()
+    return [photos_source(entry), asked.made(), *asked.options()]
 
 
-def _train(asked: _Asked) -> Work:
-    kind, entry = asked.subject("captures", "photos")
+def _train(asked: _Asked) -> Line:
+    kind, entry = asked.source()
     source = photos_source(entry) if kind == "photos" else entry
-    resumes = asked.request.get("resume") is True
-    if resumes and asked.purpose is not Purpose.SHOW:
-        out = asked.library.entry("runs", asked.request.get("to"))
-        asked.library.check_tree(out)
-    else:
-        out = asked.made("runs", entry.name)
-        resumes |= asked.purpose is Purpose.CONTINUE and (out / "config.json").is_file()
-    argv = ["train", str(source), "--out", str(out), *asked.options(TRAIN_OPTIONS)]
-    argv += ["--resume"] if resumes else []
-    chosen = {"to": out.name} | ({"resume": True} if resumes else {})
-    return asked.work(argv, f"training of {out.name}", f"runs/{out.name}", **chosen)
+    return [source, "--out", asked.made(), *asked.options()]
 
 
-def _doctor(asked: _Asked) -> Work:
-    kind, entry = asked.subject("captures", "runs")
-    words = ["--no-forecast"] if kind == "captures" else []
-    argv = ["doctor", str(entry), *words, *asked.options(DOCTOR_OPTIONS if kind == "captures" else {})]
-    return asked.work(argv, f"doctor of {entry.name}", f"{kind}/{entry.name}")
+def _doctor(asked: _Asked) -> Line:
+    kind, entry = asked.source()
+    return [entry, *(["--no-forecast"] if kind == "captures" else []), *asked.options()]
 
 
-def _clean(asked: _Asked) -> Work:
-    kind, entry = asked.subject("runs")
-    out = asked.made("scenes", f"{entry.name}-clean")
-    argv = ["clean", str(entry), "--out", str(out / f"{out.name}.ply"), *asked.options(CLEAN_OPTIONS)]
-    return asked.work(argv, f"cleaning of {entry.name}", f"{kind}/{entry.name}", to=out.name)
+def _clean(asked: _Asked) -> Line:
+    _, entry = asked.source()
+    out = asked.made()
+    return [entry, "--out", out / f"{out.name}.ply", *asked.options()]
 
 
-def _convert(asked: _Asked) -> Work:
-    kind, entry = asked.subject("runs", "scenes")
-    form = asked.request.get("format")
-    if form not in FORMATS:
-        raise RefusedError(f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(FORMATS)}")
-    name = checked_name("to", asked.request.get("to") or entry.name)
-    out = entry / EXPORTS / f"{name}.{form}"
-    argv = ["convert", str(asked.scene(kind, entry)), str(out), *asked.options(CONVERT_OPTIONS)]
-    argv += [*asked.edits(kind, entry), "--verify"]
-    return asked.work(argv, f"export of {out.name}", f"{kind}/{entry.name}", to=name)
+def _convert(asked: _Asked) -> Line:
+    return [asked.scene(), asked.exported(), *asked.options(), *asked.edits(), "--verify"]
 
 
-def _render(asked: _Asked) -> Work:
-    kind, entry = asked.subject("runs", "scenes")
-    name = checked_name("to", asked.request.get("to") or entry.name)
-    argv = ["render", str(asked.scene(kind, entry)), "--out", str(entry / EXPORTS / f"{name}.mp4")]
-    argv += [*asked.edits(kind, entry), *asked.options(RENDER_OPTIONS)]
-    return asked.work(argv, f"video of {entry.name}", f"{kind}/{entry.name}", to=name)
+def _render(asked: _Asked) -> Line:
+    return [asked.scene(), "--out", asked.exported(), *asked.edits(), *asked.options()]
+
+
+@dataclass(frozen=True)
+class _Command:
+    """What a command reads, writes and accepts.
+
+    Args:
+        line: Makes the command line of a work.
+        title: A few words for people; INPUT and OUTPUT stand for the names of what it reads and writes.
+        options: The options that it accepts.
+        reads: Kinds of the entries that it works on.
+        makes: Kind of the entry that it makes; empty if it makes none.
+        suffix: Added to the name of what it reads, for the default name of the entry that it makes.
+        forms: Endings of the file that it writes among the exports of what it reads; none if it writes none.
+        edits: Whether it can apply edits.
+        without_options: Kinds of entries with which it accepts no options.
+    """
+
+    line: Callable[[_Asked], Line]
+    title: str
+    options: Mapping[str, Option]
+    reads: tuple[str, ...]
+    makes: str = ""
+    suffix: str = ""
+    forms: tuple[str, ...] = ()
+    edits: bool = False
+    without_options: tuple[str, ...] = ()
+
+
+COMMANDS: Mapping[str, _Command] = {
+    "sfm": _Command(_sfm, "poses of INPUT", SFM_OPTIONS, ("photos",), "captures"),
+    "train": _Command(_train, "training of OUTPUT", TRAIN_OPTIONS, ("captures", "photos"), "runs"),
+    "doctor": _Command(
+        _doctor, "doctor of INPUT", DOCTOR_OPTIONS, ("captures", "runs"), without_options=("runs",)
+    ),
+    "clean": _Command(_clean, "cleaning of INPUT", CLEAN_OPTIONS, ("runs",), "scenes", "-clean"),
+    "convert": _Command(
+        _convert, "export of OUTPUT", CONVERT_OPTIONS, ("runs", "scenes"), forms=FORMATS, edits=True
+    ),
+    "render": _Command(
+        _render, "video of INPUT", RENDER_OPTIONS, ("runs", "scenes"), forms=("mp4",), edits=True
+    ),
+}
+"""The commands that can be asked for."""
+
+
+def work_of(library: Library, request: Mapping[str, Any]) -> Work:
+    """Turn a request into work; `rendered` checks the rest of it.
+
+    Args:
+        library: Where the entries are.
+        request: command, subject ("captures/toy"), to (the name of what is made), options, and for each command
+            what docs/STUDIO.md lists.
+
+    Raises:
+        RefusedError: the command or a field is unknown, or a name is not allowed.
+    """
+    name = request.get("command")
+    command = _command_of(name if isinstance(name, str) else str(name))
+    known = {"command", "subject", "to", "options", "format", "edits", "resume"}
+    if unknown := sorted(set(request) - known):
+        raise RefusedError(f"{shortened(unknown[0])}: is not known; see docs/STUDIO.md")
+    _, path = _place_of(library, "subject", str(request.get("subject")), command.reads)
+    subject, entry, to = library.name(path), path.name, request.get("to")
+    options = request.get("options", {})
+    if not isinstance(options, dict):
+        raise RefusedError("options: has to be an object")
+    options = {option: value for option, value in options.items() if value is not None}
+    if request.get("resume") is True and "resume" in command.options:
+        options["resume"] = True
+    outputs: tuple[str, ...] = ()
+    if command.makes:
+        free = to or library.free_name(command.makes, f"{entry}{command.suffix}")
+        outputs = (f"{command.makes}/{legible(checked_name('to', free))}",)
+    elif command.forms:
+        form = request.get("format") if len(command.forms) > 1 else command.forms[0]
+        if form not in command.forms:
+            raise RefusedError(
+                f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(command.forms)}"
+            )
+        outputs = (f"{subject}/{EXPORTS}/{legible(checked_name('to', to or entry))}.{form}",)
+    inputs = (subject, f"{subject}/{EDITS}") if request.get("edits") is True else (subject,)
+    return Work(str(name), inputs, outputs, options)
+
+
+def rendered(library: Library, work: Work, purpose: Purpose) -> Rendered:
+    """Validate work and render its command line, whose paths all lie in the library or in what it has adopted.
+
+    Args:
+        library: Where the entries are.
+        work: The work; a training that has begun its run gets the option `resume` when it is started again.
+        purpose: What for.
+
+    Raises:
+        RefusedError: the command is unknown, an option is not allowed, the places are not those of the command, an
+            entry does not exist or exists already, or a path leads out of the library.
+    """
+    command = _command_of(work.command)
+    asked = _Asked(library, work, purpose)
+    if (
+        purpose is Purpose.CONTINUE
+        and "resume" in command.options
+        and (asked.made() / "config.json").is_file()
+    ):
+        asked = replace(asked, work=replace(work, options={**work.options, "resume": True}))
+    if not (command.makes or command.forms) and work.outputs:
+        raise RefusedError(f"outputs: {work.command} writes nothing; leave them out")
+    argv = [work.command]
+    for word in command.line(asked):
+        if isinstance(word, Path):
+            library.check_within(word)
+        argv.append(str(word))
+    return Rendered(asked.work, tuple(argv))
+
+
+def _command_of(name: str) -> _Command:
+    if name not in COMMANDS:
+        raise RefusedError(f"command: is {name[:40]!r}, but has to be one of {', '.join(COMMANDS)}")
+    return COMMANDS[name]
+
+
+def title_of(work: Work) -> str:
+    """Return a few words for people that say what work does."""
+    words = {"INPUT": work.inputs[0], "OUTPUT": work.outputs[0] if work.outputs else ""}
+    return " ".join(
+        words[word].rpartition("/")[2] if word in words else word
+        for word in COMMANDS[work.command].title.split()
+    )
+
+
+def subject_of(work: Work) -> str:
+    """Return the entry on whose screen work is shown: the run of a training, else what is read."""
+    return work.outputs[0] if work.command == "train" else work.inputs[0]

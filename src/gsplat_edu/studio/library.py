@@ -25,7 +25,7 @@ from typing import Any
 
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import open_file
-from gsplat_edu.base.text import legible, shortened, whole_of
+from gsplat_edu.base.text import as_file_name, legible, shortened, whole_of
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.adopted import adopted, note_adopted
@@ -94,6 +94,19 @@ class Library:
     def hidden(self, part: str) -> Path:
         """Return a folder of what the studio keeps for itself."""
         return self.root / HIDDEN / part
+
+    def name(self, path: Path) -> str:
+        """Return how jobs name a path of the library: "runs/toy", "runs/toy/exports/toy.ply"."""
+        return legible(path.relative_to(self.root).as_posix())
+
+    def identity(self, name: str) -> object:
+        """Return what two names have in common if, by links or by letters of either case, they are one place."""
+        path = self.root / as_file_name(name)
+        try:
+            facts = path.stat()
+        except OSError:
+            return str(path.resolve())
+        return facts.st_dev, facts.st_ino
 
     def entries(self, kind: str) -> list[Path]:
         """Return the entries of a kind, by name."""

@@ -18,19 +18,14 @@ from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.jobs.record import ACTIVE, Job, State
 from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.studio.replies import Json, act, answered
 from gsplat_edu.studio.scene_routes import BINARY, page_answer
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.viewer.live_folder import LiveFolder, header_of
-
-WAIT = 2.0
-"""Seconds that a request waits for something new."""
-
-POLL = 0.1
-"""Seconds between two looks at the files."""
+from gsplat_edu.viewer.live_folder import WAIT, LiveFolder, header_of
 
 PAGE_WAIT = 5.0
 """Seconds that the page waits for the training to write its facts."""
@@ -54,8 +49,9 @@ def _live(studio: Studio, request: Request) -> tuple[Job, LiveFolder]:
         RefusedError: no job trains it.
     """
     entry = studio.library.place("runs", request.path_params["name"])
+    name = studio.library.name(entry)
     for job in studio.queue.jobs():
-        if job.state in ACTIVE and job.argv[0] == "train" and job.subject == f"runs/{entry.name}":
+        if job.state in ACTIVE and job.work.command == "train" and job.work.outputs == (name,):
             folder = LiveFolder(entry)
             if (entry / "config.json").is_file():
                 folder.ask()

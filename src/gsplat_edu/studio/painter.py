@@ -9,6 +9,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.workers import Worker
 
@@ -24,9 +25,6 @@ for that core.
 
 MOST_WAITING = 4
 """Requests that wait; each holds a thread of the server."""
-
-POLL = 0.1
-"""Seconds between two looks at whether the pause is over."""
 
 
 class Painter:

@@ -92,8 +92,10 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     kind, entry = entry_of(studio, request)
     if kind not in ("captures", "runs"):
         raise RefusedError(f"{kind}: the doctor examines captures and runs")
-    subject = f"{kind}/{entry.name}"
-    jobs = [job for job in studio.queue.jobs() if job.argv[0] == "doctor" and job.subject == subject]
+    subject = studio.library.name(entry)
+    jobs = [
+        job for job in studio.queue.jobs() if job.work.command == "doctor" and job.work.inputs == (subject,)
+    ]
     if not jobs:
         return {
             "job": None,

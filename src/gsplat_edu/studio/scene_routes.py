@@ -142,8 +142,9 @@ def _exports(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
 
 def _made_by(studio: Studio, path: Path) -> dict[str, Any]:
     """Return the job that wrote a file last, its command, and the PSNR that it measured; None where unknown."""
+    place = studio.library.name(path)
     for job in reversed(studio.queue.jobs()):
-        if job.state is State.DONE and str(path) in job.outputs:
+        if job.state is State.DONE and place in job.work.outputs:
             metrics = [event for _, _, event in events_after(studio.queue.files(job.id).events)]
             measured = (
                 m for m in metrics if isinstance(m, Metric) and Path(m.of).name == path.name

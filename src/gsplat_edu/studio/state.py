@@ -9,8 +9,8 @@ from typing import Any
 
 from gsplat_edu.jobs.following import last_stage
 from gsplat_edu.jobs.queue import JobQueue
-from gsplat_edu.jobs.record import ACTIVE, Job, Purpose, State, Work
-from gsplat_edu.studio.commands import renamed, work_of
+from gsplat_edu.jobs.record import ACTIVE, Job, State, Work
+from gsplat_edu.studio.commands import rendered, title_of, work_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.painter import Painter
 from gsplat_edu.studio.refusal import conflict
@@ -44,17 +44,26 @@ class Studio:
         self.decoder = Worker(waiting=MOST_THUMBNAILS)
         self.painter = Painter()
         jobs = self.library.hidden("jobs")
-        self.queue = JobQueue(jobs, self._work, at_once, self.stream.changed, hold=self._hold)
+        self.queue = JobQueue(
+            jobs,
+            lambda work, purpose: rendered(self.library, work, purpose),
+            at_once,
+            self.stream.changed,
+            hold=self._hold,
+            identify=self.library.identity,
+        )
         self._starting = threading.Lock()
 
     def start(self, request: Mapping[str, Any]) -> Job:
         """Queue the job that a request describes.
 
         Raises:
-            RefusedError: it is not allowed, or a job that waits or runs writes to the same place.
+            RefusedError: it is not allowed, or a job that waits or runs does the same or writes to the same place.
         """
         with self._starting:
-            return self.queue.submit(self._work(request, Purpose.BEGIN))
+            work = work_of(self.library, request)
+            self._check_first(work, self._pending())
+            return self.queue.submit(work)
 
     def resume(self, name: str) -> Job:
         """Continue a paused job, or queue one again; see `JobQueue.resume`.
@@ -63,15 +72,20 @@ class Studio:
             ArgumentError: it cannot be resumed, it is not allowed any more, or another job writes to the same place.
         """
         with self._starting:
+            others = [job for job in self._pending() if job.id != name]
+            self._check_first(self.queue.get(name).work, others)
             return self.queue.resume(name)
 
-    def _work(self, request: Mapping[str, Any], purpose: Purpose) -> Work:
-        """Turn a request into a command line; see `work_of`."""
-        work = work_of(self.library, request, purpose)
-        for job in () if purpose is Purpose.SHOW else self._pending():
-            if job.argv == work.argv or set(_places(work.argv)) & set(_outputs(job.argv)):
-                raise conflict(f"job {job.id}: {job.title} works there; wait until it ends, or cancel it")
-        return work
+    def _check_first(self, work: Work, others: list[Job]) -> None:
+        """Check that no other job does the same, or writes to the same place: the second would find it made.
+
+        Raises:
+            RefusedError: one does.
+        """
+        for job in others:
+            if job.work == work or set(job.work.outputs) & set(work.outputs):
+                title = title_of(job.work)
+                raise conflict(f"job {job.id}: {title} works there; wait until it ends, or cancel it")
 
     def rename(self, kind: str, name: str, to: object) -> Path:
         """Give an entry another name; jobs that made or used it can be resumed there.
@@ -82,12 +96,7 @@ class Studio:
         library = self.library
         with library.lock:
             old, new = library.entry(kind, name), library.fresh(kind, to)
-            self.queue.move(
-                old,
-                new,
-                lambda request: renamed(request, kind, old.name, new.name),
-                lambda: library.rename(kind, name, to),
-            )
+            self.queue.rename(library.name(old), library.name(new), lambda: library.rename(kind, name, to))
         return new
 
     def close(self) -> None:
@@ -100,13 +109,13 @@ class Studio:
 
     def is_training(self) -> bool:
         """Return whether a training runs, and does not wait."""
-        return any(job.state is State.RUNNING and job.argv[0] == "train" for job in self.queue.jobs())
+        return any(job.state is State.RUNNING and job.work.command == "train" for job in self.queue.jobs())
 
     def _hold(self, job: Job, wait: bool) -> bool:
         """Let a training wait between two iterations, where its clock stops, if it has come that far."""
-        if job.argv[0] != "train":
+        if job.work.command != "train":
             return False
-        folder = LiveFolder(Path(job.argv[job.argv.index("--out") + 1]))
+        folder = LiveFolder(self.library.root / job.work.outputs[0])
         if not self.library.is_within(folder.pause):
             return False
         if not wait:
@@ -123,19 +132,6 @@ class Studio:
     def in_use(self, path: Path) -> str | None:
         """Return which job uses a path of the library, which may then not be moved."""
         for job in self._pending():
-            if any(Path(word).is_relative_to(path) for word in job.argv if word.startswith("/")):
-                return f"is used by job {job.id} ({job.title}); wait until it ends, or cancel it"
+            if job.work.uses(self.library.name(path)):
+                return f"is used by job {job.id} ({title_of(job.work)}); wait until it ends, or cancel it"
         return None
-
-
-def _places(argv: tuple[str, ...]) -> list[str]:
-    return [word for word in argv if word.startswith("/")]
-
-
-def _outputs(argv: tuple[str, ...]) -> list[str]:
-    """Return the paths that a command writes."""
-    if argv[0] == "doctor":
-        return []
-    if "--out" in argv[:-1]:
-        return [argv[argv.index("--out") + 1]]
-    return _places(argv)[1:2]

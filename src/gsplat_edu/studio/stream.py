@@ -11,17 +11,16 @@ from collections import deque
 from collections.abc import AsyncIterator
 from typing import Any
 
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.text import whole_of
 from gsplat_edu.jobs.events import Event
 from gsplat_edu.jobs.following import Follower
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job
+from gsplat_edu.studio.commands import subject_of, title_of
 
 KEPT = 4_000
 """Events that a browser may have missed and still gets; after more it reads the list of jobs again."""
-
-POLL = 0.2
-"""Seconds between two looks at the files of running jobs."""
 
 HEARTBEAT = 15.0
 """Seconds of silence after which a comment tells whether the browser is still there."""
@@ -34,8 +33,9 @@ def job_document(job: Job) -> dict[str, Any]:
     """Return a job as the API shows it."""
     return {
         "id": job.id,
-        "title": job.title,
-        "subject": job.subject,
+        "title": title_of(job.work),
+        "subject": subject_of(job.work),
+        "work": job.work.document(),
         "state": job.state.value,
         "command": job.command,
         "argv": list(job.argv),
@@ -44,7 +44,7 @@ def job_document(job: Job) -> dict[str, Any]:
         "ended": job.ended,
         "attempts": job.attempts,
         "line": job.line,
-        "outputs": list(job.outputs),
+        "waits_for": [{"job": name, "place": place} for name, place in job.waits_for],
         "resumable": job.resumable,
         "cancelling": job.cancelled and job.state in ACTIVE,
     }

@@ -38,14 +38,12 @@ from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.guard import Guard
+from gsplat_edu.viewer.live_folder import WAIT
 from gsplat_edu.viewer.serve import CHUNK, LOOPBACK, PORT, PageHandler, PageServer, url_of
 from gsplat_edu.viewer.snapshots import page_facts
 
 NAMES = ("--view-host", "--view-port")
 """The user's names for host and port."""
-
-WAIT = 2.0
-"""Seconds that a request waits for something new."""
 
 GRACE = 5.0
 """Seconds after the last request during which a browser is expected to return; reloading a page takes one or two."""

@@ -43,6 +43,9 @@ from gsplat_edu.base.reading import open_file, parse_json, read_text
 FRESH = 5.0
 """Seconds after which a touch of `wanted` no longer counts."""
 
+WAIT = 2.0
+"""Seconds that a page's request for a state or a scene waits for something new."""
+
 SNAPSHOT_FORMAT = "gsplat-edu snapshot"
 SNAPSHOT_VERSION = 1
 

@@ -18,6 +18,7 @@ import torch
 
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.base.files import described
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.training import CaptureRun
@@ -39,12 +40,6 @@ PICTURE_SHARE = 0.2
 
 STATE_EVERY = 0.5
 """Seconds between two states."""
-
-LOOK_EVERY = 0.1
-"""Seconds between two looks at the files of a watcher."""
-
-POLL = 0.03
-"""Seconds between two looks at the watchers while the training waits."""
 
 BEAT = 2.0
 """Seconds after which a state is repeated although nothing changed."""
@@ -153,7 +148,7 @@ class FolderWatcher:
 
     def _look(self) -> None:
         now = time.perf_counter()
-        if now - self._looked_at < LOOK_EVERY:
+        if now - self._looked_at < POLL:
             return
         self._looked_at = now
         self._wanted = not self._failed and self._folder.is_wanted()
@@ -239,7 +234,7 @@ class Broadcast:
         if watching:
             self._tell(watching, state, now)
         taken = time.perf_counter() - now
-        self._free_at = now + max(taken / SHARE, LOOK_EVERY)
+        self._free_at = now + max(taken / SHARE, POLL)
 
     def _tell(self, watching: Sequence[Watcher], state: str, now: float) -> None:
         iteration = self._trainer.iteration

@@ -54,6 +54,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     h("summary", {}, "Output"),
     output,
   );
+  const waits = h("p", { class: "waits quiet" });
   const ask = h("p", {}, "An earlier start of the studio left this job waiting. It runs this command once you start it:");
   const label = h("p", { class: "label" });
   const command = h("div", {});
@@ -64,6 +65,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     stages,
     h("div", { class: "row progress" }, bar, left),
     said,
+    waits,
     line,
     ask,
     h("div", { class: "row" }, pause, resume, stop, forget),
@@ -96,6 +98,8 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     else bar.value = 0;
     left.textContent = known && found.active ? leftOf(progress, found.stages.length > 1) : "";
     said.textContent = found.active ? (messages.at(-1) ?? "") : "";
+    waits.textContent = job.state === "queued" ? waitingFor(store, job.waits_for) : "";
+    waits.hidden = !waits.textContent;
     line.classList.toggle("error", job.state !== "cancelled"); // stopping is no error
     if (job.line) put(line, job.line);
     pause.hidden = job.state !== "running" || job.cancelling;
@@ -111,6 +115,16 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
 
   update();
   return { element, update, id };
+}
+
+// What a job in the queue waits for, in one sentence. Its card is updated with each state of a job.
+function waitingFor(store, others) {
+  const titles = others.map(({ job }) => `“${store.jobs.get(job)?.job.title ?? `job ${job}`}”`);
+  const places = [...new Set(others.map(({ place }) => place))];
+  const [have, use] = others.length > 1 ? ["have", "they use"] : ["has", "it uses"];
+  if (others.length) return `Waits until ${titles.join(" and ")} ${have} ended: ${use} ${places.join(" and ")} too.`;
+  const running = [...store.jobs.values()].filter(({ job }) => job.state === "running" || job.state === "paused").length;
+  return running ? `Waits for its turn: ${running === 1 ? "1 job is" : `${running} jobs are`} running.` : "";
 }
 
 // Progress is that of the present stage.

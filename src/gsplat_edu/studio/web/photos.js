@@ -68,7 +68,7 @@ export function photos(given) {
         job.update();
         pictures.read(now).then(() => (later.hidden = false), (error) => put(line, error.message));
         form.hidden = Boolean(job.view?.active);
-        const made = job.view?.job.state === "done" && store.entryAt(job.view.job.outputs[0] ?? "");
+        const made = store.madeBy(job.view);
         if (made && next.dataset.entry !== made.entry) {
           next.dataset.entry = made.entry;
           next.replaceChildren(link(`Continue with the capture ${made.name}`, addressOf(made), { class: "button primary" }));

@@ -114,7 +114,7 @@ function cleaning(store, entry) {
   const update = () => {
     if (!next.isConnected) return store.removeEventListener("change", update);
     job.update();
-    const made = job.view?.job.state === "done" && store.entryAt(job.view.job.outputs[0] ?? "");
+    const made = store.madeBy(job.view);
     if (made && next.hidden) next.append(link(`Open the scene ${made.name}`, addressOf(made), { class: "button" }));
     next.hidden = !made;
     return undefined;

@@ -66,9 +66,15 @@ export class Store extends EventTarget {
     if (kind !== "runs" || !this.library) return found;
     const names = new Set(found.map(({ entry }) => entry));
     const coming = [...this.jobs.values()].filter(({ job, active }) => {
-      return job.subject.startsWith("runs/") && job.argv[0] === "train" && !names.has(job.subject) && (active || job.line || job.state === "held");
+      return job.subject.startsWith("runs/") && job.work.command === "train" && !names.has(job.subject) && (active || job.line || job.state === "held");
     });
     return [...found, ...new Map(coming.map(({ job }) => [job.subject, runOf(job)])).values()];
+  }
+
+  // The entry that a finished job has made; null if there is none.
+  madeBy(view) {
+    const [kind, name] = (view?.job.state === "done" && view.job.work.outputs[0]?.split("/")) || [];
+    return (kind && this.entry(kind, name)) || null;
   }
 
   // The entry that a path lies in.
@@ -85,7 +91,7 @@ export class Store extends EventTarget {
   // Jobs about an entry, newest first.
   jobsOf(entry, ...commands) {
     const all = [...this.jobs.values()].filter(({ job }) => job.subject === entry);
-    const found = all.filter(({ job }) => !commands.length || commands.includes(job.argv[0]));
+    const found = all.filter(({ job }) => !commands.length || commands.includes(job.work.command));
     return found.sort((a, b) => b.job.id.localeCompare(a.job.id));
   }
 
