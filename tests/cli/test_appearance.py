@@ -55,26 +55,6 @@ def test_the_references_and_none_stay_as_they_are(uneven, tmp_path, capsys, word
     assert "--appearance" not in capsys.readouterr().out and stored(run) == "none"
 
 
-def test_a_run_of_an_older_version_resumes(uneven, tmp_path):
-    run = tmp_path / "run"
-    words = [
-        "train",
-        str(uneven),
-        "--out",
-        str(run),
-        "--resolution",
-        "2",
-        "--strategy",
-        "adc",
-        "--iterations",
-    ]
-    assert main([*words, "3"]) == 0
-    config = json.loads((run / "config.json").read_text())
-    del config["train"]["appearance"]
-    (run / "config.json").write_text(json.dumps(config))
-    assert main([*words, "4", "--resume"]) == 0
-
-
 def test_transparent_photos_are_corrected_and_unknown_names_are_refused(tmp_path, capsys):
     views, *_ = procedural_capture(24, 4, splats=60)
     alpha = np.full(views[0].image.shape[:2], 255, np.uint8)

@@ -97,14 +97,10 @@ def test_auto_says_why_and_a_resumed_run_keeps_it(struck, tmp_path, capsys):
     assert "was started with transients = mask, not none" in capsys.readouterr().err
 
 
-def test_the_default_masks_nothing_and_runs_of_older_versions_resume(struck, tmp_path, capsys):
+def test_the_default_masks_nothing(struck, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "run", iterations=3)
     assert stored(folder) == "none" and not (folder / "transients").exists()
     assert "moved" not in capsys.readouterr().out
-    config = json.loads((folder / "config.json").read_text())
-    del config["train"]["transients"]
-    (folder / "config.json").write_text(json.dumps(config))
-    finished(struck[0], folder, "--resume", iterations=4)
 
 
 def test_few_photos_and_unknown_names_are_refused(tmp_path, capsys):

@@ -335,7 +335,7 @@ def test_mismatched_antialiasing_is_reported(capture, finished, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--max-gaussians", "10"], "more than --max-gaussians 10"),
+        (["--max-gaussians", "10"], "more than max_gaussians = 10"),
         (["--points", "x.ply"], "not allowed with argument"),
         (["--start-opacity", "0.2"], "--start-opacity: only a start from points uses it"),
     ],

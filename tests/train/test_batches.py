@@ -319,7 +319,7 @@ def test_what_does_not_fit_a_batch_is_refused():
         recipe(10, batch=4)
     with pytest.raises(ArgumentError, match="^batch: "):
         recipe(10, batch=0)
-    with pytest.raises(ArgumentError, match="^--batch: is 4, but has to be a multiple of the 3 processes"):
+    with pytest.raises(ArgumentError, match="^batch: is 4, but has to be a multiple of the 3 processes"):
         together(3, lambda team: trainer(config(), team))
 
 

@@ -9,12 +9,14 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Interrupted
 from gsplat_edu.render.settings import check_backend
+from gsplat_edu.train.config import SETTINGS
 
 COMMANDS = {
     "demo": "train a sphere from 24 renders of it and evaluate the result with a held-out camera",
@@ -88,4 +90,17 @@ def _run(name: str, arguments: argparse.Namespace) -> None:
     if hasattr(options, "check"):
         options.check(arguments)
     module = options.runner(arguments) if hasattr(options, "runner") else name
-    importlib.import_module(f"gsplat_edu.cli.{module}").run(arguments)
+    try:
+        importlib.import_module(f"gsplat_edu.cli.{module}").run(arguments)
+    except ArgumentError as error:
+        if (told := _as_option(str(error))) == str(error):
+            raise
+        raise ArgumentError(told) from error
+
+
+def _as_option(message: str) -> str:
+    """Name the option of a setting that an error of the library names: "batch: is" becomes "--batch: is"."""
+    name, colon, rest = message.partition(": ")
+    if colon and name in {setting.name for setting in SETTINGS}:
+        return f"--{name.replace('_', '-')}: {rest}"
+    return message

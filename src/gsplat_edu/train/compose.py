@@ -111,16 +111,7 @@ def training(
     of_type("config", config, TrainConfig)
     check_backend_value(backend)
     offers("dataset", dataset, TrainingData)
-    if not dataset.train:
-        raise ArgumentError("dataset: has no training views; give at least one")
-    config = _with_cap(config, dataset.train, 0 if start is None else len(start.gaussians))
-    if config.sky != "none" and (start is None or start.shell is None):
-        raise ArgumentError(
-            f"sky: is {config.sky!r}, but start has no shell of splats; gsplat_edu.runs.skies makes it, or set"
-            " sky='none'"
-        )
-    if start is None:
-        start = Start(sorted_in_space(from_points(dataset.points, dataset.colors, config)))
+    config, start = _begin(config, dataset, start)
     cameras = [view.camera for view in dataset.train]
     extent = scene_extent(cameras) if start.extent is None else start.extent
     gaussians, shell = start.gaussians.to(backend.device), start.shell
@@ -141,6 +132,21 @@ def training(
             team=team,
         ),
     )
+
+
+def _begin(config: TrainConfig, dataset: TrainingData, start: Start | None) -> tuple[TrainConfig, Start]:
+    """Return the configuration with its cap, and where the training starts."""
+    if not dataset.train:
+        raise ArgumentError("dataset: has no training views; give at least one")
+    config = _with_cap(config, dataset.train, 0 if start is None else len(start.gaussians))
+    if config.sky != "none" and (start is None or start.shell is None):
+        raise ArgumentError(
+            f"sky: is {config.sky!r}, but start has no shell of splats; gsplat_edu.runs.skies makes it, or set"
+            " sky='none'"
+        )
+    if start is None:
+        start = Start(sorted_in_space(from_points(dataset.points, dataset.colors, config)))
+    return config, start
 
 
 def _with_cap(config: TrainConfig, views: Sequence[View], start: int) -> TrainConfig:

@@ -121,12 +121,12 @@ def from_gaussians(gaussians: Gaussians, config: TrainConfig) -> tuple[Gaussians
         raise ArgumentError("contains no Gaussian to start from; give another scene")
     if config.max_gaussians is not None and len(kept) > config.max_gaussians:
         raise ArgumentError(
-            f"contains {len(kept)} Gaussians, more than --max-gaussians {config.max_gaussians}; raise that, or reduce"
+            f"contains {len(kept)} Gaussians, more than max_gaussians = {config.max_gaussians}; raise that, or reduce"
             " the scene with `gsplat-edu convert --min-opacity`"
         )
     wanted, stored = (config.sh_degree + 1) ** 2 - 1, kept.sh_rest.shape[1]
     if stored > wanted:
-        notes.append(f"contains harmonics up to degree {kept.sh_degree}; those above --sh-degree are dropped")
+        notes.append(f"contains harmonics up to degree {kept.sh_degree}; those above sh_degree are dropped")
     elif stored < wanted:
         notes.append(f"contains harmonics up to degree {kept.sh_degree}; the others start at zero")
     rest = torch.zeros(len(kept), wanted, 3)

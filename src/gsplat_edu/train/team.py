@@ -78,7 +78,7 @@ def places_of(team: Team, batch: int) -> range:
     """
     if batch % team.size:
         raise ArgumentError(
-            f"--batch: is {batch}, but has to be a multiple of the {team.size} processes, so that each renders equally"
+            f"batch: is {batch}, but has to be a multiple of the {team.size} processes, so that each renders equally"
             " many views"
         )
     each = batch // team.size

@@ -146,8 +146,8 @@ def check_enough(count: int) -> None:
     """
     if count < FEWEST:
         raise ArgumentError(
-            f"--transients: {count} training photos are too few to tell what moved; give at least {FEWEST}, or"
-            " --transients none"
+            f"transients: {count} training photos are too few to tell what moved; give at least {FEWEST}, or"
+            " none"
         )
 
 
