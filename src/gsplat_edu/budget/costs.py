@@ -1,7 +1,8 @@
 """Cost model of a training: memory and time for any number of Gaussians, pixels and iterations.
 
 Memory is the sum of everything held at the same time, added to the process's own; the constants were measured from
-outside on whole runs (benchmarks/archive/RESULTS-2026-11.md). Time is fitted to the steps measured by `gsplat_edu.budget.probe`.
+outside on whole runs (benchmarks/archive/RESULTS-2026-11.md). Time is fitted to the steps measured by
+`gsplat_edu.budget.probe`.
 """
 
 from __future__ import annotations
