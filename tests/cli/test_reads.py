@@ -3,8 +3,8 @@
 from collections import Counter
 
 import pytest
-from gsplat_edu.data.city import City, write_city
 
+from fixtures.city import City, write_city
 from gsplat_edu.cli.main import main
 from gsplat_edu.data import images, reader
 from gsplat_edu.data.procedural import procedural_capture
