@@ -3,7 +3,7 @@
     python benchmarks/blocks.py [CAPTURE] [--photos N] [--width PX] [--blocks N] [--iterations N] [--gaussians N]
                                 [--keep FOLDER] [--smoke] [--out FILE.json]
 
-Without CAPTURE, writes a procedural city (`gsplat_edu.data.city`) from the air. The capture is trained as a whole, and
+Without CAPTURE, writes a procedural city (tests/fixtures/city.py) from the air. The capture is trained as a whole, and
 in blocks: a coarse model takes a quarter of the iterations, and the blocks share the rest: both ways take as many in
 total. Every eighth photo is held out. The strips lie along the cuts; the depth of the merged scene says which pixels
 show them, for both scenes. PSNR of strips is that of all their pixels together. Other options go to all trainings.
@@ -28,6 +28,7 @@ from typing import Any
 import hardware
 import numpy as np
 
+from fixtures.city import City, write_city
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
@@ -37,7 +38,6 @@ from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
 from gsplat_edu.blocks.split import SplitOptions, coarse_scene, split_capture
 from gsplat_edu.blocks.task import block_options
 from gsplat_edu.cli.arguments import run_command
-from gsplat_edu.data.city import City, write_city
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.io.ply import save_ply

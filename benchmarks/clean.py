@@ -2,7 +2,7 @@
 
     python benchmarks/clean.py [RUN] [--count N] [--seed S] [--million] [--smoke] [--out FILE.json]
 
-Floaters are planted in the scene of a run (`gsplat_edu.clean.plant`): between its training cameras and what they see.
+Floaters are planted in the scene of a run (tests/fixtures/plant.py): between its training cameras and what they see.
 Then the scene is cleaned with the run's photos. Recall is the share of the planted floaters that is removed. Precision
 is the share of planted ones among all that is removed as floaters, so that splats of the scene itself count against it,
 whether the scene needs them or not; splats that no view sees are listed apart. The loss is the held-out PSNR of the
@@ -33,9 +33,9 @@ import torch
 from captures import capture
 
 import gsplat_edu.cli.main as command_line
+from fixtures.plant import floaters
 from gsplat_edu.clean.guard import Cleaning, clean
 from gsplat_edu.clean.judge import Reason
-from gsplat_edu.clean.plant import floaters
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.render.api import render

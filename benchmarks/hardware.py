@@ -1,4 +1,7 @@
-"""Describe the machine of a measurement and store the result."""
+"""Describe the machine of a measurement and store the result.
+
+Importing this module lets benchmarks import what tests/fixtures makes.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,15 @@ import argparse
 import json
 import os
 import platform
+import sys
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from gsplat_edu import _native
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
 
 def describe() -> dict[str, str | int]:

@@ -26,11 +26,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
+from fixtures.outdoors import outdoor_capture, photograph
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
-from gsplat_edu.data.outdoors import outdoor_capture, photograph
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.remedies import remedies_for

@@ -6,7 +6,8 @@ main branch itself it is HEAD's first parent, so uncommitted work there is teste
 GSPLAT_EDU_BASE names another base.
 
 - A changed test file is touched. A changed conftest.py touches the tests of its folder, and so do data beside tests.
-- A helper of tests touches the test files that import it, also through other helpers.
+- A helper of tests (one of tests/fixtures, say) touches the test files and benchmarks that import it, also through
+  other helpers.
 - src/gsplat_edu/PACKAGE touches tests/PACKAGE, tests/test_PACKAGE.py and what ELSEWHERE names.
 - A module of a package without a folder of tests (base, scene, ops, photos) touches tests/test_MODULE.py and the test
   files that import it. If at most FEW packages import it, or no test does, the tests of these packages are touched as
@@ -127,8 +128,13 @@ def module_name(root: Path, path: Path) -> str:
 
 
 def users(root: Path, module: str, seen: frozenset[str] = frozenset()) -> set[Path]:
-    """Return the test files that import a module, also through helpers and through the conftest.py of their folder."""
+    """Return the test files that import a module, also through helpers and through the conftest.py of their folder.
+
+    Of a helper of tests, also the benchmarks that import it.
+    """
     found: set[Path] = set()
+    if not module.startswith("gsplat_edu"):
+        found |= {path for path in (root / "benchmarks").glob("*.py") if imports(path, module)}
     for path in (root / "tests").rglob("*.py"):
         if path == root / "tests" / "conftest.py" or not imports(path, module):
             continue
@@ -202,4 +208,5 @@ def tests_of(root: Path, changed: Iterable[str]) -> set[str]:
             names.add(f"[{path.stem}]")
         if path.parts[0] == "benchmarks":
             names.add(f"[{'/'.join(path.parts[:2])}]")
-    return {path.relative_to(root).as_posix() for path in found if path.is_file()} | names
+    files = {path.relative_to(root).as_posix() for path in found if path.is_file()}
+    return {f"[{name}]" if name.startswith("benchmarks/") else name for name in files} | names

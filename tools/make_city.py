@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 from pathlib import Path
 
-from gsplat_edu.data.city import City, write_city
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+
+from fixtures.city import City, write_city
 
 
 def main() -> None:

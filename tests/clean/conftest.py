@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from fixtures.plant import floaters
 from gsplat_edu.base.constants import C0
-from gsplat_edu.clean.plant import floaters
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import gsplat_edu.cli.main as command_line
+from fixtures.plant import floaters
 from gsplat_edu.base.constants import C0
-from gsplat_edu.clean.plant import floaters
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap

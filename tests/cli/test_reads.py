@@ -4,9 +4,9 @@ from collections import Counter
 
 import pytest
 
+from fixtures.city import City, write_city
 from gsplat_edu.cli.main import main
 from gsplat_edu.data import images, reader
-from gsplat_edu.data.city import City, write_city
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs import pilot

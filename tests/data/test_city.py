@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsplat_edu.data.city import City, write_city
+from fixtures.city import City, write_city
 from gsplat_edu.data.dataset import load_dataset
 
 SMALL = City(photos=9, width=48, street=0.25, points=30, seed=3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsplat_edu.data.outdoors import outdoor_capture, photograph, sky_colors
+from fixtures.outdoors import outdoor_capture, photograph, sky_colors
 
 
 @pytest.fixture(scope="module")

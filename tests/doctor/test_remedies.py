@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from doctor.rooms import replaced, room, with_photo
-from gsplat_edu.data.outdoors import outdoor_capture
+from fixtures.outdoors import outdoor_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.doctor.remedies import remedies_for, transients_for

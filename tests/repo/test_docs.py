@@ -109,7 +109,59 @@ def test_the_architecture_is_short():
     assert len(lines) <= 130 and max(map(len, lines)) <= 160
 
 
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("conformance/*.md")])
+def longest_line(text):
+    """Return the length of the longest line that is no table row."""
+    return max(len(line) for line in text.splitlines() if not line.startswith("|"))
+
+
+def test_the_results_are_short_and_every_table_has_its_machine_and_date():
+    text = (ROOT / "benchmarks" / "RESULTS.md").read_text()
+    assert text.count("\n") <= 160 and longest_line(text) <= 160
+    sections = text.split("\n## ")[1:]
+    assert len(sections) > 5
+    for section in sections:
+        title = section.splitlines()[0]
+        assert "\n|---|" in section, title
+        assert re.search(r"\b(EPYC|Xeon)\b", section) and "2026-" in section, title
+
+
+def test_every_benchmark_is_named_in_the_results():
+    """Modules that benchmarks import measure nothing."""
+    folder = ROOT / "benchmarks"
+    results = (folder / "RESULTS.md").read_text() + "".join(
+        p.read_text() for p in folder.glob("archive/*.md")
+    )
+    scripts = [path for path in folder.glob("*.py") if 'if __name__ == "__main__":' in path.read_text()]
+    scripts += [path.parent for path in folder.glob("*/__main__.py")]
+    assert len(scripts) > 20
+    for path in scripts:
+        assert re.search(rf"benchmarks/{re.escape(path.name)}(?![\w/])", results), path.name
+
+
+def test_the_changelog_is_short():
+    text = (ROOT / "CHANGELOG.md").read_text()
+    assert text.count("\n") <= 40 and longest_line(text) <= 160
+
+
+def test_sections_that_documents_name_are_in_the_results():
+    """As in: "Glare" in RESULTS.md, or: section "Glare" of [RESULTS.md](...)."""
+    headings = re.findall(r"^## ([^(\n]+?)(?: \(|$)", (ROOT / "benchmarks" / "RESULTS.md").read_text(), re.M)
+    named = set()
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]:
+        text = " ".join(path.read_text().split())
+        named |= set(re.findall(r'"([\w ]+)" (?:in|of) \[?(?:benchmarks/)?RESULTS\.md', text))
+    assert len(named) > 5
+    assert named <= set(headings)
+
+
+DOCUMENTS = sorted(
+    [
+        *ROOT.glob("*.md"),
+        *ROOT.glob("docs/**/*.md"),
+        *ROOT.glob("conformance/*.md"),
+        *ROOT.glob("benchmarks/**/*.md"),
+    ]
+)
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

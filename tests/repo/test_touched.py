@@ -109,6 +109,10 @@ def project(tmp_path):
         tests__helper="",
         tests__fixtures="",
         tests__conftest="import helper\n",
+        tests__made__city="from made.paint import x\n",
+        tests__made__paint="",
+        tests__p2__test_e="from made.city import x\n",
+        benchmarks__blocks="from made.city import x\n",
     )
     return tmp_path
 
@@ -120,8 +124,9 @@ def project(tmp_path):
         ("tests/helper.py", ["tests/p0/test_a.py", "tests/p1/test_b.py"]),
         ("tests/p1/near.py", ["tests/p1/test_b.py"]),
         ("tests/p1/data/x.bin", ["tests/p1/test_b.py", "tests/p1/test_c.py"]),
-        ("tests/p2/conftest.py", ["tests/p2/test_d.py"]),
-        ("tests/fixtures.py", ["tests/p2/test_d.py"]),
+        ("tests/p2/conftest.py", ["tests/p2/test_d.py", "tests/p2/test_e.py"]),
+        ("tests/fixtures.py", ["tests/p2/test_d.py", "tests/p2/test_e.py"]),
+        ("tests/made/paint.py", ["[benchmarks/blocks.py]", "tests/p2/test_e.py"]),
         ("tests/conftest.py", []),
         ("src/gsplat_edu/p1/m.py", ["tests/p1/test_b.py", "tests/p1/test_c.py"]),
         ("src/gsplat_edu/ruler.py", ["tests/p0/test_a.py", "tests/test_ruler.py"]),

@@ -24,6 +24,7 @@ import nanobind
 import pytest
 
 import gsplat_edu._native
+import touched
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -178,6 +179,28 @@ def test_a_wheel_has_every_file_of_the_package(wheel):
     assert {n for n in names if n.startswith("gsplat_edu/")} == wanted | {
         f"gsplat_edu/{Path(gsplat_edu._native.__file__).name}"
     }
+
+
+def test_no_wheel_has_what_only_tests_and_benchmarks_use(wheel):
+    names = {Path(name).name for name in zipfile.ZipFile(wheel).namelist()}
+    fixtures = {path.name for path in (ROOT / "tests" / "fixtures").glob("*.py")} - {"__init__.py"}
+    assert {"city.py", "outdoors.py", "plant.py"} <= fixtures
+    assert not fixtures & names
+
+
+@pytest.mark.parametrize("room", ["data", "clean"])
+def test_users_need_every_module_of_a_room_that_once_held_fixtures(room):
+    """A module there is imported by the package, or shown by the course or the documents."""
+    package = ROOT / "src" / "gsplat_edu"
+    sources = list(package.rglob("*.py"))
+    shown = [*ROOT.glob("notebooks/source/*.py"), ROOT / "README.md", *ROOT.glob("docs/*.md")]
+    text = "".join(path.read_text() for path in shown if path.name != "MODULES.md")
+    modules = {path: f"gsplat_edu.{room}.{path.stem}" for path in (package / room).glob("*.py")}
+    del modules[package / room / "__init__.py"]
+    assert len(modules) > 3
+    for path, module in modules.items():
+        users = [source for source in sources if source != path and touched.imports(source, module)]
+        assert users or module in text, f"{module}: only tests use it; move it to tests/fixtures"
 
 
 def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):

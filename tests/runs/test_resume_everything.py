@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from fixtures.outdoors import outdoor_capture
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.arguments import OneLineParser
 from gsplat_edu.cli.options import train as command
-from gsplat_edu.data.outdoors import outdoor_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from doctor.rooms import room
-from gsplat_edu.data.outdoors import outdoor_capture, photograph, sky_colors
+from fixtures.outdoors import outdoor_capture, photograph, sky_colors
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sky.find import fibonacci, find_sky, scene_size
 

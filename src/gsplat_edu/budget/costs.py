@@ -1,7 +1,8 @@
 """Cost model of a training: memory and time for any number of Gaussians, pixels and iterations.
 
 Memory is the sum of everything held at the same time, added to the process's own; the constants were measured from
-outside on whole runs (benchmarks/RESULTS.md). Time is fitted to the steps measured by `gsplat_edu.budget.probe`.
+outside on whole runs (benchmarks/archive/RESULTS-2026-11.md). Time is fitted to the steps measured by
+`gsplat_edu.budget.probe`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ PER_PAIR = 75
 """Bytes per pair of Gaussian and tile: the pair, its gradient slot, a quarter for growth, and outgrown buffers."""
 
 TRAINED_PAIRS = 5
-"""Pairs per Gaussian in a trained scene; those in benchmarks/RESULTS.md have 3.4 to 5.0."""
+"""Pairs per Gaussian in a trained scene; those in benchmarks/archive/RESULTS-2026-11.md have 3.4 to 5.0."""
 
 PER_PIXEL = 180
 """Bytes per pixel during evaluation: float64 images and their differences. A training step takes fewer."""

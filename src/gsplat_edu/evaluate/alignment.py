@@ -5,7 +5,8 @@ misplaced. Its pose is therefore aligned on half of the photo, with the scene fi
 the alignment has not seen. If the training corrected exposures too, the colours are fitted with the pose.
 
 The halves are the light and the dark squares of a chessboard. A left half says little of some moves of the camera,
-which then spoil the right half: on a clean capture, aligned photos lost 0.4 dB there (benchmarks/RESULTS.md).
+which then spoil the right half: on a clean capture, aligned photos lost 0.4 dB there
+(benchmarks/archive/RESULTS-2026-11.md).
 """
 
 from __future__ import annotations

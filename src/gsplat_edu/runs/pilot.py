@@ -30,7 +30,8 @@ PILOT_STEPS, PILOT_CAP = 600, 10_000
 """Length and cap of a pilot."""
 
 CLEARLY = 0.3
-"""dB that refining more has to gain. Where nothing was wrong, pilots differed by less (benchmarks/RESULTS.md)."""
+"""dB that refining more has to gain. Where nothing was wrong, pilots differed by less
+(benchmarks/archive/RESULTS-2026-11.md)."""
 
 ORDER = ("none", "poses", "both")
 

@@ -48,7 +48,8 @@ NEWEST = 0.3
 
 
 SPREAD = 0.05
-"""Standard deviation of the k that are measured for photos of one vignetting (benchmarks/RESULTS.md)."""
+"""Standard deviation of the k that are measured for photos of one vignetting
+(benchmarks/archive/RESULTS-2026-11.md)."""
 
 
 class Exposure(Identity):

@@ -27,7 +27,8 @@ from gsplat_edu.train.feed import Draw, Target
 
 LEAST_SHARE = 0.25
 """A view that shows less than this share of the Gaussians weighs the opacity of those only. Views of one subject show
-a third and more of the start's Gaussians, those of an aerial capture of a city a tenth (benchmarks/RESULTS.md)."""
+a third and more of the start's Gaussians, those of an aerial capture of a city a tenth
+(benchmarks/archive/RESULTS-2026-11.md)."""
 
 OUTSIDE_WEIGHT = 0.3
 """Weight of the mean alpha outside the masks of an object. 0.1 leaves 1.4 times the alpha outside, 3 costs 1.3 dB
