@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 
@@ -46,6 +47,8 @@ class Backend:
         add_noise: Moves means at random along their covariances, in place.
         recolored: Applies a matrix of colours to an image, differentiably.
         lacks: Names of `FEATURES` that it does not offer.
+        stepper: Makes a `gsplat_edu.train.stepper.Stepper` that keeps a whole run on the device, from the arguments of
+            `TensorStepper`; None to step on torch's tensors with the kernels above.
     """
 
     name: str
@@ -56,6 +59,7 @@ class Backend:
     add_noise: NoiseKernel
     recolored: RecolorKernel
     lacks: frozenset[str] = field(default_factory=frozenset)
+    stepper: Callable[..., Any] | None = None
 
     def require(self, feature: str, what: str) -> None:
         """Check that the backend offers a feature.

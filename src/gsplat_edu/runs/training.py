@@ -436,7 +436,7 @@ class CaptureRun:
     def _record(self, trainer: Trainer, event: Event) -> None:
         if self._leads:
             self._log.record(event, self.elapsed)
-        if not len(trainer.gaussians):
+        if not trainer.stepper.count:
             raise ArgumentError(
                 f"iteration {trainer.iteration}: every Gaussian was pruned; lower --min-opacity or the learning rates"
             )

@@ -124,13 +124,35 @@ class Loaded(NamedTuple):
 class Stepper(Protocol):
     """Holds the Gaussians and what moves them, and takes steps.
 
+    The trainer asks for `count` after every step, and for `gaussians` only where something reads them: callbacks,
+    milestones, checkpoints and the end of a run.
+
     Attributes:
-        gaussians: The current Gaussians.
+        gaussians: The current Gaussians; a stepper on a device reads them back.
+        count: Their number.
         shown: The last image that was compared; None before the first step.
+        objective: What is minimised.
+        parts: The other parts of a step.
+        places: The places of a batch whose views this process renders.
     """
 
-    gaussians: Gaussians
-    shown: Shown | None
+    @property
+    def gaussians(self) -> Gaussians: ...  # noqa: D102
+
+    @property
+    def count(self) -> int: ...  # noqa: D102
+
+    @property
+    def shown(self) -> Shown | None: ...  # noqa: D102
+
+    @property
+    def objective(self) -> Objective: ...  # noqa: D102
+
+    @property
+    def parts(self) -> StepParts: ...  # noqa: D102
+
+    @property
+    def places(self) -> range: ...  # noqa: D102
 
     def step(self, views: Iterable[StepView], iteration: int) -> Terms:
         """Take one step with the gradients of these views, each drawn when the one before it is done.
@@ -205,6 +227,11 @@ class TensorStepper:
             if not self._density_reads_output_only:
                 raise ArgumentError("density: observes more than renders; train it in one process")
         self.optimizer = self._make_optimizer(self.parameters())
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.gaussians)
 
     @property
     def fuses(self) -> bool:

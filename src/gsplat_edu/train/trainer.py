@@ -30,7 +30,7 @@ from gsplat_edu.train.optimizer import MOMENTS
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
 from gsplat_edu.train.stepper import StepParts as StepParts
-from gsplat_edu.train.stepper import StepView, TensorStepper
+from gsplat_edu.train.stepper import Stepper, StepView, TensorStepper
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import ViewModel
 
@@ -116,7 +116,8 @@ class Trainer:
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, outside=empty)
         objective = parts.objective or make_objective(config, loss=backend.loss)
         groups = gaussian_groups(config, extent)
-        self.stepper = TensorStepper(gaussians, backend, groups, objective, density, parts, config.batch)
+        make: Callable[..., Stepper] = backend.stepper or TensorStepper
+        self.stepper = make(gaussians, backend, groups, objective, density, parts, config.batch)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
     @property
@@ -178,7 +179,7 @@ class Trainer:
             self.transients.find(self.gaussians, settings, self.view_model.camera, factor)
         terms = self.stepper.step(self._views(self._draw()), self.iteration)
         self.iteration += self.config.batch
-        return StepEvent(self.iteration - 1, terms[PHOTO], len(self.gaussians), terms, factor)
+        return StepEvent(self.iteration - 1, terms[PHOTO], self.stepper.count, terms, factor)
 
     def _draw(self) -> list[Draw]:
         """Return the views of the next step that this process renders. If a photo cannot be read, all remain due."""
