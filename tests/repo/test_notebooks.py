@@ -31,7 +31,8 @@ def top_level_names(text: str) -> set[str]:
             names.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names |= {n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)}
+            found = (n for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
+            names |= {n.id for n in found if isinstance(n.ctx, ast.Store)}
     return names
 
 

@@ -14,7 +14,7 @@ from gsplat_edu.studio.commands import (
     RENDER_OPTIONS,
     SFM_OPTIONS,
     TRAIN_OPTIONS,
-    rendered,
+    command_line,
     subject_of,
     title_of,
     work_of,
@@ -45,7 +45,7 @@ def library(tmp_path):
 
 def begun(library, request):
     """The command line of a request."""
-    return rendered(library, work_of(library, request), Purpose.BEGIN).argv
+    return command_line(library, work_of(library, request), Purpose.BEGIN).argv
 
 
 def parsed(argv):
@@ -100,8 +100,8 @@ REQUESTS = (
 def test_work_makes_the_same_command_for_every_purpose(library, request_, title, subject):
     work = work_of(library, request_)
     assert (title_of(work), subject_of(work)) == (title, subject)
-    assert {rendered(library, work, purpose).argv for purpose in Purpose} == {begun(library, request_)}
-    assert {rendered(library, work, purpose).work == work for purpose in Purpose} == {True}
+    assert {command_line(library, work, purpose).argv for purpose in Purpose} == {begun(library, request_)}
+    assert {command_line(library, work, purpose).work == work for purpose in Purpose} == {True}
 
 
 def test_inputs_and_outputs_are_entries_and_files_of_the_library(library):
@@ -121,26 +121,26 @@ def test_inputs_and_outputs_are_entries_and_files_of_the_library(library):
 
 def test_a_training_resumes_once_its_run_has_begun(library):
     work = work_of(library, {"command": "train", "subject": "captures/a"})
-    argv = rendered(library, work, Purpose.BEGIN).argv
+    argv = command_line(library, work, Purpose.BEGIN).argv
     out = library.root / "runs" / "a-2"
     out.mkdir()
-    assert rendered(library, work, Purpose.CONTINUE).argv == argv
+    assert command_line(library, work, Purpose.CONTINUE).argv == argv
     (out / "config.json").touch()
-    resumed = rendered(library, work, Purpose.CONTINUE)
+    resumed = command_line(library, work, Purpose.CONTINUE)
     assert resumed.argv == (*argv, "--resume")
-    assert {rendered(library, resumed.work, purpose) == resumed for purpose in Purpose} == {True}
+    assert {command_line(library, resumed.work, purpose) == resumed for purpose in Purpose} == {True}
     with pytest.raises(RefusedError, match="exists already"):
-        rendered(library, work, Purpose.BEGIN)
+        command_line(library, work, Purpose.BEGIN)
 
 
 def test_what_is_gone_can_be_shown_but_not_started(library):
     work = work_of(library, {"command": "train", "subject": "captures/a"})
-    argv = rendered(library, work, Purpose.BEGIN).argv
+    argv = command_line(library, work, Purpose.BEGIN).argv
     (library.root / "captures" / "a").rmdir()
-    assert rendered(library, work, Purpose.SHOW).argv == argv
+    assert command_line(library, work, Purpose.SHOW).argv == argv
     for purpose in (Purpose.BEGIN, Purpose.CONTINUE):
         with pytest.raises(RefusedError, match="captures/a: does not exist"):
-            rendered(library, work, purpose)
+            command_line(library, work, purpose)
 
 
 def test_work_follows_a_rename(library):
@@ -286,7 +286,7 @@ def test_other_requests_are_refused_in_one_line(library, request_):
 def test_a_record_names_no_other_place_than_a_request_could(library, work, purpose):
     (library.root / "scenes" / "a" / "edits.json").touch()
     with pytest.raises(RefusedError) as caught:
-        rendered(library, work, purpose)
+        command_line(library, work, purpose)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 
 

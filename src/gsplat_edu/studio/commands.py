@@ -1,6 +1,6 @@
 """Requests become work, and work becomes a command line: a checked subset of each command's options.
 
-`rendered` is the only way to a command line, for work from a request as for work from a record on disk.
+`command_line` is the only way to a command line, for work from a request as for work from a record on disk.
 """
 
 from __future__ import annotations
@@ -378,7 +378,7 @@ COMMANDS: Mapping[str, _Command] = {
 
 
 def work_of(library: Library, request: Mapping[str, Any]) -> Work:
-    """Turn a request into work; `rendered` checks the rest of it.
+    """Turn a request into work; `command_line` checks the rest of it.
 
     Args:
         library: Where the entries are.
@@ -416,7 +416,7 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
     return Work(str(name), inputs, outputs, options)
 
 
-def rendered(library: Library, work: Work, purpose: Purpose) -> Rendered:
+def command_line(library: Library, work: Work, purpose: Purpose) -> Rendered:
     """Validate work and render its command line, whose paths all lie in the library or in what it has adopted.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 from gsplat_edu.jobs.following import last_stage
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job, State, Work
-from gsplat_edu.studio.commands import rendered, title_of, work_of
+from gsplat_edu.studio.commands import command_line, title_of, work_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.painter import Painter
 from gsplat_edu.studio.refusal import conflict
@@ -46,7 +46,7 @@ class Studio:
         jobs = self.library.hidden("jobs")
         self.queue = JobQueue(
             jobs,
-            lambda work, purpose: rendered(self.library, work, purpose),
+            lambda work, purpose: command_line(self.library, work, purpose),
             at_once,
             self.stream.changed,
             hold=self._hold,
