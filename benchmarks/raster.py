@@ -37,7 +37,10 @@ def round_gaussians(count: int, size: int) -> dict[str, torch.Tensor]:
         "colors": rng.uniform(0, 1, (count, 3)),
         "opacities": rng.uniform(0.1, 0.99, count),
     }
-    return {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
+    parameters = {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
+    return parameters | {
+        "cov3ds": torch.tensor(arrays["cov3ds"])
+    }  # the kernels take covariances in double only
 
 
 class Room(NamedTuple):

@@ -86,7 +86,9 @@ def test_a_plan_is_read_as_it_was_written(tmp_path):
     assert BlockPlan.read(tmp_path).digest() == plan.digest()
     assert dataclasses.replace(plan, capture="elsewhere").digest() == plan.digest()
     assert dataclasses.replace(plan, origin=(1.0, 2.0, 4.0)).digest() != plan.digest()
-    with pytest.raises(CheckpointError, match=r"has no plan\.json; make one with"):
+    with pytest.raises(
+        CheckpointError, match=r"has no plan\.json; `train CAPTURE .* --until split` makes it"
+    ):
         BlockPlan.read(tmp_path / "nothing")
     (tmp_path / PLAN).write_text('{"area": 3}')
     with pytest.raises(CheckpointError, match="is damaged"):

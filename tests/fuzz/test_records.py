@@ -4,6 +4,7 @@ Whatever is read keeps what the readers promise: command lines of jobs name plac
 and records of blocks and stages name files in their folder only.
 """
 
+import functools
 import json
 import random
 from pathlib import Path
@@ -22,10 +23,10 @@ from gsplat_edu.blocks.task import block_options
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.jobs.events import Progress, line_of, parse_line
-from gsplat_edu.jobs.record import JobFolder, Purpose
+from gsplat_edu.jobs.record import Job, JobFolder, State, Work
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.sfm.stages import Stages
-from gsplat_edu.studio.commands import work_of
+from gsplat_edu.studio.commands import command_line
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.unpack import ZipLimits, unpack
 from gsplat_edu.train.config import recipe
@@ -60,28 +61,18 @@ def test_damaged_jobs(tmp_path):
     (library.root / "captures" / "toy").mkdir()
     folder = JobFolder(library.root / ".studio" / "jobs" / "000001")
     folder.path.mkdir(parents=True)
-    request = {
-        "command": "train",
-        "subject": "captures/toy",
-        "to": "toy",
-        "options": {"iterations": 30, "scale": "x"},
-    }
-    whole = {"version": 2, "id": "000001", "request": request, "state": "queued", "created": 1.0}
-    whole |= {"started": None, "ended": None, "attempts": 1, "pid": 77, "identity": "a", "line": ""}
-    folder.record.write_text(json.dumps(whole | {"outputs": ["a"], "cancelled": False}))
-
-    def rebuild(wanted, purpose):
-        return work_of(library, wanted, purpose)
-
-    assert folder.read(rebuild).work.argv[:2] == ("train", str(library.root / "captures" / "toy"))
+    work = Work("train", ("captures/toy",), ("runs/toy",), {"iterations": 30})
+    render = functools.partial(command_line, library)
+    job = Job("000001", work, (), State.QUEUED, 1.0, attempts=1, pid=77, identity="a")
+    folder.write(job)
+    assert folder.read(render).argv[:2] == ("train", str(library.root / "captures" / "toy"))
     read = 0
     for seed, data in each_damage(folder.record.read_bytes()):
         folder.record.write_bytes(data)
-        if refused(lambda: folder.read(rebuild)):
+        if refused(lambda: folder.read(render)):
             continue
         read += 1
-        argv = rebuild(folder.read(rebuild).work.request, Purpose.SHOW).argv
-        for word in argv:
+        for word in folder.read(render).argv:
             assert not word.startswith("/") or Path(word).is_relative_to(library.root), seed
             assert word not in ("--scheduler", "--workers", "--export", "--view"), seed
     assert read < RECORDS, "some are refused"

@@ -1,6 +1,7 @@
 """Every script runs to the end at a tiny size and gives readable results."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -57,7 +58,10 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-def run(*words, cwd=ROOT, env=None):
+def run(*words, cwd=ROOT):
+    """Run a command without the settings of the make that may run these tests."""
+    own = ("SHARD", "PART", "SMOKE", "BASE", "MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES")
+    env = {name: value for name, value in os.environ.items() if name not in own}
     return subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, check=False)
 
 
