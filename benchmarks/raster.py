@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from gsplat_edu import _native
-from gsplat_edu.base.constants import ALPHA_MAX, Z_NEAR
+from gsplat_edu.base.constants import ALPHA_MAX, DILATION, Z_NEAR
 
 SIZE, FOCAL, SIGMA, ROUNDS = 1024, 1000.0, 2.0, 7
 STAGES = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward")
@@ -89,6 +89,7 @@ def frame_seconds(
             background=[0.0] * 3,
             sh_degree=0,
             antialiased=False,
+            dilation=DILATION,
             alpha_max=ALPHA_MAX,
             pixel_stop=False,
         ),
