@@ -60,7 +60,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 def run(*words, cwd=ROOT):
     """Run a command without the settings of the make that may run these tests."""
-    own = ("SHARD", "PART", "SMOKE", "BASE", "MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES")
+    own = ("SHARD", "PART", "SMOKE", "BASE", "MAKEFLAGS", "MFLAGS", "GSPLAT_EDU_SHARD", "GSPLAT_EDU_BASE")
     env = {name: value for name, value in os.environ.items() if name not in own}
     return subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, check=False)
 
