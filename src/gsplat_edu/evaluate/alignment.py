@@ -79,8 +79,7 @@ def aligned_psnr(
     if not fitted.any() or not scored.any():
         return None
     fixed = gaussians.map(lambda tensor: tensor.detach())
-    device = fixed.means.device
-    target, mask = torch.from_numpy(truth).to(device), torch.from_numpy(fitted).to(device)
+    target, mask = torch.from_numpy(truth), torch.from_numpy(fitted)
 
     def shown(camera: Camera | CameraTensors) -> Tensor:
         output = render(fixed, camera)
@@ -94,7 +93,7 @@ def aligned_psnr(
     first, second = torch.zeros_like(twist), torch.zeros_like(twist)
     for step in range(STEPS):
         leaf = twist.clone().requires_grad_()
-        image = shown(start.moved(leaf * units))
+        image = shown(start.moved(leaf * units)).cpu()  # compared by the native loss, whatever rendered it
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
         adam_in_torch(twist, first, second, gradient, _numbers(step))
     with torch.no_grad():

@@ -154,7 +154,7 @@ class PhotoTerm:
 
     Args:
         ssim_weight: k, 0 to 1.
-        loss: Compares them; see `photo_loss`.
+        loss: Compares them; `Backend.loss` of the backend that renders. The native loss if None.
     """
 
     ssim_weight: float
