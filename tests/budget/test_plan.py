@@ -21,11 +21,10 @@ from gsplat_edu.budget.costs import (
     wanted_gaussians,
 )
 from gsplat_edu.budget.deadline import Deadline
-from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Request, choose, flags, plan, taken_up
 from gsplat_edu.budget.probe import resident_bytes
 from gsplat_edu.cli.arguments import bytes_text, seconds_text
-from gsplat_edu.cli.main import build_parser, main
+from gsplat_edu.cli.main import build_parser
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
@@ -35,7 +34,6 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.initialize import random_ball
 
 MIB = 2**20
@@ -347,75 +345,14 @@ def test_a_damaged_config_is_one_line(capture, tmp_path, stored, named):
     assert named in str(refused.value) and "\n" not in str(refused.value)
 
 
-class Clock:
-    """A clock on which every iteration takes ten seconds, on any machine."""
-
-    def __init__(self, before=0.0):
-        self.iteration, self.before = 0, before
-
-    def __call__(self, trainer=None, event=None):
-        if isinstance(event, StepEvent):
-            self.iteration = trainer.iteration
-        return self.before + 10.0 * self.iteration
-
-
-def paced(run, limit, clock, **settings):
-    pace = Pace(run, Deadline(limit, clock), **settings)
-    return trained(run, [clock, pace], pace.over), pace.outcome
-
-
-def test_training_ends_in_time_to_evaluate(capture, tmp_path):
-    """600 s minus the time before training and the reserve for evaluation: 2.5 s for the report and little more."""
-    run = CaptureRun(options(capture, tmp_path / "run", 100))
-    folder, outcome = paced(run, 600.0, Clock(before=100.0))
-    # It stops when less than 10 s plus the reserve are left. Evaluating 16 tiny views takes less than 30 s.
-    assert 46 <= folder.read_metrics()["iterations"] <= 50
-    assert folder.read_config()["train"]["iterations"] == 100 and outcome is None, "it can be resumed"
-
-
-def test_remaining_time_is_used_and_the_printed_options_repeat_the_run_exactly(capture, tmp_path):
-    run = CaptureRun(options(capture, tmp_path / "run", max_gaussians=400))
-    folder, outcome = paced(run, 600.0, Clock(), extend=True)
-    total = folder.read_metrics()["iterations"]
-    # 60 would fit without evaluation. Less than 2.5 % of the time, or less than one iteration, is left unused.
-    assert 50 <= total <= 59
-    stored = folder.read_config()["train"]
-    assert stored["iterations"] == total and stored["means_rate_iterations"] == 20, "milestones stay"
-    assert f"20 iterations were planned, {total} fitted" in outcome
-    words = outcome.split("to repeat the run: ")[1].split()
-    fixed = ["--strategy", "adc", "--save-every", "0", "--eval-every", "0"]
-    assert main(["train", str(capture), "--out", str(tmp_path / "again"), *fixed, *words]) == 0
-    scenes = [RunFolder(tmp_path / name).latest_scene()[0].read_bytes() for name in ("run", "again")]
-    assert scenes[0] == scenes[1]
-
-
-class SlowingClock(Clock):
-    """Each of the first 25 iterations takes ten seconds, every later one 40."""
-
-    def __call__(self, trainer=None, event=None):
-        return super().__call__(trainer, event) + 30.0 * max(self.iteration - 25, 0)
-
-
-def test_an_extended_run_that_is_cut_short_is_still_complete(capture, tmp_path):
-    """20 iterations take 200 s of 600. The extension that then seems to fit does not: the machine slows down."""
-    run = CaptureRun(options(capture, tmp_path / "run"))
-    folder, outcome = paced(run, 600.0, SlowingClock(), extend=True)
-    # 250 s for 25, then (600 - 250 - reserve) / 40 more, with a reserve of less than 40 s; the last may run over.
-    assert folder.read_metrics()["iterations"] == folder.read_config()["train"]["iterations"] in (33, 34)
-    assert "20 iterations were planned" in outcome
-    assert is_finished(dataclasses.replace(run.options, resume=True))
-
-
-def test_a_run_that_was_not_planned_is_not_extended(capture, tmp_path):
-    folder, outcome = paced(CaptureRun(options(capture, tmp_path / "run")), 600.0, Clock())
-    assert outcome is None and folder.read_metrics()["iterations"] == 20
-
-
 def test_flags_include_milestones_that_differ_from_the_recipe():
     config = dataclasses.replace(recipe(3_400), iterations=4_000)
     words = flags(dataclasses.replace(OPTIONS, config=config))
     assert words.startswith("--iterations 4000 --means-rate-iterations 3400 ")
     assert flags(dataclasses.replace(OPTIONS, config=recipe(4_000))) == "--iterations 4000"
+    stretched = recipe(3_400).changed(iterations=4_000, tempo="3400,200:4000")
+    words = "--iterations 4000 --tempo 3400,200:4000"
+    assert flags(dataclasses.replace(OPTIONS, config=stretched)) == words, "the milestones are those of 3,400"
 
 
 RUN = """

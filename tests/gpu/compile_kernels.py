@@ -15,8 +15,7 @@ from pathlib import Path
 
 from triton.backends import nvidia
 from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
-from triton.compiler import compile as compiled
+from triton.compiler import ASTSource, compile as compiled
 
 from gsplat_edu.render.triton import adam, composite, intersect, loss, project
 

@@ -12,9 +12,10 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
@@ -54,6 +55,10 @@ PICTURE_BYTES = 250_000
 
 LATER = 150 * 2**20
 """Growth of the process once it trains and evaluates, bytes, for any scene: code, threads, allocator arenas."""
+
+
+Amount = TypeVar("Amount", float, np.ndarray)
+"""A number, or one for each iteration."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +129,8 @@ class Speed:
     per_pixel: float
     per_gaussian: float
 
-    def seconds(self, gaussians: float, pixels: float) -> float:
-        """Return the seconds of an iteration."""
+    def seconds(self, gaussians: Amount, pixels: Amount) -> Amount:
+        """Return the seconds of an iteration, or of several for arrays."""
         return self.fixed + self.per_pixel * pixels + self.per_gaussian * gaussians
 
     @classmethod
@@ -203,6 +208,19 @@ def pixel_share(config: TrainConfig) -> float:
     """Return the mean over the iterations, or over a thousand of them, of the fraction of pixels that are rendered."""
     some = range(0, config.iterations, max(config.iterations // 1_000, 1))
     return float(np.mean([photo_factor(config, iteration) ** -2 for iteration in some]))
+
+
+def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.ndarray, " iterations"]:
+    """Return the expected seconds of every iteration.
+
+    Args:
+        config: The run, with the schedule of its recipe.
+        facts: The capture at training size.
+        speed: This machine's.
+    """
+    counts = expected_counts(config, facts.points, facts.pixels)
+    factors = np.array([photo_factor(config, iteration) for iteration in range(config.iterations)])
+    return np.array(speed.seconds(counts.astype(np.float64), facts.pixels / factors**2))
 
 
 def reduced_bytes(config: TrainConfig, facts: Facts) -> int:

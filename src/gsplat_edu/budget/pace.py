@@ -1,4 +1,4 @@
-"""Keep a run within its time limit: stop it in time, or extend it if time is left."""
+"""Use a time limit: measure the speed while training, and stretch or shrink what is left of the schedule."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import dataclasses
 import statistics
 from collections import deque
 from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float64
 
 from gsplat_edu.budget.costs import Facts
 from gsplat_edu.budget.deadline import Deadline
@@ -21,31 +24,41 @@ REMEASURE_AT = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Fractions of the time limit at which the cost of the final evaluation is measured again, by scoring one view. The
 median of the last three measurements counts, so that one disturbed by another program does not."""
 
-WINDOW = 200
-"""Number of recent iterations from which the current speed is computed."""
+DECIDE_EVERY = 0.02
+"""Fraction of the time limit between two decisions about the rest of the schedule."""
 
-CAREFUL = 0.97
-"""Fraction of the remaining time that an extension plans to use."""
+WINDOW = 0.05
+"""Fraction of the time limit over which the current speed is measured; at least `LEAST_STEPS` iterations."""
+
+LEAST_STEPS = 10
+
+DEAD_BAND = 0.01
+"""A decision changes the schedule only if the remaining iterations differ by more than this fraction."""
+
+CAREFUL = 0.985
+"""Fraction of the remaining time that a decision plans to use."""
 
 MARGIN = 1.3
 """Factor on the estimated time after training, since the views that are not measured may take longer, and the process
 takes a moment to exit. Without it, a quiet but slow machine exceeded a limit of two minutes by 0.2 s."""
 
-LEFT_OVER = 0.025
-"""Do not extend if less than this fraction of the limit is left."""
+WORTH_SAYING = 0.2
+"""Tell the user about a change of the number of iterations by more than this fraction."""
 
 
 class Pace:
-    """Keeps a run within a time limit, from the start of the command to its end.
+    """Keeps a run within a time limit, from the start of the command to its end, and uses the time.
 
-    It is a callback of the trainer, which calls `over` after every iteration. With `extend`, a run that reaches its
-    last iteration early continues at its current learning rates; no milestone moves. The new number of iterations is
-    written to config.json, so that the run can be repeated like any other.
+    It is a callback of the trainer, which calls `over` after every iteration. With `profile`, the number of iterations
+    follows the machine: at regular times, the rest of the schedule is stretched or shrunk to what still fits (see
+    `gsplat_edu.train.tempo.Tempo`). Each such decision is written to config.json before the iteration that it concerns,
+    so that a resumed or repeated run takes the same steps.
 
     Args:
         run: The run, with its dataset loaded.
-        deadline: The limit and its clock.
-        extend: Whether the iterations were chosen for the limit, see `gsplat_edu.budget.plan.Plan.by_time`.
+        deadline: The limit and its clock, which also times the evaluation.
+        profile: Expected seconds of each iteration of the recipe, of which only ratios count; None to keep the
+            schedule.
         say: Called with sentences for the user.
     """
 
@@ -54,78 +67,123 @@ class Pace:
         run: CaptureRun,
         deadline: Deadline,
         *,
-        extend: bool = False,
+        profile: Float64[np.ndarray, " iterations"] | None = None,
         say: Callable[[str], None] = lambda sentence: None,
     ) -> None:
-        self._run, self._deadline, self._extend, self._say = run, deadline, extend, say
+        self._run, self._deadline, self._say = run, deadline, say
         self._facts = Facts.of(run.dataset)
+        self._profile = profile
         self._due = [part * deadline.seconds for part in REMEASURE_AT]
-        self._costs = deque[tuple[float, float]](maxlen=3)
-        self._marks = deque[tuple[int, float]](maxlen=WINDOW)
-        self._reserve = 0.0
-        self._planned: int | None = None
+        self._next_decision = 0.0
+        self._costs = deque[tuple[float, float, float]](maxlen=3)
+        self._marks = deque(
+            [(0.0, 0.0, deadline.spent)]
+        )  # after each step: seconds by the model, of steps, spent
+        self._last = deadline.spent
+        self._aside = 0.0  # seconds between steps: density, evaluations, checkpoints
+        self._planned = self._told = run.options.config.iterations
 
     def over(self) -> bool:
         """Return whether training has to end now."""
-        late = self._deadline.left <= self._reserve
-        if late and self._planned is not None:
-            # The planned iterations are done, so the run is complete at this iteration.
-            self._settle(self._run.trainer.iteration)
+        now = self._deadline.spent
+        self._aside, self._last = self._aside + now - self._last, now
+        late = self._deadline.seconds - now <= self._reserve
+        if late and self._profile is not None:
+            # The schedule follows the time, so the run is complete at this iteration.
+            self._settle(self._run.trainer.iteration, self._run.options.config.tempo)
         return late
 
     @property
     def outcome(self) -> str | None:
         """How the finished run deviates from the plan; None if it does not."""
-        if self._planned is None:
-            return None
         options = self._run.options
+        if self._profile is None or options.config.iterations == self._planned:
+            return None
         return (
             f"{self._planned} iterations were planned, {options.config.iterations} fitted; "
             f"to repeat the run: {flags(options)}"
         )
 
     def __call__(self, trainer: Trainer, event: Event) -> None:
-        """Record a step, measure again if due, and extend the run if it ends early."""
+        """Record a step, measure the evaluation again if due, and fit the rest of the schedule to the time."""
         if not isinstance(event, StepEvent):
             return
         now = self._deadline.spent
-        self._marks.append((trainer.iteration, now))
+        self._mark(trainer, now)
         if self._due and now >= self._due[0]:
             self._due = [moment for moment in self._due if moment > now]
             self._measure(trainer)
-        if self._extend and trainer.iteration == trainer.config.iterations:
-            self._lengthen(trainer)
+        at_end = trainer.iteration >= trainer.config.iterations
+        if self._profile is not None and (now >= self._next_decision or at_end):
+            self._next_decision = now + DECIDE_EVERY * self._deadline.seconds
+            self._decide(trainer, self._profile)
+        self._last = self._deadline.spent
+
+    def _mark(self, trainer: Trainer, now: float) -> None:
+        """Remember how long the step took, and how long the model says."""
+        expected = 1.0
+        if self._profile is not None:
+            position = trainer.tempo.position(trainer.iteration - trainer.config.batch)
+            expected = float(self._profile[min(position, len(self._profile) - 1)])
+        modelled, stepped, _ = self._marks[-1]
+        batch = trainer.config.batch
+        self._marks.append((modelled + expected * batch, stepped + now - self._last, now))
+        window = WINDOW * self._deadline.seconds
+        while len(self._marks) > LEAST_STEPS + 1 and self._marks[1][2] < now - window:
+            self._marks.popleft()
+
+    @property
+    def _slowness(self) -> float:
+        """Measured over modelled time of the steps in the window; 1 before the first step."""
+        (modelled, stepped, _), (last, now, _) = self._marks[0], self._marks[-1]
+        return (now - stepped) / (last - modelled) if last > modelled and now > stepped else 1.0
+
+    @property
+    def _reserve(self) -> float:
+        """Seconds to keep for the end of the run, at the current speed."""
+        if not self._costs:
+            return 0.0
+        score, picture, slowness = (statistics.median(parts) for parts in zip(*self._costs, strict=True))
+        trainer = self._run.trainer
+        count, degree = trainer.stepper.count, trainer.config.sh_degree
+        ending = ending_seconds(self._facts, score, picture) + 2 * saving_seconds(count, degree)
+        slower = self._slowness / slowness if self._profile is not None else 1.0
+        return MARGIN * ending * max(slower, 1.0)
 
     def _measure(self, trainer: Trainer) -> None:
-        """Score a view and update the time reserved for the end of the run."""
+        """Score a view, which tells what the end of the run takes."""
         dataset, options = self._run.dataset, self._run.options
         view = (dataset.test or dataset.train)[0]
-        self._costs.append(judging_seconds(trainer.gaussians, [view], options.config, options.backend))
-        score, picture = (statistics.median(parts) for parts in zip(*self._costs, strict=True))
-        count, degree = len(trainer.gaussians), options.config.sh_degree
-        ending = ending_seconds(self._facts, score, picture) + 2 * saving_seconds(count, degree)
-        self._reserve = MARGIN * ending
+        clock = self._deadline.clock
+        found = judging_seconds(trainer.gaussians, [view], options.config, options.backend, clock)
+        self._costs.append((*found, self._slowness))
 
-    def _lengthen(self, trainer: Trainer) -> None:
-        (first, then), (done, now) = self._marks[0], self._marks[-1]
-        self._measure(trainer)
-        left = self._deadline.left - self._reserve
-        if done == first or left < LEFT_OVER * self._deadline.seconds:
+    def _decide(self, trainer: Trainer, profile: Float64[np.ndarray, " iterations"]) -> None:
+        """Change the number of iterations to what fits, if it differs enough."""
+        done, config, tempo = trainer.iteration, trainer.config, trainer.tempo
+        if len(self._marks) <= LEAST_STEPS:
             return
-        total = min(done + int(CAREFUL * left * (done - first) / (now - then)), RECIPE_ITERATIONS)
-        total -= total % trainer.config.batch
-        if total <= done:
+        rest = profile[min(tempo.position(done), len(profile) - 1) :]
+        share_of_steps = self._marks[-1][1] / (self._marks[-1][1] + self._aside)
+        left = CAREFUL * (self._deadline.left - self._reserve) * share_of_steps
+        fitting = min(int(left / (self._slowness * float(rest.mean()))), RECIPE_ITERATIONS - done)
+        fitting -= fitting % config.batch
+        remaining = config.iterations - done
+        if fitting < config.batch or abs(fitting - remaining) <= DEAD_BAND * max(fitting, remaining):
             return
-        self._planned = self._planned or done
-        self._settle(total)
-        self._say(f"iteration {done}: there is time for {total - done} more")
+        total = done + fitting
+        self._settle(total, str(tempo.changed(done, total)))
+        if abs(total - self._told) > WORTH_SAYING * self._told:
+            self._say(f"iteration {done}: the time is enough for {total} iterations, instead of {self._told}")
+            self._told = total
 
-    def _settle(self, iterations: int) -> None:
-        """Set the number of iterations here and in config.json; no milestone moves."""
+    def _settle(self, iterations: int, tempo: str) -> None:
+        """Set the number of iterations and the tempo here and in config.json."""
         run = self._run
-        if run.options.config.iterations == iterations:
+        if (run.options.config.iterations, run.options.config.tempo) == (iterations, tempo):
             return
-        config = dataclasses.replace(run.options.config, iterations=iterations)
+        config = dataclasses.replace(run.options.config, iterations=iterations, tempo=tempo)
         run.trainer.config, run.options = config, dataclasses.replace(run.options, config=config)
         stored = run.folder.read_config()
-        run.folder.write_config(stored | {"train": {**stored["train"], "iterations": iterations}})
+        changed = {"iterations": iterations, "tempo": tempo}
+        run.folder.write_config(stored | {"train": {**stored["train"], **changed}})

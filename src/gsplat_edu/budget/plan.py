@@ -13,9 +13,20 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float64
+
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.text import spelled_seconds
-from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, reduced_bytes, wanted_gaussians
+from gsplat_edu.budget.costs import (
+    LATER,
+    Facts,
+    Footprint,
+    Measurements,
+    reduced_bytes,
+    step_profile,
+    wanted_gaussians,
+)
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import probe, resident_bytes
@@ -26,7 +37,7 @@ from gsplat_edu.runs.start import scene_start
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
 
-PLANNED = ("iterations", *MILESTONES, "densify_every", "max_gaussians", "resolution", "image_memory")
+PLANNED = ("iterations", "tempo", *MILESTONES, "densify_every", "max_gaussians", "resolution", "image_memory")
 """Settings that a plan may choose; `given` lists those that the user set."""
 
 FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
@@ -53,8 +64,8 @@ WORTHWHILE_ITERATIONS = 1_500
 
 WORTHWHILE_PIXELS = 100_000
 
-TIME_SHARE = 0.9
-"""Fraction of the time limit for which the schedule is planned; the rest extends the end of the schedule."""
+TIME_SHARE = 0.95
+"""Fraction of the time limit for which the schedule is planned; `gsplat_edu.budget.pace` fits it to the time later."""
 
 GUARD = 1.5
 """adc: the cap as a multiple of the expected number of Gaussians, so that a scene that grows more keeps the time."""
@@ -90,15 +101,17 @@ class Plan:
 
     Args:
         options: The run with the chosen values.
-        by_time: Whether the iterations were chosen; `gsplat_edu.budget.pace.Pace` then uses up the remaining time.
+        by_time: Whether the iterations were chosen; `gsplat_edu.budget.pace.Pace` then lets them follow the machine.
         forecast: Expected time and memory; None if nothing had to be chosen.
         sentences: Explanation for the user.
+        profile: Expected seconds of every iteration if `by_time`.
     """
 
     options: RunOptions
     by_time: bool = False
     forecast: Forecast | None = None
     sentences: tuple[str, ...] = ()
+    profile: Float64[np.ndarray, " iterations"] | None = dataclasses.field(default=None, compare=False)
 
     @property
     def resolution(self) -> float | None:
@@ -288,7 +301,11 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     )
     options = dataclasses.replace(request.options, config=config, data_settings=settings)
     facts = request.facts.smaller(choice.factor)
-    found = Plan(options, request.by_time, _predicted(request, measured, choice, config))
+    profile = None
+    if request.by_time:
+        profile = step_profile(config, request.facts.smaller(choice.factor), measured.speed)
+    forecast = _predicted(request, measured, choice, config)
+    found = Plan(options, request.by_time, forecast, profile=profile)
     at_cap = Footprint(
         facts, process + reduced_bytes(config, facts), pairs, config.sh_degree, config.batch
     ).peak(found.max_gaussians or 0, found.image_memory)
@@ -419,13 +436,17 @@ def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = Fa
         words.append(f"--max-gaussians {config.max_gaussians}")
     if "iterations" not in given:
         words.append(f"--iterations {config.iterations}")
-        chosen, scaled = config.flat(), recipe(config.iterations, strategy=config.strategy).flat()
+        chosen, scaled = (
+            config.flat(),
+            recipe(config.iterations, strategy=config.strategy, tempo=config.tempo).flat(),
+        )
         idle = {name for key, names in ONLY_FOR.items() if key != config.strategy for name in names}
         words += [
             f"--{name.replace('_', '-')} {chosen[name]}"
             for name in MILESTONES
             if name not in {*given, *idle} and chosen[name] != scaled[name]
         ]
+        words += [f"--tempo {config.tempo}"] if config.tempo else []
     return " ".join(words)
 
 

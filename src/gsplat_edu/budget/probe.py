@@ -235,7 +235,11 @@ def _halved(view: View) -> View:
 
 
 def judging_seconds(
-    gaussians: Gaussians, views: Sequence[View], config: TrainConfig, backend: str
+    gaussians: Gaussians,
+    views: Sequence[View],
+    config: TrainConfig,
+    backend: str,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> tuple[float, float]:
     """Time the scoring of views at the end of a run.
 
@@ -244,6 +248,7 @@ def judging_seconds(
         views: Views to score, at least one; the fastest counts.
         config: Rendering settings.
         backend: Name of the rendering backend.
+        clock: Returns seconds.
 
     Returns:
         Seconds per pixel to score a view, and to write the pictures of a test view.
@@ -260,17 +265,17 @@ def judging_seconds(
     drawing = list[float]()
 
     def draw(view: View, score: ImageScore, image: Bytes, truth: Bytes) -> None:
-        began = time.perf_counter()
+        began = clock()
         with tempfile.TemporaryDirectory() as folder:
             save_png(Path(folder) / "probe.png", side_by_side([image, truth]))
         Picture.of(view.name, image, truth)
-        drawing.append((time.perf_counter() - began) / (view.camera.W * view.camera.H))
+        drawing.append((clock() - began) / (view.camera.W * view.camera.H))
 
     scoring = list[float]()
     for view in views:
-        began = time.perf_counter()
+        began = clock()
         score_views(placed, [view], renderer, config.background, draw)
-        scoring.append((time.perf_counter() - began) / (view.camera.W * view.camera.H))
+        scoring.append((clock() - began) / (view.camera.W * view.camera.H))
     if not drawing:  # masks exclude every pixel of these views
         return min(scoring), 0.0
     return max(min(scoring) - min(drawing), 0.0), min(drawing)

@@ -18,8 +18,7 @@ from jaxtyping import Float32
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.options.demo import CHAPTER, REDUCED
-from gsplat_edu.cli.options.demo import Budget as Budget
+from gsplat_edu.cli.options.demo import CHAPTER, REDUCED, Budget as Budget
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
 from gsplat_edu.io.ply import save_ply

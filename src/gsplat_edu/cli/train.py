@@ -137,8 +137,9 @@ def _run(
             capture = CaptureRun(options, say, photos_read(bar, interrupted), team, reader=reader)
         callbacks: list[Callback] = []
         ends = interrupted
+        pace = None
         if deadline is not None:
-            pace = Pace(capture, deadline, extend=chosen.by_time, say=say)
+            pace = Pace(capture, deadline, profile=chosen.profile if team.size == 1 else None, say=say)
             callbacks.append(pace)
             ends = functools.partial(_either, interrupted, pace.over)
         view = _view(capture, host, port, say, closing) if arguments.view else None
@@ -151,6 +152,8 @@ def _run(
                 f"interrupted after {capture.trainer.iteration} iterations;"
                 " add --resume to the same command to continue"
             )
+        if pace is not None and pace.outcome is not None:
+            say(pace.outcome)
         with progress_bar(console, "") as bar:
             task = bar.add_task("evaluating", total=len(capture.dataset.test) + len(capture.dataset.train))
 

@@ -24,8 +24,7 @@ from gsplat_edu.data.points import random_cloud
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
-from gsplat_edu.scene.camera import Camera, point_nearest_axes
-from gsplat_edu.scene.camera import scene_extent as scene_extent
+from gsplat_edu.scene.camera import Camera, point_nearest_axes, scene_extent as scene_extent
 from gsplat_edu.scene.views import View
 
 TEST_EVERY = 8

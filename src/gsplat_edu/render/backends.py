@@ -20,8 +20,7 @@ from gsplat_edu.ops.noise import add_noise_in_torch, add_noise_natively
 from gsplat_edu.ops.recolor import recolored_in_torch, recolored_natively
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.self_check import cuda_failure
-from gsplat_edu.render.settings import BACKENDS as BACKENDS
-from gsplat_edu.render.settings import check_backend
+from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
 
 CUDA_LACKS = frozenset({"stop", "processes"})
 """What the Triton kernels do not offer."""

@@ -28,8 +28,7 @@ from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.masks import turn_mask
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts
-from gsplat_edu.sfm.scale import Sight
-from gsplat_edu.sfm.scale import placed as placed_world
+from gsplat_edu.sfm.scale import Sight, placed as placed_world
 from gsplat_edu.sfm.scale_text import AUTO
 
 QUALITY = 95

@@ -10,9 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gsplat_edu.train.compose import Start as Start
-    from gsplat_edu.train.compose import Views as Views
-    from gsplat_edu.train.compose import training as training
+    from gsplat_edu.train.compose import Start as Start, Views as Views, training as training
 
 __all__ = ["Start", "Views", "training"]
 

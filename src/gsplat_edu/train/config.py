@@ -18,39 +18,19 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import one_of, whole_number
 from gsplat_edu.train.checks import (
     accept_at_least_1 as _at_least_1,
-)
-from gsplat_edu.train.checks import (
     accept_cap as _cap,
-)
-from gsplat_edu.train.checks import (
     accept_color as _color,
-)
-from gsplat_edu.train.checks import (
     accept_flag as _flag,
-)
-from gsplat_edu.train.checks import (
     accept_fraction as _fraction,
-)
-from gsplat_edu.train.checks import (
     accept_name_of as _one_of,
-)
-from gsplat_edu.train.checks import (
     accept_not_negative as _not_negative,
-)
-from gsplat_edu.train.checks import (
     accept_opacity as _opacity,
-)
-from gsplat_edu.train.checks import (
     accept_positive as _positive,
-)
-from gsplat_edu.train.checks import (
     accept_share as _share,
-)
-from gsplat_edu.train.checks import (
     accept_whole as _whole,
 )
-from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Check
-from gsplat_edu.train.setting import Setting as Setting
+from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Check, Setting as Setting
+from gsplat_edu.train.tempo import Tempo, accept_tempo as _tempo
 
 RECIPE_ITERATIONS = 30_000
 """Length of the run for which the recipe's milestones are defined."""
@@ -247,6 +227,12 @@ class TrainConfig:
         RECIPE_ITERATIONS, _whole(1), "Number of images to train on; a step renders `batch` of them.", "2023"
     )
     batch: int = _number(1, _whole(1, 4096), "Views of a step; rates grow with its root.", "Zhao et al. 2024")
+    tempo: str = _number(
+        "",
+        _tempo,
+        "How a run with a time limit stretched its schedule: iterations of the recipe, then FROM:END for each change.",
+        "ours",
+    )
     seed: int = _number(
         0,
         _whole(0, 2**63 - 1),
@@ -467,7 +453,8 @@ def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **chang
     """Make the configuration of a run of any length.
 
     Milestones scale with the length of the run: with 7,000 iterations densification ends at 3,500 instead of 15,000.
-    Runs under 3,000 iterations do not reset opacities. Fast runs under 2,000 densify every 20th of the run.
+    Runs under 3,000 iterations do not reset opacities. Fast runs under 2,000 densify every 20th of the run. A `tempo`
+    names the length that milestones scale with.
 
     Args:
         iterations: Number of steps.
@@ -478,14 +465,15 @@ def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **chang
         ArgumentError: a value is out of range, or a setting is unknown.
     """
     whole_number("iterations", iterations, 1)
+    length = Tempo.parsed(changes.get("tempo", ""), iterations).length
     scaled: dict[str, Any] = dict(FOR_FAST) if changes.get("strategy") == "fast" else {}
     if rescale and scaled:
-        scaled["densify_every"] = min(max(iterations // FAST_DENSIFICATIONS, 1), TrainConfig.densify_every)
+        scaled["densify_every"] = min(max(length // FAST_DENSIFICATIONS, 1), TrainConfig.densify_every)
     if rescale:
         for setting in SETTINGS:
             if setting.milestone:
                 full = scaled.get(setting.name, setting.default)
-                scaled[setting.name] = max(1, round(full * iterations / RECIPE_ITERATIONS))
-    if iterations < SHORT_RUN:
+                scaled[setting.name] = max(1, round(full * length / RECIPE_ITERATIONS))
+    if length < SHORT_RUN:
         scaled["reset_every"] = 0
     return TrainConfig().changed(**{"iterations": iterations, **scaled, **changes})

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,14 +23,14 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
-from gsplat_edu.train.events import Event, Losses, StepEvent
+from gsplat_edu.train.events import Change, Event, Losses, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
 from gsplat_edu.train.objective import PHOTO, make_objective
 from gsplat_edu.train.optimizer import MOMENTS
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
-from gsplat_edu.train.stepper import StepParts as StepParts
-from gsplat_edu.train.stepper import Stepper, StepView, TensorStepper
+from gsplat_edu.train.stepper import StepParts as StepParts, Stepper, StepView, TensorStepper
+from gsplat_edu.train.tempo import Tempo
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import ViewModel
 
@@ -136,6 +136,16 @@ class Trainer:
         return self.stepper.parts.transients
 
     @property
+    def tempo(self) -> Tempo:
+        """Which iteration of the recipe each iteration of this run stands for."""
+        return Tempo.parsed(self.config.tempo, self.config.iterations, self.config.batch)
+
+    @property
+    def position(self) -> int:
+        """The iteration of the recipe that the next step stands for; rates and sizes follow it."""
+        return self.tempo.position(self.iteration)
+
+    @property
     def last(self) -> tuple[Tensor, Tensor, Tensor | None] | None:
         """The last image that was compared, its photo and its mask, for display; None before the first step."""
         shown = self.stepper.shown
@@ -164,7 +174,7 @@ class Trainer:
                 losses.add(step.loss_tensor)
                 counts.append(step.num_gaussians)
                 self._tell(step, receivers)
-                for event in self.stepper.change(step.iteration):
+                for event in self._change(step.iteration):
                     self._tell(event, receivers)
                 if stop():
                     break
@@ -172,14 +182,28 @@ class Trainer:
 
     def _step(self) -> StepEvent:
         """Take one step: draw the views, and let the stepper move the Gaussians."""
-        factor = photo_factor(self.config, self.iteration)
+        position = self.position
+        factor = photo_factor(self.config, position)
         self._feed.use_factor(factor)
-        if self.transients is not None and self.transients.is_due(self.iteration, self.config.batch):
+        if self.transients is not None and any(
+            self.transients.is_due(passed, self.config.batch) for passed in self.tempo.passed(self.iteration)
+        ):
             settings = self._settings(self.config.background)
             self.transients.find(self.gaussians, settings, self.view_model.camera, factor)
-        terms = self.stepper.step(self._views(self._draw()), self.iteration)
+        terms = self.stepper.step(self._views(self._draw()), position)
         self.iteration += self.config.batch
         return StepEvent(self.iteration - 1, terms[PHOTO], self.stepper.count, terms, factor)
+
+    def _change(self, iteration: int) -> Iterator[Change]:
+        """Let the density strategy act at every position that the step passed; yield what it did.
+
+        Args:
+            iteration: The last image of the step.
+        """
+        batch = self.config.batch
+        for position in self.tempo.passed(iteration - batch + 1):
+            for event in self.stepper.change(position + batch - 1):
+                yield event if event.iteration == iteration else replace(event, iteration=iteration)
 
     def _draw(self) -> list[Draw]:
         """Return the views of the next step that this process renders. If a photo cannot be read, all remain due."""
@@ -215,7 +239,7 @@ class Trainer:
         """Return the render settings of the iteration."""
         return RenderSettings(
             background=background,
-            sh_degree=sh_degree(self.config, self.iteration),
+            sh_degree=sh_degree(self.config, self.position),
             antialiased=self.config.antialiased,
             jacobian_limit=self.config.jacobian_limit,
             depth=self.stepper.objective.needs_depth,

@@ -23,8 +23,7 @@ from gsplat_edu.io.formats import (
     read_scene,
     write_scene,
 )
-from gsplat_edu.io.lod import codec as lod_codec
-from gsplat_edu.io.lod import tiles
+from gsplat_edu.io.lod import codec as lod_codec, tiles
 from gsplat_edu.io.lod.levels import LodOptions, build_levels
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
