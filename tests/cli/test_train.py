@@ -100,7 +100,8 @@ def test_every_field_of_the_recipe_has_an_option(capsys):
 def test_config_json_has_flat_names(tmp_path):
     """An `mcmc` config. Resuming compares configurations key by key."""
     flat = {
-        "iterations": 700, "tempo": "", "seed": 0, "means_rate": 0.00016, "means_rate_final": 1.6e-06, "means_rate_iterations": 700,
+        "iterations": 700, "tempo": "", "seed": 0,
+        "means_rate": 0.00016, "means_rate_final": 1.6e-06, "means_rate_iterations": 700,
         "quats_rate": 0.001, "scales_rate": 0.005, "sh0_rate": 0.0025, "sh_rest_rate": 0.000125, "opacities_rate": 0.05,
         "adam_eps": 1e-15, "ssim_weight": 0.2, "sh_degree": 3, "sh_every": 23, "view_order": "shuffled",
         "background": [1.0, 1.0, 1.0], "random_background": False, "antialiased": False, "jacobian_limit": 1.3,
