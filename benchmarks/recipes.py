@@ -47,9 +47,9 @@ from gsplat_edu.evaluate.figures import save_figure
 from gsplat_edu.evaluate.metrics import ImageScore, OnImage, score_views, summarize
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.config import QUALITIES
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.length import QUALITIES, UNIT
 from gsplat_edu.train.trainer import Trainer
 
 try:
@@ -92,7 +92,7 @@ class Recipe:
     density: type[PlannedDensity] | None = None
 
 
-STANDARD = QUALITIES["standard"]
+STANDARD = QUALITIES["standard"] * UNIT
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ RECIPES = {
     "adc-7k": Recipe("adc", 7_000),
     "mcmc-7k": Recipe("mcmc", 7_000),
     "adc-30k": Recipe("adc", 30_000),
-    **{f"fast-{name}": Recipe("fast", iterations) for name, iterations in QUALITIES.items()},
+    **{f"fast-{name}": Recipe("fast", share * UNIT) for name, share in QUALITIES.items()},
     **{f"without-{name}": without(name) for name in PIECES},
     **{f"only-{name}": without(*(other for other in PIECES if other != name)) for name in PIECES},
     "no-piece": without(*PIECES),

@@ -21,7 +21,7 @@ from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, is_finished
-from gsplat_edu.train.config import QUALITIES, TrainConfig, recipe
+from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import StepEvent
 
@@ -154,21 +154,21 @@ def test_a_run_is_resumed_with_its_own_strategy_unless_another_is_named(capture,
 
 def test_a_longer_quality_extends_a_run_and_a_shorter_one_is_refused(capture, tmp_path, capsys, monkeypatch):
     """A quality is a number of iterations: the one given, not that of config.json, is the new length."""
-    for name, count in (("draft", 4), ("standard", 8), ("high", 12)):
-        monkeypatch.setitem(QUALITIES, name, count)
+    monkeypatch.setattr("gsplat_edu.train.length.UNIT", 4)
+    monkeypatch.setattr("gsplat_edu.runs.thin.LENGTHS", (1,))
 
     def run(*words):
         return main(["train", str(capture), "--out", str(tmp_path / "run"), *BASE, *words])
 
-    assert run() == 0 and RunFolder(tmp_path / "run").read_metrics()["iterations"] == 8
+    assert run() == 0 and RunFolder(tmp_path / "run").read_metrics()["iterations"] == 12
     stop = RunFolder(tmp_path / "run").read_config()["train"]["fast_stop"]
     capsys.readouterr()
     assert run("--quality", "draft", "--resume") == 2
-    assert "with iterations = 8, not 4: a run can be extended, not shortened" in capsys.readouterr().err
+    assert "with iterations = 12, not 4: a run can be extended, not shortened" in capsys.readouterr().err
     assert run("--quality", "high", "--resume") == 0
     train = RunFolder(tmp_path / "run").read_config()["train"]
-    assert (train["iterations"], train["fast_stop"]) == (12, stop), "milestones stay"
-    assert RunFolder(tmp_path / "run").read_metrics()["iterations"] == 12
+    assert (train["iterations"], train["fast_stop"]) == (40, stop), "milestones stay"
+    assert RunFolder(tmp_path / "run").read_metrics()["iterations"] == 40
 
 
 def test_a_run_is_complete_once_it_is_constructed(capture, tmp_path):

@@ -75,6 +75,7 @@ class Facts:
         photo_bytes: Bytes of all photos in memory.
         workers: Number of photos decoded at the same time.
         decoding: Bytes per pixel of the file during decoding, most for HEIC and 16 bits.
+        measured: Whether the start points are points of the scene; otherwise they are random.
     """
 
     train: int
@@ -86,6 +87,7 @@ class Facts:
     photo_bytes: int
     workers: int
     decoding: int = BYTES_PER_PIXEL
+    measured: bool = True
 
     @classmethod
     def of(cls, dataset: Dataset, full: Dataset | None = None) -> Facts:
@@ -108,6 +110,7 @@ class Facts:
             dataset.images.needed,
             dataset.images.workers,
             dataset.images.decoding,
+            dataset.measured,
         )
 
     def smaller(self, factor: float) -> Facts:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ from gsplat_edu.budget.costs import (
 )
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
+from gsplat_edu.budget.length import with_iterations, with_planned_length
 from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
@@ -174,10 +175,7 @@ class Request:
         """
         config = self.options.config
         if "iterations" not in self.given:
-            iterations = max(iterations // config.batch, 1) * config.batch
-            fresh = recipe(iterations, rescale=self.rescale, strategy=config.strategy).flat()
-            scaled = {name: fresh[name] for name in (*MILESTONES, "densify_every") if name not in self.given}
-            config = config.changed(iterations=iterations, **scaled)
+            config = with_iterations(config, iterations, self.given, rescale=self.rescale)
         if "max_gaussians" in self.given:
             return config
         caps = [] if cap is None else [max(_rounded(cap), self.least)]
@@ -205,11 +203,14 @@ def plan(
     *,
     rescale: bool = True,
     reader: CaptureReader | None = None,
+    quality: str | None = None,
+    progress: Callable[[], None] = lambda: None,
 ) -> Plan:
     """Choose the settings that the user did not give so that the limits hold. The probe takes a few seconds.
 
-    Nothing is chosen if there is no memory limit and either no time limit or a given number of iterations; a training
-    with a time limit is then cut short at the limit. A resumed run keeps the values of its config.json.
+    Without limits, only the iterations (of a quality) and the number of Gaussians of the recipe fast are chosen. A
+    training with a time limit and a given number of iterations is cut short at the limit. A resumed run keeps the
+    values of its config.json.
 
     Args:
         options: The run as it would be without limits.
@@ -217,6 +218,8 @@ def plan(
         given: Names of `PLANNED` that the user gave.
         rescale: Whether milestones that are not given stretch with the iterations.
         reader: Has read the capture already; None to read it.
+        quality: Of `gsplat_edu.train.length.QUALITIES`, to choose the iterations; None to keep them.
+        progress: Called after every iteration of a trial of lengths.
 
     Raises:
         ArgumentError: even the smallest settings exceed a limit (the message names a sufficient one), or the backend is
@@ -225,17 +228,24 @@ def plan(
         SceneFormatError: the start scene cannot be read.
         CheckpointError: the config.json of a run to resume is damaged.
     """
+    reader, told = reader_for(options.data, reader), tuple[str, ...]()
+    if quality is not None:
+        options, said = with_planned_length(
+            options, quality, reader, given, rescale=rescale, progress=progress
+        )
+        given, told = (*given, "iterations"), (said,)
     if options.resume and options.folder.exists():
         said = f"{limits}: a resumed run keeps the values of its config.json; memory is not planned again"
         return Plan(taken_up(options, given), sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
-        return _with_planned_count(options, reader)
+        found = _with_planned_count(options, reader)
+        return dataclasses.replace(found, sentences=(*told, *found.sentences))
     if options.backend == "torch":
         raise ArgumentError(f"{limits}: cannot be planned for --backend torch; choose cpu or cuda")
     settings = options.data_settings
     chosen = {"resolution": settings.resolution, "max_gaussians": options.config.max_gaussians}
     fixed = frozenset(given) | {name for name, value in chosen.items() if value is not None}
-    dataset_at = functools.partial(Dataset.of, reader_for(options.data, reader), points=options.points)
+    dataset_at = functools.partial(Dataset.of, reader, points=options.points)
     files = dataset_at(dataclasses.replace(settings, resolution=None))
     dataset = files if settings.resolution is None else dataset_at(settings)
     factors: tuple[float, ...] = (1.0,)
@@ -255,15 +265,16 @@ def plan(
     )
     probed = tuple(factor for factor in factors if factor >= first.factor)
     spent = 0.0 if limits.time is None else limits.time.spent
-    return choose(dataclasses.replace(request, factors=probed), measured, spent)
+    found = choose(dataclasses.replace(request, factors=probed), measured, spent)
+    return dataclasses.replace(found, sentences=(*told, *found.sentences))
 
 
-def _with_planned_count(options: RunOptions, reader: CaptureReader | None) -> Plan:
+def _with_planned_count(options: RunOptions, reader: CaptureReader) -> Plan:
     """Choose the number of Gaussians that the fast recipe grows to, unless it is given."""
     config = options.config
     if config.strategy != "fast" or config.max_gaussians is not None:
         return Plan(options)
-    dataset = Dataset.of(reader_for(options.data, reader), options.data_settings, points=options.points)
+    dataset = Dataset.of(reader, options.data_settings, points=options.points)
     facts = Facts.of(dataset)
     if options.scene is not None:
         facts = dataclasses.replace(facts, points=len(scene_start(options.scene, config, dataset.origin)[0]))

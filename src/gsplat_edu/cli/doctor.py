@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.reader import CaptureReader
@@ -31,7 +32,8 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.train.config import DEFAULT_QUALITY, DEFAULT_STRATEGY, QUALITIES, TrainConfig, recipe
+from gsplat_edu.train.config import DEFAULT_STRATEGY, TrainConfig, recipe
+from gsplat_edu.train.length import DEFAULT_QUALITY, planned_iterations
 
 EXIT_HOPELESS = 1
 """Exit code if training would be pointless."""
@@ -71,7 +73,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
     settings, reader = DataSettings(resolution=arguments.resolution), CaptureReader(arguments.path)
-    config = recipe(arguments.iterations, strategy=DEFAULT_STRATEGY)
+    if arguments.iterations is not None:
+        whole_number("--iterations", arguments.iterations, 1)
     backend = resolve_backend(arguments.backend)
     if backend == "torch" and not arguments.no_forecast:
         raise ArgumentError(
@@ -92,6 +95,8 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
     try:
         dataset, full = Dataset.of(reader, settings), Dataset.of(reader)
         facts = Facts.of(dataset)
+        length = arguments.iterations or planned_iterations(DEFAULT_QUALITY, facts.train, facts.measured)
+        config = recipe(length, strategy=DEFAULT_STRATEGY)
         cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         config = dataclasses.replace(config, max_gaussians=cap)
         said = forecast(dataset, full, config, backend=backend).lines()
@@ -103,7 +108,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
 def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Return the options of the training that is forecast where they are not the defaults."""
     words: tuple[str, ...] = ()
-    if arguments.iterations != QUALITIES[DEFAULT_QUALITY]:
+    if arguments.iterations is not None:
         words += ("--iterations", str(arguments.iterations))
     if arguments.resolution is not None:
         words += ("--resolution", f"{arguments.resolution:g}")

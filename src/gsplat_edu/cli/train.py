@@ -21,7 +21,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.options.train import AUTO, left_open, options_from
+from gsplat_edu.cli.options.train import AUTO, left_open, options_from, quality_of
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars
@@ -42,6 +42,7 @@ from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.pilot import ORDER, PILOT_STEPS, refinement_for
 from gsplat_edu.runs.processes import Member, joined
+from gsplat_edu.runs.thin import LENGTHS
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import needs_poses
@@ -256,8 +257,16 @@ def _planned(
     options = with_choices(options, reader, left_open(arguments), console, say)
     limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
-    given += ["iterations"] if arguments.quality is not None else []
-    chosen = plan(options, limits, given, rescale=not arguments.no_rescale, reader=reader)
+    with progress_bar(console, "") as bar:
+        task = bar.add_task("trials of lengths", total=sum(LENGTHS), visible=False)
+
+        def progress() -> None:
+            bar.update(task, advance=1, visible=True)
+
+        quality, rescale = quality_of(arguments), not arguments.no_rescale
+        chosen = plan(
+            options, limits, given, rescale=rescale, reader=reader, quality=quality, progress=progress
+        )
     for sentence in chosen.sentences:
         say(sentence)
     return chosen

@@ -17,7 +17,8 @@ from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
-from gsplat_edu.train.config import DEFAULT_QUALITY, QUALITIES, RECIPE_ITERATIONS
+from gsplat_edu.train.config import RECIPE_ITERATIONS
+from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, planned_iterations
 
 POOR = 20.0
 """Warn when the training views' mean PSNR is below this, dB: 20 dB is an RMS error of a tenth of the range. Three
@@ -103,12 +104,17 @@ class Trained:
     @property
     def usual(self) -> int:
         """The default number of iterations of the run's recipe."""
-        return QUALITIES[DEFAULT_QUALITY] if self.strategy == "fast" else RECIPE_ITERATIONS
+        return self._length(DEFAULT_QUALITY)
 
     @property
     def longest(self) -> int:
         """Iterations of the longest run that is advised."""
-        return max(QUALITIES.values()) if self.strategy == "fast" else RECIPE_ITERATIONS
+        return self._length(max(QUALITIES, key=lambda name: QUALITIES[name]))
+
+    def _length(self, quality: str) -> int:
+        if self.strategy != "fast":
+            return RECIPE_ITERATIONS
+        return planned_iterations(quality, max(len(self.train), 1))
 
     @property
     def rising(self) -> bool | None:

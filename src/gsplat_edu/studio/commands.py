@@ -17,7 +17,8 @@ from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import Library, files_within, scene_file
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
-from gsplat_edu.train.config import APPEARANCES, QUALITIES, REFINEMENTS, SKIES, STRATEGIES
+from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SKIES, STRATEGIES
+from gsplat_edu.train.length import QUALITIES
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
 
 EXPORTS = "exports"

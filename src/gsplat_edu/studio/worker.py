@@ -187,7 +187,8 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     from gsplat_edu.data.settings import DataSettings
     from gsplat_edu.render.backends import resolve_backend
     from gsplat_edu.train.capacity import advised_side
-    from gsplat_edu.train.config import DEFAULT_STRATEGY, QUALITIES, recipe
+    from gsplat_edu.train.config import DEFAULT_STRATEGY, recipe
+    from gsplat_edu.train.length import QUALITIES, planned_iterations
 
     reader = CaptureReader(capture)
     whole = Dataset.of(reader)
@@ -198,7 +199,8 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     dataset = Dataset.of(reader, DataSettings(resolution=resolution))
     facts = Facts.of(dataset, whole)
     measured, found = None, {}
-    for name, iterations in sorted(QUALITIES.items(), key=lambda entry: -entry[1]):
+    for name in sorted(QUALITIES, key=lambda name: -QUALITIES[name]):
+        iterations = planned_iterations(name, facts.train, facts.measured)
         config = recipe(iterations, strategy=DEFAULT_STRATEGY)
         cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         config = replace(config, max_gaussians=cap)

@@ -64,11 +64,8 @@ FOR_FAST = {
 FAST_DENSIFICATIONS = 20
 """The recipe fast densifies at least this often: a Gaussian has two children, and few points have to become many."""
 
-QUALITIES = {"draft": 1_000, "standard": 3_000, "high": 10_000}
-"""Iterations of the fast recipe by the name of its quality."""
-
-DEFAULT_STRATEGY, DEFAULT_QUALITY = "fast", "standard"
-"""Defaults of `gsplat-edu train`. `TrainConfig` itself defaults to adc, since fast needs a cap."""
+DEFAULT_STRATEGY = "fast"
+"""Default of `gsplat-edu train`. `TrainConfig` itself defaults to adc, since fast needs a cap."""
 
 FAST_FROM_SCENE = {"fast_start_factor": 1.0}
 """Further default of a fast run that starts from a scene: small photos would undo its detail."""

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
-from gsplat_edu.train.config import DEFAULT_QUALITY, QUALITIES
+from gsplat_edu.train.length import DEFAULT_QUALITY
 
 EXAMPLE = "example: gsplat-edu doctor captures/plush"
 
@@ -24,8 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--iterations",
         type=whole_number_text,
         metavar="N",
-        default=QUALITIES[DEFAULT_QUALITY],
-        help=f"iterations of the forecast training (default: {QUALITIES[DEFAULT_QUALITY]}, as in train)",
+        help=f"iterations of the forecast training (default: those of --quality {DEFAULT_QUALITY} in train)",
     )
     before.add_argument(
         "--resolution",

@@ -17,15 +17,14 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.sfm.options import PANORAMA
 from gsplat_edu.sfm.scale_text import check_scale
+from gsplat_edu.train.capacity import PLANNED_VIEWS
 from gsplat_edu.train.config import (
     APPEARANCES,
-    DEFAULT_QUALITY,
     DEFAULT_STRATEGY,
     FAST_FROM_SCENE,
     FOR_FAST,
     FROM_SCENE,
     ONLY_FOR,
-    QUALITIES,
     RECIPE_ITERATIONS,
     REFINEMENTS,
     SETTINGS,
@@ -35,6 +34,7 @@ from gsplat_edu.train.config import (
     TrainConfig,
     recipe,
 )
+from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, UNIT, planned_iterations
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
@@ -189,12 +189,13 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
         metavar="NAME",
         help=f"recipe of the training: {names} (default: {DEFAULT_STRATEGY}, or that of the run to resume)",
     )
-    lengths = ", ".join(f"{name} {count:,}" for name, count in QUALITIES.items())
+    lengths = ", ".join(f"{name} {share * UNIT:,}" for name, share in QUALITIES.items())
     group.add_argument(
         "--quality",
         metavar="NAME",
-        help=f"length of the recipe fast in iterations: {lengths} (default: {DEFAULT_QUALITY}, unless --iterations or"
-        " --time-limit is given)",
+        help=f"length of the recipe fast in iterations: {lengths}, more for captures of more than {PLANNED_VIEWS}"
+        f" photos and less where more would hurt (default: {DEFAULT_QUALITY}, unless --iterations or --time-limit is"
+        " given)",
     )
     _add_number(
         group,
@@ -470,6 +471,15 @@ def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:
     return tuple(name for name in names if name != "sky" or arguments.scene is None)
 
 
+def quality_of(arguments: argparse.Namespace) -> str | None:
+    """Return the quality that decides on the iterations; None if they are given, follow from a limit, or are stored."""
+    if arguments.quality is not None:
+        return str(arguments.quality)
+    stored = arguments.resume and RunFolder(arguments.out).exists()
+    open_ = arguments.iterations is None and arguments.time_limit is None and not stored
+    return DEFAULT_QUALITY if open_ and strategy_of(arguments) == "fast" else None
+
+
 def length_of(arguments: argparse.Namespace, strategy: str) -> int:
     """Return the iterations: those given, or those of the quality or the recipe, as whole batches."""
     fast, quality = strategy == "fast", arguments.quality
@@ -485,7 +495,8 @@ def length_of(arguments: argparse.Namespace, strategy: str) -> int:
             )
     if arguments.iterations is not None:
         return int(arguments.iterations)
-    length = QUALITIES[quality or DEFAULT_QUALITY] if fast else RECIPE_ITERATIONS
+    # Of a usual capture: `gsplat_edu.budget.plan.plan` replaces it once the capture is read.
+    length = planned_iterations(quality or DEFAULT_QUALITY, PLANNED_VIEWS) if fast else RECIPE_ITERATIONS
     return length + -length % max(arguments.batch or 1, 1)  # whole batches
 
 

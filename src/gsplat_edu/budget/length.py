@@ -1,0 +1,69 @@
+"""Choose the length of a run from its capture: units of the capture's own, fewer where more would hurt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.thin import needs_trial, try_lengths
+from gsplat_edu.train.config import MILESTONES, TrainConfig, recipe
+from gsplat_edu.train.length import planned_iterations, reasons
+
+
+def with_iterations(
+    config: TrainConfig, iterations: int, given: Collection[str] = (), *, rescale: bool = True
+) -> TrainConfig:
+    """Return a configuration for another number of iterations.
+
+    Args:
+        config: The run.
+        iterations: New number, of which whole batches count.
+        given: Names of settings that the user gave, which stay.
+        rescale: Whether milestones that are not given stretch with the iterations.
+    """
+    iterations = max(iterations // config.batch, 1) * config.batch
+    fresh = recipe(iterations, rescale=rescale, strategy=config.strategy).flat()
+    scaled = {name: fresh[name] for name in (*MILESTONES, "densify_every") if name not in given}
+    return config.changed(iterations=iterations, **scaled)
+
+
+def with_planned_length(
+    options: RunOptions,
+    quality: str,
+    reader: CaptureReader,
+    given: Collection[str] = (),
+    *,
+    rescale: bool = True,
+    progress: Callable[[], None] = lambda: None,
+) -> tuple[RunOptions, str]:
+    """Choose the iterations of a run by the recipe fast.
+
+    Args:
+        options: The run.
+        quality: Of `gsplat_edu.train.length.QUALITIES`.
+        reader: The run's capture.
+        given: Names of settings that the user gave, which stay.
+        rescale: Whether milestones that are not given stretch with the iterations.
+        progress: Called after every iteration of a trial.
+
+    Returns:
+        The run with its length, and a sentence that says how long it is and why.
+
+    Raises:
+        DatasetError: the capture or one of its photos cannot be read.
+    """
+    dataset = Dataset.of(reader, options.data_settings, points=options.points)
+    views = len(dataset.train)
+    measured = dataset.measured or options.scene is not None
+    iterations = planned_iterations(quality, views, measured, options.config.batch)
+    why = reasons(views, measured)
+    if options.scene is None and not options.resume and needs_trial(views):
+        trial = try_lengths(options, reader, progress)
+        if trial.longest is not None and trial.longest < iterations:
+            iterations, why = trial.longest + -trial.longest % options.config.batch, str(trial)
+    config = with_iterations(options.config, iterations, given, rescale=rescale)
+    said = f"{quality} is {config.iterations:,} iterations ({why}); --iterations changes that"
+    return replace(options, config=config), said

@@ -1,0 +1,89 @@
+"""A capture of few photos is tried: where longer trainings make unseen photos worse, the run ends early."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from gsplat_edu.budget.plan import Limits, plan
+from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.runs import thin
+from gsplat_edu.runs.thin import ThinTrial, needs_trial, try_lengths
+from gsplat_edu.runs.training import RunOptions
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import View
+from gsplat_edu.train.config import recipe
+
+COUNT = 10
+
+
+def turned(camera, angle):
+    """Turn a camera about its vertical axis."""
+    s, c = np.sin(angle), np.cos(angle)
+    return Camera.posed(
+        np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ camera.R, camera.eye, camera.intrinsics
+    )
+
+
+def capture(folder, error):
+    """Write ten photos whose cameras are turned by an error, radians, to the right and to the left in turn."""
+    views, *rest = procedural_capture(size=64, count=COUNT)
+    moved = [
+        View(turned(view.camera, error if i % 2 else -error), view.read().image, name=view.name)
+        for i, view in enumerate(views)
+    ]
+    write_colmap(folder, moved, *rest)
+    return folder
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.06], ids=["exact", "wrong"])
+def given(request, tmp_path_factory):
+    folder = capture(tmp_path_factory.mktemp("capture"), request.param)
+    config = recipe(1_000, strategy="fast", sh_degree=3)
+    options = RunOptions(folder, folder / "run", config, DataSettings(test_every=0))
+    return request.param, options, CaptureReader(folder)
+
+
+def test_wrong_poses_end_a_training_early_and_exact_ones_do_not(given, monkeypatch):
+    error, options, reader = given
+    steps = []
+    trial = try_lengths(options, reader, lambda: steps.append(1))
+    assert trial.judges == 2 and len(steps) == sum(trial.scores)
+    if error:
+        assert trial.longest is not None and trial.scores[max(trial.scores)] < trial.scores[trial.longest]
+        assert "2 training photos" in str(trial) and "check the poses" in str(trial)
+    else:
+        assert trial.longest is None and list(trial.scores) == list(thin.LENGTHS) and str(trial) == ""
+
+
+def test_the_plan_follows_the_trial_and_says_why(given, monkeypatch):
+    _, options, reader = given
+    monkeypatch.setattr(
+        "gsplat_edu.budget.length.try_lengths", lambda *_: ThinTrial(200, {200: 20.0, 400: 19.0}, 2)
+    )
+    found = plan(options, Limits(), reader=reader, quality="standard")
+    assert found.iterations == 200 and found.options.config.fast.stop == 120, "the schedule ends with the run"
+    assert "standard is 200 iterations (longer trainings make photos worse" in found.sentences[0]
+    assert "20.0 dB after 200 iterations and 19.0 dB after 400" in found.sentences[0]
+    stayed = plan(options, Limits(), ["fast_stop"], reader=reader, quality="standard")
+    assert stayed.options.config.fast.stop == options.config.fast.stop
+
+
+def test_only_thin_captures_from_points_are_tried(given, monkeypatch):
+    _, options, reader = given
+    assert [needs_trial(views) for views in (1, 3, 4, 29, 30)] == [False, False, True, True, False]
+
+    def refuse(*_):
+        raise AssertionError("tried")
+
+    monkeypatch.setattr("gsplat_edu.budget.length.try_lengths", refuse)
+    with pytest.raises(AssertionError, match="tried"):
+        plan(options, Limits(), reader=reader, quality="draft")
+    assert plan(options, Limits(), reader=reader).iterations == 1_000
+    resumed = dataclasses.replace(options, resume=True)
+    assert plan(resumed, Limits(), reader=reader, quality="draft").iterations == 1_000
+    shutil.rmtree(options.out, ignore_errors=True)
