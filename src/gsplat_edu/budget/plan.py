@@ -240,6 +240,15 @@ def plan(
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
         found = _with_planned_count(options, reader)
         return dataclasses.replace(found, sentences=(*told, *found.sentences))
+    request, measured = _measured(options, limits, given, rescale, reader)
+    found = choose(request, measured, 0.0 if limits.time is None else limits.time.spent)
+    return dataclasses.replace(found, sentences=(*told, *found.sentences))
+
+
+def _measured(
+    options: RunOptions, limits: Limits, given: Collection[str], rescale: bool, reader: CaptureReader
+) -> tuple[Request, Measurements]:
+    """Return the input of a plan with limits, and measurements with the largest photos that fit into memory."""
     if options.backend == "torch":
         raise ArgumentError(f"{limits}: cannot be planned for --backend torch; choose cpu or cuda")
     settings = options.data_settings
@@ -264,9 +273,7 @@ def plan(
         dataset_at(reduced), request.config(length, first.factor, first.cap), options.backend, scene
     )
     probed = tuple(factor for factor in factors if factor >= first.factor)
-    spent = 0.0 if limits.time is None else limits.time.spent
-    found = choose(dataclasses.replace(request, factors=probed), measured, spent)
-    return dataclasses.replace(found, sentences=(*told, *found.sentences))
+    return dataclasses.replace(request, factors=probed), measured
 
 
 def _with_planned_count(options: RunOptions, reader: CaptureReader) -> Plan:

@@ -21,7 +21,8 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.options.train import AUTO, left_open, options_from, quality_of
+from gsplat_edu.cli.options.length import quality_of
+from gsplat_edu.cli.options.train import AUTO, left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars

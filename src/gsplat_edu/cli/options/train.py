@@ -10,6 +10,7 @@ from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
+from gsplat_edu.cli.options.length import length_of, strategy_of
 from gsplat_edu.cli.options.several import check_several
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
 from gsplat_edu.data.settings import DataSettings
@@ -34,7 +35,7 @@ from gsplat_edu.train.config import (
     TrainConfig,
     recipe,
 )
-from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, UNIT, planned_iterations
+from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, UNIT
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
@@ -435,16 +436,6 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
     return config
 
 
-def strategy_of(arguments: argparse.Namespace) -> str:
-    """Return the strategy: that given, that of the run to resume, or the default."""
-    if arguments.strategy is not None:
-        return str(arguments.strategy)
-    folder = RunFolder(arguments.out)
-    stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
-    found = stored.get("strategy") if isinstance(stored, dict) else None
-    return DEFAULT_STRATEGY if found is None else str(found)
-
-
 def _given_or_stored(arguments: argparse.Namespace, name: str) -> str:
     """Return the value of one of `OPEN`: given, of the run to resume, or the first value (see `left_open`)."""
     given = getattr(arguments, name)
@@ -469,35 +460,6 @@ def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:
         name for name in OPEN if (getattr(arguments, name) or (AUTO if name in default else None)) == AUTO
     ]
     return tuple(name for name in names if name != "sky" or arguments.scene is None)
-
-
-def quality_of(arguments: argparse.Namespace) -> str | None:
-    """Return the quality that decides on the iterations; None if they are given, follow from a limit, or are stored."""
-    if arguments.quality is not None:
-        return str(arguments.quality)
-    stored = arguments.resume and RunFolder(arguments.out).exists()
-    open_ = arguments.iterations is None and arguments.time_limit is None and not stored
-    return DEFAULT_QUALITY if open_ and strategy_of(arguments) == "fast" else None
-
-
-def length_of(arguments: argparse.Namespace, strategy: str) -> int:
-    """Return the iterations: those given, or those of the quality or the recipe, as whole batches."""
-    fast, quality = strategy == "fast", arguments.quality
-    if quality is not None:
-        one_of("--quality", quality, tuple(QUALITIES))
-        if not fast:
-            raise ArgumentError(
-                "--quality: is the length of --strategy fast; leave it out or choose that strategy"
-            )
-        if arguments.iterations is not None or arguments.time_limit is not None:
-            raise ArgumentError(
-                "--quality: --iterations or --time-limit already says how long; leave one of them out"
-            )
-    if arguments.iterations is not None:
-        return int(arguments.iterations)
-    # Of a usual capture: `gsplat_edu.budget.plan.plan` replaces it once the capture is read.
-    length = planned_iterations(quality or DEFAULT_QUALITY, PLANNED_VIEWS) if fast else RECIPE_ITERATIONS
-    return length + -length % max(arguments.batch or 1, 1)  # whole batches
 
 
 def _starts_from_scene(arguments: argparse.Namespace) -> bool:
