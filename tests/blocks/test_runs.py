@@ -11,10 +11,12 @@ from PIL import Image
 
 from block_runs import RECIPE
 from gsplat_edu.blocks.layout import BlocksFolder, Done
+from gsplat_edu.blocks.merge import finished_blocks, merged
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.train.length import planned_iterations
 
 
 def scene(folder):
@@ -262,3 +264,50 @@ def test_blocks_with_few_views_join(city, serial, tmp_path, capsys):
         f"6 blocks would have fewer than 25 training views: the capture is split into {len(plan.blocks)}"
         in (capsys.readouterr().out.replace("\n", " "))
     )
+
+
+def test_merging_keeps_the_cap_of_the_whole_scene(serial):
+    """A cap below what the blocks have together: what covers least goes, and the order stays."""
+    plan, folder = BlockPlan.read(serial), BlocksFolder(serial)
+    records = finished_blocks(folder, plan)
+    whole, counts = merged(folder, plan, records)
+    cap = sum(counts) - 100
+    tight = replace(plan, recipe=plan.recipe | {"train": plan.recipe["train"] | {"max_gaussians": cap}})
+    kept, fewer = merged(folder, tight, records)
+    assert len(kept) == sum(fewer) == cap and all(a <= b for a, b in zip(fewer, counts, strict=True))
+    rows = {row.tobytes(): i for i, row in enumerate(whole.means.numpy())}
+    places = [rows[row.tobytes()] for row in kept.means.numpy()]
+    assert places == sorted(places)
+    covers = [
+        scene.opacities.log() + scene.log_scales.sort(dim=1).values[:, 1:].sum(dim=1)
+        for scene in (whole, kept)
+    ]
+    gone = np.delete(covers[0].numpy(), places)
+    assert gone.max() <= covers[1].min() + 1e-6
+
+
+def test_each_block_is_as_long_as_its_own_views_need(city, tmp_path, monkeypatch):
+    monkeypatch.setattr("gsplat_edu.train.length.UNIT", 16)
+    monkeypatch.setattr("gsplat_edu.train.length.PLANNED_VIEWS", 10)
+    out = tmp_path / "run"
+    words = [
+        "--blocks",
+        "4",
+        "--until",
+        "split",
+        "--min-views",
+        "5",
+        "--quality",
+        "draft",
+        "--sh-degree",
+        "0",
+    ]
+    words += ["--appearance", "none", "--sky", "none", "--transients", "none", "--refine", "none"]
+    assert main(["train", str(city), "--out", str(out), *words]) == 0
+    plan = BlockPlan.read(out)
+    lengths = [planned_iterations("draft", len(block.train)) for block in plan.blocks]
+    assert [block.iterations for block in plan.blocks] == lengths and min(lengths) > 16
+    assert main(["block", str(out), "0"]) == 0
+    trained = json.loads((out / "blocks" / "block_00" / "config.json").read_text())["train"]
+    assert trained["iterations"] == BlocksFolder(out).read_done(0, plan.digest()).iterations == lengths[0]
+    assert trained["fast_stop"] == pytest.approx(0.6 * lengths[0], abs=2), "the schedule ends with the block"

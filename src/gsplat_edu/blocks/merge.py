@@ -55,7 +55,7 @@ def finished_blocks(folder: BlocksFolder, plan: BlockPlan) -> list[Done]:
 
 
 def merged(folder: BlocksFolder, plan: BlockPlan, records: list[Done]) -> tuple[Gaussians, list[int]]:
-    """Concatenate the Gaussians that lie in the cell of their block, in the order of the blocks.
+    """Concatenate the Gaussians that lie in the cell of their block, in the order of the blocks, and keep the cap.
 
     Args:
         folder: The run in blocks.
@@ -71,7 +71,32 @@ def merged(folder: BlocksFolder, plan: BlockPlan, records: list[Done]) -> tuple[
         places = plan.area.ground.coordinates(gaussians.means.numpy())
         stays = torch.from_numpy(np.flatnonzero(block.core.holds(places)))
         parts.append(gaussians.map(functools.partial(torch.index_select, dim=0, index=stays)))
+    cap = plan.recipe["train"].get("max_gaussians")
+    if cap is not None and sum(map(len, parts)) > cap:
+        parts = _within(parts, int(cap))
     return Gaussians.concatenated(parts), [len(part) for part in parts]
+
+
+def _within(parts: list[Gaussians], cap: int) -> list[Gaussians]:
+    """Remove the Gaussians that cover least, until a cap is met: the smallest opacities times areas.
+
+    Args:
+        parts: The Gaussians of each block.
+        cap: Most Gaussians of all parts.
+    """
+    covers = []
+    for part in parts:
+        two_largest = part.log_scales.detach().double().numpy()
+        two_largest = np.sort(two_largest, axis=1)[:, 1:].sum(axis=1)
+        covers.append(np.log(part.opacities.detach().double().numpy()) + two_largest)
+    ranks = np.argsort(-np.concatenate(covers), kind="stable")
+    kept = np.zeros(len(ranks), dtype=bool)
+    kept[ranks[:cap]] = True
+    found = []
+    for part, stays in zip(parts, np.split(kept, np.cumsum([len(part) for part in parts])[:-1]), strict=True):
+        rows = torch.from_numpy(np.flatnonzero(stays))
+        found.append(part.map(functools.partial(torch.index_select, dim=0, index=rows)))
+    return found
 
 
 def merge_blocks(

@@ -131,6 +131,7 @@ class Block:
         test: Names of the held-out views that look at the core, sorted.
         start: SHA-256 of the file with the Gaussians to start from; "" before it is written.
         max_gaussians: Cap on the number of Gaussians; None for that of the recipe.
+        iterations: Length of the training; None for that of the recipe.
     """
 
     core: Cell
@@ -138,6 +139,7 @@ class Block:
     test: tuple[str, ...]
     start: str = ""
     max_gaussians: int | None = None
+    iterations: int | None = None
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,10 @@ class BlockPlan:
                     tuple(map(str, entry["train"])),
                     tuple(map(str, entry["test"])),
                     str(entry["start"]),
-                    None if entry["max_gaussians"] is None else int(entry["max_gaussians"]),
+                    *(
+                        None if entry[name] is None else int(entry[name])
+                        for name in ("max_gaussians", "iterations")
+                    ),
                 )
                 for entry in found["blocks"]
             )

@@ -30,12 +30,18 @@ from gsplat_edu.runs.start import scene_file, scene_start
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.length import planned_iterations
 
 OPAQUE = 0.1
 """Gaussians of the coarse model above this opacity count as points of the scene."""
 
 ROOM = 1.5
 """fast: a block may grow to at least this multiple of the Gaussians that it starts with."""
+
+MARGIN_ROOM = 1.25
+"""Cap of a block as a multiple of its cell's share of the whole scene's cap; the rest is for the margin, which merging
+removes. `gsplat_edu.blocks.merge` keeps the cap of the whole."""
 
 Say = Callable[[str], None]
 
@@ -47,10 +53,17 @@ class SplitOptions:
     Args:
         count: Number of blocks; None chooses it from the number of training views.
         least_views: Smallest number of training views of a block.
+        quality: Of `gsplat_edu.train.length.QUALITIES`: the length of each block follows from its own views; None for
+            the iterations of the options.
     """
 
     count: int | None = None
     least_views: int = LEAST_VIEWS
+    quality: str | None = None
+
+    def iterations_of(self, views: int, batch: int) -> int | None:
+        """Return the length of a block of so many training views; None for that of the options."""
+        return None if self.quality is None else planned_iterations(self.quality, views, batch=batch)
 
 
 def recipe_of(options: RunOptions) -> dict[str, Any]:
@@ -100,9 +113,7 @@ def split_capture(
     dataset = Dataset.of(reader_for(options.data, reader), options.data_settings)
     for note in dataset.notes:
         say(note)
-    gaussians, notes = scene_start(coarse, config.changed(max_gaussians=None), dataset.origin)
-    for note in notes:
-        say(note)
+    gaussians = _coarse_gaussians(coarse, config, dataset, say)
     means = gaussians.means.double().numpy()
     solid = (gaussians.opacities.numpy() > OPAQUE) & ~far_shell(means)
     points = means[solid if solid.any() else slice(None)]
@@ -124,11 +135,15 @@ def split_capture(
         kept = torch.from_numpy(np.flatnonzero(stays))
         start = gaussians.map(functools.partial(torch.index_select, dim=0, index=kept))
         save_ply(folder.start(number), start, dataset.origin, config.antialiased)
-        cap = _cap(options, dataset, block, len(kept), len(gaussians))
-        made.append(dataclasses.replace(block, start=file_digest(folder.start(number)), max_gaussians=cap))
+        inside = int(block.core.holds(places).sum())
+        cap = _cap(options, dataset, block, len(kept), inside / len(gaussians))
+        views = len(block.train)
+        length = split.iterations_of(views, config.batch)
+        digest = file_digest(folder.start(number))
+        made.append(dataclasses.replace(block, start=digest, max_gaussians=cap, iterations=length))
         say(
-            f"block {number}: {len(block.train)} training views, {len(block.test)} held out,"
-            f" {len(kept):,} Gaussians to start from"
+            f"block {number}: {views} training views, {len(block.test)} held out, {len(kept):,} Gaussians to start"
+            f" from, {length or config.iterations:,} iterations"
         )
     x, y, z = dataset.origin.tolist()
     capture = str(options.data.resolve())
@@ -138,22 +153,38 @@ def split_capture(
     return plan
 
 
+def _coarse_gaussians(coarse: Path, config: TrainConfig, dataset: Dataset, say: Say) -> Gaussians:
+    """Read the coarse model, and refuse one that the cap leaves no room for."""
+    gaussians, notes = scene_start(coarse, config.changed(max_gaussians=None), dataset.origin)
+    for note in notes:
+        say(note)
+    if config.max_gaussians is not None and config.max_gaussians < len(gaussians):
+        raise ArgumentError(
+            f"--max-gaussians: is {config.max_gaussians}, but the coarse model has {len(gaussians)} already; raise it,"
+            " or give a smaller one with --from"
+        )
+    return gaussians
+
+
 def _render(options: RunOptions, gaussians: Gaussians, camera: Camera, features: Tensor) -> RenderOutput:
     return render(
         gaussians, camera, settings=options.render_settings, features=features, backend=options.backend
     )
 
 
-def _cap(options: RunOptions, dataset: Dataset, block: Block, start: int, whole: int) -> int | None:
-    """Return the cap of a block: its share of that of the scene, or what the recipe plans for its views."""
+def _cap(options: RunOptions, dataset: Dataset, block: Block, start: int, share: float) -> int | None:
+    """Return the cap of a block: that of the scene for the cell, with room for the margin, or what the recipe plans.
+
+    Args:
+        options: Options of the run in blocks.
+        dataset: The capture.
+        block: The block.
+        start: Number of Gaussians that the block starts with, those of the margin included.
+        share: Share of the coarse model's Gaussians that lie in the cell.
+    """
     config = options.config
     if config.max_gaussians is not None:
-        if config.max_gaussians < whole:
-            raise ArgumentError(
-                f"--max-gaussians: is {config.max_gaussians}, but the coarse model has {whole} already; raise it, or"
-                " give a smaller one with --from"
-            )
-        return max(config.max_gaussians * start // whole, 1)
+        return max(int(MARGIN_ROOM * config.max_gaussians * share), start)
     if config.strategy != "fast":
         return None
     pixels = np.mean([view.camera.W * view.camera.H for view in dataset.train])

@@ -43,9 +43,9 @@ def statuses(folder: BlocksFolder, plan: BlockPlan, digest: str) -> list[BlockSt
         plan: Its plan.
         digest: Digest of the plan.
     """
-    wanted = int(plan.recipe["train"]["iterations"])
     found = []
     for number, block in enumerate(plan.blocks):
+        wanted = block.iterations or int(plan.recipe["train"]["iterations"])
         views = len(block.train)
         if (done := folder.read_done(number, digest)) is not None:
             found.append(BlockStatus(number, views, done.iterations, wanted, None, done.gaussians, True))

@@ -22,7 +22,7 @@ from gsplat_edu.ops.kernels import REASON, native
 from gsplat_edu.render.settings import BACKENDS
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun
-from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.config import TrainConfig, stretched
 from gsplat_edu.train.trainer import Callback
 
 Say = Callable[[str], None]
@@ -52,6 +52,8 @@ def block_options(folder: BlocksFolder, plan: BlockPlan, number: int, data: Path
     try:
         train, settings = (_tuples(plan.recipe[name]) for name in ("train", "data"))
         config = TrainConfig().changed(**train | {"max_gaussians": block.max_gaussians})
+        if block.iterations is not None:
+            config = stretched(config, block.iterations)
         views = {"train_views": block.train, "test_views": block.test}
         return RunOptions(
             data=capture,

@@ -24,6 +24,7 @@ from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.block_parts import parts_of_blocks
 from gsplat_edu.cli.options.blocks import LEAST_VIEWS, SPLIT, block_count
+from gsplat_edu.cli.options.length import quality_of
 from gsplat_edu.cli.options.train import OPEN, left_open, options_from
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train import (
@@ -110,7 +111,7 @@ def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> Bloc
         else:
             options = replace(options, config=options.config.changed(**_chosen_before(coarse, of_block)))
         _train_coarse(coarse, reader, console, say)
-    split = SplitOptions(block_count(arguments), arguments.min_views or LEAST_VIEWS)
+    split = SplitOptions(block_count(arguments), arguments.min_views or LEAST_VIEWS, quality_of(arguments))
     scene = coarse_scene(replace(options, scene=arguments.scene))
     return split_capture(replace(options, scene=None), scene, split, say, reader)
 

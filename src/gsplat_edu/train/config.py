@@ -474,3 +474,22 @@ def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **chang
     if length < SHORT_RUN:
         scaled["reset_every"] = 0
     return TrainConfig().changed(**{"iterations": iterations, **scaled, **changes})
+
+
+def stretched(config: TrainConfig, iterations: int) -> TrainConfig:
+    """Return a configuration whose milestones are moved in proportion to a new number of iterations.
+
+    Args:
+        config: The configuration, for a run without a tempo.
+        iterations: New number of iterations, a multiple of the batch.
+
+    Raises:
+        ArgumentError: the number is out of range.
+    """
+    values = config.flat()
+    moved = {
+        name: max(round(values[name] * iterations / config.iterations), 1)
+        for name in MILESTONES
+        if values[name]
+    }
+    return config.changed(iterations=iterations, **moved)
