@@ -107,10 +107,9 @@ def test_a_scene_that_no_photo_supports_is_refused(room, rings):
 
 
 def test_all_photos_of_an_ordinary_capture_judge_a_scene_by_adc():
-    """36 views out of 84, in 360 steps, found 94.6 % of the planted floaters; 84 views in 672 steps found 95.9 %."""
+    """36 of 84 views found 94.6 % of the planted floaters of such a scene, all of them 96.2 %, in as many steps."""
     splats, views = 164_000, 84
     assert Rules().views_of_round(splats, views) == views
-    assert Rules().joint_steps(splats, views) == 8 * views
 
 
 def test_the_work_on_large_scenes_is_bounded():

@@ -101,7 +101,7 @@ class Rules:
     price: float = 0.01
     missed: float = 1.0
     passes: int = 8
-    joint_work: float = 1.2e8
+    joint_work: float = 6e7
     least_steps: int = 40
     least_views: int = 3
     rounds: int = 4
