@@ -5,7 +5,9 @@
 Floaters are planted in the scene of a run (tests/fixtures/plant.py): between its training cameras and what they see.
 Then the scene is cleaned with the run's photos. Recall is the share of the planted floaters that is removed. Precision
 is the share of planted ones among all that is removed as floaters, so that splats of the scene itself count against it,
-whether the scene needs them or not; splats that no view sees are listed apart. The loss is the held-out PSNR of the
+whether the scene needs them or not; splats that no view sees are listed apart. A scene has floaters of its own, which
+cleaning is for. So the scene is also cleaned as it is, and a second precision counts against cleaning only the own
+splats that went because of the planted ones. The loss is the held-out PSNR of the
 scene before planting minus that of the planted and cleaned one. The own splats removed are also taken out of the scene
 alone, which tells whether it needed them.
 
@@ -90,6 +92,8 @@ def planted(subject: Subject, count: int, seed: int) -> dict[str, Any]:
     original, removed = held_out(subject, own), found.reasons != Reason.KEPT
     mine, theirs = found.reasons[: len(own)], found.reasons[len(own) :]
     hits, misses = int(removed[len(own) :].sum()), int((mine > Reason.UNSEEN).sum())
+    alone, _ = timed(subject, own)
+    caused = int(((mine > Reason.UNSEEN) & (alone.reasons == Reason.KEPT)).sum())
     return {
         "splats": len(own),
         "planted": count,
@@ -100,9 +104,12 @@ def planted(subject: Subject, count: int, seed: int) -> dict[str, Any]:
         "loss": original - (found.after or math.nan),
         "recall": hits / count,
         "precision": hits / max(hits + misses, 1),
+        "precision_beyond_own": hits / max(hits + caused, 1),
         "own_unseen": int((mine == Reason.UNSEEN).sum()),
         "own_in_front": int((mine == Reason.IN_FRONT).sum()),
         "own_refuted": int((mine == Reason.REFUTED).sum()),
+        "own_only_with_planted": caused,
+        "own_as_it_is": int((alone.reasons > Reason.UNSEEN).sum()),
         "planted_by_reason": {reason.name.lower(): int((theirs == reason).sum()) for reason in Reason},
         "loss_of_own_alone": original - held_out(subject, rows(own, mine == Reason.KEPT)),
         "seconds": seconds,
@@ -156,7 +163,7 @@ def main() -> int:
             else:
                 result = planted(subject, 20 if options.smoke else options.count, options.seed)
         for name, value in result.items():
-            print(f"{name:18} {value:.4f}" if isinstance(value, float) else f"{name:18} {value}")
+            print(f"{name:22} {value:.4f}" if isinstance(value, float) else f"{name:22} {value}")
         hardware.report(result, options.out)
 
     return run_command("clean.py", measure, debug=False)

@@ -106,8 +106,21 @@ class Rules:
     least_views: int = 3
     rounds: int = 4
     few: float = 1e-4
-    work: float = 6e6
+    work: float = 1.5e7
     round_views: int = 12
+
+    def views_of_round(self, splats: int, views: int) -> int:
+        """Return how many of a capture's views judge a scene of this many splats in a round."""
+        return min(views, max(self.round_views, int(self.work / max(splats, 1))))
+
+    def joint_steps(self, splats: int, views: int) -> int:
+        """Return the steps in which the doubtful ones of this many splats are judged together.
+
+        Args:
+            splats: Number of splats.
+            views: Number of views of a round.
+        """
+        return min(self.passes * views, max(self.least_steps, int(self.joint_work / max(splats, 1))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +183,7 @@ def judge(
 
 def _chosen(views: Sequence[View], rules: Rules, count: int) -> list[View]:
     """Return views spread evenly over the list, as many as the work of a round allows."""
-    most = max(rules.round_views, int(rules.work / max(count, 1)))
-    number = min(len(views), most)
+    number = rules.views_of_round(count, len(views))
     return [views[i * len(views) // number] for i in range(number)]
 
 
@@ -190,8 +202,7 @@ class _Rounds:
         self._gaussians, self._views, self._rules, self._progress = gaussians, views, rules, progress
         self._everything = everything
         self._settings = replace(settings, depth=False, median_depth=True)
-        most = max(rules.least_steps, int(rules.joint_work / max(len(gaussians), 1)))
-        self._steps = min(rules.passes * len(views), most)
+        self._steps = rules.joint_steps(len(gaussians), len(views))
         self._done, self._total = 0, rules.rounds * len(views) + self._steps
         self._reasons: UInt8[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.uint8)
 
