@@ -24,7 +24,8 @@ from gsplat_edu.data.points import random_cloud
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
-from gsplat_edu.scene.camera import Camera, point_nearest_axes, scene_extent as scene_extent
+from gsplat_edu.data.visible_cloud import cloud_in_cube, cloud_in_view
+from gsplat_edu.scene.camera import Camera, scene_extent as scene_extent
 from gsplat_edu.scene.views import View
 
 TEST_EVERY = 8
@@ -104,8 +105,7 @@ class Dataset:
                 "--resolution"
             )
         train, test = _split(path, views, [frame.part for frame in frames], settings, notes)
-        cameras = [view.camera for view in views]
-        start = placed.cloud or _random_start(capture, cameras, notes, placed.origin)
+        start = placed.cloud or _random_start(capture, [view.camera for view in train], notes, placed.origin)
         return cls(
             path,
             capture.layout,
@@ -305,16 +305,16 @@ def _places(cameras: Sequence[Camera]) -> list[int]:
 def _random_start(
     capture: Capture, cameras: Sequence[Camera], notes: list[str], origin: Float64[np.ndarray, "3"]
 ) -> Cloud:
-    """Generate random initial points and report it."""
+    """Generate random initial points where the training photos look, and report it."""
+    made = None
     if capture.cube is not None:
-        made = random_cloud(-origin, capture.cube)
-        where = f"in the cube +-{capture.cube:g}"
+        made = cloud_in_cube(cameras, -origin, capture.cube)
+        where = f"in the cube +-{capture.cube:g}, where two or more photos look"
     else:
+        made, where = cloud_in_view(cameras), "where two or more photos look"
+    if made is None:
         half_edge = scene_extent(cameras)
-        centre = point_nearest_axes(cameras)
-        if centre is None:
-            centre = np.mean([camera.eye for camera in cameras], axis=0)
-        made = random_cloud(centre, half_edge)
-        where = f"within {half_edge:.4g} of ({', '.join(f'{c:.4g}' for c in centre)})"
+        made = random_cloud(np.mean([camera.eye for camera in cameras], axis=0), half_edge)
+        where = f"within {half_edge:.4g} of the cameras, since no two photos see the same place"
     notes.append(f"{capture.no_cloud}: starting from {len(made.points):,} random points {where}")
     return made
