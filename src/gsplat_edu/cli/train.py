@@ -22,7 +22,7 @@ from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.length import quality_of
-from gsplat_edu.cli.options.train import AUTO, left_open, options_from
+from gsplat_edu.cli.options.train import AUTO, RANDOM_POINTS, left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars
@@ -43,6 +43,7 @@ from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.pilot import ORDER, PILOT_STEPS, refinement_for
 from gsplat_edu.runs.processes import Member, joined
+from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
@@ -102,7 +103,7 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
         arguments.out,
         TrainConfig().changed(**train),
         DataSettings(**data),
-        points=arguments.points,
+        points=None if arguments.points == RANDOM_POINTS else arguments.points,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
     )
@@ -126,6 +127,8 @@ def _run(
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     options = with_poses(options_from(arguments), arguments, console, say)
     reader = CaptureReader(options.data)
+    if team.size == 1 and arguments.points is None:
+        options = _with_points(options, reader, console, say)
     chosen = _planned(arguments, options, reader, deadline, console, say)
     with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:
         options = chosen.options
@@ -174,6 +177,14 @@ def _run(
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
             broadcast.stay(lambda: view.watched)
+
+
+def _with_points(
+    options: RunOptions, reader: CaptureReader, console: Console, say: Callable[[str], None]
+) -> RunOptions:
+    """Triangulate start points if the capture has none."""
+    with stage_bars(console) as progress:
+        return with_start_points(options, reader, say, progress)
 
 
 def _view(

@@ -70,6 +70,9 @@ COMMON = (
 )
 """What `--help` shows; `--help-all` shows the other options too."""
 
+RANDOM_POINTS = Path("random")
+"""Value of --points: do not triangulate start points."""
+
 AUTO = "auto"
 """The value of an option that stands for a choice by the photos."""
 
@@ -154,7 +157,11 @@ def _add_start(start: argparse._MutuallyExclusiveGroup) -> None:
         f" are in use from the first iteration, and --means-rate is {FROM_SCENE['means_rate']:g} unless given",
     )
     start.add_argument(
-        "--points", type=Path, metavar="X.ply", help="start from these points instead of the capture's"
+        "--points",
+        type=Path,
+        metavar="X.ply",
+        help=f"start from these points instead of the capture's; {RANDOM_POINTS}: where the capture has none, do not"
+        " triangulate any",
     )
 
 
@@ -353,7 +360,7 @@ def check(arguments: argparse.Namespace) -> None:
         )
     check_several(arguments)
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
-        if path is not None and not path.exists():
+        if path is not None and not path.exists() and (flag, path) != ("--points", RANDOM_POINTS):
             raise ArgumentError(f"{flag}: {path} does not exist; correct the name, or omit the option")
 
 
@@ -383,7 +390,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         out=arguments.out,
         config=config,
         data_settings=settings,
-        points=arguments.points,
+        points=None if arguments.points == RANDOM_POINTS else arguments.points,
         scene=arguments.scene,
         backend=backend,
         eval_every=arguments.eval_every,

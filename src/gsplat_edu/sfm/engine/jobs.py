@@ -322,11 +322,78 @@ def _pinhole(key: tuple[float, ...], number: int) -> pycolmap.Camera:
     return pycolmap.Camera(model="PINHOLE", width=W, height=H, params=intrinsics, camera_id=number)
 
 
+def pinholes(tell: Tell, database: str, views: list[dict[str, Any]]) -> dict[str, Any]:
+    """Make a database of photos with known cameras, one camera for each.
+
+    Args:
+        tell: Not called.
+        database: The database; it is created.
+        views: The photos: "name", size "W" and "H", and intrinsics "fx", "fy", "cx", "cy" with the first pixel's centre
+            at (0.5, 0.5), px.
+    """
+    with opened(database) as db, pycolmap.DatabaseTransaction(db):
+        for number, view in enumerate(views, 1):
+            add_camera(db, _pinhole(_pinhole_key(view), number))
+            add_photo(db, view["name"], number, number)
+    return {}
+
+
+def triangulation(
+    tell: Tell,
+    database: str,
+    photos: str,
+    out: str,
+    views: list[dict[str, Any]],
+    threads: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Triangulate the matches of photos with known cameras, and write the points as PLY.
+
+    Args:
+        tell: Not called.
+        database: Database of `pinholes` with features and matches.
+        photos: Folder of the photos, for the colours of the points.
+        out: The file.
+        views: As for `pinholes`, with "rotation" and "translation" from the world to the camera.
+        threads: Number of threads, -1 for all.
+        seed: Seed of all random draws.
+
+    Returns:
+        "points": their number.
+    """
+    pycolmap.set_random_seed(seed)
+    model = pycolmap.Reconstruction()
+    with opened(database) as db:
+        for number, view in enumerate(views, 1):
+            model.add_camera_with_trivial_rig(_pinhole(_pinhole_key(view), number))
+            seen = (
+                np.array(db.read_keypoints(number))[:, :2]
+                if db.exists_keypoints(number)
+                else np.zeros((0, 2))
+            )
+            image = pycolmap.Image(
+                name=view["name"], keypoints=seen.astype(np.float64), camera_id=number, image_id=number
+            )
+            matrix = np.column_stack([np.array(view["rotation"]), np.array(view["translation"])])
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.num_threads, pipeline.random_seed = threads, seed
+    found = pycolmap.triangulate_points(model, database, photos, str(Path(out).parent), options=pipeline)
+    found.export_PLY(out)
+    return {"points": found.num_points3D()}
+
+
+def _pinhole_key(view: dict[str, Any]) -> tuple[float, ...]:
+    return (view["W"], view["H"], view["fx"], view["fy"], view["cx"], view["cy"])
+
+
 JOBS: dict[str, Callable[..., dict[str, Any]]] = {
     "features": features,
     "matches": matches,
     "mapping": mapping,
     "finish": finish,
+    "pinholes": pinholes,
+    "triangulation": triangulation,
 }
 
 
