@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.textured_box import BOX_FACES, box_orbit, photograph_box
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.scene.views import View
 from gsplat_edu.sfm.triangulate import LEAST_POINTS, STAGES, triangulate
+from gsplat_edu.train.config import recipe
 
 pytest.importorskip("pycolmap")
 
@@ -104,3 +108,15 @@ def test_random_points_on_request_and_without_the_extra(views, tmp_path, capsys,
     said = capsys.readouterr().out.replace("\n", " ")
     assert "the capture has no points; " in said and "lets train triangulate" in said
     assert RunFolder(tmp_path / "b").read_config()["data"]["points"] is None
+
+
+def test_a_short_time_limit_leaves_no_time_to_triangulate(views, tmp_path):
+    write_transforms(tmp_path / "capture", views)
+    options = RunOptions(tmp_path / "capture", tmp_path / "run", recipe(10, strategy="fast"), DataSettings())
+    said = []
+    reader = CaptureReader(options.data)
+    assert with_start_points(options, reader, said.append, time_limit=20.0).points is None
+    assert said == [
+        "the time limit is too short to triangulate start points; the run starts from random ones"
+    ]
+    assert with_start_points(options, reader, said.append, time_limit=3_600.0).points is not None

@@ -128,7 +128,7 @@ def _run(
     options = with_poses(options_from(arguments), arguments, console, say)
     reader = CaptureReader(options.data)
     if team.size == 1 and arguments.points is None:
-        options = _with_points(options, reader, console, say)
+        options = _with_points(options, reader, seconds, console, say)
     chosen = _planned(arguments, options, reader, deadline, console, say)
     with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:
         options = chosen.options
@@ -180,11 +180,15 @@ def _run(
 
 
 def _with_points(
-    options: RunOptions, reader: CaptureReader, console: Console, say: Callable[[str], None]
+    options: RunOptions,
+    reader: CaptureReader,
+    time_limit: float | None,
+    console: Console,
+    say: Callable[[str], None],
 ) -> RunOptions:
     """Triangulate start points if the capture has none."""
     with stage_bars(console) as progress:
-        return with_start_points(options, reader, say, progress)
+        return with_start_points(options, reader, say, progress, time_limit)
 
 
 def _view(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import os
 from collections.abc import Callable
 
 from gsplat_edu.base.text import install_command
@@ -18,6 +19,10 @@ from gsplat_edu.sfm.triangulate import LONGEST_SIDE, triangulate
 NAME = "points.ply"
 """File of the triangulated points in a run's folder, in the capture's coordinates."""
 
+CORE_SECONDS, TIME_SHARE = 3.0, 0.25
+"""Expected processor time of a photo's features and matches, s, twice that of the machine of benchmarks/RESULTS.md; and
+the largest share of a time limit that triangulation may take."""
+
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
 
@@ -27,6 +32,7 @@ def with_start_points(
     reader: CaptureReader,
     say: Say = lambda sentence: None,
     progress: Progress = lambda stage, done, total: None,
+    time_limit: float | None = None,
 ) -> RunOptions:
     """Triangulate start points if the capture has none, and keep them in the run's folder.
 
@@ -38,6 +44,8 @@ def with_start_points(
         reader: The run's capture.
         say: Receives sentences for the user.
         progress: Called with a stage, the amount done and the total.
+        time_limit: Seconds of the whole command; if points would take more than a quarter of them, none are
+            triangulated.
 
     Returns:
         The options with the file as `points`; unchanged if there are points, or a scene to start from.
@@ -59,6 +67,9 @@ def with_start_points(
             f"the capture has no points; {install_command('sfm')} lets train triangulate some from its photos"
         )
         return options
+    if time_limit is not None and _expected_seconds(len(dataset.train)) > TIME_SHARE * time_limit:
+        say("the time limit is too short to triangulate start points; the run starts from random ones")
+        return options
     size = max(max(view.camera.W, view.camera.H) for view in Dataset.of(reader, _sized(options, None)).train)
     photos = Dataset.of(reader, _sized(options, float(LONGEST_SIDE) if size > LONGEST_SIDE else None))
     cloud = triangulate(photos.train, options.folder.path / "points", progress)
@@ -70,6 +81,10 @@ def with_start_points(
         f"triangulated {len(cloud.points):,} start points from the given poses; --points random starts without"
     )
     return dataclasses.replace(options, points=stored)
+
+
+def _expected_seconds(photos: int) -> float:
+    return CORE_SECONDS * photos / (os.cpu_count() or 1)
 
 
 def _sized(options: RunOptions, resolution: float | None) -> DataSettings:
