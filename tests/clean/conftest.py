@@ -9,10 +9,13 @@ import torch
 from fixtures.plant import floaters
 from gsplat_edu.base.constants import C0
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+
+CPU = load_backend("cpu")
 
 SETTINGS = RenderSettings(depth=False, sh_degree=0, jacobian_limit=1.3)
 

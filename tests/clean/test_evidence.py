@@ -16,6 +16,8 @@ from gsplat_edu.scene.gaussian_math import build_cov3d_batch, quat_to_R_batch
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
+from .conftest import CPU
+
 CAMERA = Camera(np.eye(3), (0.1, -0.05, -3.0), fx=50.0, fy=45.0, cx=20.3, cy=16.8, H=35, W=41)
 
 SETTINGS = RenderSettings(depth=False, median_depth=True, sh_degree=0)
@@ -71,7 +73,7 @@ def without(gaussians, i) -> Gaussians:
 
 def test_weights_and_gaps_are_those_of_the_reference(scene, photo):
     """float64 kernels and the reference differ by rounding only: 1e-9 of sums over 1,435 pixels."""
-    found = gather(scene, [View(CAMERA, photo)], SETTINGS)
+    found = gather(scene, [View(CAMERA, photo)], SETTINGS, CPU)
     weights = reference_weights(scene)
     np.testing.assert_allclose(found.weight, weights.sum(axis=(1, 2)), rtol=1e-9)
     np.testing.assert_allclose(found.peak, weights.max(axis=(1, 2)), rtol=1e-6)  # peak is float32
@@ -93,7 +95,7 @@ def test_the_gain_is_the_change_of_the_error_without_the_splat(scene, photo):
     The square term is a mean over random signs. A sum of random signs has a square of mean S and standard deviation
     at most sqrt(2) S, so the mean of 100 views is off by 0.14 S at one sigma; 5 sigma are allowed.
     """
-    found = gather(scene, [View(CAMERA, photo)] * REPEATS, SETTINGS)
+    found = gather(scene, [View(CAMERA, photo)] * REPEATS, SETTINGS, CPU)
     whole = squared_error(scene, photo)
     assert found.error == pytest.approx(REPEATS * whole)
     full = render(scene, CAMERA, settings=SETTINGS, backend="cpu").image
@@ -108,7 +110,7 @@ def test_a_splat_that_is_removed_is_judged_by_what_it_would_add(scene, photo):
     """It is drawn at 0.02, whose core holds 80 % of the linear and 96 % of the square term: alpha ends at 1/255."""
     removed = np.zeros(COUNT, dtype=bool)
     removed[7] = True
-    found = gather(scene, [View(CAMERA, photo)] * (TURNS * REPEATS), SETTINGS, removed)
+    found = gather(scene, [View(CAMERA, photo)] * (TURNS * REPEATS), SETTINGS, CPU, removed)
     present, absent = squared_error(scene, photo), squared_error(without(scene, 7), photo)
     images = [render(g, CAMERA, settings=SETTINGS, backend="cpu").image for g in (scene, without(scene, 7))]
     square = float((images[0] - images[1]).square().sum())
@@ -124,7 +126,7 @@ def test_masked_pixels_say_nothing(scene, photo):
     mask[:, :20] = True
     other = photo.copy()
     other[~mask] = 255 - other[~mask]
-    one, two = (gather(scene, [View(CAMERA, image, mask=mask)], SETTINGS) for image in (photo, other))
+    one, two = (gather(scene, [View(CAMERA, image, mask=mask)], SETTINGS, CPU) for image in (photo, other))
     for field in dataclasses.fields(one):
         assert np.array_equal(getattr(one, field.name), getattr(two, field.name)), field.name
     weights = reference_weights(scene)
@@ -134,5 +136,7 @@ def test_masked_pixels_say_nothing(scene, photo):
 
 
 def test_peak_weights_are_those_of_the_evidence(scene, photo):
-    found = gather(scene, [View(CAMERA, photo)], SETTINGS)
-    np.testing.assert_allclose(peak_weights(scene, [View(CAMERA, photo)], SETTINGS), found.peak, rtol=1e-6)
+    found = gather(scene, [View(CAMERA, photo)], SETTINGS, CPU)
+    np.testing.assert_allclose(
+        peak_weights(scene, [View(CAMERA, photo)], SETTINGS, CPU), found.peak, rtol=1e-6
+    )

@@ -10,12 +10,22 @@ from gsplat_edu.base.constants import ALPHA_MIN
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.evidence import peak_weights
 from gsplat_edu.clean.guard import clean
-from gsplat_edu.clean.judge import Reason, Rules, judge
+from gsplat_edu.clean.judge import (
+    JOINT_WORK,
+    LEAST_ROUND_VIEWS,
+    LEAST_STEPS,
+    ROUND_WORK,
+    Reason,
+    joint_steps,
+    judge,
+    views_of_round,
+)
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
-from .conftest import SETTINGS, photographed, shell
+from .conftest import CPU, SETTINGS, photographed, shell
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +94,7 @@ def test_masked_pixels_judge_nothing(room, planted, rings):
     mask = np.zeros((rings[0][0].H, rings[0][0].W), dtype=bool)
     found = judge(planted, photographed(room, rings[0], mask), SETTINGS)
     assert set(np.unique(found.reasons)) <= {Reason.KEPT, Reason.UNSEEN}
-    seen = peak_weights(planted, photographed(room, rings[0]), SETTINGS) > ALPHA_MIN
+    seen = peak_weights(planted, photographed(room, rings[0]), SETTINGS, CPU) > ALPHA_MIN
     assert np.array_equal(found.reasons == Reason.KEPT, seen)
 
 
@@ -109,24 +119,44 @@ def test_a_scene_that_no_photo_supports_is_refused(room, rings):
 def test_all_photos_of_an_ordinary_capture_judge_a_scene_by_adc():
     """36 of 84 views found 94.6 % of the planted floaters of such a scene, all of them 96.2 %, in as many steps."""
     splats, views = 164_000, 84
-    assert Rules().views_of_round(splats, views) == views
+    assert views_of_round(splats, views) == views
 
 
 def test_the_work_on_large_scenes_is_bounded():
-    rules = Rules()
     for splats, views in ((1_000_000, 84), (1_000_000, 3_000), (500_000, 300)):
-        of_round = rules.views_of_round(splats, views)
-        assert rules.round_views <= of_round < views
-        assert splats * of_round <= max(rules.work, splats * rules.round_views)
-        assert splats * rules.joint_steps(splats, of_round) <= rules.joint_work
-    assert rules.views_of_round(10_000_000, 84) == rules.round_views
-    assert rules.joint_steps(10_000_000, 12) == rules.least_steps
-    assert rules.views_of_round(0, 84) == 84
+        of_round = views_of_round(splats, views)
+        assert LEAST_ROUND_VIEWS <= of_round < views
+        assert splats * of_round <= max(ROUND_WORK, splats * LEAST_ROUND_VIEWS)
+        assert splats * joint_steps(splats, of_round) <= JOINT_WORK
+    assert views_of_round(10_000_000, 84) == LEAST_ROUND_VIEWS
+    assert joint_steps(10_000_000, 12) == LEAST_STEPS
+    assert views_of_round(0, 84) == 84
 
 
 def test_no_views_are_refused(room):
     with pytest.raises(ArgumentError, match="views: there are none"):
         judge(room, [], SETTINGS)
+
+
+def test_a_backend_without_statistics_is_refused_before_any_photo_is_read(room):
+    with pytest.raises(
+        ArgumentError,
+        match="^clean: needs a backend that collects statistics .*, which torch does not; use the ",
+    ):
+        clean(room, [], [], SETTINGS, backend=load_backend("torch"))
+
+
+def test_the_backend_that_is_given_renders(room, rings):
+    calls = []
+
+    def rasterize(*arguments):
+        calls.append(arguments)
+        return CPU.rasterize(*arguments)
+
+    views, held_out = photographed(room, rings[0][:4]), photographed(room, rings[1][:1])
+    given = clean(room, views, held_out, SETTINGS, backend=replace(CPU, rasterize=rasterize))
+    assert len(calls) > len(views)
+    assert np.array_equal(given.reasons, clean(room, views, held_out, SETTINGS).reasons)
 
 
 def test_an_empty_scene_stays_empty(room, rings):

@@ -10,7 +10,7 @@ from gsplat_edu.clean.settle import Doubtful, _slope, settle
 from gsplat_edu.render.api import render
 from gsplat_edu.scene.gaussians import Gaussians
 
-from .conftest import SETTINGS, photographed
+from .conftest import CPU, SETTINGS, photographed
 
 UNIT = 1e-6
 
@@ -35,7 +35,9 @@ def test_the_gradient_is_that_of_the_error(planted, rings):
     # The price's part is added by a closed form, so that it cancels here.
     price = 0.3
     factor = 1.0 / (1.0 + np.exp(-logits))
-    found = _slope(faint, doubtful, logits, view, SETTINGS, price) - price * factor * (1.0 - factor)
+    found = _slope(
+        faint, Doubtful(doubtful, logits, price), logits, view, SETTINGS, CPU, 1.0
+    ) - price * factor * (1.0 - factor)
     direction = np.random.default_rng(1).normal(size=len(doubtful))
     step = 1e-6
     up, down = (error(faint, doubtful, logits + s * step * direction, view) for s in (1, -1))
@@ -54,8 +56,8 @@ def test_of_two_that_fill_one_hole_the_one_that_the_photos_show_stays(room, ring
         room.map(lambda tensor: tensor[hole : hole + 1]), sh0=-room.sh0[hole : hole + 1] + 0.2 * red
     )
     both = Gaussians.concatenated([room, other])
-    doubtful = Doubtful(np.array([hole, len(room)]), np.array([-1.0, -1.0]))
-    logits = settle(both, doubtful, views, SETTINGS, UNIT, 0.01, 80)
+    doubtful = Doubtful(np.array([hole, len(room)]), np.array([-1.0, -1.0]), 0.01)
+    logits = settle(both, doubtful, views, SETTINGS, CPU, UNIT, 80)
     assert logits[0] > 1.0
     assert logits[1] < -1.5
 
@@ -67,7 +69,13 @@ def test_what_no_photo_shows_stays_where_it_was(room, rings):
     both = Gaussians.concatenated([room, far])
     start = np.array([1.0])
     found = settle(
-        both, Doubtful(np.array([len(room)]), start), photographed(room, rings[0]), SETTINGS, UNIT, 0.01, 40
+        both,
+        Doubtful(np.array([len(room)]), start, 0.01),
+        photographed(room, rings[0]),
+        SETTINGS,
+        CPU,
+        UNIT,
+        40,
     )
     assert 0.9 < found[0] < 1.0
 
@@ -76,5 +84,5 @@ def test_masked_pixels_do_not_count(room, planted, rings):
     mask = np.zeros((rings[0][0].H, rings[0][0].W), dtype=bool)
     views = photographed(room, rings[0], mask)
     start = np.full(60, -1.0)
-    found = settle(planted, Doubtful(np.arange(1300, 1360), start), views, SETTINGS, UNIT, 0.0, 40)
+    found = settle(planted, Doubtful(np.arange(1300, 1360), start, 0.0), views, SETTINGS, CPU, UNIT, 40)
     assert np.array_equal(found, start)

@@ -1,4 +1,4 @@
-"""All constants of the renderer: value, unit, purpose, source.
+"""All constants of the renderer, and values that several packages share: value, unit, purpose, source.
 
 Kerbl et al. 2023 is "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (ACM TOG 42.4);
 "its code" is the rasteriser published with it.
@@ -110,6 +110,12 @@ Source: Kerbl et al. 2023, its code."""
 
 SH_MAX_DEGREE: Final = 3
 """Highest supported SH degree: 16 coefficients per channel."""
+
+AUTO: Final = "auto"
+"""Value of an option or a field that leaves the choice to the program, which decides by the photos."""
+
+LOOPBACK: Final = "127.0.0.1"
+"""IPv4 address of this computer, reachable from this computer only. Source: RFC 1122, section 3.2.1.3."""
 
 SRGB_OFFSET: Final = 0.055
 """Offset of the sRGB curve, of encoded colours: 1.055 l^(1/2.4) - 0.055. Source: IEC 61966-2-1."""

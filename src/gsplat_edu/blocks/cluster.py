@@ -20,12 +20,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError, SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.headroom import shortage
 from gsplat_edu.base.text import install_command
-
-LOOPBACK = "127.0.0.1"
 
 FAILURES = 20
 """How many workers a block may lose before it is abandoned. Each next worker resumes from the last checkpoint."""

@@ -22,6 +22,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
@@ -38,6 +40,20 @@ TURNS = 4
 
 Progress = Callable[[], None]
 """Called after every view."""
+
+
+def judging_backend(backend: Backend | None) -> Backend:
+    """Return the backend that renders a judgement, `cpu` if none is given.
+
+    Args:
+        backend: A backend that collects the statistics of each splat.
+
+    Raises:
+        ArgumentError: it does not collect them.
+    """
+    backend = load_backend("cpu") if backend is None else backend
+    backend.require("statistics", "clean:")
+    return backend
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +84,7 @@ def gather(
     gaussians: Gaussians,
     views: Sequence[View],
     settings: RenderSettings,
+    backend: Backend,
     removed: Bool[np.ndarray, " N"] | None = None,
     progress: Progress = lambda: None,
 ) -> Evidence:
@@ -77,6 +94,7 @@ def gather(
         gaussians: N Gaussians on the CPU.
         views: Cameras and photos.
         settings: The scene's render settings.
+        backend: What renders; it has to collect statistics (`judging_backend`).
         removed: (N,) splats that are removed already: they are drawn faintly, each in a quarter of the views, and
             their `gain` is scaled to their own opacity. None for none.
         progress: Called after every view.
@@ -85,7 +103,7 @@ def gather(
         DatasetError: a photo cannot be read.
     """
     count = len(gaussians)
-    sums = _Sums(count)
+    sums = _Sums(count, backend)
     gone = np.zeros(count, dtype=bool) if removed is None else removed
     ids = np.arange(count)
     for index, view in enumerate(views):
@@ -96,7 +114,7 @@ def gather(
 
 
 def peak_weights(
-    gaussians: Gaussians, views: Sequence[View], settings: RenderSettings
+    gaussians: Gaussians, views: Sequence[View], settings: RenderSettings, backend: Backend
 ) -> Float32[np.ndarray, " N"]:
     """Return the largest weight of each splat in any pixel of any view; photos are not read.
 
@@ -104,11 +122,12 @@ def peak_weights(
         gaussians: N Gaussians on the CPU.
         views: The cameras.
         settings: The scene's render settings.
+        backend: What renders; it has to collect statistics (`judging_backend`).
     """
     found: Float32[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.float32)
     for view in views:
         some = replace(gaussians, logit_opacities=gaussians.logit_opacities.detach().clone().requires_grad_())
-        output = render(some, view.camera, settings=settings, backend="cpu")
+        output = render(some, view.camera, settings=settings, backend=backend)
         weights = output.collect("weight_max")
         torch.autograd.grad(output.image, some.logit_opacities, torch.zeros_like(output.image))
         ids = output.visible.numpy()
@@ -145,7 +164,8 @@ def residual_of(
 class _Sums:
     """Running sums of the evidence."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, backend: Backend) -> None:
+        self._backend = backend
         self.weight, self.near, self.gain, self.spread = (np.zeros(count) for _ in range(4))
         self.peak: Float32[np.ndarray, " N"] = np.zeros(count, dtype=np.float32)
         self.views = np.zeros(count, dtype=np.int32)
@@ -170,7 +190,9 @@ class _Sums:
         full = np.minimum(some.opacities.double().numpy(), MOST_OPAQUE)
         shown = np.where(gone[drawn], np.minimum(full, FAINT), full)
         logits = torch.from_numpy(np.log(shown / (1.0 - shown))).to(some.means).requires_grad_()
-        output = render(replace(some, logit_opacities=logits), view.camera, settings=settings, backend="cpu")
+        output = render(
+            replace(some, logit_opacities=logits), view.camera, settings=settings, backend=self._backend
+        )
         residual, counts = residual_of(output, view, settings)
         self.error += float(np.square(residual.double().numpy()).sum())
         signs = np.random.default_rng(index).integers(0, 2, output.image.shape, dtype=np.int8)

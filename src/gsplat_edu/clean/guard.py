@@ -18,9 +18,11 @@ from jaxtyping import Bool, Int64, UInt8
 from gsplat_edu.base.buffers import reused_buffers
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.clean.judge import Progress, Reason, Rules, Verdict, judge
+from gsplat_edu.clean.evidence import judging_backend
+from gsplat_edu.clean.judge import Progress, Reason, Verdict, judge
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
@@ -81,7 +83,7 @@ def clean(
     test: Sequence[View],
     settings: RenderSettings,
     max_loss: float = MAX_LOSS,
-    rules: Rules | None = None,
+    backend: Backend | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Cleaning:
     """Find the splats that the photos do not support, and how many of them can go.
@@ -92,24 +94,26 @@ def clean(
         test: The views that were held out; they guard. If there are none, the training views do.
         settings: The scene's render settings.
         max_loss: Largest loss of the guard's mean PSNR, dB.
-        rules: Thresholds of the judgement; None takes the defaults.
+        backend: What renders; None takes the backend cpu.
         progress: Called after every view that judges.
 
     Raises:
-        ArgumentError: there are no training views, no splat would be left, or `max_loss` is negative.
+        ArgumentError: there are no training views, no splat would be left, `max_loss` is negative, or the
+            backend collects no statistics.
         DatasetError: a photo cannot be read.
     """
     in_range("max_loss", max_loss, 0.0)
+    backend = judging_backend(backend)
     gaussians = gaussians.map(lambda tensor: tensor.detach())
     with reused_buffers():
-        verdict = judge(gaussians, train, settings, rules, progress)
+        verdict = judge(gaussians, train, settings, backend, progress)
     if len(gaussians) and verdict.removed.all():
         raise ArgumentError(
             f"scene: none of its {len(gaussians):,} splats is supported by the photos; check that the capture"
             " is that of the scene"
         )
     guards = test or train
-    score = functools.partial(_score, gaussians, views=guards, settings=settings)
+    score = functools.partial(_score, gaussians, views=guards, settings=settings, backend=backend)
     reasons = verdict.reasons
     before = score(np.ones(len(gaussians), dtype=bool))
     whole = after = before if not verdict.removed.any() else score(reasons == Reason.KEPT)
@@ -136,7 +140,11 @@ def _rows(gaussians: Gaussians, kept: Bool[np.ndarray, " N"]) -> Gaussians:
 
 
 def _score(
-    gaussians: Gaussians, kept: Bool[np.ndarray, " N"], views: Sequence[View], settings: RenderSettings
+    gaussians: Gaussians,
+    kept: Bool[np.ndarray, " N"],
+    views: Sequence[View],
+    settings: RenderSettings,
+    backend: Backend,
 ) -> float | None:
     """Return the mean PSNR over the views, dB; None if no view has a pixel that counts."""
     some, scores = _rows(gaussians, kept), []
@@ -145,6 +153,6 @@ def _score(
         if photo.mask is not None and not photo.mask.any():
             continue
         with torch.no_grad():
-            image = render(some, view.camera, settings=settings, backend="cpu").image
+            image = render(some, view.camera, settings=settings, backend=backend).image
         scores.append(psnr(image, photo.over(settings.background), photo.mask))
     return float(np.mean(scores)) if scores else None

@@ -21,11 +21,86 @@ from jaxtyping import Bool, Float64, UInt8
 
 from gsplat_edu.base.constants import ALPHA_MIN
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.clean.evidence import Evidence, gather, peak_weights
+from gsplat_edu.clean.evidence import Evidence, gather, judging_backend, peak_weights
 from gsplat_edu.clean.settle import Doubtful, settle
+from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+
+# The thresholds. gap: distance of a splat in front of the surface that the views see, as a fraction of the surface's
+# distance (`Evidence.gap`). error: decrease of the squared error if this splat alone is removed, in multiples of the
+# error of all photos divided by the number of splats. z: defined above.
+
+FREE_GAP = 0.15
+"""Remove as in free space if gap > FREE_GAP and z > FREE_Z."""
+
+FREE_Z = -0.9
+"""See `FREE_GAP`; a lower z says that the photos miss the splat."""
+
+FAR_GAP = 0.3
+"""Remove as in free space if gap > FAR_GAP and z > FAR_Z."""
+
+FAR_Z = -2.0
+"""See `FAR_GAP`."""
+
+RARE_VIEWS = 0.05
+"""Remove for any z if gap > FAR_GAP and at most this fraction of the views see the splat: a few views fit their noise
+with splats close to them."""
+
+NEAR_GAP = 0.05
+"""Refute if gap > NEAR_GAP, error > NEAR_ERROR and z > NEAR_Z."""
+
+NEAR_ERROR = 10.0
+"""See `NEAR_GAP`."""
+
+NEAR_Z = 0.3
+"""See `NEAR_GAP`."""
+
+LARGE_ERROR = 20.0
+"""Refute for any gap if error > LARGE_ERROR and z > LARGE_Z."""
+
+LARGE_Z = 2.0
+"""See `LARGE_ERROR`."""
+
+GROSS_ERROR = 100.0
+"""Refute for any gap if error > GROSS_ERROR and z > GROSS_Z. For any z, the splat is doubtful."""
+
+GROSS_Z = 1.0
+"""See `GROSS_ERROR`."""
+
+DOUBTFUL_GAP = 0.1
+"""A kept splat is doubtful if gap > DOUBTFUL_GAP and |error| > PRICE."""
+
+PRICE = 0.01
+"""Remove a doubtful splat if the joint judgement finds that this adds less than this error."""
+
+MISSED_ERROR = 1.0
+"""A removed splat with error < -MISSED_ERROR enters the joint judgement as kept, because the photos miss it."""
+
+STEPS_PER_VIEW = 8
+"""The joint judgement takes this many steps per view of a round, unless `JOINT_WORK` allows fewer."""
+
+JOINT_WORK = 6e7
+"""Largest number of splats times steps of the joint judgement; `LEAST_STEPS` may exceed it."""
+
+LEAST_STEPS = 40
+"""Least number of steps that `JOINT_WORK` can reduce the joint judgement to."""
+
+LEAST_VIEWS = 3
+"""With fewer views, only splats that no view sees are removed."""
+
+MAX_ROUNDS = 4
+"""Largest number of rounds of evidence."""
+
+LAST_ROUND_REMOVED = 1e-4
+"""Stop the rounds after one that removes at most this fraction of the splats."""
+
+ROUND_WORK = 1.5e7
+"""Largest number of splats times views of a round; views are left out evenly to stay below it."""
+
+LEAST_ROUND_VIEWS = 12
+"""A round has at least this many views, if the capture has them; `ROUND_WORK` may be exceeded."""
 
 
 class Reason(IntEnum):
@@ -50,77 +125,24 @@ SENTENCES = {
 }
 
 
-@dataclass(frozen=True)
-class Rules:
-    """Thresholds of a judgement.
-
-    Distances are fractions of the distance from the camera. Errors are multiples of the average squared error per
-    splat: that of all photos divided by the number of splats.
+def views_of_round(splats: int, views: int) -> int:
+    """Return how many of a capture's views judge a scene in one round.
 
     Args:
-        gap: A splat is in free space from this gap on, as a fraction of the distance (`Evidence.gap`).
-        against: z below which the photos miss a splat in free space; it then stays.
-        far_gap: From this gap on, it takes more to keep a splat:
-        far_against: z below which the photos miss it.
-        rare: With such a gap, a splat that at most this share of the views see goes even if they miss it: few views fit
-            their noise with splats right in front of them.
-        near_gap: A splat is refuted from this gap on if removing it alone lowers the error by
-        near_error: this much, with a z above
-        near_z: this one.
-        error: A splat is refuted, wherever it is, if removing it alone lowers the error by this much, with a z above
-        agreement: this one;
-        gross_error: or by this much, with a z above
-        gross_z: this one.
-        doubt: From this gap on, a splat that the rounds kept is doubtful, unless it changes the error by less than the
-        price: a doubtful splat goes if its absence adds less than this much error. One whose removal lowers the error
-            by `gross_error` is doubtful wherever it is.
-        missed: The photos miss a splat whose absence adds more than this error.
-        passes: The doubtful splats are judged together in this many steps for each view of a round,
-        joint_work: in fewer if splats times steps would be more than this,
-        least_steps: but then in at least this many.
-        least_views: Fewer views than this do not find floaters, only what they do not see.
-        rounds: Most rounds of evidence.
-        few: The rounds end once one removes at most this share of the splats.
-        work: Splats times views of a round; views are left out evenly to stay below it.
-        round_views: Views of a round, at least.
+        splats: Number of splats.
+        views: Number of views of the capture.
     """
+    return min(views, max(LEAST_ROUND_VIEWS, int(ROUND_WORK / max(splats, 1))))
 
-    gap: float = 0.15
-    against: float = -0.9
-    far_gap: float = 0.3
-    far_against: float = -2.0
-    rare: float = 0.05
-    near_gap: float = 0.05
-    near_error: float = 10.0
-    near_z: float = 0.3
-    error: float = 20.0
-    agreement: float = 2.0
-    gross_error: float = 100.0
-    gross_z: float = 1.0
-    doubt: float = 0.1
-    price: float = 0.01
-    missed: float = 1.0
-    passes: int = 8
-    joint_work: float = 6e7
-    least_steps: int = 40
-    least_views: int = 3
-    rounds: int = 4
-    few: float = 1e-4
-    work: float = 1.5e7
-    round_views: int = 12
 
-    def views_of_round(self, splats: int, views: int) -> int:
-        """Return how many of a capture's views judge a scene of this many splats in a round."""
-        return min(views, max(self.round_views, int(self.work / max(splats, 1))))
+def joint_steps(splats: int, views: int) -> int:
+    """Return the number of steps in which the doubtful splats are judged together.
 
-    def joint_steps(self, splats: int, views: int) -> int:
-        """Return the steps in which the doubtful ones of this many splats are judged together.
-
-        Args:
-            splats: Number of splats.
-            views: Number of views of a round.
-        """
-        return min(self.passes * views, max(self.least_steps, int(self.joint_work / max(splats, 1))))
+    Args:
+        splats: Number of splats of the scene.
+        views: Number of views of a round.
+    """
+    return min(STEPS_PER_VIEW * views, max(LEAST_STEPS, int(JOINT_WORK / max(splats, 1))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +175,7 @@ def judge(
     gaussians: Gaussians,
     views: Sequence[View],
     settings: RenderSettings,
-    rules: Rules | None = None,
+    backend: Backend | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Verdict:
     """Decide which splats the photos do not support.
@@ -162,28 +184,28 @@ def judge(
         gaussians: N Gaussians on the CPU, in the frame of the cameras.
         views: The views that the scene was trained on.
         settings: The scene's render settings; photos that are not opaque are judged over their background.
-        rules: Thresholds; None takes the defaults.
+        backend: What renders; None takes the backend cpu.
         progress: Called after every view.
 
     Raises:
-        ArgumentError: there are no views.
+        ArgumentError: there are no views, or the backend collects no statistics.
         DatasetError: a photo cannot be read.
     """
-    rules = rules or Rules()
+    backend = judging_backend(backend)
     if not views:
         raise ArgumentError("views: there are none; a scene can only be judged by photos")
     finite = gaussians.finite_rows().numpy()
     some = gaussians if finite.all() else gaussians.map(lambda tensor: tensor[torch.from_numpy(finite)])
     reasons = np.full(len(gaussians), Reason.UNSEEN, dtype=np.uint8)
     certainty = np.zeros(len(gaussians))
-    chosen = _chosen(views, rules, len(some))
-    reasons[finite], certainty[finite] = _Rounds(some, views, chosen, settings, rules, progress).result()
+    chosen = _chosen(views, len(some))
+    reasons[finite], certainty[finite] = _Rounds(some, views, chosen, settings, backend, progress).result()
     return Verdict(reasons, certainty, len(chosen))
 
 
-def _chosen(views: Sequence[View], rules: Rules, count: int) -> list[View]:
+def _chosen(views: Sequence[View], count: int) -> list[View]:
     """Return views spread evenly over the list, as many as the work of a round allows."""
-    number = rules.views_of_round(count, len(views))
+    number = views_of_round(count, len(views))
     return [views[i * len(views) // number] for i in range(number)]
 
 
@@ -196,21 +218,28 @@ class _Rounds:
         everything: Sequence[View],
         views: Sequence[View],
         settings: RenderSettings,
-        rules: Rules,
+        backend: Backend,
         progress: Progress,
     ) -> None:
-        self._gaussians, self._views, self._rules, self._progress = gaussians, views, rules, progress
+        self._gaussians, self._views, self._backend, self._progress = gaussians, views, backend, progress
         self._everything = everything
         self._settings = replace(settings, depth=False, median_depth=True)
-        self._steps = rules.joint_steps(len(gaussians), len(views))
-        self._done, self._total = 0, rules.rounds * len(views) + self._steps
+        self._steps = joint_steps(len(gaussians), len(views))
+        self._done, self._total = 0, MAX_ROUNDS * len(views) + self._steps
         self._reasons: UInt8[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.uint8)
 
     def result(self) -> tuple[UInt8[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
-        rules, reasons = self._rules, self._reasons
+        reasons = self._reasons
         seen, doubtful, rare = (np.zeros(len(reasons), dtype=bool) for _ in range(3))
-        for _ in range(rules.rounds):
-            found = gather(self._gaussians, self._views, self._settings, reasons != Reason.KEPT, self._step)
+        for _ in range(MAX_ROUNDS):
+            found = gather(
+                self._gaussians,
+                self._views,
+                self._settings,
+                self._backend,
+                reasons != Reason.KEPT,
+                self._step,
+            )
             seen |= found.peak > ALPHA_MIN
             free, refuted = self._found(found)
             kept = reasons == Reason.KEPT
@@ -218,12 +247,12 @@ class _Rounds:
             reasons[kept & refuted] = Reason.REFUTED
             reasons[kept & free] = Reason.IN_FRONT
             doubtful |= (reasons != Reason.KEPT) | self._doubtful(found)
-            if (kept & (free | refuted)).sum() <= rules.few * len(reasons):
+            if (kept & (free | refuted)).sum() <= LAST_ROUND_REMOVED * len(reasons):
                 break
         certainty = self._settled(doubtful, rare, found)
         if len(self._views) < len(self._everything) and not seen.all():
             rest = [view for view in self._everything if view not in self._views]
-            seen |= peak_weights(self._gaussians, rest, self._settings) > ALPHA_MIN
+            seen |= peak_weights(self._gaussians, rest, self._settings, self._backend) > ALPHA_MIN
         reasons[(reasons == Reason.KEPT) & ~seen] = Reason.UNSEEN
         self._progress(self._total, self._total)
         return reasons, certainty
@@ -236,19 +265,19 @@ class _Rounds:
         Those that the rounds kept, and those that the photos miss in the last round, start as needed.
         """
         certainty = np.zeros(len(doubtful))
-        if not doubtful.any() or len(self._views) < self._rules.least_views:
+        if not doubtful.any() or len(self._views) < LEAST_VIEWS:
             return certainty
         ids = np.flatnonzero(doubtful)
-        needed = (self._reasons == Reason.KEPT) | (_errors(last) < -self._rules.missed)
+        needed = (self._reasons == Reason.KEPT) | (_errors(last) < -MISSED_ERROR)
         start = np.where(needed[ids], 1.0, -1.0)
         unit = max(last.error / len(doubtful) / len(self._views), np.finfo(np.float64).tiny)
         logits = settle(
             self._gaussians,
-            Doubtful(ids, start),
+            Doubtful(ids, start, PRICE),
             self._views,
             self._settings,
+            self._backend,
             unit=unit,
-            price=self._rules.price,
             steps=self._steps,
             progress=self._step,
         )
@@ -260,25 +289,25 @@ class _Rounds:
 
     def _found(self, found: Evidence) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
         """Return which splats are in free space, and which the photos refute."""
-        rules, errors, z = self._rules, _errors(found), _agreement(found)
-        free = (found.gap > rules.gap) & (z > rules.against)
-        free |= (found.gap > rules.far_gap) & (z > rules.far_against) | self._rare(found)
+        errors, z = _errors(found), _agreement(found)
+        free = (found.gap > FREE_GAP) & (z > FREE_Z)
+        free |= (found.gap > FAR_GAP) & (z > FAR_Z) | self._rare(found)
         free &= found.views > 0
-        refuted = (found.gap > rules.near_gap) & (errors > rules.near_error) & (z > rules.near_z)
-        refuted |= (errors > rules.error) & (z > rules.agreement)
-        refuted |= (errors > rules.gross_error) & (z > rules.gross_z)
-        enough = len(self._views) >= rules.least_views
+        refuted = (found.gap > NEAR_GAP) & (errors > NEAR_ERROR) & (z > NEAR_Z)
+        refuted |= (errors > LARGE_ERROR) & (z > LARGE_Z)
+        refuted |= (errors > GROSS_ERROR) & (z > GROSS_Z)
+        enough = len(self._views) >= LEAST_VIEWS
         return free & enough, refuted & enough
 
     def _doubtful(self, found: Evidence) -> Bool[np.ndarray, " N"]:
         """Return which splats may have to go, if the photos agree to it."""
-        rules, errors = self._rules, _errors(found)
-        doubtful: Bool[np.ndarray, " N"] = (np.abs(errors) > rules.price) & (found.gap > rules.doubt)
-        return (doubtful | (errors > rules.gross_error)) & (found.views > 0)
+        errors = _errors(found)
+        doubtful: Bool[np.ndarray, " N"] = (np.abs(errors) > PRICE) & (found.gap > DOUBTFUL_GAP)
+        return (doubtful | (errors > GROSS_ERROR)) & (found.views > 0)
 
     def _rare(self, found: Evidence) -> Bool[np.ndarray, " N"]:
-        rare: Bool[np.ndarray, " N"] = found.views <= self._rules.rare * len(self._views)
-        return rare & (found.gap > self._rules.far_gap) & (found.views > 0)
+        rare: Bool[np.ndarray, " N"] = found.views <= RARE_VIEWS * len(self._views)
+        return rare & (found.gap > FAR_GAP) & (found.views > 0)
 
     def _step(self) -> None:
         self._done += 1

@@ -20,6 +20,7 @@ from jaxtyping import Float64, Int64
 
 from gsplat_edu.clean.evidence import MOST_OPAQUE, residual_of
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
@@ -44,10 +45,12 @@ class Doubtful:
     Args:
         ids: (D,) their indices.
         start: (D,) logits of their factors to start from.
+        price: Squared error per view that a splat has to be worth, in multiples of `unit` of `settle`.
     """
 
     ids: Int64[np.ndarray, " D"]
     start: Float64[np.ndarray, " D"]
+    price: float
 
 
 def settle(
@@ -55,8 +58,8 @@ def settle(
     doubtful: Doubtful,
     views: Sequence[View],
     settings: RenderSettings,
+    backend: Backend,
     unit: float,
-    price: float,
     steps: int,
     progress: Progress = lambda: None,
 ) -> Float64[np.ndarray, " D"]:
@@ -67,9 +70,9 @@ def settle(
         doubtful: The doubtful splats, D of them.
         views: Cameras and photos; each pass takes them in a new random order, always the same one.
         settings: The scene's render settings.
+        backend: What renders.
         unit: Average squared error per splat and view. It is added to Adam's denominator, so that gradients far below
             it, the price's included, hardly move a factor.
-        price: Squared error per view that a splat has to be worth, in units.
         steps: Number of steps.
         progress: Called after every step.
 
@@ -85,7 +88,7 @@ def settle(
     order: list[int] = []
     for step in range(1, steps + 1):
         order = order or rng.permutation(len(views)).tolist()
-        slope = _slope(gaussians, doubtful.ids, logits, views[order.pop()], settings, price * unit)
+        slope = _slope(gaussians, doubtful, logits, views[order.pop()], settings, backend, unit)
         first += (1.0 - BETAS[0]) * (slope - first)
         second += (1.0 - BETAS[1]) * (np.square(slope) - second)
         rate = RATE if step <= (1.0 - LAST) * steps else RATE / 3.0
@@ -97,22 +100,25 @@ def settle(
 
 def _slope(
     gaussians: Gaussians,
-    doubtful: Int64[np.ndarray, " D"],
+    doubtful: Doubtful,
     logits: Float64[np.ndarray, " D"],
     view: View,
     settings: RenderSettings,
-    price: float,
+    backend: Backend,
+    unit: float,
 ) -> Float64[np.ndarray, " D"]:
     """Return the gradient of one view's part of the sum in the logits of the factors."""
     factor = 1.0 / (1.0 + np.exp(-logits))
     opacity = np.minimum(gaussians.opacities.double().numpy(), MOST_OPAQUE)
-    opacity[doubtful] *= factor
+    opacity[doubtful.ids] *= factor
     shown = torch.from_numpy(np.log(opacity / (1.0 - opacity))).to(gaussians.means).requires_grad_()
-    output = render(replace(gaussians, logit_opacities=shown), view.camera, settings=settings, backend="cpu")
+    output = render(
+        replace(gaussians, logit_opacities=shown), view.camera, settings=settings, backend=backend
+    )
     residual, _ = residual_of(output, view, settings)
     (found,) = torch.autograd.grad(output.image, shown, 2.0 * residual)
     # d logit(f o) = (1 - f) / (1 - f o) d logit(f)
-    chain = (1.0 - factor) / (1.0 - opacity[doubtful])
-    photo: Float64[np.ndarray, " D"] = found.double().numpy()[doubtful] * chain
-    slope: Float64[np.ndarray, " D"] = photo + price * factor * (1.0 - factor)
+    chain = (1.0 - factor) / (1.0 - opacity[doubtful.ids])
+    photo: Float64[np.ndarray, " D"] = found.double().numpy()[doubtful.ids] * chain
+    slope: Float64[np.ndarray, " D"] = photo + doubtful.price * unit * factor * (1.0 - factor)
     return slope

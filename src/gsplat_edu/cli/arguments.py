@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
+from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import BackendWarning, SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.headroom import shortage
@@ -25,7 +26,6 @@ from gsplat_edu.cli.ranks import is_first, speaks_for_all
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Failed, Interrupted
 from gsplat_edu.render.settings import BACKENDS
-from gsplat_edu.viewer.serve import LOOPBACK
 
 EXIT_BUG = 1
 """Exit code of Python for a traceback."""

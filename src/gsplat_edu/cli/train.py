@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
+from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.locks import locked
 from gsplat_edu.budget.deadline import Deadline, stopwatch
@@ -56,7 +57,7 @@ from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
 from gsplat_edu.viewer.live import NAMES, LiveView
 from gsplat_edu.viewer.live_folder import LiveFolder
-from gsplat_edu.viewer.serve import LOOPBACK, PORT, exposure, free_port
+from gsplat_edu.viewer.serve import PORT, exposure, free_port
 from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, Watcher, page_facts
 
 LINES = 20

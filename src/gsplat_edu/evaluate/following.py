@@ -54,8 +54,9 @@ RISE = 0.85
 """Amplitude of the rise and fall of a path that turns back, in local standard deviations of the elevation. Between two
 rows of cameras it covers 0.85 of the distance to them."""
 
-SPREAD = 1.2
-"""Half axes of a loop, in standard deviations of the cameras: 0.7 of the way to the ends of a uniform line."""
+LOOP_HALF_AXIS = 1.2
+"""Half axis of a loop, in standard deviations of the camera centres along it. For centres spread evenly on a line, the
+loop covers 0.7 of the line."""
 
 LEAST_LOOP = 0.03
 """Smallest half axis of a loop, in scene depths: even a single camera position gets some parallax."""
@@ -286,7 +287,7 @@ def _loop_between(
     halves, main = [], _units(basis).T @ vectors[:, ::-1]
     for column in (flat @ vectors[:, ::-1]).T:
         reach = float(np.quantile(np.abs(column), 0.85))
-        halves.append(max(min(SPREAD * float(column.std()), reach), LEAST_LOOP * depth))
+        halves.append(max(min(LOOP_HALF_AXIS * float(column.std()), reach), LEAST_LOOP * depth))
     focus = middle + max(depth, halves[0] / MOST_TURN) * forward if target is None else target
     path = (
         middle

@@ -16,8 +16,9 @@ from gsplat_edu.scene.shells import far_shell
 
 Vector = Float64[np.ndarray, "3"]
 
-SPREAD = 0.01
-"""The right axes define up from this mean square along their second principal direction (a spread of 6 degrees)."""
+LEAST_SPREAD_OF_RIGHT_AXES = 0.01
+"""The cameras' right axes define up only if their mean square along the second principal direction exceeds this, which
+corresponds to directions that differ by 6 degrees (root mean square)."""
 
 STEEPEST = math.radians(80.0)
 """Largest elevation of an orbit: straight above, the image's up direction is undefined."""
@@ -112,7 +113,11 @@ def common_up(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
     values, vectors = np.linalg.eigh(rights.T @ rights / len(cameras))
     up: Vector = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
     # The right axes must span a plane, and that plane must be the ground: some cameras may be held in portrait.
-    return up if values[1] > SPREAD and values[1] > 4 * values[0] and up @ mean > 0.7 else mean
+    return (
+        up
+        if values[1] > LEAST_SPREAD_OF_RIGHT_AXES and values[1] > 4 * values[0] and up @ mean > 0.7
+        else mean
+    )
 
 
 def _circle(

@@ -26,6 +26,7 @@ Rasterize = Callable[[Gaussians, "Camera | CameraTensors", RenderSettings, Extra
 FEATURES = {
     "stop": "stops compositing pixel by pixel (RenderSettings.stop)",
     "processes": "shares a step among processes",
+    "statistics": "collects statistics of each Gaussian (RenderOutput.collect)",
     "forecast": "is fast enough to be measured on a capture before a training",
 }
 """What a backend may lack, by name, and what it means."""

@@ -22,7 +22,7 @@ from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.self_check import cuda_failure
 from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
 
-CUDA_LACKS = frozenset({"stop", "processes"})
+CUDA_LACKS = frozenset({"stop", "processes", "statistics"})
 """What the Triton kernels do not offer."""
 
 
@@ -133,7 +133,7 @@ def _dense() -> Backend:
         adam_in_torch,
         add_noise_in_torch,
         recolored_in_torch,
-        frozenset({"stop", "processes", "forecast"}),
+        frozenset({"stop", "processes", "statistics", "forecast"}),
     )
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.validation import one_of, whole_number
-from gsplat_edu.sfm.scale_text import AUTO, check_scale
+from gsplat_edu.sfm.scale_text import check_scale
 
 MATCHERS = ("auto", "exhaustive", "sequential", "nearest")
 

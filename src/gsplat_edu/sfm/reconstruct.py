@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import remove_leftovers
 from gsplat_edu.data.images import UPRIGHT
@@ -46,7 +47,6 @@ from gsplat_edu.sfm.photos import (
     stored_mask,
 )
 from gsplat_edu.sfm.result import build_capture, note_published, publish, published
-from gsplat_edu.sfm.scale_text import AUTO
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
@@ -29,7 +30,6 @@ from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.masks import turn_mask
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts
 from gsplat_edu.sfm.scale import Sight, placed as placed_world
-from gsplat_edu.sfm.scale_text import AUTO
 
 QUALITY = 95
 """JPEG quality of undistorted photos."""

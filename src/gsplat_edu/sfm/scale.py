@@ -9,6 +9,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from jaxtyping import Float64
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.scale import Scale
@@ -17,7 +18,7 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.align import upright
 from gsplat_edu.sfm.gps import TILT, GpsFit, east_north_up, fit_positions
 from gsplat_edu.sfm.photos import PhotoFacts
-from gsplat_edu.sfm.scale_text import AUTO, NONE, Mark, marks_of
+from gsplat_edu.sfm.scale_text import NONE, Mark, marks_of
 
 PARALLEL = 2.0
 """Smallest angle between two rays to a marked point, degrees: below it, an error of a pixel moves the point far."""

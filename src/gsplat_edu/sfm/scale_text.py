@@ -6,9 +6,11 @@ import math
 import re
 from dataclasses import dataclass
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError
 
-AUTO, NONE = "auto", "none"
+NONE = "none"
+"""Value of `--scale` that keeps the reconstruction's unit."""
 
 MARKS = '"A.jpg:120,340;B.jpg:300,310 A.jpg:520,340;B.jpg:700,310 1.20m"'
 """Example of two points marked in photos."""

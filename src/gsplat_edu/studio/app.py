@@ -15,13 +15,13 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
+from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.studio import job_routes, library_routes, live_routes, run_routes, scene_routes
 from gsplat_edu.studio.guard import Guard
 from gsplat_edu.studio.patience import Patience
 from gsplat_edu.studio.refusal import not_found
 from gsplat_edu.studio.replies import act, file_answer
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.viewer.serve import LOOPBACK
 
 TYPES = {
     ".html": "text/html; charset=utf-8",

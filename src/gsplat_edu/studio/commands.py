@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import legible, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
@@ -113,9 +114,6 @@ SFM_OPTIONS: Mapping[str, Option] = {
     "max_image_size": _whole(64, 20_000),
     "threads": _whole(0, 1_024),
 }
-
-AUTO = "auto"
-"""The resolution that the planned Gaussians resolve."""
 
 TRAIN_OPTIONS: Mapping[str, Option] = {
     "quality": _choice(*QUALITIES),

@@ -10,12 +10,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.studio.commands import AUTO
 from gsplat_edu.studio.library import photo_names
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer

@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.reading import parse_json
 from gsplat_edu.base.validation import in_range, whole_number
@@ -39,7 +40,7 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.guard import Guard
 from gsplat_edu.viewer.live_folder import WAIT
-from gsplat_edu.viewer.serve import CHUNK, LOOPBACK, PORT, PageHandler, PageServer, url_of
+from gsplat_edu.viewer.serve import CHUNK, PORT, PageHandler, PageServer, url_of
 from gsplat_edu.viewer.snapshots import page_facts
 
 NAMES = ("--view-host", "--view-port")

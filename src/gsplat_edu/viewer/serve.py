@@ -17,11 +17,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.base.validation import whole_number
-
-LOOPBACK = "127.0.0.1"
 
 PORT = 8080
 """Default port of a page."""

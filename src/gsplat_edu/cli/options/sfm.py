@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.cli.arguments import whole_number_text
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA, SfmOptions
-from gsplat_edu.sfm.scale_text import AUTO, MARKS
+from gsplat_edu.sfm.scale_text import MARKS
 
 EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
 

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.constants import AUTO as AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
@@ -72,9 +73,6 @@ COMMON = (
 
 RANDOM_POINTS = Path("random")
 """Value of --points: do not triangulate start points."""
-
-AUTO = "auto"
-"""The value of an option that stands for a choice by the photos."""
 
 OPEN = {
     "appearance": APPEARANCES,

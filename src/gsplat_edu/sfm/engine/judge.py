@@ -16,7 +16,7 @@ STEADY = 15
 """Of these, smallest number that are also seen by two photos whose pose counts. A point seen by only one other
 photo does not determine the distance between the two photos; half the support may be of this kind."""
 
-SPREAD = 0.02
+LEAST_POINT_SPREAD = 0.02
 """Smallest standard deviation of the supporting points in the photo, along any direction, as a fraction of the longer
 side. Points on a line or in one spot do not determine the pose. An object as wide as a tenth of the photo has 0.03."""
 
@@ -131,7 +131,7 @@ def _supported(count: np.ndarray, places: np.ndarray, longest: int) -> bool:
     if (count > 0).sum() < SUPPORT or (count > 1).sum() < STEADY:
         return False
     covariance = np.cov(places[count > 0].T)
-    return bool(np.sqrt(max(float(np.linalg.eigvalsh(covariance)[0]), 0.0)) >= SPREAD * longest)
+    return bool(np.sqrt(max(float(np.linalg.eigvalsh(covariance)[0]), 0.0)) >= LEAST_POINT_SPREAD * longest)
 
 
 def _counts(seen: dict[int, tuple[np.ndarray, np.ndarray]], images: set[int], size: int) -> np.ndarray:
