@@ -74,13 +74,13 @@ def test_both_kinds_of_poses(written, small):
     write_transforms(folder, small[0][:5])
     dataset = load_dataset(folder)
     assert dataset.layout == "transforms.json" and len(dataset.train) + len(dataset.test) == 5
-    assert any("transforms.json and a COLMAP model" in note for note in dataset.notes)
+    assert any("transforms.json and a COLMAP model" in note for note in map(str, dataset.notes))
 
 
 def test_several_models_are_reported(written):
     folder = written("colmap")
     (folder / "sparse" / "1").mkdir()
-    assert any("2 models: 0 is read, 1 not" in note for note in load_dataset(folder).notes)
+    assert any("2 models: 0 is read, 1 not" in note for note in map(str, load_dataset(folder).notes))
 
 
 def test_every_eighth_view_by_name_is_held_out(written, small):
@@ -98,8 +98,8 @@ def test_one_photo_is_trained_on(tmp_path, small):
     write_transforms(tmp_path, small[0][:1])
     dataset = load_dataset(tmp_path)
     assert len(dataset.train) == 1 and dataset.test == ()
-    assert any("one photo" in note for note in dataset.notes)
-    assert any("no points: starting from 100,000 random points" in note for note in dataset.notes)
+    assert any("one photo" in note for note in map(str, dataset.notes))
+    assert any("no points: starting from 100,000 random points" in note for note in map(str, dataset.notes))
     assert np.isfinite(dataset.points).all()
     with pytest.raises(DatasetError, match="for training"):
         load_dataset(tmp_path, DataSettings(test_every=8))
@@ -111,7 +111,7 @@ def test_the_captures_own_split(tmp_path, small):
     write_transforms(tmp_path, views, extra={"train_filenames": names[:4], "test_filenames": names[6:]})
     dataset = load_dataset(tmp_path)
     assert [v.name for v in dataset.train] == names[:4] and [v.name for v in dataset.test] == names[6:]
-    assert any("2 of 9 photos are in none" in note for note in dataset.notes)
+    assert any("2 of 9 photos are in none" in note for note in map(str, dataset.notes))
     assert len(load_dataset(tmp_path, DataSettings(test_every=0)).train) == 9  # another split is requested
     write_transforms(tmp_path, views, extra={"val_filenames": names[:2]})
     assert [v.name for v in load_dataset(tmp_path).train] == names[2:]
@@ -141,7 +141,7 @@ def test_far_coordinates_are_moved_to_the_origin(tmp_path, small):
             np.testing.assert_allclose(view.camera.eye + dataset.origin, before.camera.eye, rtol=0, atol=1e-9)
             assert np.abs(view.camera.eye).max() < 10
         np.testing.assert_allclose(dataset.points + dataset.origin, points + shift, rtol=0, atol=1e-9)
-        assert any("coordinates are large" in note for note in dataset.notes)
+        assert any("coordinates are large" in note for note in map(str, dataset.notes))
 
 
 def test_points_from_another_file(written, tmp_path, small):
@@ -150,7 +150,7 @@ def test_points_from_another_file(written, tmp_path, small):
     dataset = load_dataset(written("colmap"), points=tmp_path / "p.ply")
     np.testing.assert_array_equal(dataset.points, [[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(dataset.colors, [[0.2, 0.4, 0.6]], atol=1e-12)
-    assert any("1 of 2 points are NaN" in note for note in dataset.notes)
+    assert any("1 of 2 points are NaN" in note for note in map(str, dataset.notes))
     with pytest.raises(DatasetError, match=r"none\.ply"):
         load_dataset(written("colmap"), points=tmp_path / "none.ply")
 
@@ -244,8 +244,10 @@ def test_photos_over_the_memory_budget_are_read_again_unchanged(written):
 
 def test_photos_that_do_not_fit_in_memory_are_reported(written):
     folder = written("colmap")
-    assert not any("memory" in note for note in load_dataset(folder).notes)
-    (note,) = load_dataset(folder, DataSettings(image_memory=9 * 24 * 18 * 3 - 1)).notes
+    assert not any("memory" in note for note in map(str, load_dataset(folder).notes))
+    (note,) = [
+        str(note) for note in load_dataset(folder, DataSettings(image_memory=9 * 24 * 18 * 3 - 1)).notes
+    ]
     assert "take 0.01112 MiB of memory" in note and "--image-memory" in note and "--resolution" in note
     assert load_dataset(folder, DataSettings(image_memory=9 * 24 * 18 * 3)).notes == ()
     assert load_dataset(folder, DataSettings(image_memory=9 * 12 * 9 * 3, resolution=2.0)).notes == ()
@@ -291,7 +293,9 @@ def test_ready_made_sizes_are_used_if_there_are_no_full_photos(written, resoluti
                 Image.fromarray(pixels).save(folder / f"images_{factor}" / file.name)
         shutil.rmtree(folder / "images")
         dataset = load_dataset(folder, DataSettings(resolution=resolution, test_every=0))
-        assert len(dataset.train) == 9 and any("intrinsics rescaled" in note for note in dataset.notes)
+        assert len(dataset.train) == 9 and any(
+            "intrinsics rescaled" in note for note in map(str, dataset.notes)
+        )
         for view in dataset.train:
             assert view.image.shape == (9, 12, 3) and (view.image == 20).all()
             assert view.camera.fx == pytest.approx(1.15 * 12)
@@ -311,7 +315,7 @@ def test_a_photo_whose_name_is_too_long_is_missing(written):
     folder = written("text")
     path = folder / "sparse" / "0" / "images.txt"
     path.write_text(path.read_text().replace("view_003.png", "x" * 300))
-    assert any("1 of 9 photos have no file" in note for note in load_dataset(folder).notes)
+    assert any("1 of 9 photos have no file" in note for note in map(str, load_dataset(folder).notes))
 
 
 @pytest.mark.parametrize("place", ["images", "sparse"])
@@ -342,7 +346,7 @@ def test_preload_names_the_corrupt_photo(written, as_shipped):
 def test_a_camera_with_uneven_pixels_is_reported(tmp_path):
     camera = Camera(look_at((0, 0, -3), (0, 0, 0)), (0, 0, -3), 40, 20, 3.5, 3.5, 8, 8)
     write_transforms(tmp_path, [View(camera, np.zeros((8, 8, 3), np.uint8), name="a.png")])
-    assert any("calibration may be wrong" in note for note in load_dataset(tmp_path).notes)
+    assert any("calibration may be wrong" in note for note in map(str, load_dataset(tmp_path).notes))
 
 
 def test_views_with_one_centre_are_held_out_together(tmp_path, small):
@@ -363,7 +367,7 @@ def test_views_with_one_centre_are_held_out_together(tmp_path, small):
     # In the order of names, places are numbered 3, 0, 1, 2; every second one of these is held out: 3 and 1.
     assert held == {0, 3, 5, 7, 8}
     said = "9 photos have 4 centres, like the faces of panoramas: those with one centre are held out together"
-    assert said in dataset.notes
+    assert said in map(str, dataset.notes)
 
 
 def test_a_single_panorama_is_split_by_faces(tmp_path, small):
@@ -380,4 +384,4 @@ def test_a_single_panorama_is_split_by_faces(tmp_path, small):
     write_colmap(tmp_path, moved, points, colors)
     dataset = load_dataset(tmp_path)
     assert len(dataset.test) == 2 and len(dataset.train) == 7
-    assert not any("centres" in note for note in dataset.notes)
+    assert not any("centres" in note for note in map(str, dataset.notes))

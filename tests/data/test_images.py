@@ -164,7 +164,9 @@ def test_a_photo_of_another_size_rescales_its_camera(one_photo):
     assert (camera.W, camera.H) == (33, 25)
     np.testing.assert_allclose((camera.fx, camera.fy), (60 * 33 / 64, 58 * 25 / 48))
     np.testing.assert_allclose((camera.cx, camera.cy), (30 * 33 / 64 - 0.5, 22 * 25 / 48 - 0.5))
-    assert any("1 of 1 photos differ in size" in note and "rescaled" in note for note in dataset.notes)
+    assert any(
+        "1 of 1 photos differ in size" in note and "rescaled" in note for note in map(str, dataset.notes)
+    )
     folder = one_photo(np.zeros((64, 48, 3), np.uint8), w=64, h=48)
     with pytest.raises(
         DatasetError, match=r"images/a\.png is 48x64 but its camera 64x48, another aspect ratio"

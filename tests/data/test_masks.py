@@ -50,7 +50,7 @@ def test_a_mask_may_have_the_name_of_its_photo_and_any_suffix(written, layout, e
             path.unlink()
         else:
             path.rename(path.with_name(stem + ending))
-    notes = load_dataset(capture, EVERYTHING).notes
+    notes = [str(note) for note in load_dataset(capture, EVERYTHING).notes]
     assert masked(capture) == stems
     assert any("photos have no mask" in note for note in notes)
 
@@ -116,4 +116,4 @@ def test_the_noise_of_a_jpeg_mask_does_not_count(written):
     found = decode_mask(path)
     assert not found[radius > 41].any() and found[radius < 39].all()
     Image.fromarray(COUNTS).save(path, quality=60)
-    assert any("pixels of at least 128 count" in note for note in load_dataset(capture).notes)
+    assert any("pixels of at least 128 count" in note for note in map(str, load_dataset(capture).notes))

@@ -167,9 +167,9 @@ def test_a_capture_of_colmaps_panoramas_is_read_as_faces(tmp_path, resolution, s
     dataset = load_dataset(tmp_path, DataSettings(resolution=resolution, test_every=2))
     assert [view.name for view in dataset.test] == [f"p1_{k}.png" for k in range(8)]
     assert len(dataset.train) == 8 and not any(
-        "distortion" in note or "cropped" in note for note in dataset.notes
+        "distortion" in note or "cropped" in note for note in map(str, dataset.notes)
     )
-    assert "16 of 16 views are faces of panoramas, cut on loading" in dataset.notes
+    assert "16 of 16 views are faces of panoramas, cut on loading" in map(str, dataset.notes)
     assert not check_sizes(prepare(CaptureReader(tmp_path)))
     for view in dataset.test:
         camera, photo = view.camera, view.read()

@@ -52,7 +52,7 @@ def test_ascii(tmp_path):
     np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [-1, np.nan, 1000]])
     np.testing.assert_allclose(cloud.colors, [[1, 0, 0.2], [0, 0, 0]], atol=1e-12)
     clean, note = finite_cloud(cloud)
-    assert len(clean.points) == 1 and note.startswith("1 of 2 points")
+    assert len(clean.points) == 1 and str(note).startswith("1 of 2 points")
 
 
 def test_colours(tmp_path):

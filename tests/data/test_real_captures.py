@@ -70,7 +70,7 @@ def test_snowmikus_points_have_the_colour_of_the_photos(real):
 def test_fox(real):
     dataset = load_dataset(real("fox"))
     assert dataset.layout == "transforms.json" and len(dataset.train) == 43 and len(dataset.test) == 7
-    notes = " | ".join(dataset.notes)
+    notes = " | ".join(map(str, dataset.notes))
     assert "17 of 67 photos have no file" in notes and "50 of 50 photos have lens distortion" in notes
     assert "no points: starting from 100,000 random" in notes
     photo = dataset.train[0].read()
@@ -86,7 +86,7 @@ def test_the_foxs_colmap_model(real):
     dataset = load_dataset(real("fox/colmap9_opencv"), DataSettings(test_every=0))
     assert len(dataset.train) == 9 and len(dataset.points) == 1457
     assert points_in_sight(dataset).any(axis=0).mean() > 0.99
-    assert any("distortion" in note for note in dataset.notes)
+    assert any("distortion" in note for note in map(str, dataset.notes))
     assert dataset.train[0].image.shape == (1920, 1080, 3)
 
 
@@ -96,7 +96,7 @@ def test_truck11(real):
     folder = real("truck11")
     dataset = load_dataset(folder, DataSettings(test_every=0))
     assert len(dataset.train) == 11 and len(dataset.points) == 8143
-    assert any("1198 and 501.4 px: the calibration may be wrong" in note for note in dataset.notes)
+    assert any("1198 and 501.4 px: the calibration may be wrong" in note for note in map(str, dataset.notes))
     stated = {entry["img_name"]: entry for entry in json.loads((folder / "cameras.json").read_text())}
     for view in dataset.train:
         entry = stated[view.name]

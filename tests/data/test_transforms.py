@@ -147,7 +147,9 @@ def test_missing_photos(edited):
         (folder / "images" / f"view_00{i}.png").unlink()
     dataset = load_dataset(folder, EVERYTHING)
     assert len(dataset.train) == 6
-    assert dataset.notes == ("3 of 9 photos have no file: skipped, first images/view_000.png",)
+    assert tuple(map(str, dataset.notes)) == (
+        "3 of 9 photos have no file: skipped, first images/view_000.png",
+    )
     shutil.rmtree(folder / "images")
     with pytest.raises(DatasetError, match=r"none of its 9 photos has a file, first images/view_000\.png"):
         load_dataset(folder)
@@ -192,7 +194,7 @@ def test_distortion_keys(one_photo):
     assert camera_of(one_photo(PIXELS, camera_model="PINHOLE")).fx == 30
     fisheye = camera_of(one_photo(PIXELS, camera_model="OPENCV_FISHEYE", k1=0.05))
     assert fisheye.fx == camera_of(one_photo(PIXELS, is_fisheye=True, k1=0.05)).fx != 30
-    assert any("distortion" in note for note in load_dataset(one_photo(PIXELS, k1=0.05)).notes)
+    assert any("distortion" in note for note in map(str, load_dataset(one_photo(PIXELS, k1=0.05)).notes))
 
 
 def test_blenders_splits(tmp_path, small):
@@ -272,17 +274,20 @@ def test_val_is_not_trained_on(tmp_path, small):
     dataset = load_dataset(tmp_path)
     assert [v.name for v in dataset.train] == names[2:6] and [v.name for v in dataset.test] == names[6:]
     assert any(
-        "2 of 9 photos are in none of the capture's training and test lists" in n for n in dataset.notes
+        "2 of 9 photos are in none of the capture's training and test lists" in n
+        for n in map(str, dataset.notes)
     )
 
 
 def test_blenders_val_is_left_out_and_reported(tmp_path, small):
     write_blender(tmp_path, small[0][3:], small[0][:3])
-    assert not any("val" in note for note in load_dataset(tmp_path).notes)
+    assert not any("val" in note for note in map(str, load_dataset(tmp_path).notes))
     shutil.copy(tmp_path / "transforms_test.json", tmp_path / "transforms_val.json")
     dataset = load_dataset(tmp_path)
     assert len(dataset.train) == 6 and len(dataset.test) == 3
-    assert any(note.startswith("transforms_val.json: its photos are ignored") for note in dataset.notes)
+    assert any(
+        note.startswith("transforms_val.json: its photos are ignored") for note in map(str, dataset.notes)
+    )
 
 
 @pytest.mark.parametrize(
@@ -298,7 +303,7 @@ def test_why_colmaps_points_are_not_used(tmp_path, small, extra, why):
     write_transforms(tmp_path, views, extra=extra)
     dataset = load_dataset(tmp_path)
     assert len(dataset.points) == 100_000
-    (note,) = [note for note in dataset.notes if "random points" in note]
+    (note,) = [note for note in map(str, dataset.notes) if "random points" in note]
     assert "points of the COLMAP model in" in note and why in note and "has no points" not in note
     write_transforms(tmp_path, views, extra={"applied_transform": np.eye(4).tolist(), "applied_scale": 1.0})
     np.testing.assert_array_equal(load_dataset(tmp_path).points, points)

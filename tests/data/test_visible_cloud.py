@@ -68,7 +68,9 @@ def test_captures_without_points_start_in_view_of_their_training_photos(tmp_path
         dataset = load_dataset(tmp_path / path, DataSettings())
         cameras = [view.camera for view in dataset.train]
         assert not dataset.measured and seen_by(dataset.points, cameras, 2).all()
-        assert any("random points" in note and "two or more photos look" in note for note in dataset.notes)
+        assert any(
+            "random points" in note and "two or more photos look" in note for note in map(str, dataset.notes)
+        )
 
 
 def test_photos_that_share_nothing_start_around_the_cameras(tmp_path):
@@ -85,7 +87,7 @@ def test_photos_that_share_nothing_start_around_the_cameras(tmp_path):
     ]
     write_transforms(tmp_path, turned)
     dataset = load_dataset(tmp_path, DataSettings(test_every=0))
-    assert any("no two photos see the same place" in note for note in dataset.notes)
+    assert any("no two photos see the same place" in note for note in map(str, dataset.notes))
     assert len(dataset.points) == RANDOM_POINTS
 
 

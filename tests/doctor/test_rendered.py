@@ -38,7 +38,7 @@ def test_the_background_is_named_and_the_usual_one(tmp_path, cut_out):
     write_colmap(tmp_path / "colmap", views, points, colors)
 
     def said(layout, color):
-        notes = load_dataset(tmp_path / layout, DataSettings(background=color)).notes
+        notes = [str(note) for note in load_dataset(tmp_path / layout, DataSettings(background=color)).notes]
         return next(note for note in notes if "alpha channel" in note)
 
     black = said("blender", (0.0, 0.0, 0.0))

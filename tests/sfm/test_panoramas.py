@@ -113,7 +113,7 @@ def test_whole_panoramas_are_held_out(room):
     places = [{view.name.partition("_")[0] for view in part} for part in (dataset.train, dataset.test)]
     assert places == [{"p1", "p2", "p4", "p5"}, {"p0", "p3", "p6"}]
     assert len(dataset.test) == 3 * FACES
-    assert any("56 photos have 7 centres" in note for note in dataset.notes)
+    assert any("56 photos have 7 centres" in note for note in map(str, dataset.notes))
 
 
 @pytest.mark.slow

@@ -112,7 +112,7 @@ def split_capture(
     folder, config = BlocksFolder(options.out), options.config
     dataset = Dataset.of(reader_for(options.data, reader), options.data_settings)
     for note in dataset.notes:
-        say(note)
+        say(str(note))
     gaussians = _coarse_gaussians(coarse, config, dataset, say)
     means = gaussians.means.double().numpy()
     solid = (gaussians.opacities.numpy() > OPAQUE) & ~far_shell(means)

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
         export.check_target("--preview", arguments.preview)
     subject = open_subject(arguments.source, arguments.dataset)
     for note in subject.dataset.notes:
-        console.print(note, soft_wrap=True)
+        console.print(str(note), soft_wrap=True)
     source, dataset = subject.source, subject.dataset
     columns = (
         Field("{task.description}"),

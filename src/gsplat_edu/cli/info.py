@@ -202,7 +202,7 @@ def _dataset_facts(path: Path) -> list[Fact]:
         facts.append(("units", str(dataset.scale)))
     if np.any(dataset.origin):
         facts.append(("origin", f"shifted to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
-    return facts + [("note", note) for note in dataset.notes]
+    return facts + [("note", str(note)) for note in dataset.notes]
 
 
 def _section(values: Mapping[str, Any], key: str) -> Mapping[str, Any]:

@@ -17,6 +17,20 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import Capture, Cloud, Frame, photo_file
 from gsplat_edu.data.images import UPRIGHT, ImageStore, PhotoFile, PhotoHeaders
 from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
+from gsplat_edu.data.loading_notes import (
+    CroppedPhotos,
+    DistortedPhotos,
+    LoadingNote,
+    OnlyOnePhoto,
+    PanoramaFaces,
+    PhotosExceedMemory,
+    RandomStart,
+    RescaledIntrinsics,
+    SharedCentres,
+    TurnedPhotos,
+    UnevenFocalLengths,
+    UnlistedPhotos,
+)
 from gsplat_edu.data.notes import Background, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.panorama import FaceLens
@@ -47,7 +61,7 @@ class Dataset:
         points: (N, 3) initial point cloud, in the cameras' coordinate frame, world units.
         colors: (N, 3) their colours, 0 to 1.
         origin: (3,) offset that was subtracted from all coordinates; zero unless they exceeded 1e4.
-        notes: Notes for the user: skipped, rescaled, undistorted or generated data.
+        notes: What was skipped, rescaled, undistorted or generated; `str` of a note gives the sentence for the user.
         images: The photo cache.
         files: Name and files of each photo, sorted by name.
         scale: What a unit of the coordinates is; None if unknown.
@@ -61,7 +75,7 @@ class Dataset:
     points: Float64[np.ndarray, "N 3"]
     colors: Float64[np.ndarray, "N 3"]
     origin: Float64[np.ndarray, "3"]
-    notes: tuple[str, ...]
+    notes: tuple[LoadingNote, ...]
     images: ImageStore
     files: tuple[tuple[str, PhotoFile], ...] = ()
     scale: Scale | None = None
@@ -99,11 +113,7 @@ class Dataset:
         notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
         notes += _file_notes(frames, sources, headers) + _alpha_notes(capture, sources, settings, headers)
         if store.needed > store.budget:
-            notes.append(
-                f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} are kept: the "
-                "others are decoded again whenever they are used; raise --image-memory, or load smaller photos with "
-                "--resolution"
-            )
+            notes.append(PhotosExceedMemory(store.needed, store.budget))
         train, test = _split(path, views, [frame.part for frame in frames], settings, notes)
         start = placed.cloud or _random_start(capture, [view.camera for view in train], notes, placed.origin)
         return cls(
@@ -182,37 +192,22 @@ def _listed(path: Path, frames: Sequence[Frame], settings: DataSettings) -> Sequ
     return [by_name[name] for name in sorted(set(names))]
 
 
-def _spelled(nbytes: int) -> str:
-    return f"{nbytes / 2**30:.1f} GiB" if nbytes >= 2**30 else f"{nbytes / 2**20:.4g} MiB"
-
-
-def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
+def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[LoadingNote]:
     """Report changes of the intrinsics."""
     faces = [frame for frame in frames if isinstance(frame.lens, FaceLens)]
-    notes = [f"{len(faces)} of {len(frames)} views are faces of panoramas, cut on loading"] if faces else []
+    notes: list[LoadingNote] = [PanoramaFaces(len(faces), len(frames))] if faces else []
     distorted = [frame for frame in frames if frame.lens.distorts and not isinstance(frame.lens, FaceLens)]
     if distorted:
-        notes.append(
-            f"{len(distorted)} of {len(frames)} photos have lens distortion and are undistorted on loading"
-        )
+        notes.append(DistortedPhotos(len(distorted), len(frames)))
     if wide := [frame.name for frame in distorted if frame.lens.cropped]:
         seen, shown = (round(2 * math.degrees(angle)) for angle in (MAX_ANGLE, CROPPED_ANGLE))
-        notes.append(
-            f"{len(wide)} of {len(frames)} photos see more than {seen} degrees and are cropped to {shown}, first "
-            f"{wide[0]}"
-        )
+        notes.append(CroppedPhotos(len(wide), len(frames), wide[0], seen, shown))
     if others := [frame for frame, is_it in zip(frames, rescaled, strict=True) if is_it]:
-        notes.append(
-            f"{len(others)} of {len(frames)} photos differ in size from their camera, first {others[0].name}: "
-            "intrinsics rescaled"
-        )
+        notes.append(RescaledIntrinsics(len(others), len(frames), others[0].name))
     uneven = [frame for frame in frames if frame.lens.uneven]
     if uneven:
         lens = uneven[0].lens
-        notes.append(
-            f"{len(uneven)} of {len(frames)} cameras have fx and fy that differ widely, first {lens.fx:.4g} and "
-            f"{lens.fy:.4g} px: the calibration may be wrong"
-        )
+        notes.append(UnevenFocalLengths(len(uneven), len(frames), lens.fx, lens.fy))
     return notes
 
 
@@ -221,35 +216,32 @@ def _alpha_notes(
     sources: Sequence[PhotoFile],
     settings: DataSettings,
     headers: PhotoHeaders,
-) -> list[str]:
+) -> list[LoadingNote]:
     """Report what lies behind transparent photos."""
     count = sum(headers.of(source.path).alpha for source in sources)
-    return (
-        [str(Background(count, len(sources), settings.background, capture.layout == "Blender"))]
-        if count
-        else []
-    )
+    if not count:
+        return []
+    return [Background(count, len(sources), settings.background, capture.layout == "Blender")]
 
 
-def _file_notes(frames: Sequence[Frame], sources: Sequence[PhotoFile], headers: PhotoHeaders) -> list[str]:
+def _file_notes(
+    frames: Sequence[Frame], sources: Sequence[PhotoFile], headers: PhotoHeaders
+) -> list[LoadingNote]:
     """Report colours that are not converted, and photos that are turned."""
     problems = [
         (frame.name, headers.of(source.path).problem) for frame, source in zip(frames, sources, strict=True)
     ]
-    notes = [str(note) for note in UnreadColors.of(problems)]
+    notes: list[LoadingNote] = [*UnreadColors.of(problems)]
     turned = [
         frame.name for frame, source in zip(frames, sources, strict=True) if source.orientation != UPRIGHT
     ]
     if turned:
-        notes.append(
-            f"{len(turned)} of {len(frames)} photos are turned as EXIF says, because their poses are those of upright "
-            f"photos, first {turned[0]}"
-        )
+        notes.append(TurnedPhotos(len(turned), len(frames), turned[0]))
     return notes
 
 
 def _split(
-    path: Path, views: Sequence[View], parts: Sequence[str], settings: DataSettings, notes: list[str]
+    path: Path, views: Sequence[View], parts: Sequence[str], settings: DataSettings, notes: list[LoadingNote]
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Divide views, sorted by name, into training and test views."""
     test_every = settings.test_every
@@ -262,22 +254,17 @@ def _split(
             tuple(v for v, p in zip(views, parts, strict=True) if p == part) for part in ("train", "test")
         )
         if left_out := len(views) - len(train) - len(test):
-            notes.append(
-                f"{left_out} of {len(views)} photos are in none of the capture's training and test lists: left out"
-            )
+            notes.append(UnlistedPhotos(left_out, len(views)))
     elif test_every == 0 or (test_every is None and len(views) == 1):
         train, test = tuple(views), ()
         if test_every is None:
-            notes.append("the capture has only one photo: it is used for training, and none is held out")
+            notes.append(OnlyOnePhoto())
     else:
         every, places = test_every or TEST_EVERY, _places([view.camera for view in views])
         if max(places) == 0:  # all views have one centre: a panorama is all there is
             places = list(range(len(views)))
         elif (count := max(places) + 1) < len(views):
-            notes.append(
-                f"{len(views)} photos have {count} centres, like the faces of panoramas: those with one centre are "
-                "held out together"
-            )
+            notes.append(SharedCentres(len(views), count))
         train = tuple(view for i, view in zip(places, views, strict=True) if i % every)
         test = tuple(view for i, view in zip(places, views, strict=True) if i % every == 0)
     if not train:
@@ -303,18 +290,14 @@ def _places(cameras: Sequence[Camera]) -> list[int]:
 
 
 def _random_start(
-    capture: Capture, cameras: Sequence[Camera], notes: list[str], origin: Float64[np.ndarray, "3"]
+    capture: Capture, cameras: Sequence[Camera], notes: list[LoadingNote], origin: Float64[np.ndarray, "3"]
 ) -> Cloud:
     """Generate random initial points where the training photos look, and report it."""
-    made = None
-    if capture.cube is not None:
-        made = cloud_in_cube(cameras, -origin, capture.cube)
-        where = f"in the cube +-{capture.cube:g}, where two or more photos look"
-    else:
-        made, where = cloud_in_view(cameras), "where two or more photos look"
+    half_edge = capture.cube
+    made = cloud_in_view(cameras) if half_edge is None else cloud_in_cube(cameras, -origin, half_edge)
+    shared = made is not None
     if made is None:
         half_edge = scene_extent(cameras)
         made = random_cloud(np.mean([camera.eye for camera in cameras], axis=0), half_edge)
-        where = f"within {half_edge:.4g} of the cameras, since no two photos see the same place"
-    notes.append(f"{capture.no_cloud}: starting from {len(made.points):,} random points {where}")
+    notes.append(RandomStart(capture.no_cloud, len(made.points), half_edge, shared))
     return made

@@ -13,6 +13,7 @@ from gsplat_edu.base.errors import DatasetError, SceneFormatError
 from gsplat_edu.base.ply_table import read_elements, read_rows
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.data.capture import MAX_COORDINATE, Cloud, unit_colors
+from gsplat_edu.data.loading_notes import IgnoredPoints
 
 RANDOM_POINTS = 100_000
 """Size of a random initial cloud, as in Inria's code for Blender scenes."""
@@ -74,16 +75,16 @@ def write_points_ply(path: Path, cloud: Cloud) -> None:
     path.write_bytes("\n".join([*header, "end_header", ""]).encode("ascii") + table.tobytes())
 
 
-def finite_cloud(cloud: Cloud) -> tuple[Cloud, str]:
+def finite_cloud(cloud: Cloud) -> tuple[Cloud, IgnoredPoints | None]:
     """Remove points that are NaN, infinite or absurdly far away.
 
     Returns:
-        The remaining points, and a sentence with the number removed; "" if none was.
+        The remaining points, and the number removed; None if none was.
     """
     good = np.all(np.abs(cloud.points) < MAX_COORDINATE, axis=1)
     if good.all():
-        return cloud, ""
-    note = f"{np.count_nonzero(~good)} of {len(good)} points are NaN, infinite or absurdly far away: ignored"
+        return cloud, None
+    note = IgnoredPoints(int(np.count_nonzero(~good)), len(good))
     return Cloud(cloud.points[good], cloud.colors[good]), note
 
 

@@ -24,6 +24,7 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import PhotoHeaders
+from gsplat_edu.data.loading_notes import LoadingNote, MovedOrigin
 from gsplat_edu.data.notes import TwoLayouts
 from gsplat_edu.data.points import finite_cloud, read_points_ply
 from gsplat_edu.data.scale import read_scale
@@ -48,7 +49,7 @@ class PlacedCapture:
     frames: tuple[Frame, ...]
     cloud: Cloud | None
     origin: Float64[np.ndarray, "3"]
-    notes: tuple[str, ...]
+    notes: tuple[LoadingNote, ...]
 
 
 class CaptureReader:
@@ -88,8 +89,7 @@ class CaptureReader:
         if points not in self._placed:
             capture = self.capture
             given = read_points_ply(points) if points else capture.cloud
-            notes = [str(note) for note in capture.notes]
-            self._placed[points] = _near_origin(capture.frames, given, notes)
+            self._placed[points] = _near_origin(capture.frames, given, capture.notes)
         return self._placed[points]
 
 
@@ -122,18 +122,21 @@ def read_capture(path: Path) -> Capture:
     raise DatasetError(f"{path}: is not a capture; looked for {looked}")
 
 
-def _near_origin(found: Sequence[Frame], cloud: Cloud | None, notes: list[str]) -> PlacedCapture:
+def _near_origin(
+    found: Sequence[Frame], cloud: Cloud | None, found_notes: Sequence[LoadingNote]
+) -> PlacedCapture:
     """Sort frames by name, and move a scene whose coordinates are too large for float32, as on a map, to the origin."""
-    frames = sorted(found, key=lambda frame: frame.name)
+    frames, notes = sorted(found, key=lambda frame: frame.name), list(found_notes)
     eyes = np.stack([frame.eye for frame in frames])
     if cloud is not None:
         cloud, note = finite_cloud(cloud)
-        notes += [note] if note else []
+        notes += [note] if note is not None else []
         cloud = cloud if len(cloud.points) else None
     if np.abs(eyes).max() <= FAR:
         return PlacedCapture(tuple(frames), cloud, np.zeros(3), tuple(notes))
     origin = np.round(eyes.mean(axis=0))
-    notes.append(f"coordinates are large: {tuple(origin.tolist())} was subtracted from all of them")
+    x, y, z = origin.tolist()
+    notes.append(MovedOrigin((x, y, z)))
     moved = tuple(replace(frame, eye=frame.eye - origin) for frame in frames)
     cloud = None if cloud is None else replace(cloud, points=cloud.points - origin)
     return PlacedCapture(moved, cloud, origin, tuple(notes))

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gsplat_edu.base.validation import ArrayLike
+from gsplat_edu.data.loading_notes import LoadingNote
 from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import Picture, Report, write_report
@@ -37,13 +38,13 @@ class ScoredViews:
         test: Held-out views.
         train: Training views; empty to skip them.
         background: (3,) colour behind the renders and behind photos that are not opaque.
-        notes: Sentences to print in the report.
+        notes: Notes of the capture, for the report.
     """
 
     test: Sequence[View]
     train: Sequence[View] = ()
     background: ArrayLike = (0.0, 0.0, 0.0)
-    notes: Sequence[str] = ()
+    notes: Sequence[LoadingNote] = ()
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,8 @@ def evaluate_run(
     }
     masked = masked_pictures(folder, metrics, judged.train, gaussians, render, judged.background)
     title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
-    report = Report(title, metrics, log, config, test, gallery.pictures, masked, judged.notes)
+    notes = [str(note) for note in judged.notes]
+    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes)
     write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated

@@ -186,7 +186,7 @@ class CaptureRun:
         settings = as_trained(options.data_settings, options.config.appearance)
         self.dataset = Dataset.of(reader_for(options.data, reader), settings, points=options.points)
         for note in self.dataset.notes:
-            say(note)
+            say(str(note))
         check(self.dataset)
         self.dataset.preload(progress)
         if options.config.transients != "none":

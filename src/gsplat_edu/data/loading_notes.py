@@ -1,0 +1,283 @@
+"""Notes about how a capture was loaded and divided: values with fields; `str` gives the sentence for the user."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsplat_edu.data.notes import Note
+
+
+@dataclass(frozen=True)
+class IgnoredPoints:
+    """Start points without a usable position.
+
+    Args:
+        points: Number of such points.
+        total: Number of start points in the file.
+    """
+
+    points: int
+    total: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.points} of {self.total} points are NaN, infinite or absurdly far away: ignored"
+
+
+@dataclass(frozen=True)
+class MovedOrigin:
+    """A shift of all coordinates, which were too large for float32.
+
+    Args:
+        origin: (x, y, z) what was subtracted, world units.
+    """
+
+    origin: tuple[float, float, float]
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"coordinates are large: {self.origin} was subtracted from all of them"
+
+
+@dataclass(frozen=True)
+class PanoramaFaces:
+    """Views that are cut from panoramas.
+
+    Args:
+        faces: Number of such views.
+        total: Number of views.
+    """
+
+    faces: int
+    total: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.faces} of {self.total} views are faces of panoramas, cut on loading"
+
+
+@dataclass(frozen=True)
+class DistortedPhotos:
+    """Photos that are undistorted.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+    """
+
+    photos: int
+    total: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.photos} of {self.total} photos have lens distortion and are undistorted on loading"
+
+
+@dataclass(frozen=True)
+class CroppedPhotos:
+    """Photos with a wider field of view than a pinhole camera can show.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+        first: Name of the first such photo.
+        widest: Widest field of view that is kept whole, degrees.
+        kept: Field of view of a cropped photo, degrees.
+    """
+
+    photos: int
+    total: int
+    first: str
+    widest: int
+    kept: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} of {self.total} photos see more than {self.widest} degrees and are cropped to {self.kept}, "
+            f"first {self.first}"
+        )
+
+
+@dataclass(frozen=True)
+class RescaledIntrinsics:
+    """Photos whose size differs from their camera's.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+        first: Name of the first such photo.
+    """
+
+    photos: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} of {self.total} photos differ in size from their camera, first {self.first}: "
+            "intrinsics rescaled"
+        )
+
+
+@dataclass(frozen=True)
+class UnevenFocalLengths:
+    """Cameras whose two focal lengths differ more than those of real lenses.
+
+    Args:
+        cameras: Number of photos with such a camera.
+        total: Number of photos.
+        fx, fy: Focal lengths of the first such camera, px.
+    """
+
+    cameras: int
+    total: int
+    fx: float
+    fy: float
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.cameras} of {self.total} cameras have fx and fy that differ widely, first {self.fx:.4g} and "
+            f"{self.fy:.4g} px: the calibration may be wrong"
+        )
+
+
+@dataclass(frozen=True)
+class TurnedPhotos:
+    """Photos that are turned by their EXIF orientation, because their poses are those of upright photos.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+        first: Name of the first such photo.
+    """
+
+    photos: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} of {self.total} photos are turned as EXIF says, because their poses are those of upright "
+            f"photos, first {self.first}"
+        )
+
+
+@dataclass(frozen=True)
+class PhotosExceedMemory:
+    """A photo cache that is too small for all photos.
+
+    Args:
+        needed: Bytes that all photos take.
+        budget: Bytes of the cache.
+    """
+
+    needed: int
+    budget: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"the photos take {_spelled(self.needed)} of memory, but only {_spelled(self.budget)} are kept: the others "
+            "are decoded again whenever they are used; raise --image-memory, or load smaller photos with --resolution"
+        )
+
+
+def _spelled(nbytes: int) -> str:
+    return f"{nbytes / 2**30:.1f} GiB" if nbytes >= 2**30 else f"{nbytes / 2**20:.4g} MiB"
+
+
+@dataclass(frozen=True)
+class UnlistedPhotos:
+    """Photos that neither the training nor the test list of the capture names.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+    """
+
+    photos: int
+    total: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.photos} of {self.total} photos are in none of the capture's training and test lists: left out"
+
+
+@dataclass(frozen=True)
+class OnlyOnePhoto:
+    """A capture of one photo, which leaves none for testing."""
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return "the capture has only one photo: it is used for training, and none is held out"
+
+
+@dataclass(frozen=True)
+class SharedCentres:
+    """Photos that were taken from fewer places than there are photos.
+
+    Args:
+        photos: Number of photos.
+        centres: Number of different camera centres.
+    """
+
+    photos: int
+    centres: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} photos have {self.centres} centres, like the faces of panoramas: those with one centre are "
+            "held out together"
+        )
+
+
+@dataclass(frozen=True)
+class RandomStart:
+    """Random start points, because the capture has none.
+
+    Args:
+        reason: Why the capture has no points.
+        points: Number of random points.
+        cube: Half the edge of the cube that contains them, world units; None if no cube limits them.
+        shared: Whether they lie where two or more photos look. Otherwise no two photos see the same place, and the cube
+            is centred on the cameras.
+    """
+
+    reason: str
+    points: int
+    cube: float | None
+    shared: bool
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        if not self.shared:
+            where = f"within {self.cube:.4g} of the cameras, since no two photos see the same place"
+        elif self.cube is not None:
+            where = f"in the cube +-{self.cube:g}, where two or more photos look"
+        else:
+            where = "where two or more photos look"
+        return f"{self.reason}: starting from {self.points:,} random points {where}"
+
+
+LoadingNote = (
+    Note
+    | IgnoredPoints
+    | MovedOrigin
+    | PanoramaFaces
+    | DistortedPhotos
+    | CroppedPhotos
+    | RescaledIntrinsics
+    | UnevenFocalLengths
+    | TurnedPhotos
+    | PhotosExceedMemory
+    | UnlistedPhotos
+    | OnlyOnePhoto
+    | SharedCentres
+    | RandomStart
+)
+"""Anything that `Dataset.notes` may hold."""
