@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu.base.constants import C0
-from gsplat_edu.clean.evidence import FAINT, MOST_OPAQUE, TURNS, gather, peak_weights
+from gsplat_edu.clean.evidence import FAINT, MOST_OPAQUE, REDRAWN_EVERY, gather, peak_weights
 from gsplat_edu.render.api import render
 from gsplat_edu.render.numpy_reference import render_gaussians
 from gsplat_edu.render.settings import RenderSettings
@@ -110,7 +110,7 @@ def test_a_splat_that_is_removed_is_judged_by_what_it_would_add(scene, photo):
     """It is drawn at 0.02, whose core holds 80 % of the linear and 96 % of the square term: alpha ends at 1/255."""
     removed = np.zeros(COUNT, dtype=bool)
     removed[7] = True
-    found = gather(scene, [View(CAMERA, photo)] * (TURNS * REPEATS), SETTINGS, CPU, removed)
+    found = gather(scene, [View(CAMERA, photo)] * (REDRAWN_EVERY * REPEATS), SETTINGS, CPU, removed)
     present, absent = squared_error(scene, photo), squared_error(without(scene, 7), photo)
     images = [render(g, CAMERA, settings=SETTINGS, backend="cpu").image for g in (scene, without(scene, 7))]
     square = float((images[0] - images[1]).square().sum())

@@ -13,7 +13,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs import pilot
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.runs.pilot import CLEARLY, refinement_for
+from gsplat_edu.runs.pilot import LEAST_GAIN, refinement_for
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 
@@ -49,10 +49,10 @@ def test_the_least_that_none_beats_clearly_is_chosen():
     def chosen(none, poses, both):
         return pilot._choice({"none": none, "poses": poses, "both": both})[0]
 
-    assert chosen(20.0, 20.0 + 0.9 * CLEARLY, 20.0) == "none"
-    assert chosen(20.0, 20.0 + 1.1 * CLEARLY, 20.0) == "poses"
-    assert chosen(20.0, 20.0 + 1.1 * CLEARLY, 20.0 + 1.9 * CLEARLY) == "poses"
-    assert chosen(20.0, 20.0, 20.0 + 1.1 * CLEARLY) == "both"
+    assert chosen(20.0, 20.0 + 0.9 * LEAST_GAIN, 20.0) == "none"
+    assert chosen(20.0, 20.0 + 1.1 * LEAST_GAIN, 20.0) == "poses"
+    assert chosen(20.0, 20.0 + 1.1 * LEAST_GAIN, 20.0 + 1.9 * LEAST_GAIN) == "poses"
+    assert chosen(20.0, 20.0, 20.0 + 1.1 * LEAST_GAIN) == "both"
     assert chosen(20.0, 19.0, 19.0) == "none"
 
 

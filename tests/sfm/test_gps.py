@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.sfm.gps import OFF, TILT, east_north_up, fit_positions, similarity
+from gsplat_edu.sfm.gps import LARGEST_MISFIT, TILT, east_north_up, fit_positions, similarity
 from gsplat_edu.sfm.photos import taken_at
 
 
@@ -87,7 +87,7 @@ def test_positions_that_say_nothing_are_not_used():
     places = orbit(30, size=3.0)
     eyes, _ = moved(places)
     fit = fit_positions(eyes, places + 5 * rng.normal(size=places.shape))
-    assert not fit.good and fit.residual > OFF * fit.spread
+    assert not fit.good and fit.residual > LARGEST_MISFIT * fit.spread
     assert fit_positions(eyes[:5], places[:5]) is None
     assert fit_positions(eyes, np.zeros_like(places)) is None
 

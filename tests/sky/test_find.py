@@ -29,7 +29,7 @@ def searched(capture, points=None, images=None, cameras=None):
 
 def test_the_sky_is_found_where_it_is(outdoors):
     sky = searched(outdoors)
-    assert sky.is_certain and sky.moves and sky.photos == 20
+    assert sky.is_certain and sky.lies_at_infinity and sky.photos == 20
     assert np.abs(sky.up - (0, -1, 0)).max() < 0.05
     true = sum(int(part.sum()) for part in outdoors.sky)
     assert 0.6 * true < len(sky.directions) <= true
@@ -45,7 +45,7 @@ def test_the_same_colours_on_a_dome_are_no_sky():
         near = outdoor_capture(96, 72, 20, points=1_000, dome=dome)
         sky = searched(near)
         assert sky.share > 0.1, "single photos look alike"
-        assert not sky.is_certain and not sky.moves
+        assert not sky.is_certain and not sky.lies_at_infinity
 
 
 def test_walls_of_a_room_are_no_sky():
@@ -58,7 +58,7 @@ def test_walls_of_a_room_are_no_sky():
 
 def test_a_sky_of_one_colour_counts_only_if_it_is_white(outdoors):
     grey = outdoor_capture(96, 72, 20, points=1_000, clouds=0.0)
-    assert searched(grey).is_certain and not searched(grey).moves
+    assert searched(grey).is_certain and not searched(grey).lies_at_infinity
     images = [
         np.where(part[..., None], np.uint8(170), view.image)
         for part, view in zip(grey.sky, grey.views, strict=True)
@@ -92,7 +92,7 @@ def test_noise_and_exposures_that_wander_do_not_hide_it(outdoors):
     for view in outdoors.views:
         light = view.image * rng.uniform(0.75, 1.0, 3) + rng.normal(scale=1.5, size=view.image.shape)
         images.append(np.clip(np.round(light), 0, 255).astype(np.uint8))
-    assert searched(outdoors, images=images).moves
+    assert searched(outdoors, images=images).lies_at_infinity
 
 
 def test_photos_may_differ_in_size(outdoors):

@@ -1,1 +1,1 @@
-"""What everything else stands on: constants, errors, files, text, checks, threads and memory."""
+"""The lowest layer: constants, errors, files, text, checks, threads and memory."""

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 LARGE = 1 << 18
-"""Smaller tensors, in bytes, stay in the heap: other small ones fill the holes they leave."""
+"""Smaller tensors, in bytes, stay in the heap, where others fill the holes that they leave."""
 
 SLACK = 1.25
 """A buffer is reused if it is at most this factor larger than requested; the number of Gaussians changes often."""

@@ -18,7 +18,7 @@ WORTH_ASKING = 64 * 2**20
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 UNLIMITED = 2**60
-"""Limits from this many bytes on count as none."""
+"""A limit of at least this number of bytes counts as no limit."""
 
 _SHORTAGES = (
     "can't allocate memory",

@@ -1,4 +1,4 @@
-"""One writer per folder: a lock that the operating system releases when its process ends, however it ends."""
+"""One writer per folder: a lock that the operating system releases whenever its process ends, even by a kill."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FAR = 1 << 30
 """Offset of the locked byte on Windows, far beyond the contents, because a locked byte cannot be read."""
 
 POLL = 0.1
-"""Seconds between two looks at what another process or thread does: a lock, a file, whether it runs."""
+"""Seconds between two checks of another process or thread: its lock, its files, whether it runs."""
 
 _held: set[int] = set()
 

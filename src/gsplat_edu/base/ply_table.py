@@ -50,7 +50,7 @@ MOST_ROWS = 10**12
 """Most rows of an element; more indicate a damaged header or a malicious file."""
 
 COPIES = 3
-"""Peak number of copies of the rows when they are read at once: the table, its columns and what is made of them."""
+"""Peak number of copies of the rows if they are read at once: the table, its columns and the result."""
 
 BLOCK = 2**18
 """Rows that are read at a time; those of a scene of SH degree 3 take 62 MiB."""
@@ -190,7 +190,7 @@ def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np
 def read_blocks(
     path: Path, file: BinaryIO, header: Header, wanted: Element
 ) -> Iterator[np.ndarray[Any, np.dtype[Any]]]:
-    """Yield the rows of one element in blocks, so that what is made of them is the only copy of all.
+    """Yield the rows of one element in blocks, so that the caller's result is the only copy of all rows.
 
     Nothing is allocated for rows that do not fit into the file.
 
@@ -213,7 +213,7 @@ def read_blocks(
 def _blocks(
     path: Path, file: BinaryIO, header: Header, wanted: Element, rows: int, copies: int
 ) -> Iterator[np.ndarray[Any, np.dtype[Any]]]:
-    """Yield blocks of some rows if there is memory for so many copies of all of them."""
+    """Yield blocks of rows if memory suffices for a given number of copies of all rows."""
     order = FORMATS[header.format]
     before = header.elements[: header.elements.index(wanted)]
     dtype = wanted.dtype(path, order)

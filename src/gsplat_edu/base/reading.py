@@ -1,6 +1,6 @@
 """Open files of unknown origin safely: only regular files, and only within the available memory.
 
-JSON either parses or fails with a ValueError, however deeply it is nested.
+JSON parses or fails with a ValueError at any depth of nesting.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def parse_json(text: str | bytes, parse_constant: Callable[[str], Any] | None = 
 
 
 def stored_path(value: object) -> Path | None:
-    """Return a path that a file names, such as a run's config.json; None if it must not be opened.
+    """Return a path from a file such as config.json; None if it must not be opened.
 
     These files are exchanged. On Windows, //server/share is an address: opening it logs in there with the user's name.
     A network share is therefore never taken from a file, only from the command line.

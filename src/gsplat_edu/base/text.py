@@ -26,7 +26,7 @@ _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 _WHOLE = re.compile("[0-9]{1,20}")
 
 MOST_SPELLED = 1e12
-"""From this on `short_number` uses an exponent."""
+"""`short_number` uses an exponent for numbers of at least this."""
 
 RAW_BYTES = 0xDC80, 0xDCFF
 """Lone surrogates that represent the bytes 0x80 to 0xFF."""
@@ -91,7 +91,7 @@ def shortened(text: str, most: int = 80) -> str:
 def bounded(line: str) -> str:
     """Return a line for people of limited length; values that it quotes may be of any length, and are shortened.
 
-    The start and the end remain: they say what is wrong, and what to do.
+    The start and the end remain, which say what is wrong and what to do.
     """
     words = _LONG_WORD.sub(lambda match: shortened(match[0], LONGEST_WORD), line)
     return shortened(words, LONGEST_LINE)

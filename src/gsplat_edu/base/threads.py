@@ -1,8 +1,8 @@
-"""Run torch on a single thread where its result would depend on the number of threads.
+"""Run torch on a single thread if its result would depend on the number of threads.
 
 Torch splits an elementwise operation into one piece per thread and computes the last few numbers of each piece by a
 different routine: a sigmoid of 100,001 numbers has other bits on two threads than on one. Matrix products are split
-likewise, by torch and by NumPy; torch's can be controlled.
+likewise, by torch and by NumPy; only torch's number of threads can be set.
 """
 
 from __future__ import annotations

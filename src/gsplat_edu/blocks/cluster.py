@@ -1,8 +1,8 @@
 """Train blocks on dask.distributed: workers on this machine, or those of a scheduler elsewhere.
 
 A task is a folder and the number of a block; its answer is the name of a file and a digest. Photos and results stay in
-folders that every worker sees. Dask unpickles what it receives, so whoever reaches a scheduler or a worker can run any
-program there: the local cluster listens on the loopback interface only.
+folders that every worker sees. Dask unpickles its messages, so anyone who can connect to a scheduler or a worker can
+run any program there. The local cluster therefore listens on the loopback interface only.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gsplat_edu.base.headroom import shortage
 from gsplat_edu.base.text import install_command
 
 FAILURES = 20
-"""How many workers a block may lose before it is abandoned. Each next worker resumes from the last checkpoint."""
+"""A block is abandoned after it has lost this many workers. Each new worker resumes from the last checkpoint."""
 
 PATIENCE = 60.0
 """Seconds without a worker or a scheduler after which the command ends."""
@@ -109,17 +109,15 @@ def run_on_cluster(
 
 
 def _task(folder: str, number: int, share: int) -> dict[str, Any]:
-    """Train a block on a worker; return the digest of its scene, or what went wrong in one line."""
+    """Train a block on a worker; return the digest of its scene, or the error in one line."""
     import torch
 
     from gsplat_edu.blocks.task import train_block
 
-    with (
-        _ONE_AT_A_TIME
-    ):  # a worker may have several threads, but the number of torch's is that of the process
+    with _ONE_AT_A_TIME:  # a worker may have several threads, but torch's thread count is set per process
         torch.set_num_threads(max(_processors() // share, 1))
         try:
-            # a worker that was cut off may still be at it: it finishes the block, or its end frees the lock
+            # a disconnected worker may still train the block: it finishes it, or frees the lock when it ends
             done = train_block(Path(folder), number, patience=math.inf)
         except SplatError as error:
             return {"error": str(error)}
@@ -182,7 +180,7 @@ def _client(distributed: Any, options: ClusterOptions, say: Callable[[str], None
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Dask's tracebacks off the terminal: what they mean is said in one line."""
+    """Keep Dask's tracebacks off the terminal; one line reports each failure."""
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client", "distributed.core")]
     before = [logger.level for logger in loggers]
     for logger in loggers:
@@ -240,7 +238,7 @@ def _watch(client: Any, futures: Sequence[Any], options: ClusterOptions, watch: 
     while not all(future.status in ("finished", "error") for future in futures):
         time.sleep(WATCH_EVERY)
         watch()
-        # A future whose worker took its answer along is "lost" until another worker gives the answer again.
+        # A future is "lost" if its worker ended with the result, until another worker computes it again.
         if client.status != "running" or any(future.status == "cancelled" for future in futures):
             raise CheckpointError(f"{place}: the scheduler was lost; {AGAIN}")
         try:
@@ -254,7 +252,7 @@ def _watch(client: Any, futures: Sequence[Any], options: ClusterOptions, watch: 
 
 
 def _answer(number: int, future: Any) -> str | None:  # noqa: ANN401
-    """Return what went wrong with a block; None if it is finished."""
+    """Return the error of a block in one line; None if it is finished."""
     if future.status == "error":
         error = future.exception()
         if type(error).__name__ == "KilledWorker":

@@ -75,7 +75,7 @@ class BlocksFolder:
         return self.run(number).scene(iterations)
 
     def record(self, number: int) -> Path:
-        """Return the file that says that a block is finished."""
+        """Return the file whose presence means that a block is finished."""
         return self.path / "blocks" / f"block_{number:02d}.json"
 
     def read_done(self, number: int, plan: str) -> Done | None:

@@ -73,12 +73,12 @@ def merged(folder: BlocksFolder, plan: BlockPlan, records: list[Done]) -> tuple[
         parts.append(gaussians.map(functools.partial(torch.index_select, dim=0, index=stays)))
     cap = plan.recipe["train"].get("max_gaussians")
     if cap is not None and sum(map(len, parts)) > cap:
-        parts = _within(parts, int(cap))
+        parts = _within_cap(parts, int(cap))
     return Gaussians.concatenated(parts), [len(part) for part in parts]
 
 
-def _within(parts: list[Gaussians], cap: int) -> list[Gaussians]:
-    """Remove the Gaussians that cover least, until a cap is met: the smallest opacities times areas.
+def _within_cap(parts: list[Gaussians], cap: int) -> list[Gaussians]:
+    """Remove the Gaussians with the smallest opacity times area until a cap is met.
 
     Args:
         parts: The Gaussians of each block.

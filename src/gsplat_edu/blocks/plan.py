@@ -32,10 +32,10 @@ MARGIN = 0.2
 """Width of the margin around a cell, as a fraction of the cell's side (VastGaussian, Lin et al. 2024)."""
 
 OUTLIERS = 0.01
-"""This fraction of the points lies outside of the ground's rectangle on each side, unless cameras are there."""
+"""The ground's rectangle leaves out this fraction of the points on each side, but no camera."""
 
 REACH = 0.5
-"""Points farther outside of the cameras' rectangle than this fraction of its longer side count for nothing."""
+"""Ignore points that lie outside the cameras' rectangle by more than this fraction of its longer side."""
 
 TURNS = 90
 """Number of directions, one degree apart, in which the rectangle of the cameras is measured."""
@@ -279,7 +279,8 @@ def measured_area(cameras: Sequence[Camera], points: Points) -> Area:
 def halved(area: Area, cameras: Sequence[Camera], points: Points, count: int) -> list[Cell]:
     """Split the ground into cells, recursively, each time across the longer side.
 
-    Each cut leaves both sides their share of the cameras and points: all cameras weigh as much as all points.
+    Each cut divides the cameras and points in proportion to the cells on both sides. All cameras together weigh as much
+    as all points.
 
     Args:
         area: The ground.
@@ -319,7 +320,7 @@ def _halved(
 
 
 def _cut(places: np.ndarray, weights: Float64[np.ndarray, " N"], share: float, ends: Pair) -> float:
-    """Return the place that has a share of the weights below it; the one by length where nothing weighs."""
+    """Return the place with this share of the weights below it; without weights, divide the length."""
     if len(places) < 2:
         return ends[0] + share * (ends[1] - ends[0])
     order = np.argsort(places, kind="stable")

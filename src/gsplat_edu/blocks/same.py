@@ -1,4 +1,4 @@
-"""Whether the views of a capture are those that were split."""
+"""Check that a capture's views are the ones that were split."""
 
 from __future__ import annotations
 

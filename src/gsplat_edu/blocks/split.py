@@ -37,7 +37,7 @@ OPAQUE = 0.1
 """Gaussians of the coarse model above this opacity count as points of the scene."""
 
 ROOM = 1.5
-"""fast: a block may grow to at least this multiple of the Gaussians that it starts with."""
+"""fast: the cap of a block is at least this multiple of its start Gaussians."""
 
 MARGIN_ROOM = 1.25
 """Cap of a block as a multiple of its cell's share of the whole scene's cap; the rest is for the margin, which merging
@@ -62,12 +62,12 @@ class SplitOptions:
     quality: str | None = None
 
     def iterations_of(self, views: int, batch: int) -> int | None:
-        """Return the length of a block of so many training views; None for that of the options."""
+        """Return the iterations for a block with this number of training views; None for the options'."""
         return None if self.quality is None else planned_iterations(self.quality, views, batch=batch)
 
 
 def recipe_of(options: RunOptions) -> dict[str, Any]:
-    """Return what a plan stores of the options of its blocks."""
+    """Return the options of the blocks that a plan stores."""
     return {
         "train": options.config.flat(),
         "data": dataclasses.asdict(options.data_settings),
@@ -154,7 +154,7 @@ def split_capture(
 
 
 def _coarse_gaussians(coarse: Path, config: TrainConfig, dataset: Dataset, say: Say) -> Gaussians:
-    """Read the coarse model, and refuse one that the cap leaves no room for."""
+    """Read the coarse model; refuse it if it exceeds the cap."""
     gaussians, notes = scene_start(coarse, config.changed(max_gaussians=None), dataset.origin)
     for note in notes:
         say(note)
@@ -173,7 +173,7 @@ def _render(options: RunOptions, gaussians: Gaussians, camera: Camera, features:
 
 
 def _cap(options: RunOptions, dataset: Dataset, block: Block, start: int, share: float) -> int | None:
-    """Return the cap of a block: that of the scene for the cell, with room for the margin, or what the recipe plans.
+    """Return the cap of a block: its cell's share of the scene's cap plus room for the margin, or the recipe's plan.
 
     Args:
         options: Options of the run in blocks.

@@ -1,4 +1,4 @@
-"""The state of every block, read from its files: it costs the trainings nothing, and works wherever they run."""
+"""The state of every block, read from its files, which does not slow the trainings and works wherever they run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 
 TAIL = 4096
-"""Bytes at the end of a log in which its last whole line is looked for."""
+"""Number of bytes at the end of a log that are searched for its last whole line."""
 
 
 @dataclass(frozen=True)

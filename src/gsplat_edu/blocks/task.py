@@ -106,7 +106,7 @@ def train_block(
         return done
     with locked(f"block {number}", options.out, "a training of this block", say, patience):
         if (done := folder.read_done(number, plan.digest())) is not None:
-            return done  # by a process that held the lock until now
+            return done  # another process may have finished the block while this one waited for the lock
         start = folder.start(number)
         if not start.is_file() or file_digest(start) != plan.blocks[number].start:
             raise CheckpointError(f"{start}: is missing or not as it was split; restore it, or split again")

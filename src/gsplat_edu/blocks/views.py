@@ -1,4 +1,4 @@
-"""Which views a block needs: those inside it, and those that show enough of it."""
+"""Choose the views of a block: those taken inside it, and those that show enough of it."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def airspace_shares(area: Area, cameras: Sequence[Camera], cells: Sequence[Cell]
 def seen_shares(
     area: Area, gaussians: Gaussians, render: Renderer, cameras: Sequence[Camera], cells: Sequence[Cell]
 ) -> Shares:
-    """Measure how much of each view's image shows Gaussians of each cell; what hides another thing counts alone.
+    """Measure how much of each view's image shows Gaussians of each cell, with occlusion.
 
     The share is the mean over the pixels of the sum of weights w_i of the Gaussians in the cell.
 

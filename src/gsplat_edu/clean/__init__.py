@@ -1,1 +1,1 @@
-"""Removes floaters, and what no camera supports, from a trained scene: the capture's photos are the judges."""
+"""Remove floaters and invisible splats from a trained scene, judged by the capture's photos."""

@@ -1,4 +1,4 @@
-"""What a capture's photos say about each splat of a scene.
+"""Measure for each splat of a scene how much better the capture's photos fit without it.
 
 In one view, w is the weight (alpha times transmittance) of a splat in a pixel, z the splat's depth, D the median depth
 of the scene there, I the render and P the photo. Without the splat, the pixel changes by
@@ -8,7 +8,7 @@ of the scene there, I the render and P the photo. Without the splat, the pixel c
 exactly, because a pixel is linear in the alpha of each splat. Its squared error therefore changes by 2 (I - P) d + d².
 Summed over pixels, the first term follows from the gradient of the squared error in the splat's opacity. The second is
 the mean of (sum of s d)² over random signs s; one draw per view suffices, because many views are added. Two backward
-passes per view thus measure, for every splat at once, how much better the photos fit without it.
+passes per view thus measure this for every splat at once.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
 MOST_OPAQUE = 0.985
-"""Opacities are lowered to this for the measurement: below the clamp of alpha, so that every pixel has a gradient."""
+"""Upper bound of opacities during the measurement. It is below the clamp of alpha, so that every pixel has a
+gradient."""
 
 FAINT = 0.02
-"""Opacity at which a removed splat is shown to the photos again: it hides nothing, and still counts in its core."""
+"""Opacity at which a removed splat is rendered again: it hides nothing, and its core still exceeds 1/255."""
 
-TURNS = 4
-"""A removed splat is shown again in every fourth view, so that few of them lie over each other."""
+REDRAWN_EVERY = 4
+"""Render a removed splat again in one of this many views, so that few removed splats overlap."""
 
 Progress = Callable[[], None]
 """Called after every view."""
@@ -63,10 +64,10 @@ class Evidence:
     Args:
         weight: (N,) sum of w over all pixels.
         peak: (N,) largest w in any pixel, masked ones included.
-        gap: (N,) mean of 1 - z/D, weighted by w: how far the splat lies in front of what the views see, as a fraction
+        gap: (N,) mean of 1 - z/D, weighted by w: distance of the splat in front of the visible surface, as a fraction
             of D; negative behind the surface. Pixels that are masked or see nothing solid add 0.
-        gain: (N,) squared error of the photos with the splat minus that without it, all others unchanged.
-        spread: (N,) sum of the squares of the parts of `gain` that come from each view.
+        gain: (N,) squared error of the photos with the splat minus the error without it, all other splats unchanged.
+        spread: (N,) sum over the views of the squared contribution to `gain`.
         views: (N,) number of views in which the splat has a weight in a pixel that adds to `gap`.
         error: Squared error of all photos, summed over pixels and channels.
     """
@@ -107,7 +108,7 @@ def gather(
     gone = np.zeros(count, dtype=bool) if removed is None else removed
     ids = np.arange(count)
     for index, view in enumerate(views):
-        drawn = ~gone if not gone.any() else ~gone | ((ids + index) % TURNS == 0)
+        drawn = ~gone if not gone.any() else ~gone | ((ids + index) % REDRAWN_EVERY == 0)
         sums.add(gaussians, np.flatnonzero(drawn), gone, view, settings, index)
         progress()
     return sums.evidence()
@@ -138,7 +139,7 @@ def peak_weights(
 def residual_of(
     output: RenderOutput, view: View, settings: RenderSettings
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
-    """Return the render minus the photo where pixels count, and which do.
+    """Return the render minus the photo, and which pixels count.
 
     Args:
         output: A render of the view's camera.
@@ -184,7 +185,7 @@ class _Sums:
         settings: RenderSettings,
         index: int,
     ) -> None:
-        """Add what one view says about the splats `drawn`, of which those in `gone` are faint."""
+        """Add the evidence of one view for the splats `drawn`. Those in `gone` are rendered faintly."""
         rows = torch.from_numpy(drawn)
         some = gaussians if len(drawn) == len(gaussians) else gaussians.map(lambda tensor: tensor[rows])
         full = np.minimum(some.opacities.double().numpy(), MOST_OPAQUE)

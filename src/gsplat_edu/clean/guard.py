@@ -1,8 +1,8 @@
 """Clean a scene: remove what the photos do not support, as long as held-out photos do not suffer.
 
-The views that judge are those the scene was trained on. The views that were held out limit what is removed: if their
-PSNR falls by more than the stated loss, only the more certain half of the floaters goes, then a quarter, and so on, and
-in the end only what no view sees, or nothing.
+The training views judge the splats. The held-out views guard the result: if their PSNR falls by more than the allowed
+loss, only the more certain half of the floaters is removed, then a quarter, and so on. In the end only splats that no
+view sees are removed, or nothing.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
 MAX_LOSS = 0.05
-"""dB: loss of PSNR that cleaning may cost by default."""
+"""Default of the largest loss of PSNR, dB."""
 
-LEAST = 8
-"""Fewer floaters are not divided further; they all stay."""
+LEAST_DIVIDED = 8
+"""If fewer floaters than this are left and the loss is still too large, keep them all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +40,11 @@ class Cleaning:
 
     Args:
         reasons: (N,) a `Reason` for every splat of the scene; not KEPT: removed.
-        judged: (N,) the same before the guard.
+        judged: (N,) the reasons before the guard took anything back.
         before: Mean PSNR of the guard's views, dB, of the scene; None if no view has a pixel that counts.
-        after: The same without the removed splats.
-        all_removed: The same without all splats that were judged; equal to `after` if the guard took nothing back.
+        after: Mean PSNR without the removed splats.
+        all_removed: Mean PSNR without all splats that were judged removable; equal to `after` if the guard took nothing
+            back.
         held_out: Whether the guard's views were held out; otherwise the scene was trained on them.
         guards: Number of the guard's views.
         views: Number of views that judged.
@@ -86,7 +87,7 @@ def clean(
     backend: Backend | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Cleaning:
-    """Find the splats that the photos do not support, and how many of them can go.
+    """Find the splats that the photos do not support, and decide how many of them to remove.
 
     Args:
         gaussians: N Gaussians on the CPU, in the frame of the cameras.
@@ -119,7 +120,7 @@ def clean(
     whole = after = before if not verdict.removed.any() else score(reasons == Reason.KEPT)
     ranked = _ranked(verdict)
     while before is not None and after is not None and before - after > max_loss:
-        stay = ranked[len(ranked) // 2 if len(ranked) >= 2 * LEAST else 0 :]
+        stay = ranked[len(ranked) // 2 if len(ranked) >= 2 * LEAST_DIVIDED else 0 :]
         reasons = reasons.copy()
         reasons[stay if len(ranked) else slice(None)] = Reason.KEPT
         ranked = ranked[: len(ranked) - len(stay)]

@@ -1,12 +1,12 @@
-"""Which splats of a scene its photos do not support, and why.
+"""Decide which splats of a scene its photos do not support, and why.
 
-Rounds of evidence (`gsplat_edu.clean.evidence`) find the doubtful splats. A floater hides those behind it, so that each
-round sees more than the one before. Then all doubtful splats are judged together (`gsplat_edu.clean.settle`).
+Rounds of evidence (`gsplat_edu.clean.evidence`) find the doubtful splats. A floater hides the floaters behind it, so
+each round finds more than the one before. Then all doubtful splats are judged together (`gsplat_edu.clean.settle`).
 
     z = sum over views of gain / sqrt(sum over views of gain²)
 
-measures how well the views agree that a splat should go: at most 1 in size if a single view has an opinion, and the
-square root of their number if all agree.
+measures how well the views agree that a splat should be removed. |z| is at most 1 if a single view has a gain, and at
+most sqrt(n) for n views, if all agree.
 """
 
 from __future__ import annotations
@@ -151,8 +151,8 @@ class Verdict:
 
     Args:
         reasons: (N,) a `Reason` for every splat.
-        certainty: (N,) how sure it is that a doubtful splat should go; 0 at the border, and for all that are not
-            doubtful.
+        certainty: (N,) how certain the removal of a doubtful splat is; negative if it is kept, and 0 for all other
+            splats.
         views: Number of views that judged.
     """
 
@@ -204,7 +204,7 @@ def judge(
 
 
 def _chosen(views: Sequence[View], count: int) -> list[View]:
-    """Return views spread evenly over the list, as many as the work of a round allows."""
+    """Return `views_of_round` views, spread evenly over the list."""
     number = views_of_round(count, len(views))
     return [views[i * len(views) // number] for i in range(number)]
 
@@ -262,7 +262,7 @@ class _Rounds:
     ) -> Float64[np.ndarray, " N"]:
         """Judge the doubtful splats together, and return how certain their removal is; rare ones stay removed.
 
-        Those that the rounds kept, and those that the photos miss in the last round, start as needed.
+        Splats that the rounds kept, and splats that the photos miss in the last round, start as needed.
         """
         certainty = np.zeros(len(doubtful))
         if not doubtful.any() or len(self._views) < LEAST_VIEWS:
@@ -300,7 +300,7 @@ class _Rounds:
         return free & enough, refuted & enough
 
     def _doubtful(self, found: Evidence) -> Bool[np.ndarray, " N"]:
-        """Return which splats may have to go, if the photos agree to it."""
+        """Return which splats are doubtful, so that the joint judgement decides."""
         errors = _errors(found)
         doubtful: Bool[np.ndarray, " N"] = (np.abs(errors) > PRICE) & (found.gap > DOUBTFUL_GAP)
         return (doubtful | (errors > GROSS_ERROR)) & (found.views > 0)
@@ -315,7 +315,7 @@ class _Rounds:
 
 
 def _agreement(found: Evidence) -> Float64[np.ndarray, " N"]:
-    """Return z; 0 for a splat about which no view has an opinion."""
+    """Return z; 0 for a splat without a gain in any view."""
     spread = np.sqrt(found.spread)
     z: Float64[np.ndarray, " N"] = np.divide(found.gain, spread, out=np.zeros_like(spread), where=spread > 0)
     return z

@@ -1,12 +1,12 @@
-"""How opaque the photos want the doubtful splats of a scene, all at once.
+"""Fit the opacities of all doubtful splats of a scene to the photos together.
 
-The gain of a splat (`gsplat_edu.clean.evidence`) holds all others fixed. Where several splats could fill the same hole,
-each of them seems to be missed while all are gone, and none while all are there. So every doubtful splat gets a factor
-f on its opacity, and all factors are fitted together, by Adam, one view per step:
+The gain of a splat (`gsplat_edu.clean.evidence`) assumes that all others stay. If several splats can fill one hole,
+each seems necessary while all are removed, and none while all are present. Each doubtful splat therefore gets a factor
+f on its opacity, and Adam fits all factors together, one view per step:
 
     minimise  sum over views of the squared error  +  price * sum of f,    0 < f < 1.
 
-The price decides where the photos say nothing.
+The price removes splats that do not change the photos.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ RATE = 0.25
 BETAS = (0.9, 0.99)
 """Decay of Adam's two moments."""
 
-LAST = 0.5
-"""In this last part of the steps the rate is a third."""
+SLOW_PART = 0.5
+"""In this last fraction of the steps the rate is a third."""
 
 Progress = Callable[[], None]
 """Called after every step."""
@@ -45,7 +45,7 @@ class Doubtful:
     Args:
         ids: (D,) their indices.
         start: (D,) logits of their factors to start from.
-        price: Squared error per view that a splat has to be worth, in multiples of `unit` of `settle`.
+        price: Remove a splat if that adds less than this squared error per view, in multiples of `unit` of `settle`.
     """
 
     ids: Int64[np.ndarray, " D"]
@@ -77,7 +77,7 @@ def settle(
         progress: Called after every step.
 
     Returns:
-        (D,) logits of the factors: below 0, the photos do without the splat.
+        (D,) logits of the factors; a negative one means that the splat can be removed.
 
     Raises:
         DatasetError: a photo cannot be read.
@@ -91,7 +91,7 @@ def settle(
         slope = _slope(gaussians, doubtful, logits, views[order.pop()], settings, backend, unit)
         first += (1.0 - BETAS[0]) * (slope - first)
         second += (1.0 - BETAS[1]) * (np.square(slope) - second)
-        rate = RATE if step <= (1.0 - LAST) * steps else RATE / 3.0
+        rate = RATE if step <= (1.0 - SLOW_PART) * steps else RATE / 3.0
         spread = np.sqrt(second / (1.0 - BETAS[1] ** step)) + unit
         logits -= rate * first / (1.0 - BETAS[0] ** step) / spread
         progress()
@@ -107,7 +107,7 @@ def _slope(
     backend: Backend,
     unit: float,
 ) -> Float64[np.ndarray, " D"]:
-    """Return the gradient of one view's part of the sum in the logits of the factors."""
+    """Return the gradient of one view's summand with respect to the logits of the factors."""
     factor = 1.0 / (1.0 + np.exp(-logits))
     opacity = np.minimum(gaussians.opacities.double().numpy(), MOST_OPAQUE)
     opacity[doubtful.ids] *= factor

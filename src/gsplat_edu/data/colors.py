@@ -17,7 +17,7 @@ SAME = 2
 """Largest change of a value, of 255, by a profile that counts as sRGB's. Its versions differ by 1 from rounding."""
 
 RELATIVE = ImageCms.Intent.RELATIVE_COLORIMETRIC
-"""White becomes white, and colours outside of sRGB are clipped."""
+"""Rendering intent: white becomes white, and colours outside of sRGB are clipped."""
 
 D50 = (0.9642, 1.0, 0.8249)
 """White of the space in which ICC profiles are connected, XYZ (ICC.1:2022, 7.2.16)."""
@@ -38,7 +38,8 @@ PLAIN_PRIMARIES = (1, 2)
 """Numbers in H.273 of sRGB's primaries, and of unspecified ones."""
 
 HDR_CURVES = {16: "PQ", 18: "HLG"}
-"""Curves in H.273 of high dynamic range. The others resemble sRGB's, and phones mean that one by them."""
+"""Curves of high dynamic range in H.273. All other curves are taken as sRGB's, which they resemble and which phones
+mean."""
 
 DAMAGED = "its colour profile is damaged"
 
@@ -47,17 +48,17 @@ SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 
 
 Info = Mapping[str | tuple[int, int], Any]
-"""What Pillow reads from a header: `Image.info`."""
+"""The information that Pillow reads from a header: `Image.info`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """What a profile does to pixels.
+    """The conversion of pixels by a profile.
 
     Args:
         rgb: Converts RGB in place; None keeps the pixels.
         rgba: The same for RGBA, keeping alpha.
-        problem: Why the pixels are taken as sRGB although the file declares other colours; empty if they are not.
+        problem: Why the pixels are taken as sRGB although the file declares other colours; empty if they are converted.
     """
 
     rgb: ImageCms.ImageCmsTransform | None = None
@@ -151,7 +152,7 @@ def _direction(x: float, y: float) -> Float64[np.ndarray, "3"]:
 
 @lru_cache(maxsize=16)
 def _from_profile(profile: bytes) -> Conversion:
-    """Read an ICC profile; kept, because all photos of a camera have the same."""
+    """Read an ICC profile, with a cache, because all photos of a camera have the same."""
     try:
         given = ImageCms.ImageCmsProfile(BytesIO(profile))
         space = given.profile.xcolor_space.strip()

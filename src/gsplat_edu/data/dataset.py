@@ -89,7 +89,7 @@ class Dataset:
         *,
         points: Path | None = None,
     ) -> Dataset:
-        """Derive a dataset from a capture. What the reader has read already is not read again.
+        """Derive a dataset from a capture, without reading anything twice.
 
         Args:
             reader: The capture.
@@ -179,7 +179,7 @@ def load_dataset(
 
 
 def _listed(path: Path, frames: Sequence[Frame], settings: DataSettings) -> Sequence[Frame]:
-    """Return the frames that the settings name, all if they name none; refuse a capture that lacks one."""
+    """Return the frames that the settings name, or all if they name none."""
     if settings.train_views is None:
         return frames
     names = (*settings.train_views, *settings.test_views)
@@ -217,7 +217,7 @@ def _alpha_notes(
     settings: DataSettings,
     headers: PhotoHeaders,
 ) -> list[LoadingNote]:
-    """Report what lies behind transparent photos."""
+    """Report the background of transparent photos."""
     count = sum(headers.of(source.path).alpha for source in sources)
     if not count:
         return []
@@ -261,7 +261,7 @@ def _split(
             notes.append(OnlyOnePhoto())
     else:
         every, places = test_every or TEST_EVERY, _places([view.camera for view in views])
-        if max(places) == 0:  # all views have one centre: a panorama is all there is
+        if max(places) == 0:  # all views have one centre: the capture is one panorama
             places = list(range(len(views)))
         elif (count := max(places) + 1) < len(views):
             notes.append(SharedCentres(len(views), count))
@@ -277,7 +277,7 @@ def _split(
 def _places(cameras: Sequence[Camera]) -> list[int]:
     """Number the centres of cameras in the order in which they occur; centres within `ONE_PLACE` are one.
 
-    Poses that were estimated from photos one by one never agree so well: the centres of a panorama's faces do.
+    Only the centres of a panorama's faces agree so well; poses estimated photo by photo never do.
     """
     eyes = np.stack([camera.eye for camera in cameras])
     near = ONE_PLACE * float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())

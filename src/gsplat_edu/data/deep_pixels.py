@@ -1,4 +1,4 @@
-"""Round photos with 16 bits per value to 8; Pillow keeps only the upper 8 bits of coloured ones."""
+"""Round photos with 16 bits per value to 8; Pillow would keep only the upper 8 bits of colours."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _packing(file: Image.Image) -> str:
 
 
 def _repack(file: Image.Image, packing: str) -> None:
-    """Choose another arrangement of the same number of bits before decoding."""
+    """Set another arrangement of the same number of bits before decoding."""
     tiles = file.tile  # type: ignore[attr-defined]
     file.tile = [  # type: ignore[attr-defined]
         tile._replace(args=(packing, *tile.args[1:]) if isinstance(tile.args, tuple) else packing)
@@ -113,7 +113,7 @@ def _rounded(
 def _unweighted(
     upper: UInt8[np.ndarray, "H W 4"], lower: UInt8[np.ndarray, "H W 4"]
 ) -> UInt8[np.ndarray, "H W 4"]:
-    """Divide colours by the alpha that they were stored multiplied with, and round; black where alpha is zero."""
+    """Divide premultiplied colours by alpha, and round; black where alpha is zero."""
     pixels = np.empty(upper.shape, np.uint8)
     for first in range(0, len(upper), ROWS):
         band = slice(first, first + ROWS)
@@ -125,5 +125,5 @@ def _unweighted(
 
 
 def _opaque(differs: np.ndarray) -> UInt8[np.ndarray, "H W"]:
-    """Return alpha: opaque where a pixel is not of the transparent colour."""
+    """Return alpha: transparent for pixels of the transparent colour, else opaque."""
     return np.where(differs, 255, 0).astype(np.uint8)

@@ -43,7 +43,7 @@ UPRIGHT = 1
 """EXIF orientation of a photo that is stored upright."""
 
 TURNS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}
-"""Quarter turns clockwise that bring a photo upright, by EXIF orientation; mirrored ones are mirrored before."""
+"""Quarter turns clockwise that bring a photo upright, by EXIF orientation; mirrored photos are mirrored first."""
 
 MIRRORED = (2, 4, 5, 7)
 """EXIF orientations of photos whose stored columns are reversed."""
@@ -66,7 +66,7 @@ class PhotoFile:
         W: Width after downscaling, px.
         H: Height after downscaling, px.
         background: (r, g, b), 0 to 1, behind transparent pixels; None keeps the alpha.
-        orientation: EXIF orientation by which the stored photo is turned; lens and mask are those of the turned one.
+        orientation: EXIF orientation by which the stored photo is turned; lens and mask refer to the turned photo.
     """
 
     path: Path
@@ -80,11 +80,11 @@ class PhotoFile:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What a file's header tells.
+    """Facts from an image file's header.
 
     Args:
         size: Width and height as stored, px. A HEIC's are upright, because its container turns it.
-        problem: Why the colours are taken as sRGB although the file declares others; empty if they are not.
+        problem: Why the colours are taken as sRGB although the file declares others; empty if they are converted.
         decoding: Bytes per pixel that decoding takes.
         alpha: Whether pixels may be transparent.
     """
@@ -139,7 +139,7 @@ def image_orientation(path: Path) -> int:
 
 
 class PhotoHeaders:
-    """What the headers of image files tell; each file is opened once for its header and once for its orientation.
+    """Headers of image files, cached; each file is opened once for its header and once for its orientation.
 
     Attributes:
         of: `image_header`, cached.
@@ -164,7 +164,8 @@ def stored_size(file: Image.Image) -> tuple[int, int]:
 def stored_orientation(file: Image.Image) -> int:
     """Return the EXIF orientation of an opened image that is not decoded, 1 to 8.
 
-    A HEIC's container has its own rotation, which the decoder applies; by ISO 23008-12 that of EXIF does not count.
+    A HEIC's container has its own rotation, which the decoder applies; ISO 23008-12 says to ignore the rotation in
+    EXIF.
     """
     if file.format == HEIF:
         return UPRIGHT
@@ -192,7 +193,7 @@ def decode(
 
     Args:
         path: The file.
-        orientation: EXIF orientation by which the stored pixels are turned. The file's own does not count.
+        orientation: EXIF orientation by which the stored pixels are turned. The orientation in the file is ignored.
         smaller: Decode JPEGs at 1/2, 1/4 or 1/8 of their size, if both sides stay this long, px; None for full size.
 
     Returns:
@@ -310,7 +311,8 @@ class ImageStore:
         self.budget = budget
         self.decoding = decoding
         self.needed = sum(source.W * source.H * _planes(source) for source in sources)
-        """Bytes that all photos take at most; whether a photo that may have alpha does is known once it is decoded."""
+        """Upper bound of the bytes of all photos; only decoding shows whether a photo with an alpha channel is
+        transparent."""
         largest = max((source.lens.W * source.lens.H for source in sources), default=1)
         self.workers = max(1, min(os.cpu_count() or 1, AT_ONCE // largest))
         """Number of photos to decode at once."""
@@ -367,7 +369,7 @@ def _undistorted(
     """Undistort a photo and its mask band by band. The maps cost less than decoding, so they are not cached.
 
     Returns:
-        The photo; the pixels that count, None for all; and those that the mask excludes, None without a mask.
+        The photo; the pixels that count, None for all; and the pixels that the mask excludes, None without a mask.
 
     Raises:
         DatasetError: as for `undistortion`.

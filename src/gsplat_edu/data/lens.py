@@ -24,7 +24,7 @@ PINHOLE_LIKE, FISHEYE = "perspective", "fisheye"
 """Two names of `gsplat_edu.data.lens_formulas.FORMULAS`."""
 
 OPENCV = (PINHOLE_LIKE, FISHEYE)
-"""The models that OpenCV has; it computes their maps."""
+"""The models whose maps OpenCV computes."""
 
 MAX_SIDE = 2**20
 """Longest plausible side of a photo, px; a larger number indicates a corrupt file."""
@@ -51,7 +51,7 @@ NOWHERE = -32768.0
 """Column and row of a pixel that no ray reaches, px."""
 
 FARTHEST = 2.0**24
-"""Column or row from which on a position counts as no position, px."""
+"""Positions with a larger column or row count as `NOWHERE`, px."""
 
 RIM = 65
 """Number of points of each edge of a photo that are examined to find its pinhole; also the number of angles in the grid
@@ -78,7 +78,7 @@ class Lens(Intrinsics):
         fy: Focal length along y, px.
         cx: Column of the principal point, px; pixel centres have integer coordinates.
         cy: Row of the principal point, px.
-        coefficients: Those of its model, in the model's order; missing trailing ones are zero.
+        coefficients: Coefficients of its model, in the model's order; missing trailing ones are zero.
         model: A name in `gsplat_edu.data.lens_formulas.FORMULAS`.
 
     Raises:
@@ -128,7 +128,7 @@ class Lens(Intrinsics):
             columns: Their columns, px; pixel centres have integer coordinates.
             rows: Their rows, px.
         """
-        with np.errstate(all="ignore"):  # implausible coefficients overflow; what they give is NaN
+        with np.errstate(all="ignore"):  # implausible coefficients overflow and give NaN
             return _rays(self, columns, rows)
 
     def undistorted(self) -> Intrinsics:
@@ -203,7 +203,7 @@ def _chosen(lens: Lens) -> tuple[Intrinsics, bool]:
 
 
 def _fitted(lens: Lens, K: Float64[np.ndarray, "3 3"]) -> Intrinsics | str:
-    """Make the pixels of a rectangle of directions as square as those of the lens; return why if that is impossible."""
+    """Give the pixels of a rectangle of directions the lens's aspect ratio; return the reason if that is impossible."""
     if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0):
         return "the photo covers no rectangle of directions"
     ratio = max(K[0, 0] / lens.fx, K[1, 1] / lens.fy)
@@ -238,7 +238,7 @@ def _opencv_rectangle(lens: Lens) -> Float64[np.ndarray, "3 3"]:
 
 
 def _rectangle(lens: Lens, steepest: float) -> Float64[np.ndarray, "3 3"]:
-    """Return the same matrix for a model that OpenCV does not have; NaN if there is no rectangle.
+    """Return this matrix for a model that OpenCV does not know; NaN if there is no rectangle.
 
     The rectangle ends at the innermost ray of each edge of the photo, and at an angle of `steepest` to the axis.
     """

@@ -92,7 +92,7 @@ def with_masks(folder: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list
         frames: Its frames; a mask is named like the frame's image file.
 
     Returns:
-        The frames, and what the user should know about the masks.
+        The frames, and notes about the masks.
 
     Raises:
         DatasetError: as for `find_named`.
@@ -105,14 +105,14 @@ def with_masks(folder: Path, frames: Sequence[Frame]) -> tuple[list[Frame], list
 
 
 def find_named(folders: Sequence[Path], names: Sequence[str]) -> tuple[dict[str, Path], list[Note]]:
-    """Find the masks of photos. A bare name counts if only one photo has it.
+    """Find the masks of photos. A mask's bare name fits a photo only if no other photo has it.
 
     Args:
         folders: Folders of masks; the first with a mask for a photo wins.
         names: Names of the photos in the capture, with slashes.
 
     Returns:
-        The masks by name, and what the user should know about them.
+        The masks by name, and notes about them.
 
     Raises:
         DatasetError: two masks fit one photo, or the folders hold images and none fits.
@@ -142,7 +142,7 @@ def find_named(folders: Sequence[Path], names: Sequence[str]) -> tuple[dict[str,
 
 
 def check_none_unused(folders: Sequence[MaskFolder], photo: str) -> None:
-    """Refuse folders of masks of which none is used.
+    """Raise an error if no mask of some folders is used.
 
     Args:
         folders: The folders.

@@ -182,7 +182,7 @@ class UnreadColors:
 
     @classmethod
     def of(cls, problems: Sequence[tuple[str, str]]) -> list[UnreadColors]:
-        """Return the note, if there is one to make.
+        """Return the note in a list; empty if no photo has a problem.
 
         Args:
             problems: Name of each photo and `gsplat_edu.data.images.ImageHeader.problem`.
@@ -197,13 +197,13 @@ class UnreadColors:
 
 @dataclass(frozen=True)
 class Background:
-    """What lies behind transparent photos.
+    """The background of transparent photos.
 
     Args:
         photos: Number of photos with an alpha channel.
         total: Number of photos.
         color: (r, g, b), 0 to 1; None if it may differ from iteration to iteration.
-        usually_white: Whether scores of such captures are usually given on white.
+        usually_white: Whether published scores of such captures are usually on white.
     """
 
     photos: int

@@ -18,8 +18,8 @@ def oriented(frames: Sequence[Frame], headers: PhotoHeaders) -> list[Frame]:
     """Mark the photos to be turned. The sizes of the cameras decide, because poses refer to the pixels that were used.
 
     COLMAP ignores EXIF, so photos are read as stored if that fits their camera. A photo is turned if only its upright
-    size fits. If there are such photos, and none with a quarter turn in EXIF that fits as stored, then the program that
-    found the poses turned all photos, also those whose size does not tell: half turns, mirrored and square ones.
+    size fits. If such photos exist, and no photo with a quarter turn in EXIF fits as stored, the program that found the
+    poses turned all photos. Then half turns, mirrored and square photos, whose sizes are ambiguous, are turned too.
 
     Args:
         frames: The frames of a capture.

@@ -39,8 +39,8 @@ LARGEST_FACE = 1600
 """Longest side of a face unless the user gives one, px: the size at which features are detected."""
 
 FINER = 1.0
-"""Smallest number of samples per pixel of the panorama at its horizon, along each axis, before they are averaged to a
-face's pixels. Twice as many give the same face to 0.05 dB."""
+"""Smallest number of samples per panorama pixel at the horizon, along each axis. Samples are averaged to a face's
+pixels; twice as many change a face by 0.05 dB at most."""
 
 MARGIN = 4
 """Columns repeated on each side of the panorama, so that no interpolation sees a border at +-180 degrees."""
@@ -54,7 +54,7 @@ BAND = 128
 
 @dataclass(frozen=True)
 class FaceLens(Lens):
-    """The lens of a panorama of which one face is shown. Its sizes are those of the panorama.
+    """The lens of one face of a panorama. Its sizes are those of the panorama.
 
     Args:
         number: Index in `face_rotations`.
@@ -78,7 +78,7 @@ class FaceLens(Lens):
 
     @property
     def cropped(self) -> bool:
-        """Whether something of the photo is lost: the other faces show it."""
+        """False: other faces show the rest of the panorama."""
         return False
 
     @property

@@ -1,4 +1,4 @@
-"""Initial point clouds: read from a PLY, or random where a capture has none."""
+"""Initial point clouds: read from a PLY, or random if a capture has none."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class PlacedCapture:
         frames: Sorted by name.
         cloud: Start points; None if there are none.
         origin: (3,) offset that was subtracted from all coordinates, world units.
-        notes: Notes for the user: those of the capture's reader, and what was left out or moved.
+        notes: Notes of the capture's reader, and about points that were left out or moved.
     """
 
     frames: tuple[Frame, ...]
@@ -56,7 +56,7 @@ class CaptureReader:
     """Reads a capture once, when it is first needed: poses, names and points, and each photo's header.
 
     `gsplat_edu.data.dataset.Dataset.of` derives datasets from it, of any resolution, split, background and memory.
-    They share the digests of the photos' files, so that a photo which changes between two of them is noticed.
+    They share the digests of the photos' files, so that a change of a photo between two datasets is detected.
 
     Args:
         path: A capture folder of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
@@ -74,7 +74,7 @@ class CaptureReader:
 
     @cached_property
     def capture(self) -> Capture:
-        """What the reader of its layout found; see `read_capture`."""
+        """The contents of the capture; see `read_capture`."""
         return read_capture(self.path)
 
     def placed(self, points: Path | None = None) -> PlacedCapture:

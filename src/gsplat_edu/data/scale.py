@@ -21,8 +21,8 @@ class Scale:
     Args:
         unit: "m", "cm" or "mm"; one unit of the coordinates is one of these.
         source: "GPS" or "a given distance".
-        detail: How well it is known, in words.
-        level: Whether up is known to be (0, -1, 0), from GPS; else it is what most photos show as up.
+        detail: Accuracy of the scale, in words.
+        level: Whether up is (0, -1, 0) by GPS; otherwise it is the mean up direction of the photos.
     """
 
     unit: str

@@ -1,7 +1,7 @@
-"""Which points which photos see, for the tracks of a COLMAP model that was not made from matches.
+"""Find the points that each photo sees, for the tracks of a COLMAP model that was not made from matches.
 
-A photo sees a point if the point is before its camera, inside the image, and not hidden: points hide what is behind
-them in their cell of the image. Cells are so large that a surface of evenly spread points has some in each.
+A photo sees a point if the point is before its camera, inside the image, and not hidden: a point hides farther points
+in its cell of the image. Cells are large enough to contain some points of an evenly covered surface.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from jaxtyping import Float64, Int64
 from gsplat_edu.scene.camera import Camera
 
 MOST_SEEN = 2_000
-"""Points that a photo sees at most, taken evenly from the order of the points: about as many as matching finds. A cloud
-of a million points in hundreds of photos would make gigabytes of tracks."""
+"""Largest number of points per photo, evenly spaced in the order of the points: about as many as matching finds. A
+cloud of a million points in hundreds of photos would make gigabytes of tracks."""
 
 PER_CELL = 4
 """Points of a cell on average."""
 
 UNMEASURED = -1.0
-"""Reprojection error of points whose tracks come from here: COLMAP's value for an error that was not computed. It says
-that the tracks are no evidence for the poses, which they were computed from."""
+"""Reprojection error of points whose tracks come from here: COLMAP's value for an error that was not computed. It means
+that the tracks are no evidence for the poses, because they were computed from them."""
 
 DEPTH_SLACK = 0.05
-"""A point is hidden if it is farther away than the nearest one of its cell by more than this fraction. Surfaces that
-are seen at a grazing angle lose points by it, which is harmless."""
+"""A point is hidden if it is farther away than the nearest one of its cell by more than this fraction. Surfaces seen at
+a grazing angle lose points, which is harmless."""
 
 
 class VisiblePoints(NamedTuple):
-    """What a photo sees."""
+    """The points that a photo sees."""
 
     points: Int64[np.ndarray, " M"]
     """Rows of the points, increasing."""
     pixels: Float64[np.ndarray, "M 2"]
-    """Where, px; the centre of the first pixel is at (0.5, 0.5), as in COLMAP's files."""
+    """Their positions, px; the centre of the first pixel is at (0.5, 0.5), as in COLMAP's files."""
 
 
 class Track(NamedTuple):
@@ -45,11 +45,11 @@ class Track(NamedTuple):
     images: Int64[np.ndarray, " L"]
     """Indices of the cameras."""
     places: Int64[np.ndarray, " L"]
-    """Rows in what those cameras see."""
+    """Rows of the point in the `VisiblePoints` of those cameras."""
 
 
 def visible_points(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> VisiblePoints:
-    """Return the points that a camera sees, as far as the points themselves tell."""
+    """Return the points that a camera sees, with occlusion by other points."""
     at = camera.world_to_cam(points)
     before = np.flatnonzero(at[:, 2] > 0)
     u, v, depth = camera.project(at[before])

@@ -1,7 +1,7 @@
-"""Random start points where a capture has none: only where at least two training photos look.
+"""Random start points for a capture without points: only places that at least two training photos see.
 
-A point that a single photo sees fits any depth, and one that no photo sees never changes: both stay as a coloured
-cloud.
+A point that a single photo sees fits at any depth, and a point that no photo sees never changes. Both would stay as a
+coloured cloud.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ points become floaters: from 0.3, 0.6, 1.0 and 1.5 on, `fox --resolution 6` scor
 iterations), a traced room whose walls lie beyond its cameras 18.9, 25.8, 29.2 and 29.7 (1,500)."""
 
 TRIES = 40
-"""Draws of `RANDOM_POINTS` candidates before a capture whose photos hardly overlap gets fewer points."""
+"""Largest number of draws of `RANDOM_POINTS` candidates; a capture whose photos hardly overlap gets fewer points."""
 
 
 def seen_by(
@@ -64,7 +64,7 @@ def cloud_in_cube(cameras: Sequence[Camera], centre: Float64[np.ndarray, "3"], h
 
 
 def cloud_in_view(cameras: Sequence[Camera]) -> Cloud | None:
-    """Draw points from what at least two photos see, as far as they see; every run draws the same ones.
+    """Draw points that at least two photos see; every run draws the same ones.
 
     A point lies on the ray of a random pixel of a camera, in turn, at a depth whose inverse is uniform.
 

@@ -57,7 +57,7 @@ def write_model(
 ) -> None:
     """Write a COLMAP model in sparse/0, without photos.
 
-    Tracks say which photos see a point (`gsplat_edu.data.tracks`); programs that supervise depth read them.
+    Tracks list the photos that see a point (`gsplat_edu.data.tracks`); programs that supervise depth read them.
 
     Args:
         folder: The capture; created if missing.

@@ -28,11 +28,11 @@ UNEXPLAINED = 3.0
 """Warn about a view whose PSNR is this far below the median of its split, dB: 3 dB is twice the squared error."""
 
 FITTED = 27.0
-"""If the training views' median PSNR is below this, dB, a single view far below it says little about that photo: the
-scene is too small or too young. 18 photos of `fern` with 45,000 Gaussians had a mean of 25.8, `snowmiku97` has 29."""
+"""Blame a photo for its low PSNR only if the training views' median PSNR is at least this, dB; otherwise the scene is
+too small or too little trained. 18 photos of `fern` with 45,000 Gaussians had a mean of 25.8, `snowmiku97` has 29."""
 
 UNEXPLAINED_SPREAD = 3.0
-"""The view must also be this many standard deviations below (sigma from the median absolute deviation)."""
+"""It must also be this many sigma below the median, with sigma from the median absolute deviation."""
 
 RISING = 0.1
 """Advise longer training if the test views' PSNR rose by at least this in the last quarter of the run, dB."""
@@ -46,7 +46,7 @@ JUMP = 0.5
 shadow stay below 0.2."""
 
 VEILED = 0.02
-"""Warn when near splats cover more than this share of a view's pixels: a spot a seventh as wide and high."""
+"""Warn if near splats cover more than this fraction of a view's pixels: a spot of a seventh of its width and height."""
 
 FAINT = 0.02
 """Splats below this opacity are hardly visible: they change a white 8-bit pixel by five levels."""
@@ -79,10 +79,10 @@ class Trained:
         beforehand: Findings about exposure from the photos alone.
         uncompared: Why the exposure of the photos was not compared; empty if it was.
         strategy: The run's recipe.
-        corrected: Whether the training corrected exposures; then the residuals are those of corrected renders, and
-            there are no findings beforehand.
-        moved: Name and share of each training photo of which a part shows what other photos do not; empty if the
-            training masked such parts.
+        corrected: Whether the training corrected exposures; the residuals then compare corrected renders, and
+            `beforehand` is empty.
+        moved: Name and affected fraction of each training photo that shows objects which other photos do not; empty if
+            the training masked them.
     """
 
     path: Path
@@ -118,9 +118,9 @@ class Trained:
 
     @property
     def rising(self) -> bool | None:
-        """Whether the scene was still improving when training ended; None if the log does not show it.
+        """Whether the scene was still improving when training ended; None if the log cannot tell.
 
-        It never shows it for the recipe fast, whose rates fall until the end, which raises the PSNR of any run.
+        It cannot tell for the recipe fast: its rates fall until the end, which raises the PSNR of any run.
         """
         if self.strategy == "fast":
             return None
@@ -277,7 +277,7 @@ def _outliers(run: Trained) -> list[Finding]:
 
 
 def _about_outliers(run: Trained, low: Sequence[Residual]) -> str:
-    """Return advice: only where the scene fits its other photos is a photo that it does not fit suspicious."""
+    """Return advice. A badly fitted photo is suspicious only if the scene fits the others."""
     usual = float(np.median([view.psnr for view in run.train])) if run.train else np.inf
     if usual < FITTED:
         more = f"train with more Gaussians (--max-gaussians {2 * len(run.gaussians)})"

@@ -261,7 +261,7 @@ def _stands(geometry: Geometry) -> tuple[Float64[np.ndarray, " C"], Float64[np.n
 
 
 def _missing(geometry: Geometry) -> Bool[np.ndarray, " C"]:
-    """Flag cameras whose image misses the common centre; none if there is no centre."""
+    """Flag cameras without the common centre in their image; none if there is no centre."""
     if geometry.centre is None:
         return np.zeros(len(geometry.cameras), dtype=np.bool_)
     return np.array([not inside(camera, geometry.centre[None])[0] for camera in geometry.cameras])

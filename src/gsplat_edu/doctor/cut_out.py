@@ -1,7 +1,7 @@
-"""Whether masks cut out an object or hide something in front of a scene: what `--outside-masks auto` decides.
+"""Decide for `--outside-masks auto` whether masks cut out an object or hide something in front of a scene.
 
-An object's mask keeps a connected region away from most of the photo's border, and differs from photo to photo. What
-hides a passer-by, a tripod or a sky keeps most of the border; what hides a lens's dark rim is the same in every photo.
+An object's mask keeps a connected region away from most of the photo's border, and differs from photo to photo. A mask
+of a passer-by, a tripod or the sky keeps most of the border. A mask of a lens's dark rim is the same in every photo.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ MOST_BORDER = 0.35
 """An object's mask keeps at most this share of the photo's border: it may stand on the lower edge."""
 
 LARGEST_PART = 0.8
-"""The largest connected part of what an object's mask keeps has at least this share of it."""
+"""The largest connected part that an object's mask keeps is at least this fraction of all it keeps."""
 
 MOST_MASKS = 0.8
 """At least this share of the masks has to cut out an object."""
 
 MOST_PHOTOS = 0.9
-"""At least this share of the photos has to have a mask: the others teach the scene what surrounds the object."""
+"""At least this fraction of the photos must have a mask, because the scene learns the surroundings from the others."""
 
 
 class Shape(NamedTuple):
@@ -93,7 +93,7 @@ def outside_masks_of(survey: Survey) -> Remedy:
 
 
 def check_masks(survey: Survey) -> list[Finding]:
-    """Say what a training does outside the masks."""
+    """Report what the training will do outside the masks."""
     remedy = outside_masks_of(survey)
     if not remedy.reason:
         return []

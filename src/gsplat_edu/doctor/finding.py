@@ -75,7 +75,7 @@ class Diagnosis:
         facts: (name, value) pairs that describe the capture or run.
         findings: In the order of the checks, most harmful kind first.
         fine: Names of the checks that found nothing.
-        otherwise: Advice to fill up with if the warnings give fewer than three pieces; the first is the next step.
+        otherwise: Advice to add if the warnings give fewer than three pieces; the first is the next step.
     """
 
     facts: tuple[tuple[str, str], ...]

@@ -1,4 +1,4 @@
-"""Which photos of a run show what the others do not, found as `gsplat-edu train --transients mask` finds them."""
+"""Find photos of a run that show objects which other photos do not, as `gsplat-edu train --transients mask` does."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from gsplat_edu.train.transient_masks import Compared, FeatureRenderer, find_mas
 from gsplat_edu.train.transients import FEWEST, reduced
 
 NOTABLE = 0.01
-"""Photos of which less than this share differs are not reported."""
+"""Report a photo only if at least this fraction of it differs."""
 
 
 def moved_parts(
     gaussians: Gaussians, views: Sequence[View], render: FeatureRenderer, settings: RenderSettings
 ) -> list[tuple[str, float]]:
-    """Return the names of the training photos that show what others do not, and which share of each that is.
+    """Return the names of training photos that show objects which others do not, and the fraction they cover.
 
     Args:
         gaussians: The trained scene, in the cameras' world coordinates.
@@ -49,7 +49,7 @@ def moved_parts(
 def moved_line(
     folder: Path, gaussians: Gaussians, dataset: Dataset, render: FeatureRenderer, settings: RenderSettings
 ) -> str:
-    """Return what a finished training says about things that moved: what is found, or how to look for it.
+    """Return a line about objects that moved: the photos that show them, or the command to find them.
 
     The comparison takes about 20 ms per photo if photos are in memory. Otherwise reading them again would take longer,
     and the line only names the command.

@@ -116,7 +116,7 @@ def _energy(gray: Float32[np.ndarray, "H W"], sigma: float) -> Float64[np.ndarra
 
 
 def _decoded(source: PhotoFile, side: int) -> tuple[UInt8[np.ndarray, "H W 3"], bool]:
-    """Decode a photo, and say whether it is transparent anywhere; there it lies over black.
+    """Decode a photo over black, and return whether any pixel is transparent.
 
     JPEGs are decoded at a reduced size, the longest side no smaller than `side`. Otherwise as in training, so that both
     refuse the same files.

@@ -1,4 +1,4 @@
-"""Which remedies a capture needs: what the options of `gsplat-edu train` choose whose value is auto.
+"""Choose the remedies that a capture needs, for the options of `gsplat-edu train` with the value auto.
 
 The checks of `gsplat_edu.doctor.appearance` name photos that a user should look at. This module decides whether the
 training should correct all photos, and whether it should start with a sky.
@@ -17,16 +17,16 @@ from gsplat_edu.doctor.finding import Finding, Remedy, Severity
 from gsplat_edu.doctor.survey import Progress, Survey, prepare
 from gsplat_edu.sky.find import Sky, find_sky
 
-UNLIKE = 0.25
-"""A photo counts if its brightness or a channel's tint differs from its neighbours' by more than this, stops."""
+DIFFERENT = 0.25
+"""A photo differs if its brightness or a channel's tint is off its neighbours' by more than this, stops."""
 
 SHARE = 0.1
-"""Exposures are corrected if at least this share of the photos counts. snowmiku97 has 0.05, whose phone drifts from
-photo to photo (the scene follows as view-dependent colour); gains drawn from +-0.7 stops give 0.4."""
+"""Correct exposures if at least this fraction of the photos differs. snowmiku97, taken by a phone whose exposure
+drifts, has 0.05, and the scene follows with view-dependent colour. Random gains of +-0.7 stops give 0.4."""
 
 ENOUGH = 12
-"""Fewest training photos with which `--transients auto` looks for things that move. With fewer, fewer than four photos
-show most places, which is too little to compare a photo with."""
+"""`--transients auto` looks for moving objects from this number of training photos on. In smaller captures, fewer than
+four photos show most places, which are too few to compare."""
 
 
 def remedies_for(
@@ -51,7 +51,7 @@ def appearance_of(survey: Survey) -> Remedy:
     if len(survey.shots) < 2 or any(shot.stats.transparent for shot in survey.shots):
         return Remedy("none")
     gains = Gains(survey)
-    differ = (np.abs(gains.light) > UNLIKE) | (gains.tint > UNLIKE)
+    differ = (np.abs(gains.light) > DIFFERENT) | (gains.tint > DIFFERENT)
     if np.mean(differ) < SHARE:
         return Remedy("none")
     largest = float(np.abs(gains.light).max())
@@ -63,7 +63,7 @@ def appearance_of(survey: Survey) -> Remedy:
 
 
 def transients_for(count: int) -> Remedy:
-    """Choose `--transients` for a number of training photos. Whether something moved shows only in the training."""
+    """Choose `--transients` from the number of training photos. Only the training can find out what moved."""
     if count < ENOUGH:
         return Remedy(
             "none",
@@ -86,7 +86,7 @@ def sky_of(survey: Survey) -> Remedy:
         if some:
             return Remedy("none", f"photos are {kind}, and a sky may be cut out of them")
     sky = _sky(survey)
-    return Remedy("shell", _seen(sky, survey)) if sky.is_certain else Remedy("none")
+    return Remedy("shell", _sky_sentence(sky, survey)) if sky.is_certain else Remedy("none")
 
 
 CHOICES = {"appearance": appearance_of, "sky": sky_of, "outside_masks": outside_masks_of}
@@ -94,11 +94,11 @@ CHOICES = {"appearance": appearance_of, "sky": sky_of, "outside_masks": outside_
 
 
 def check_sky(survey: Survey) -> list[Finding]:
-    """Find a sky, which needs splats far away."""
+    """Report a sky, which needs far splats."""
     if sky_of(survey).value == "none":
         return []
     advice = "train with --sky shell, which --sky auto of the recipe fast chooses by itself"
-    return [Finding("sky", Severity.NOTE, _seen(_sky(survey), survey), advice)]
+    return [Finding("sky", Severity.NOTE, _sky_sentence(_sky(survey), survey), advice)]
 
 
 def _sky(survey: Survey) -> Sky:
@@ -106,11 +106,11 @@ def _sky(survey: Survey) -> Sky:
     return find_sky([shot.camera for shot in shots], [shot.stats.thumbnail for shot in shots], survey.points)
 
 
-def _seen(sky: Sky, survey: Survey) -> str:
-    """Say where the sky is and how that is known."""
+def _sky_sentence(sky: Sky, survey: Survey) -> str:
+    """Describe which part of the photos is sky, and the evidence."""
     where = f"{100 * sky.share:.0f} % of the pixels, in {sky.photos} of {len(survey.shots)} photos"
     blind = "" if len(survey.points) else ", as far as photos without points tell"
-    if not sky.moves:
+    if not sky.lies_at_infinity:
         return f"{where}, are one white above the horizon{blind}"
     return (
         f"{where}, lie at infinity{blind}: in one direction, photos differ by {sky.spread:.1f} %,"

@@ -63,7 +63,7 @@ def residuals(
         render: Renders Gaussians from a camera, with depth, over `background`.
         background: (3,) RGB behind transparent photos.
         progress: Called after every view.
-        appearance: What the training corrected: each render is given the exposure of its photo first, or also its
+        appearance: The training's setting `appearance`: renders first get their photo's exposure, or exposure and
             vignetting.
 
     Returns:

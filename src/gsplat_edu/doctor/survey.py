@@ -42,7 +42,7 @@ class Shot:
         size: Width and height of the file, px.
         camera: The undistorted pinhole camera at the thumbnail's size.
         stats: Its thumbnail and measurements.
-        colors: Why its colours are taken as sRGB although its file declares others; empty if they are not.
+        colors: Why its colours are taken as sRGB although its file declares another space; empty if they are converted.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Apply operations to a scene: what is selected, hidden and deleted after each, and what is left at the end."""
+"""Apply operations to a scene: the selected, hidden and deleted splats after each, and the remaining scene."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def kept_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Boo
 
 
 def edited(scene: Scene, operations: Sequence[ops.Operation]) -> Scene:
-    """Return what is left of a scene, in its coordinates; the same object if nothing is removed."""
+    """Return the remaining scene, in its coordinates; the same object if nothing is removed."""
     stays = kept_after(operations, scene.gaussians)
     if stays.all():
         return scene

@@ -1,12 +1,11 @@
 """Scores of held-out views after their poses have been aligned with the scene.
 
-A training that refines its cameras may end with a scene in which a held-out photo, whose pose was never refined, looks
-misplaced. Its pose is therefore aligned on half of the photo, with the scene fixed, and scored on the other half, which
-the alignment has not seen. If the training corrected exposures too, the colours are fitted with the pose.
+A training that refines its cameras shifts the scene against held-out photos, whose poses it never refines. The pose of
+a held-out photo is therefore aligned on half of the photo, with the scene fixed, and scored on the other half. If the
+training corrected exposures too, the colours are fitted with the pose.
 
-The halves are the light and the dark squares of a chessboard. A left half says little of some moves of the camera,
-which then spoil the right half: on a clean capture, aligned photos lost 0.4 dB there
-(benchmarks/archive/RESULTS-2026-11.md).
+The halves are the light and the dark squares of a chessboard. The left half alone determines some moves of the camera
+poorly. On a clean capture, alignment on it cost 0.4 dB on the right half (benchmarks/archive/RESULTS-2026-11.md).
 """
 
 from __future__ import annotations
@@ -93,7 +92,7 @@ def aligned_psnr(
     first, second = torch.zeros_like(twist), torch.zeros_like(twist)
     for step in range(STEPS):
         leaf = twist.clone().requires_grad_()
-        image = shown(start.moved(leaf * units)).cpu()  # compared by the native loss, whatever rendered it
+        image = shown(start.moved(leaf * units)).cpu()  # the native loss compares the renders of any backend
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
         adam_in_torch(twist, first, second, gradient, _numbers(step))
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The blocks of a merged run as its report shows them: cells on the ground, and a table with their scores."""
+"""Figures of the blocks of a merged run for its report: cells on the ground, and a table with their scores."""
 
 from __future__ import annotations
 

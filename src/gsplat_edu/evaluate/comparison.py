@@ -1,7 +1,7 @@
 """The pictures in renders/test of a run: a photo and its render side by side, photo first, as in the report.
 
-A strip above them names both. A text chunk of the PNG says where they are, for programs that take them apart; pictures
-of earlier versions have no such chunk and no strip, and the render comes first.
+A strip above them names both. A text chunk of the PNG holds their order and the strip's height. Pictures of earlier
+versions have neither chunk nor strip, and the render comes first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SEPARATOR_WIDTH = 4
 SEPARATOR_GREY = 128
 
 STRIP_HEIGHT = 13
-"""Height of the strip with the names, px, times a whole factor that grows with the width."""
+"""Height of the strip with the names, px; it is multiplied by a whole factor that grows with the width."""
 
 WIDTH_PER_SCALE = 600
 """The strip's factor is the width of an image divided by this, px, rounded down, but at least 1."""

@@ -21,11 +21,10 @@ from gsplat_edu.base.files import written_aside
 DPI = 150
 
 CURVE_POINTS = 400
-"""Most points of a curve in a report; longer logs are averaged over stretches of equal length."""
+"""Largest number of points of a curve in a report; longer logs are averaged over intervals of equal length."""
 
 MOST_SHOWN, SHOWN_QUANTILE = 2.0, 0.95
-"""The curve of the speed is cut off at twice its 95 % quantile: a computer that was busy or asleep for a moment would
-flatten the rest."""
+"""Cut off the curve of the speed at twice its 95 % quantile, because a pause of the computer would flatten the rest."""
 
 SVG_FACTS = ("Creator", "Date", "Format", "Type")
 """Metadata that matplotlib writes into an SVG by default (dates and addresses); left out here."""
@@ -34,7 +33,8 @@ CURVE_INCHES = (5.0, 2.9)
 """Width and height of a curve's figure."""
 
 LABELS_INCHES, CHARACTER_INCHES = 0.42, 0.09
-"""Left of the axes: room for the label, and for each character of the numbers along the axis (DejaVu Sans, 10 pt)."""
+"""Space to the left of the axes, inches: for the label, and for each character of the numbers along the axis (DejaVu
+Sans, 10 pt)."""
 
 RUN_CURVES = (
     ("loss", "training loss", "loss of each iteration's view"),
@@ -86,8 +86,9 @@ def run_curve_figures(log: Sequence[Mapping[str, Any]], cap: int | None = None) 
     """Plot a run's log: loss, PSNR of evaluations, Gaussians, size of the photos, ms per iteration, objective's terms.
 
     Args:
-        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, photo_factor, ms, terms. A key that no
-            line has gets no curve, a single term, which is the loss, none of its own, and photos of constant size none.
+        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, photo_factor, ms, terms. A key without
+            values gets no curve; neither do the terms if the loss is the only one, nor the size of the photos if it is
+            constant.
         cap: Cap on the number of Gaussians; None for none.
 
     Returns:
@@ -119,7 +120,7 @@ def run_curve_figures(log: Sequence[Mapping[str, Any]], cap: int | None = None) 
         if len(lines) > 1:
             axes.legend()
         if key in ("loss", "terms") and values.min() >= 0 and values.max() > 0:
-            _decades(axes, values[values > 0])  # a term that ends leaves the axes downwards
+            _decades(axes, values[values > 0])  # log(0): the curve of a term that ends drops below the axes
         if key in ("num_gaussians", "ms"):
             axes.set_ylim(0, 1.05 * max(values.max(), 1.0))  # a count that hardly changes stays off the edge
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
@@ -148,7 +149,7 @@ def _decades(axes: Axes, values: Float[np.ndarray, " Q"]) -> None:
 
 
 def _cut_peaks(axes: Axes, title: str, values: Float[np.ndarray, " Q"]) -> None:
-    """Cut off moments that were far slower than the rest, and say how slow they were."""
+    """Cut off peaks of the curve, and state the largest value."""
     top, peak = MOST_SHOWN * float(np.quantile(values, SHOWN_QUANTILE)), float(values.max())
     if 0.0 < top < peak:
         axes.set(ylim=(0.0, top), title=f"{title} (peaks of up to {peak:,.0f} ms are cut off)")

@@ -28,7 +28,8 @@ MOST = 0.7
 """At least this fraction of the cameras must have the centre in view."""
 
 PAST, PAST_FACTOR = math.radians(20.0), 3.0
-"""A camera misses the centre if its axis is off by more than this angle and this multiple of the median angle."""
+"""A camera misses the centre if its axis is off by more than this angle and by more than this multiple of the median
+angle."""
 
 FAR = math.log(3.0)
 """A camera is an outlier if the logarithm of its distance differs from the median by more than this and by more than
@@ -48,7 +49,7 @@ BANDWIDTH = math.radians(15.0)
 """Standard deviation of the kernel that averages neighbouring cameras; on narrow arcs, a sixth of the arc."""
 
 INSIDE = 0.95
-"""A path that turns back does so at this fraction of the covered angle."""
+"""A path along an arc turns back at this fraction of the covered angle."""
 
 RISE = 0.85
 """Amplitude of the rise and fall of a path that turns back, in local standard deviations of the elevation. Between two
@@ -199,7 +200,7 @@ def _around(cameras: Sequence[Camera], centre: Vector, up: Vector, turns: Values
         return CameraPath(
             path.cameras, "the cameras are too far apart for a path: using a small loop at one place"
         )
-    # Not narrower than most of a gap: otherwise the average jumps from one camera to the next inside the gap.
+    # At least most of a gap wide; otherwise the average jumps from one camera to the next inside the gap.
     width = max(min(BANDWIDTH, covered / 6), 0.6 * crossed, 1e-6)
     data = azimuths[rows], elevations[rows], np.log(distances[rows])
     if covered >= 2.0 * np.pi:

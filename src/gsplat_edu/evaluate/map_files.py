@@ -16,7 +16,7 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.evaluate.images import save_png
 
 LIST = "maps.json"
-"""What a value of each 16-bit PNG means."""
+"""Name of the file with the scale and offset of each 16-bit PNG."""
 
 FULL = 65535
 """Largest value of a 16-bit PNG."""

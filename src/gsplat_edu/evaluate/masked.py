@@ -1,4 +1,4 @@
-"""Pictures of masked things for a report: a photo with its mask outlined, beside the render."""
+"""Pictures of masked parts for a report: a photo with its mask outlined, beside the render."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ THICKNESS = 300
 
 @dataclass(frozen=True)
 class MaskedPicture:
-    """A photo of which a part is masked, and its render, as JPEG.
+    """A photo with a masked part, and its render, as JPEG.
 
     Args:
         name: The view's name in the capture.

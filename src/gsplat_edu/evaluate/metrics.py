@@ -43,7 +43,7 @@ Renderer = Callable[[Gaussians, Camera], RenderOutput]
 
 
 class Transparency(NamedTuple):
-    """What a fit of colours has to know where the background shows through; see `transparency_of`.
+    """Inputs of a fit of colours for photos with a visible background; see `transparency_of`.
 
     Args:
         backdrop: Transmittance of the render, and the background of render and photo.
@@ -118,8 +118,8 @@ def psnr_fitted(
     """Return the PSNR of the right half of an image after a fit of its colours on the left half.
 
     Each channel's gain is `gsplat_edu.ops.exposure.measured_gains` of the left halves, which is applied to the right
-    half. So a held-out photo can be compared with a scene of another exposure, on pixels that the fit has not seen.
-    Unlike `psnr`, it covers only half of the image.
+    half. A held-out photo can thus be compared with a scene of another exposure, on pixels that are not part of the
+    fit. Unlike `psnr`, it covers only half of the image.
 
     Arguments and errors are those of `psnr`.
 
@@ -136,7 +136,7 @@ def psnr_fitted(
 
 
 def transparency_of(photo: Photo, output: RenderOutput, background: ArrayLike) -> Transparency | None:
-    """Return what shows through a photo and its render; None if the photo is opaque.
+    """Return the inputs of a colour fit that depend on the background; None if the photo is opaque.
 
     Args:
         photo: The photo.

@@ -1,4 +1,4 @@
-"""Smooth camera motion through keyframes: what lies between them, and at which speed.
+"""Smooth camera motion through keyframes: the curve between them, and the speed along it.
 
 The curve is a centripetal Catmull-Rom spline. Between keyframes 1 and 2 it blends two parabolas, one through keyframes
 0, 1, 2 and one through 1, 2, 3. Each parabola is a pyramid of linear interpolations (Aitken and Neville), and for
@@ -7,7 +7,7 @@ continuous velocity, for any spacing of the knots: at keyframe 1, the blend and 
 through 0, 1, 2, on both sides. (The angular velocity of squad is continuous only if the knots are evenly spaced.)
 
 The camera moves at constant speed along the curve, or meets the keyframes at their times. Speed combines translation,
-rotation and zoom; see `Travel`. The times do not change the curve, only the speed on it, which never turns back.
+rotation and zoom; see `Travel`. The times change only the speed along the curve, which is never negative.
 
 `viewer/web/path.js` contains the same formulas.
 

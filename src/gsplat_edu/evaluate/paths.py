@@ -48,8 +48,8 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike =
 
     The centre is the middle of the box that holds 10 to 90 % of the opacity along each axis. The extent is the radius
     of the sphere that holds 95 % of the opacity, at most twice the radius of the one that holds half. The orbit's
-    radius lets this sphere fill a field of view of 50 degrees, with a margin of 10 %. A far shell, such as a sky,
-    counts for nothing.
+    radius lets this sphere fill a field of view of 50 degrees, with a margin of 10 %. A far shell, such as a sky, is
+    ignored.
 
     Args:
         gaussians: N Gaussians, at least one.

@@ -48,7 +48,7 @@ GRADES = ((30.0, "very close"), (25.0, "close"), (20.0, "soft or partly wrong"))
 """Lower limit of the mean test PSNR, dB, and the verdict on the renders; below the last limit, "wrong in places"."""
 
 SHOWN = 0.95
-"""This quantile of a difference stays below white when the picture of the difference is brightened."""
+"""Brighten the picture of a difference only as far as this quantile stays below white."""
 
 NAMES = {
     "num_gaussians": "Gaussians",
@@ -163,7 +163,7 @@ class Report:
         config: The run's configuration.
         scores: Scores of the test views.
         pictures: Pictures of test views. At most 8 are shown, the best and the worst among them.
-        masked: Pictures of photos of which a part was masked because it moved.
+        masked: Pictures of photos with parts that were masked as moving.
         notes: Notes for the reader, one sentence each.
         machine: Facts about the machine; by default, this one.
     """

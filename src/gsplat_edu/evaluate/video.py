@@ -24,14 +24,14 @@ BT709, BT601 = 1, 6
 swscale, which OpenCV uses to convert to YUV, has the matrix of BT.601."""
 
 MOST_BITS = (2**31 - 1) // 2
-"""Bits per second that OpenCV asks of the encoder at most; it asks for 64 per pixel and frame, up to this."""
+"""Largest bit rate that OpenCV sets, bits per second; below it, OpenCV sets 64 bits per pixel and frame."""
 
 BITS_PER_PIXEL = 0.5
-"""Bits that a pixel of a frame may take on average. Frames of traced boxes have 37.0 dB then, 38.8 dB at 4.5 times the
-size without a limit (docs/decisions/0009-vp9-in-mp4.md)."""
+"""Largest average number of bits per pixel of a frame. Frames of traced boxes then have 37.0 dB; without a limit, 38.8
+dB at 4.5 times the size (docs/decisions/0009-vp9-in-mp4.md)."""
 
 FASTEST = 7_000
-"""Largest frame rate for the encoder: frames of less than 640 x 480 px get as many bits as those."""
+"""Largest frame rate that the encoder is told: frames below 640 x 480 px get as many bits as frames of 640 x 480 px."""
 
 TICKS = 1_000
 """Duration of a frame in the track's units."""

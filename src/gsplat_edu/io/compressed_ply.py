@@ -55,7 +55,7 @@ MAX_LOG_SCALE = 20.0
 """Log scales are clamped to ± this when written, as in PlayCanvas: 2e-9 to 5e8 world units."""
 
 SETTLED = 0.9
-"""A scene keeps its order if at least this fraction of its splats is in the chunk that sorting would assign."""
+"""Keep a scene's order if at least this fraction of its splats is in the chunk that sorting would assign."""
 
 _STEPS_11_10_11 = np.array((2047.0, 1023.0, 2047.0))
 _ROOT_HALF = np.sqrt(0.5)
@@ -295,8 +295,8 @@ def _order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
 def _order_in_groups(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     """Return the order along a Morton curve, a far shell last.
 
-    A chunk with splats of both would be as large as the shell, and place the near ones as coarsely. Of these, only
-    the farthest share a chunk with the shell: those that do not fill one.
+    A chunk with near and far splats would be as large as the shell, and quantise near splats as coarsely. Only the
+    farthest near splats, which do not fill a chunk, share one with the shell.
     """
     far = far_shell(means)
     if not far.any():

@@ -152,7 +152,7 @@ class Filter:
 
 
 def joined(scenes: Sequence[Scene]) -> Scene:
-    """Join scenes in the given order; those with a lower SH degree are padded with zeros.
+    """Join scenes in the given order; scenes of a lower SH degree are padded with zeros.
 
     Args:
         scenes: At least one.

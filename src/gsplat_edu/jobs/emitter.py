@@ -1,6 +1,6 @@
-"""Where a command writes its events: nowhere, unless it runs as a job.
+"""Write a command's events, if it runs as a job.
 
-`emit` is the seam: the printing layer of the command line calls it for every line and every step of a progress bar.
+The printing layer of the command line calls `emit` for every line and every step of a progress bar.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Emitter:
         self._outputs: list[str] = []
 
     def emit(self, event: Event) -> None:
-        """Write an event. A full disk must not end a training: the first failure is reported, and no more are tried."""
+        """Write an event. If that fails, report it once and stop writing: a full disk must not end a training."""
         if self._file is None:
             return
         try:
@@ -45,7 +45,7 @@ class Emitter:
     def progress(
         self, stage: str, done: float, total: float | None, seconds_left: Callable[[], float | None]
     ) -> None:
-        """Write how far a stage is, and that it began if it is a new one; rarely enough for a long file."""
+        """Write the progress of a stage, and its start if it is new, at most every `PROGRESS_SECONDS`."""
         now = time.monotonic()
         if stage != self._stage:
             self._stage, self._last = stage, 0.0
@@ -68,12 +68,12 @@ _emitter: Emitter | None = None
 
 
 def start_reporting() -> None:
-    """Begin to write events if this process is a job; processes that it starts are none."""
+    """Begin to write events if this process is a job. Its child processes are not jobs."""
     global _emitter  # noqa: PLW0603 - a process has one file of events
     path = os.environ.pop(EVENTS, "")
     if not path:
         return
-    # a server in the background of a shell ignores Ctrl-C, and its jobs inherit that
+    # a server in the background of a shell ignores SIGINT, and its jobs inherit this setting
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _emitter = Emitter(Path(path))
     emit(Started(os.getpid(), identity(os.getpid()) or ""))
@@ -88,7 +88,7 @@ def emit(event: Event) -> None:
 def progress(
     stage: str, done: float, total: float | None, seconds_left: Callable[[], float | None] = lambda: None
 ) -> None:
-    """Write how far a stage is, if this process is a job; its forecast is asked for only then."""
+    """Write the progress of a stage if this process is a job; only then is the forecast computed."""
     if _emitter is not None:
         _emitter.progress(stage, done, total, seconds_left)
 

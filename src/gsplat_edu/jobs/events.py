@@ -1,4 +1,4 @@
-"""What a command reports while it runs, as values; a file of events has one JSON object per line.
+"""Events that a command reports while it runs, as values; a file of events has one JSON object per line.
 
 A command writes them if the variable `EVENTS` of its environment names a file (`gsplat_edu.jobs.emitter`). Every line
 has `event`, the name of the kind, and `time`, seconds since 1970; the other fields are those of the class.
@@ -140,7 +140,7 @@ class Failed:
 
 @dataclass(frozen=True)
 class Interrupted:
-    """The command ended because it was asked to.
+    """The command ended because the user or the queue interrupted it.
 
     Args:
         line: The line that the command line prints.
@@ -224,7 +224,7 @@ TYPES: Mapping[str, Callable[[Any], bool]] = {
         isinstance(value, list) and all(_is_texts(pair) and len(pair) == 2 for pair in value)
     ),
 }
-"""What a line may have as a field, by the field's type."""
+"""Checks of a field's value, by the field's type."""
 
 
 def _tuple(value: Any) -> Any:  # noqa: ANN401

@@ -13,7 +13,8 @@ PIECE = 1 << 20
 """Most bytes to read at once."""
 
 LAST = 4096
-"""Bytes at the end of a file in which its last events are looked for; `PIECE` if there is no whole event."""
+"""Number of bytes at the end of a file that are searched for its last events; `PIECE` if they contain no whole
+event."""
 
 LONGEST_LINE = 8 << 20
 """Bytes of a line; a longer one is damaged."""
@@ -58,7 +59,7 @@ class Follower:
             return []
         self.offset += len(data)
         first, *others = data.split(b"\n")
-        if len(self._rest) <= LONGEST_LINE:  # else the line is damaged already, and ends some time
+        if len(self._rest) <= LONGEST_LINE:  # otherwise the line is too long; skip to its end
             self._rest += first
         if not others:
             return []
@@ -88,7 +89,7 @@ def events_after(path: Path, number: int = 0) -> list[tuple[int, float, Event]]:
 
 
 def last_word(path: Path) -> Failed | Interrupted | Finished | None:
-    """Return how the last process that wrote a file of events ended; None if it did not say."""
+    """Return how the last process that wrote a file of events ended; None if the file does not tell."""
     try:
         with open_file(path) as file:
             size = os.fstat(file.fileno()).st_size
@@ -112,7 +113,7 @@ def last_word(path: Path) -> Failed | Interrupted | Finished | None:
 
 
 def last_stage(path: Path) -> str:
-    """Return the stage of which a file of events tells last; empty if none."""
+    """Return the last stage in a file of events; empty if there is none."""
     try:
         with open_file(path) as file:
             file.seek(max(os.fstat(file.fileno()).st_size - LAST, 0))

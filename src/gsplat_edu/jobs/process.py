@@ -1,4 +1,4 @@
-"""Processes that outlive the one that started them: which one a number means, and signals to it."""
+"""Identify processes that outlive their parent, and send them signals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PROC = Path("/proc")
 
 
 def identity(pid: int) -> str | None:
-    """Return what tells a process from a later one of the same number: its start, and the boot on Linux.
+    """Return a value that distinguishes a process from later ones with its number, such as its start time.
 
     Args:
         pid: Process id.

@@ -1,8 +1,8 @@
-"""A queue of jobs on disk: it starts them in their order, follows their processes and survives its own end.
+"""A queue of jobs on disk. It starts jobs in order, follows their processes, and survives a restart.
 
-A job that writes a place never runs beside one that reads or writes it. Each job waits for running jobs, and for jobs
-that were queued before it, as far as their places collide with its own. So jobs of one place keep their order, a writer
-is not passed over for ever by readers, and no two jobs wait for each other.
+A job that writes a place never runs beside one that reads or writes it. Each job waits for running jobs and earlier
+queued jobs whose places collide with its own. So jobs of one place keep their order, readers cannot starve a writer,
+and no two jobs wait for each other.
 
 A thread looks at the processes several times a second. Nothing here waits for one: a cancelled job gets its signals in
 turn, and the end of every process is read from what it wrote, or else from its exit code.
@@ -46,7 +46,7 @@ PATIENCE = {"interrupt": 60.0, "terminate": 10.0}
 """Seconds after a signal of a cancellation until the next one: a checkpoint of millions of Gaussians takes a while."""
 
 MOST_QUEUED = 200
-"""Jobs that may wait; more are a program gone wrong."""
+"""Largest number of waiting jobs, against runaway programs."""
 
 PROGRAM = (sys.executable, "-m", "gsplat_edu")
 """What runs a command line."""
@@ -64,7 +64,7 @@ class JobQueue:
         changed: Called with every new state of a job, from any thread and while the queue is locked; with None for a
             job that was removed.
         patience: See `PATIENCE`.
-        hold: Called to let a job wait (true) or continue; returns whether it does so by itself. Otherwise its
+        hold: Called to pause a job (true) or continue it; returns whether the job pauses by itself. Otherwise its
             processes are stopped.
         program: What runs a command line.
         identify: Returns equal values for two names of the same place.
@@ -84,7 +84,7 @@ class JobQueue:
         self.folder, self.at_once = folder, at_once
         self.changed, self.hold = changed, hold
         self.damaged: dict[str, str] = {}
-        """A line for each record that could not be read or asks for what is not allowed, by id."""
+        """By id, a line for each record that is unreadable or asks for something that is not allowed."""
         self.trouble = ""
         """Why records cannot be written; empty if they can."""
         self._render, self._program, self._identify = render, tuple(program), identify
@@ -225,7 +225,7 @@ class JobQueue:
             self.changed(name, None)
 
     def rename(self, old: str, new: str, move: Callable[[], object]) -> None:
-        """Rename a place that jobs name; those that have ended then name the new one.
+        """Rename a place, and use its new name in all jobs.
 
         Args:
             old: The place.
@@ -242,7 +242,7 @@ class JobQueue:
                     self._put(job, work=work, argv=self._render(work, Purpose.SHOW).argv)
 
     def close(self, interrupt: bool = True) -> None:
-        """End the queue; waiting jobs wait for the next one.
+        """End the queue; waiting jobs stay waiting for the next queue.
 
         Args:
             interrupt: Whether running jobs are interrupted, which makes a training write a checkpoint; else they
@@ -268,7 +268,7 @@ class JobQueue:
                 self.trouble = described(error)
 
     def _start_waiting(self) -> None:
-        """Start waiting jobs while there is room, unless their places collide with those of jobs that come first."""
+        """Start waiting jobs up to `at_once`, unless their places collide with places of earlier jobs."""
         with self._lock:
             waiting = [job for job in self.jobs() if job.state is State.QUEUED]
             first = [job for job in self.jobs() if job.state in ACTIVE]
@@ -382,7 +382,7 @@ class JobQueue:
         self._put(job, ended=time.time(), **changes)
 
     def _last_line(self, job: Job, code: int) -> str:
-        """Return the last line that a job printed, for one that failed before it could write events."""
+        """Return the last line that a job printed, for a job that failed before it could write events."""
         with contextlib.suppress(OSError):
             with JobFolder(self.folder / job.id).output.open("rb") as file:
                 file.seek(max(os.fstat(file.fileno()).st_size - LAST, 0))
@@ -428,12 +428,12 @@ class JobQueue:
 
 
 def _marker(folder: JobFolder) -> str:
-    """Return the value of `EVENTS` in the environment of a job's processes, which tells them from all others."""
+    """Return the value of `EVENTS` in the environment of a job's processes, which identifies them."""
     return str(folder.events.resolve())
 
 
 def _is_of(job: Job, folder: JobFolder) -> bool:
-    """Return whether the process that a record names runs and was started for this job: only then it gets signals."""
+    """Return whether the process in a record runs and was started for this job. Only then may it get signals."""
     return (
         job.pid is not None
         and is_running(job.pid, job.identity)

@@ -1,7 +1,7 @@
-"""A job on disk: what was asked for, its state, and the files of its output.
+"""A job on disk: its work, its state, and the files of its output.
 
 A record has no command line. Its work is validated, and its command line rendered, whenever the record is read and
-again when the job starts: a folder that somebody else made cannot name a program, a path or an address.
+again when the job starts: so a folder that somebody else made cannot name a program, a path or an address.
 
 job.json        the record below
 events.jsonl    its events (`gsplat_edu.jobs.events`), of all its attempts
@@ -46,7 +46,7 @@ HIGHEST = 2**31 - 1
 
 
 class State(StrEnum):
-    """Where a job stands."""
+    """State of a job."""
 
     HELD = "held"
     """An earlier queue left it waiting; it starts only when somebody asks for it."""
@@ -73,11 +73,11 @@ class Purpose(StrEnum):
     """What a command line is rendered for."""
 
     SHOW = "show"
-    """To show it; what it names may be gone."""
+    """To show it; its places may be gone."""
     BEGIN = "begin"
-    """To start it; what it makes may not exist."""
+    """To start it; its outputs must not exist."""
     CONTINUE = "continue"
-    """To start it again; what it makes may exist in part."""
+    """To start it again; its outputs may exist in part."""
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,13 @@ Render = Callable[[Work, Purpose], Rendered]
 
 @dataclass(frozen=True)
 class Job:
-    """Work and what became of it.
+    """Work, its state and its processes.
 
     Args:
         id: Its name, that of its folder; later jobs have greater ones.
         work: What it does.
         argv: Its command line, words after `gsplat-edu`; rendered again when the job starts, and not in the record.
-        state: Where it stands.
+        state: Its state.
         created: When it was made, seconds since 1970.
         started: When its last attempt began; None before the first.
         ended: When it ended; None before.
@@ -243,7 +243,7 @@ RECORD_FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "line": _text,
     "cancelled": lambda value: isinstance(value, bool),
 }
-"""The other fields of a record, and what each may hold."""
+"""Checks of the other fields of a record."""
 
 
 WORK_FIELDS: Mapping[str, Callable[[Any], bool]] = {
@@ -252,11 +252,11 @@ WORK_FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "outputs": _texts,
     "options": lambda value: isinstance(value, dict),
 }
-"""The fields of a work in a record, and what each may hold; what its command allows is for `Render` to say."""
+"""Checks of the fields of a work in a record; `Render` checks what its command allows."""
 
 
 def one_line(text: str) -> str:
-    """Return a text as a record may have it."""
+    """Return a text as one line of at most `LONGEST_LINE` characters."""
     return shortened(printable(text), LONGEST_LINE)
 
 
@@ -301,7 +301,7 @@ class JobFolder:
             render: Validates its work.
 
         Raises:
-            ArgumentError: it is damaged, or asks for what is not allowed.
+            ArgumentError: it is damaged, or its work is not allowed.
         """
         try:
             self._check_files()
@@ -331,7 +331,7 @@ class JobFolder:
         return Job(self.path.name, shown.work, shown.argv, **facts)
 
     def _check_files(self) -> None:
-        """Check that nothing here leads elsewhere.
+        """Check that the folder and its files are no links.
 
         Raises:
             ValueError: the folder, or a file in it, is a link or no file.

@@ -1,4 +1,4 @@
-"""One step of Adam for one tensor, natively or in torch; `gsplat_edu.render.backends` says which backend takes which.
+"""One step of Adam for one tensor, natively or in torch; each backend uses one of them (`gsplat_edu.render.backends`).
 
 m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g²
 p -= rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)

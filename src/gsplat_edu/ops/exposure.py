@@ -26,13 +26,14 @@ SRGB_POWER = 2.4
 """Exponent of the sRGB curve."""
 
 SAMPLES = 1 << 12
-"""Pixels on a grid that a gain is measured at. Where ratios scatter by a tenth, their median is good to 0.2 %."""
+"""Approximate number of grid pixels at which a gain is measured. If ratios scatter by 10 %, their median is accurate to
+0.2 %."""
 
 FEWEST = 64
-"""A gain from fewer pixels than this counts as 1."""
+"""A gain is 1 if fewer pixels count."""
 
 INNER, OUTER = -0.13, 0.11
-"""Vignetting is measured between pixels whose q is below and above these, a third each of a 4:3 photo."""
+"""Vignetting is measured between pixels with q < INNER and pixels with q > OUTER, a third of a 4:3 photo each."""
 
 DARKEST, BRIGHTEST = 2.0 / 255.0, 253.0 / 255.0
 """Pixels of the photo outside this range may be clipped and do not count."""

@@ -1,4 +1,4 @@
-"""Training losses: L1 and SSIM, natively or in torch; `gsplat_edu.render.backends` says which backend uses which."""
+"""Training losses: L1 and SSIM, natively or in torch; each backend uses one of them (`gsplat_edu.render.backends`)."""
 
 from __future__ import annotations
 
@@ -204,5 +204,5 @@ class _L1Ssim(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        # Almost always 1: a pass over the image would wake torch's threads for nothing.
+        # Almost always 1: a needless pass over the image would wake torch's threads.
         return (gradient if float(grad) == 1.0 else gradient * grad), None, None

@@ -1,4 +1,4 @@
-"""What a step of Adam needs besides a parameter and its gradient: the moments, and the step's numbers."""
+"""Inputs of a step of Adam apart from the parameter and its gradient: the moments, and the step's numbers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Moments(NamedTuple):
     Args:
         first: Decaying mean of the gradient, of the parameter's shape.
         second: Decaying mean of the squared gradient, likewise.
-        extra: What else contributes to the gradient and is added to it; None if nothing does.
+        extra: Another part of the gradient, to be added; None for none.
         numbers: The numbers of the step.
     """
 

@@ -21,7 +21,7 @@ from gsplat_edu.ops import kernels
 from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
 
 SHUT = 60.0
-"""A gate below e^-60 counts as 0: a step that small changes no mean, and denormal numbers are slow."""
+"""A gate below exp(-SHUT) counts as 0: such a step changes no mean, and denormal numbers are slow."""
 
 WORD = 0xFFFFFFFF
 
@@ -34,7 +34,7 @@ class NoiseNumbers(NamedTuple):
 
     Args:
         seed: The generator's key, 0 to 2^63 - 1; another for each step.
-        amount: Size of the step where the gate is open, per world unit of covariance.
+        amount: Size of the step if the gate is fully open, per world unit squared of covariance.
         sharpness: k of the gate sigmoid(k (t - opacity)).
         threshold: t.
     """

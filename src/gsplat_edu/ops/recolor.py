@@ -31,7 +31,7 @@ Color = tuple[float, float, float]
 
 
 class Backdrop(NamedTuple):
-    """What shows through an image.
+    """The background of an image, and how much of it is visible.
 
     Args:
         transmittance: (H, W) fraction of the background's light in each pixel.
@@ -51,7 +51,7 @@ def recolored(
 ) -> Float[Tensor, "H W 3"]:
     """Return the image with the colours A x + b, or its object with them.
 
-    Natively where the native module takes the image, else in torch. A training takes `Backend.recolored`.
+    It uses the native module if that supports the image, else torch. A training uses `Backend.recolored`.
 
     Args:
         image: (H, W, 3) any range.
@@ -59,7 +59,7 @@ def recolored(
         photo: (H, W, 3) the photo that the result is compared with. Where it is saturated (255), a result above 1
             becomes 1 and has no gradient: the photo does not tell how bright the scene is there. None if it is not
             stored in bytes.
-        backdrop: What shows through; None recolours every pixel completely. The transmittance has the image's dtype and
+        backdrop: The background; None recolours every pixel completely. The transmittance has the image's dtype and
             device.
         falloff: (H, W) v, of the image's dtype and device; it counts as constant. None for 1.
 

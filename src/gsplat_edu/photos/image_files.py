@@ -1,4 +1,4 @@
-"""Open image files; no other module does. Formats of cameras and photo software, within limits on size and memory.
+"""The only module that opens image files: formats of cameras and photo software, within limits of size and memory.
 
 Pillow supports some forty more formats. One of them starts Ghostscript on the file, and others decode data that no
 photo contains.
@@ -33,7 +33,7 @@ SPELLED = "JPEG, PNG, WebP, TIFF, BMP, PPM or HEIC"
 """The accepted formats in messages."""
 
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
-"""Brands of a file's ftyp box that make it HEIF (ISO 23008-12), whatever the file's name."""
+"""Brands of a file's ftyp box that make it HEIF (ISO 23008-12), for any file name."""
 
 MAX_PIXELS = 400_000_000
 """Most pixels of a photo: cameras have up to 200 million. A header that claims more belongs to a corrupt file, to one
@@ -124,7 +124,7 @@ def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iter
 
 
 def _implausible(W: int, H: int, nbytes: int) -> str | None:
-    """Return why a file is not decoded, from the size in its header and that of the file; None if it is a photo's."""
+    """Return why a file is not decoded, from its size in px and in bytes; None if both are plausible."""
     if max(W, H) > MAX_SIDE or W * H > MAX_PIXELS:
         limits = f"at most {MAX_SIDE:,} px a side and {MAX_PIXELS // 10**6} megapixels"
         return f"{W}x{H} px is too large for a photo: {limits}"

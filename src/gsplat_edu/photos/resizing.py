@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 ALL_OF_IT = 0.9999
-"""A downscaled pixel counts if at least this fraction of its sources does: all, up to float32 rounding."""
+"""A downscaled pixel counts if at least this fraction of its area counts: all, up to float32 rounding."""
 
 
 def area_mean(
@@ -62,7 +62,7 @@ def smaller_mask(mask: Bool[np.ndarray, "H W"], W: int, H: int) -> Bool[np.ndarr
 
 
 def eroded(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Return a mask without the pixels that touch one that is not in it; the image's border does not count as one."""
+    """Return a mask without its pixels that touch a pixel outside the mask; the image's border erodes nothing."""
     import cv2
 
     kept: Bool[np.ndarray, "H W"] = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)

@@ -11,7 +11,7 @@ from typing import Any
 
 
 class _CallableModule(ModuleType):
-    """The package as a function, so that `from gsplat_edu import render` gives what its name says."""
+    """The package as a callable module, so that `from gsplat_edu import render` gives the function `render`."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:  # noqa: ANN401
         """Render; see `gsplat_edu.render.api.render`."""

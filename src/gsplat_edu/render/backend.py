@@ -1,4 +1,4 @@
-"""What a backend is: the kernels of one processor, as one value that is chosen once and handed in."""
+"""A backend: the kernels of one processor, as one value that is chosen once and handed in."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FEATURES = {
     "statistics": "collects statistics of each Gaussian (RenderOutput.collect)",
     "forecast": "is fast enough to be measured on a capture before a training",
 }
-"""What a backend may lack, by name, and what it means."""
+"""Features that a backend may lack: name, and description for messages."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def check_backend_value(backend: object) -> None:
     """Check that a backend is one, and not its name.
 
     Raises:
-        ArgumentError: it is something else; says what to write.
+        ArgumentError: it is something else; the message says what to write.
     """
     if isinstance(backend, str):
         raise ArgumentError(f"backend: is {backend!r}, but has to be a Backend: load_backend({backend!r})")

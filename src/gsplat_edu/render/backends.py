@@ -153,7 +153,9 @@ def _cuda() -> Backend:
     def adam(
         parameter: Tensor, first: Tensor, second: Tensor, gradient: Tensor, numbers: AdamNumbers
     ) -> None:
-        if parameter.dtype != torch.float32:  # what is not per Gaussian, as the lenses of a capture
+        if (
+            parameter.dtype != torch.float32
+        ):  # parameters that are not per Gaussian, such as a capture's lenses
             adam_in_torch(parameter, first, second, gradient, numbers)
             return
         with torch.no_grad(), torch.cuda.device_of(parameter):  # type: ignore[no-untyped-call]

@@ -191,7 +191,7 @@ def _output(call: _Call, extra: Extra, pose: Pose, *parameters: Tensor) -> Rende
 
 
 def _collect(calls: Sequence[_Call], means: Tensor, errors: Tensor | None) -> Callable[[], Tensor]:
-    """Ask for statistics of the next backward pass; return a function that gives those of the visible Gaussians."""
+    """Ask for statistics of the next backward pass; return a function that returns them for the visible Gaussians."""
     if errors is not None:
         check_tensor("errors", errors, (calls[0].camera.H, calls[0].camera.W), {})
         errors = errors.detach().to(means).contiguous()
@@ -361,7 +361,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _wanted(image: Tensor) -> Tensor | None:
-    """Return an image, or None for an empty one, which stands for one that was not asked for."""
+    """Return an image, or None for an empty one: it was not requested."""
     return image if image.numel() else None
 
 

@@ -43,7 +43,7 @@ SETTINGS = RenderSettings(background=(0.2, 0.5, 0.9), jacobian_limit=1.3)
 
 
 def cuda_failure(device: torch.device | None = None) -> str | None:
-    """Describe what is wrong with the kernels of the backend cuda on a device; None if they pass.
+    """Describe the failure of the kernels of the backend cuda on a device; None if they pass.
 
     The result is cached for the process; a pass is stored until device, driver or versions change.
 

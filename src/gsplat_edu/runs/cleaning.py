@@ -95,7 +95,7 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
 def _at_exposure(
     dataset: Dataset, gaussians: Gaussians, settings: RenderSettings, appearance: str
 ) -> Dataset:
-    """Return the photos as the training saw the scene; as they are if it corrected nothing."""
+    """Return the dataset with photos at the scene's exposure; unchanged if the training corrected no exposures."""
     if appearance == "none":
         return dataset
     shown = functools.partial(render, settings=settings, backend="cpu")
@@ -106,12 +106,13 @@ def _at_exposure(
 def cleaner(
     settings: RenderSettings, say: Callable[[str], None], appearance: str = "none"
 ) -> Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]:
-    """Return what cleans the scene at the end of a training; see `gsplat_edu.runs.training.CaptureRun.finish`.
+    """Return the function that `gsplat_edu.runs.training.CaptureRun.finish` cleans the scene with.
 
     Args:
         settings: The scene's render settings.
         say: Receives the report, line by line.
-        appearance: What the training corrected; the scene is then compared with photos of its own exposure.
+        appearance: The training's setting `appearance`. Unless it is "none", photos are converted to the scene's
+            exposure first.
     """
 
     def cleaned(gaussians: Gaussians, dataset: Dataset) -> tuple[Gaussians, dict[str, Any]]:

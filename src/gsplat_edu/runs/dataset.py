@@ -17,7 +17,7 @@ KEYS = ("resolution", "test_every", "background", "image_memory", "train_views",
 
 
 def appearance_of(config: Mapping[str, Any]) -> str:
-    """Return what a run's config.json says that its training corrected: one of `APPEARANCES`."""
+    """Return the setting `appearance` from a run's config.json: one of `APPEARANCES`."""
     section = config.get("train")
     return str(section.get("appearance", "none")) if isinstance(section, Mapping) else "none"
 
@@ -25,7 +25,7 @@ def appearance_of(config: Mapping[str, Any]) -> str:
 def as_trained(settings: DataSettings, appearance: str) -> DataSettings:
     """Return the settings with which a training reads photos: with their alpha if it corrects colours.
 
-    Only the object of such a photo is corrected, so that it is composited after that.
+    The correction applies to the object only, so such photos are composited after it.
     """
     return settings if appearance == "none" else replace(settings, background=None)
 

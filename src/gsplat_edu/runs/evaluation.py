@@ -123,7 +123,7 @@ def evaluate_run(
 
 
 def _appearance(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the report has to know of the photos' exposures: that they were corrected, if they were."""
+    """Return the entry of metrics.json that says which exposures were corrected; empty if none were."""
     chosen = appearance_of(config)
     return {} if chosen == "none" else {"appearance": chosen}
 

@@ -1,8 +1,8 @@
 """Refines levels of detail against photos, and scores each at the size at which it is shown.
 
-Level k has 2^-k of the splats, so one of its splats covers what one of the finest covers at full size once the photos
-are reduced by f = 2^(k/2). That is where a level is shown, and where it is trained and scored: on the capture's own
-photos, reduced by f. The number of splats stays, and no splat changes its leaf.
+Level k has 2^-k of the splats. In photos reduced by f = 2^(k/2), one of its splats covers as many pixels as a splat of
+the finest level covers at full size. A level is shown at this size, and trained and scored on the capture's photos
+reduced by f. The number of splats and the leaf of each splat stay the same.
 
 A scene without photos is compared with renders of itself from an orbit, likewise reduced; every fourth is held out.
 """
@@ -34,16 +34,17 @@ from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import FROM_SCENE, recipe
 
 MOST_JUDGED = 8
-"""Views that a level is scored on, at most."""
+"""Largest number of views that a level is scored on."""
 
 ORBIT, ORBIT_SIDE, EVERY = 32, 640, 4
-"""Views of a scene without photos; their longer side, px; every n-th is held out."""
+"""For a scene without photos: number of rendered views, their longer side in px, and hold out every n-th."""
 
 LARGEST_FACTOR = 31.0
-"""Photos are reduced at most by this factor, which a capture's settings understand as one."""
+"""Largest factor by which photos are reduced; `DataSettings.resolution` takes values from 32 on as a side."""
 
 FINEST_SIDE = 32.0
-"""Shortest longer side of reduced photos, px; also the least number that a capture's settings take for a side."""
+"""Reduced photos keep a longer side of at least this, px: the smallest value that `DataSettings.resolution` takes as a
+side."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ class LevelScore:
         count: Its splats.
         factor: By how much the photos are reduced.
         before: PSNR of the merged splats, dB.
-        after: PSNR after refining, dB; that of the scene itself for level 0. If it is not higher, the level stays as it
-            was.
+        after: PSNR after refining, dB; for level 0, of the scene itself. A level that did not improve was left
+            unchanged.
     """
 
     level: int
@@ -87,7 +88,7 @@ def refine_levels(
 ) -> tuple[Node, list[LevelScore]]:
     """Train every level but the finest for a short time, without density control, and score all levels.
 
-    A level that comes out no better, judged by held-out views, stays as it was.
+    A level whose score on held-out views does not improve is left unchanged.
 
     Args:
         source: The scene that the levels were made from; a run, or a scene without photos.

@@ -15,7 +15,7 @@ from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.train.events import Event, StepEvent
 
 IMAGES_PER_LINE = 10
-"""Images per line, or those of a step if it has more; loss and time are means over them."""
+"""Images per line; a step with more images gets its own line. Loss and time are means over a line's images."""
 
 
 class LogWriter:

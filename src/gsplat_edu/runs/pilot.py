@@ -29,8 +29,8 @@ SIDE = 240
 PILOT_STEPS, PILOT_CAP = 600, 10_000
 """Length and cap of a pilot."""
 
-CLEARLY = 0.3
-"""dB that refining more has to gain. Where nothing was wrong, pilots differed by less
+LEAST_GAIN = 0.3
+"""Refine more only if it gains at least this, dB. Pilots of captures with correct cameras differed by less
 (benchmarks/archive/RESULTS-2026-11.md)."""
 
 ORDER = ("none", "poses", "both")
@@ -70,9 +70,9 @@ def refinement_for(
 
 
 def _choice(scores: dict[str, float]) -> tuple[str, str]:
-    """Return the least refinement that none beats clearly, and the scores as a clause."""
+    """Return the smallest refinement that no other beats by `LEAST_GAIN`, and the scores as a clause."""
     best = max(scores.values())
-    chosen = next(refine for refine in ORDER if scores[refine] > best - CLEARLY)
+    chosen = next(refine for refine in ORDER if scores[refine] > best - LEAST_GAIN)
     figures = ", ".join(f"{scores[refine]:.2f} dB with {refine}" for refine in ORDER)
     return chosen, f"short trainings score the held-out photos, poses aligned, at {figures}"
 

@@ -80,7 +80,7 @@ class Processes:
         ]
 
     def _traded(self, incoming: dict[int, Tensor], outgoing: dict[int, Tensor]) -> dict[int, Tensor]:
-        """Fill the tensors to come from other processes with what these send, and send them theirs."""
+        """Send each process its tensors, and fill the tensors that are received from it."""
         with _named_loss():
             works = [self._group.recv([tensor], rank, 0) for rank, tensor in incoming.items()]
             works += [self._group.send([tensor], rank, 0) for rank, tensor in outgoing.items()]
@@ -93,7 +93,7 @@ class Processes:
         return self.told(value)[0]
 
     def told(self, value: Any) -> list[Any]:  # noqa: ANN401
-        """Return the value of every process, each of which JSON can represent."""
+        """Return the values of all processes; JSON must be able to represent each."""
         text = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
         return [json.loads(bytes(part.numpy())) for (part,) in self.exchange([[text]] * self.size)]
 
@@ -104,7 +104,7 @@ class Processes:
     def shared_state(
         self, state: tuple[dict[str, Tensor], Any] | None
     ) -> tuple[dict[str, Tensor], Any] | None:
-        """Return the tensors and the values for JSON of process 0, or its None."""
+        """Return process 0's tensors and JSON values; None if it passed None."""
         tensors, numbers = ({}, None) if state is None else state
         names, numbers = self.shared([list(tensors), numbers])
         parts = self.exchange([[tensor.contiguous() for tensor in tensors.values()]] * self.size)[0]
@@ -129,7 +129,7 @@ def joined(size: int) -> Iterator[Member]:
     if size == 1:
         yield ALONE
         return
-    import torch.distributed as dist  # no other training needs it
+    import torch.distributed as dist  # imported here because only shared trainings need it
 
     try:
         rank = int(os.environ["RANK"])
@@ -160,7 +160,7 @@ def _place() -> str:
 
 
 def facts() -> dict[str, str]:
-    """Return what the bits of a training depend on besides its options, in this process."""
+    """Return the facts about this process that a training's bits depend on, apart from its options."""
     return {
         "version of gsplat-edu": version("gsplat-edu"),
         "version of torch": torch.__version__,
@@ -171,7 +171,7 @@ def facts() -> dict[str, str]:
 
 
 def check_alike(team: Processes, what: str, found: dict[str, str]) -> None:
-    """Check that all processes found the same.
+    """Check that all processes report equal facts.
 
     Raises:
         SplatError: they did not; the message names the first difference.
@@ -193,7 +193,7 @@ def digest_of(data: bytes) -> str:
 
 
 def _rounding() -> str:
-    """Return a digest of what the libraries compute, which differs between processors for the same instruction set."""
+    """Return a digest of sample results of the libraries. Processors with one instruction set may round differently."""
     digest, numbers = hashlib.sha256(), np.random.default_rng(0).normal(size=1027)
     matrices = torch.from_numpy(numbers[:999].reshape(111, 3, 3))
     with torch.no_grad():

@@ -67,7 +67,7 @@ def aligned_score(
     extent: float,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Score held-out views after their poses are aligned; return "psnr_aligned" for metrics.json, if there is any.
+    """Score held-out views after their poses are aligned; return "psnr_aligned" for metrics.json; empty if none counts.
 
     Args:
         views: The held-out views.

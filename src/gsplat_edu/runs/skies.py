@@ -15,14 +15,14 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.far import Shell
 
 RADIUS = 50.0
-"""Radius of the shell in sizes of the scene. Nearer, the sky moves against itself from photo to photo; farther, formats
-and other viewers lose precision. Scores with 30 and 100 are alike (`benchmarks/sky.py`)."""
+"""Radius of the shell, in multiples of the scene's size. A nearer sky shows parallax between photos; a farther one
+loses precision in file formats and other viewers. Scores with 30 and 100 are alike (`benchmarks/sky.py`)."""
 
-LEAST = 0.002
-"""Least share of the sky among the pixels; less is a mistake."""
+LEAST_SKY = 0.002
+"""Below this fraction of all pixels, --sky shell is refused."""
 
-SHARE = 0.1
-"""Largest share of the cap on Gaussians that the sky has at the start."""
+MOST_OF_CAP = 0.1
+"""The sky starts with at most this fraction of the cap on Gaussians."""
 
 
 def shell_around(dataset: Dataset) -> Shell:
@@ -51,7 +51,7 @@ def start_sky(dataset: Dataset, config: TrainConfig) -> tuple[Gaussians, Shell]:
         DatasetError: a photo cannot be read.
     """
     cap = config.max_gaussians
-    most = MOST if cap is None else min(MOST, int(SHARE * cap))
+    most = MOST if cap is None else min(MOST, int(MOST_OF_CAP * cap))
     if most < 1:
         raise ArgumentError(
             f"--sky: --max-gaussians {cap} leaves no room for a sky; raise it, or use --sky none"
@@ -67,7 +67,7 @@ def start_sky(dataset: Dataset, config: TrainConfig) -> tuple[Gaussians, Shell]:
         masks.append(np.logical_and.reduce(both) if both else None)
     points = dataset.points if dataset.measured else np.zeros((0, 3))
     sky = find_sky(cameras, images, points, masks)
-    if sky.share < LEAST:
+    if sky.share < LEAST_SKY:
         raise ArgumentError(
             "--sky: no photo shows a smooth region above the horizon that reaches its edge; use --sky none"
         )

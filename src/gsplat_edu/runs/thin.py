@@ -1,7 +1,7 @@
-"""How long a training of few photos may be before it gets worse: short trainings on most of them, judged by the rest.
+"""How long a training on few photos may be before it overfits: short trials on most photos, judged by the others.
 
-A scene can satisfy a handful of photos in many ways, and a long training finds wrong ones, the more so where poses are
-off. The held-out test photos take no part.
+Many scenes fit a handful of photos, and a long training finds a wrong one, especially with inaccurate poses. The
+held-out test photos take no part.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ SIDE = 240
 LENGTHS = (100, 200, 400, 800)
 """Iterations of the trials, in this order."""
 
-FALLEN = 0.45
-"""dB below the best trial from which a longer one counts as worse, and none is tried any more. Where longer trainings
-are better, trials fluctuate by 0.3 dB."""
+OVERFIT_LOSS = 0.45
+"""Stop once a trial scores this much below the best shorter one, dB. If longer trainings are better, trials fluctuate
+by 0.3 dB."""
 
 
 @dataclass(frozen=True)
 class ThinTrial:
-    """What the trials found.
+    """The result of the trials.
 
     Args:
         longest: Iterations after which a training gets worse; None if none of the trials was too long.
@@ -66,7 +66,7 @@ class ThinTrial:
 
 
 def needs_trial(views: int) -> bool:
-    """Return whether a capture of so many training views is tried."""
+    """Return whether a capture with this number of training views needs trials."""
     return FEWEST <= views < MANY
 
 
@@ -106,10 +106,10 @@ def try_lengths(
         if not found:
             return ThinTrial(None, {}, 0)
         scores[length] = _mean(found, config.appearance != "none")
-        if scores[length] < max(scores.values()) - FALLEN:
+        if scores[length] < max(scores.values()) - OVERFIT_LOSS:
             break
     best = max(scores, key=lambda length: scores[length])
-    fell = scores[max(scores)] < scores[best] - FALLEN
+    fell = scores[max(scores)] < scores[best] - OVERFIT_LOSS
     return ThinTrial(best if fell else None, scores, len(judges))
 
 

@@ -204,7 +204,7 @@ class CaptureRun:
             self._share_start(team, gaussians)
 
     def _share_start(self, team: Processes, gaussians: Gaussians) -> None:
-        """Check that all processes start alike, and let them take up the first one's checkpoint."""
+        """Check that all processes start from equal data, and load the first one's checkpoint in all."""
         views = [(view.name, view.camera.W, view.camera.H) for view in self.dataset.train]
         start = {"photos": fingerprint(self.dataset), "views": digest_of(repr(views).encode())}
         check_alike(team, "start alike", start | {"Gaussians": scene_digest(gaussians)})

@@ -31,11 +31,11 @@ PICTURES = 6
 
 
 def write_masks(folder: RunFolder, dataset: Dataset, found: Transients) -> tuple[str, dict[str, Any]]:
-    """Write RUN/transients/NAME.png, zero for pixels that do not count, for every photo of which a part is masked.
+    """Write RUN/transients/NAME.png, zero for pixels that do not count, for every photo with a masked part.
 
     Pixels that the capture's own masks exclude are zero too. A mask has the size of its photo's file, as masks of
     captures have; where a photo is undistorted or cut from a panorama, it has the size and shape of the result. Masks
-    of an earlier end of the run are removed.
+    from an earlier completion of the run are removed.
 
     Args:
         folder: The run's folder.
@@ -82,7 +82,7 @@ def masked_pictures(
     render: Renderer,
     background: ArrayLike,
 ) -> list[MaskedPicture]:
-    """Make the pictures of the photos of which most is masked.
+    """Make the pictures of the photos with the largest masked parts.
 
     Args:
         folder: The run's folder.
@@ -110,7 +110,7 @@ def masked_pictures(
 
 
 def masked_names(metrics: Mapping[str, Any]) -> list[str]:
-    """Return the names of the masked photos in a metrics.json, of which most is masked first."""
+    """Return the names of the masked photos in a metrics.json, largest masked part first."""
     section = metrics.get("transients")
     photos = section.get("photos") if isinstance(section, Mapping) else None
     entries = photos if isinstance(photos, list) else []

@@ -401,7 +401,7 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
         cameras: At least one.
 
     Returns:
-        World units; 1 if all cameras are at the same place, which says nothing about the scene.
+        World units; 1 if all cameras are at the same place, which does not determine the size.
 
     Raises:
         ArgumentError: there is no camera.

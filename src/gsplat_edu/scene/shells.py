@@ -1,6 +1,6 @@
-"""Which points form a shell far behind all others, as splats of a sky do.
+"""Find points that form a shell far behind all others, as splats of a sky do.
 
-Files keep no mark of them. Whatever needs the size of a scene, or positions as fractions of it, asks here.
+Files do not mark them. Functions that need the size of a scene, or positions as fractions of it, call this module.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The pairs of photos that a matcher tries: all, those in sequence, and those that look alike or were taken nearby."""
+"""The pairs of photos that a matcher tries: all, consecutive, similar, or taken nearby."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ EXHAUSTIVE = 150
 """Largest number of photos for which every pair is matched: 11,175 pairs, ten minutes on two cores."""
 
 SEQUENCE = 60
-"""Number of photos from which a sequence is sought: all 1,770 pairs take minutes on two cores, finding it seconds."""
+"""Smallest number of photos for which a sequence is sought. It takes seconds, and matching all 1,770 pairs minutes on
+two cores."""
 
 OVERLAP = {"video": 10, "photos": 4}
-"""Each photo is matched with this many that follow it; photos found to be in sequence are matched like a video."""
+"""Each photo is matched with this number of following photos; photos found to be in sequence are matched like a
+video."""
 
 ALIKE = {"video": 5, "photos": 25}
-"""Each photo is matched with this many of similar appearance; in a video, these close loops."""
+"""Each photo is matched with this number of similar photos; in a video, these close loops."""
 
 CLOSE_BY = 15
-"""Each photo is matched with this many taken nearby, if EXIF gives the positions of all photos."""
+"""Each photo is matched with this number of photos taken nearby, if EXIF gives the positions of all photos."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Candidates:
 
     @cached_property
     def sequence(self) -> PhotoSequence | None:
-        """How the photos were taken in sequence, or None; not asked for frames, panoramas, and few photos."""
+        """The sequence in which the photos were taken, or None; always None for frames, panoramas, and few photos."""
         if self.video or self.unit > 1 or len(self.photos) < SEQUENCE:
             return None
         names, times = [photo.name for photo in self.photos], [photo.taken for photo in self.photos]
@@ -75,7 +77,7 @@ class Candidates:
         return f"each photo is matched with those that follow it or look alike{nearby}"
 
     def farther(self, kind: str) -> set[pairs.Pair]:
-        """Return more pairs, for photos that those of the automatic matcher `kind` did not connect."""
+        """Return more pairs, for photos that the automatic matcher `kind` did not connect."""
         return self.of("exhaustive") if len(self.photos) <= EXHAUSTIVE else self.of(kind, 3)
 
     def of(self, kind: str, farther: int = 1) -> set[pairs.Pair]:

@@ -20,24 +20,24 @@ SEMI_MAJOR, FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 FEWEST_PLACES = 6
 """Smallest number of photos with a position. A similarity has seven unknowns, and each position gives three numbers."""
 
-OFF = 0.1
-"""Largest median distance between a position and its camera, as a fraction of the positions' spread. Beyond it, the
-positions do not tell the scale: a phone's are off by 5 m, so they tell it for places larger than 50 m."""
+LARGEST_MISFIT = 0.1
+"""Use the scale only if the median distance between positions and cameras is at most this fraction of the positions'
+spread. A phone's positions are off by 5 m, so they determine the scale of places larger than 50 m."""
 
-INSIDE = 0.6
+LEAST_INLIERS = 0.6
 """Smallest fraction of the positions that must agree."""
 
 TRIALS = 2000
 """Largest number of triples of positions that are tried; the first ones of a fixed random order."""
 
-AGREES = 3.0
-"""Standard deviations within which a position agrees."""
+INLIER_SIGMAS = 3.0
+"""A position agrees if its camera lies within this number of standard deviations."""
 
 FINEST = 0.02
-"""Smallest standard deviation that is assumed, m: that of RTK receivers."""
+"""Lower bound of the standard deviation, m: the precision of RTK receivers."""
 
 TILT = 0.05
-"""Largest standard error of the direction up, radians. Positions on a line do not tell it."""
+"""Use the direction up only if its standard error is at most this, radians. Positions on a line do not determine it."""
 
 
 class GpsFit(NamedTuple):
@@ -47,7 +47,7 @@ class GpsFit(NamedTuple):
         move: From the cameras' world to east, north and up, m.
         inside: Which positions agree.
         residual: Median distance of all positions from their cameras, m.
-        spread: Root mean square distance of the positions that agree from their mean, m.
+        spread: Root mean square distance of the agreeing positions from their mean, m.
         tilt: Standard error of the direction up, radians.
     """
 
@@ -59,8 +59,8 @@ class GpsFit(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether the positions tell the scale."""
-        return bool(self.residual <= OFF * self.spread and self.inside.mean() >= INSIDE)
+        """Whether the positions determine the scale."""
+        return bool(self.residual <= LARGEST_MISFIT * self.spread and self.inside.mean() >= LEAST_INLIERS)
 
     @property
     def error(self) -> float:
@@ -113,7 +113,7 @@ def fit_positions(eyes: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, 
     """Fit cameras to positions although some positions are wrong: least median of squares, then least squares.
 
     The triple of positions whose similarity has the smallest median distance starts; it is then refined on the
-    positions within `AGREES` standard deviations. The order of the triples is fixed, so results are repeatable.
+    positions within `INLIER_SIGMAS` standard deviations. The order of the triples is fixed, so results are repeatable.
 
     Args:
         eyes: Camera centres, world units.
@@ -137,7 +137,7 @@ def fit_positions(eyes: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, 
         distances = _distances(best, eyes, places)
         # The median of a distance in three dimensions is 1.54 standard deviations of a coordinate.
         sigma = max(float(np.median(distances)) / 1.54, FINEST)
-        now = distances <= AGREES * 1.54 * sigma
+        now = distances <= INLIER_SIGMAS * 1.54 * sigma
         better = similarity(eyes[now], places[now]) if now.sum() >= 3 else None
         if better is None or np.array_equal(now, inside):
             break
@@ -151,7 +151,7 @@ def fit_positions(eyes: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, 
 
 
 def _triples(count: int) -> list[np.ndarray]:
-    """Return triples of indices: all of few, else the first ones of a fixed random order."""
+    """Return triples of indices: all, or the first `TRIALS` of a fixed random order."""
     if count <= 20:
         return [np.array(triple) for triple in islice(combinations(range(count), 3), TRIALS)]
     rng = np.random.default_rng(0)

@@ -22,20 +22,21 @@ MANY_PHOTOS = 400
 of their number."""
 
 ENOUGH_FOR_FREE = 20
-"""Photos per camera from which a freer lens is tried during mapping. Fewer are too few for the cross-validation of the
-lens (`gsplat_edu.sfm.engine.lenses.WITNESSES`)."""
+"""Try a freer lens during mapping if there are at least this number of photos per camera. Cross-validation of the lens
+needs as many (`gsplat_edu.sfm.engine.lenses.WITNESSES`)."""
 
 MAIN = 0.5
-"""If at least this fraction of the photos has one size, the others follow their lens (`gsplat_edu.sfm.engine.kin`)."""
+"""If at least this fraction of the photos has one size, photos of other sizes follow their lens
+(`gsplat_edu.sfm.engine.kin`)."""
 
 OWN = 10
-"""Number of photos of one size from which they get their own camera, as in `gsplat_edu.sfm.engine.kin`."""
+"""Photos of one size get their own camera if they are at least this number, as in `gsplat_edu.sfm.engine.kin`."""
 
 SAME = 0.5
-"""Two attempts that agree are accepted if they place more than this fraction of the connected photos."""
+"""Accept two agreeing attempts if they place more than this fraction of the connected photos."""
 
 NEARLY = 0.97
-"""Models whose score is at least this fraction of the best one's are also compared by their points."""
+"""Compare models by their points if their scores are at least this fraction of the best score."""
 
 PER_PHOTO = 6 / 8
 """Weight of a photo with its own camera: its points determine eight numbers (the pose, a focal length and a distortion
@@ -119,11 +120,11 @@ def rig_attempts(mapper: str) -> list[Attempt]:
 
 
 def shared_cameras(groups: Sequence[Mapping[str, Any]]) -> dict[int, int]:
-    """Find cameras of different sizes that are mapped as one, for photos that were scaled to various sizes.
+    """Find cameras that are mapped as one, because their photos are probably scaled versions from one camera.
 
-    One or two photos determine a focal length poorly, and if most cameras have so few, there is no main camera to
-    compare with. Photos of the same kind (by EXIF) and the same aspect ratio then share a camera. Photos of one camera
-    that were cropped to different aspect ratios still get one camera each.
+    One or two photos determine a focal length poorly. If most cameras have so few, no main camera exists to compare
+    with. Photos of the same kind (by EXIF) and the same aspect ratio then share a camera. Photos of one camera that
+    were cropped to different aspect ratios still get one camera each.
 
     Args:
         groups: Groups of photos of one size: "names", "width" and "height", px, and their "kind" by EXIF.
@@ -217,9 +218,9 @@ def map_photos(
 
 
 def _agreed(found: Sequence[dict[str, Any]], connected: int) -> bool:
-    """Return whether two attempts gave a pose that counts to the same photos, most of the connected ones.
+    """Return whether two attempts placed the same photos, and most of the connected ones.
 
-    The other photos then overlap too little with these, and no further attempt is made.
+    The remaining photos then overlap too little with them, and no further attempt is made.
     """
     sets = [set(model["names"]) for model in found if len(model["names"]) > SAME * connected]
     return any(len(one & other) >= NEARLY * len(one | other) for one, other in combinations(sets, 2))

@@ -65,7 +65,7 @@ def unused_folders(files: Sequence[Path], masks: Mapping[Path, Path]) -> list[Pa
 
 
 def check_some_used(files: Sequence[Path]) -> None:
-    """Refuse photos beside which there are masks, but none is named like a photo.
+    """Raise an error if masks lie beside the photos, but none is named like a photo.
 
     Args:
         files: The photos.
@@ -82,8 +82,9 @@ def check_some_used(files: Sequence[Path]) -> None:
 def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, int, int]]) -> set[Path]:
     """Find the photos whose masks are upright rather than oriented like the stored pixels; check all sizes.
 
-    The size of a mask reveals its orientation unless the photo is square, mirrored or upside down. Such masks are
-    oriented like the other masks. If those are ambiguous too, they are read as stored, which is COLMAP's convention.
+    The size of a mask reveals its orientation unless the photo is square, mirrored or upside down. Such masks are taken
+    to be oriented like the other masks. If all masks are ambiguous, they are read as stored, which is COLMAP's
+    convention.
 
     Args:
         masks: The result of `find_masks`.

@@ -32,10 +32,10 @@ from gsplat_edu.sfm.masks import find_masks
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts, taken_at
 
 EQUIRECTANGULAR = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular", re.IGNORECASE)
-"""What XMP says of a panorama, as attribute or as element (Google's Photo Sphere XMP)."""
+"""XMP entry of a panorama, as attribute or as element (Google's Photo Sphere XMP)."""
 
 FACE_QUALITY = 95
-"""JPEG quality of the faces of lossy panoramas; those of the others are PNG."""
+"""JPEG quality of the faces of lossy panoramas; faces of other panoramas are PNG."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Panorama:
 
 
 def are_panoramas(files: Sequence[Path], choice: str, say: Callable[[str], None]) -> bool:
-    """Decide whether photos are panoramas: as the user says, or if the XMP of all of them says so.
+    """Decide whether photos are panoramas, by the user's choice or by the XMP of all photos.
 
-    The shape alone does not decide, because a plain photo may be cropped to 2:1; a note then names the option.
+    The shape alone is not enough, because a plain photo may be cropped to 2:1; a note then names the option.
 
     Args:
         files: The photos, or some frames of a video; files that cannot be read do not count.
@@ -72,7 +72,7 @@ def are_panoramas(files: Sequence[Path], choice: str, say: Callable[[str], None]
     for path in files:
         try:
             sizes[path] = upright_size(image_size(path), image_orientation(path))
-            if is_panorama_size(*sizes[path]) and _says_so(path):
+            if is_panorama_size(*sizes[path]) and _has_panorama_xmp(path):
                 marked.append(path)
         except DatasetError:
             continue
@@ -194,7 +194,7 @@ def rig_of(photos: Sequence[PhotoFacts]) -> dict[str, Any]:
     return {"rotations": [R.tolist() for R in face_rotations()], "panoramas": panoramas}
 
 
-def _says_so(path: Path) -> bool:
+def _has_panorama_xmp(path: Path) -> bool:
     """Return whether a file's XMP says that it is an equirectangular panorama."""
     try:
         with opened_image(path) as file:

@@ -43,16 +43,16 @@ FULL_FRAME = math.hypot(36.0, 24.0)
 """Film diagonal that 35 mm equivalent focal lengths refer to, mm (CIPA DCG-001)."""
 
 COUNTER = {0: UPRIGHT, 1: 8, 2: 3, 3: 6}
-"""EXIF orientation that turns back a photo that was turned clockwise by so many quarters."""
+"""EXIF orientation that undoes a number of clockwise quarter turns."""
 
 COPY_QUALITY = 97
 """JPEG quality of the working copies."""
 
 JPEG_ENDINGS = (".jpg", ".jpeg")
-"""Endings of photos written as JPEG, because they were lossy before."""
+"""Endings of photos that are written as JPEG again."""
 
 HEIC_ENDINGS = (".heic", ".heif", ".hif")
-"""Endings of photos that become .jpg, because they were lossy before; the others are written as PNG."""
+"""Endings of lossy photos that become .jpg; photos of all other formats are written as PNG."""
 
 GRAY = (0.5, 0.5, 0.5)
 """Background of transparent photos in the working copies."""
@@ -278,11 +278,11 @@ def photo_facts(files: Sequence[Path], source: Path, folder: Path) -> list[Photo
 
 
 def camera_kinds(photos: Sequence[PhotoFacts]) -> str:
-    """Describe from how many kinds of camera photos are.
+    """Describe the number of cameras that took the photos.
 
-    A camera that was turned, and whose photos some program stored upright without noting it in EXIF, counts once. Its
-    portraits and landscapes are still calibrated apart: nothing tells whether it was turned left or right, and the
-    principal point and the tangential distortion depend on that.
+    A camera whose portraits were stored upright without a note in EXIF counts once. Its portraits and landscapes are
+    calibrated separately, because the principal point and the tangential distortion depend on whether the camera was
+    turned left or right, which is unknown.
     """
     keys = {photo.camera for photo in photos}
     turned = set[str]()

@@ -57,14 +57,14 @@ INLIERS = 15
 
 FEATURES, MAPPING = 2, 4
 """Versions of the methods. They are part of the stages' options, so results of an earlier version in a work folder are
-recomputed. Before 2, photos kept more features than `max_features`, and every pose counted. Before 3, photos of each
-size had their own focal length; before 4, this still held if every photo had its own size."""
+recomputed. Version 2 limits features to `max_features` and judges poses. Version 3 shares focal lengths between sizes;
+version 4 also if every photo has its own size."""
 
 FACES = 1
 """Version of the method that cuts panoramas."""
 
 PHOTOS = 2
-"""Version of the method that copies photos. Before 2, the facts of the photos were read from stages.json."""
+"""Version of the method that copies photos. Version 2 reads the facts of the photos from their headers."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
@@ -121,7 +121,9 @@ class _Run:
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.folder)
         if parts := published(self.folder):
-            note_published(self.folder, parts)  # before the stage that records them is discarded
+            note_published(
+                self.folder, parts
+            )  # read now, because the stage that records them may be discarded
         self.stages = Stages(self.folder / "stages.json", say)
         self.video = is_video(options.source)
         self.panoramas: list[Panorama] | None = None
@@ -333,7 +335,7 @@ class _Run:
         return {"summary": summary, "connected": len(part)}
 
     def _forget_matches(self) -> None:
-        """Delete the matches, because those of pairs chosen by another matcher would be mapped too."""
+        """Delete all matches, because the mapper would also use the pairs of another matcher."""
         forget_matches(self.folder / "database.db")
 
     @property

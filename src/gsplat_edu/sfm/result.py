@@ -89,8 +89,8 @@ def build_capture(
 
     Returns:
         "points", their number; "error" in px of the undistorted photos; "left_out", the names of photos without a pose;
-        "unclear", those of another size whose focal length is ambiguous; and "doubtful", the others whose pose did not
-        count. "scale" is the scale as JSON, or None.
+        "unclear", photos of another size with an ambiguous focal length; and "doubtful", other photos whose pose did
+        not count. "scale" is the scale as JSON, or None.
 
     Raises:
         ArgumentError: a mark of the scale cannot be used.
@@ -165,7 +165,7 @@ def published(folder: Path) -> tuple[str, ...]:
 
 
 def _published_before(stages: Path) -> tuple[str, ...]:
-    """Return the parts of captures that a version without published.json finished."""
+    """Return the parts of a capture that an earlier version, without published.json, wrote."""
     try:
         finished = parse_json(read_text(stages))["stages"]["capture"]["facts"] is not None
     except (OSError, ValueError, KeyError, TypeError):

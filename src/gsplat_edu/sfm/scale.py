@@ -21,16 +21,18 @@ from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.scale_text import NONE, Mark, marks_of
 
 PARALLEL = 2.0
-"""Smallest angle between two rays to a marked point, degrees: below it, an error of a pixel moves the point far."""
+"""Smallest angle between two rays to a marked point, degrees. At smaller angles, an error of a pixel moves the point
+far."""
 
 MISSED = 0.01
-"""Largest distance of a mark from the point found, as a fraction of the photo's longer side."""
+"""Largest distance of a mark from the triangulated point, as a fraction of the photo's longer side."""
 
 LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """East, north and up become +x, +z and -y."""
 
 NEAR = 1.0
-"""Median distance of the cameras from the points, in units, below which renderers may cut off what is near."""
+"""Warn if the median distance from the cameras to the points is below this, in units: renderers may clip near
+splats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +133,7 @@ def _by_gps(move: Similarity, fit: GpsFit) -> tuple[Similarity, Scale]:
     detail += "; up from GPS, +z is north" if level else "; up from the cameras"
     found = _rescaled(move, fit.move.s)
     if level:
-        origin = -move.R.T @ move.t / move.s  # what `upright` puts at zero
+        origin = -move.R.T @ move.t / move.s  # the point that `upright` moves to the origin
         R = LEVEL @ fit.move.R
         found = Similarity(R, fit.move.s, -fit.move.s * R @ origin)
     return found, Scale("m", "GPS", detail, level)
@@ -203,7 +205,7 @@ def _sight(mark: Mark, sights: Sequence[Sight]) -> Sight:
 
 
 def _check_near(cameras: Sequence[Camera], s: float, unit: str, say: Callable[[str], None]) -> None:
-    """Warn if cameras are so near each other in these units that renderers cut off what is in front of them."""
+    """Warn if distances are so small in these units that renderers may clip what is in front of the cameras."""
     eyes = np.stack([camera.eye for camera in cameras])
     spread = s * float(np.median(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
     if spread < NEAR and unit != "mm":

@@ -1,7 +1,7 @@
 """Find out whether photos were taken in sequence: their order by name or time, and the evidence for it.
 
-Names are in natural order (IMG_9 before IMG_10). The evidence is that a photo's successor resembles it: among the other
-photos, ranked by similarity, it is one of the first few far more often than by chance.
+Names are in natural order (IMG_9 before IMG_10). The evidence is that photos resemble their successors: ranked by
+similarity to a photo, its successor is among the first few far more often than by chance.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ import numpy as np
 from jaxtyping import Float32
 
 FIRST = 5
-"""A successor counts if it is among so many most similar photos: two on each side, and one of another lap."""
+"""A successor counts if it is among this number of most similar photos: two on each side, and one of another lap."""
 
 CHANCE = 5e-7
 """Largest probability with which a random order is taken for a sequence. Two are tried at most, by name and by time, so
 an unordered set is taken for one with a probability of at most one in a million."""
 
 MAJORITY = 0.5
-"""Fraction of the photos that their successors must resemble; chance alone would ask for few of very many photos."""
+"""At least this fraction of the photos must resemble their successors; among very many photos, a small fraction would
+already exceed chance."""
 
 BLOCK = 256
 """Number of photos whose similarities to all others are in memory at once."""
@@ -33,7 +34,7 @@ class PhotoSequence:
 
     Args:
         order: The photos' indices in the order in which they were taken.
-        by: What gave the order, for a sentence.
+        by: Source of the order, for the sentence: names or times.
         alike: Number of photos whose successor is among the `FIRST` most similar ones.
         by_chance: Largest number that a random order reaches with a probability of more than `CHANCE`.
     """
@@ -44,7 +45,7 @@ class PhotoSequence:
     by_chance: int
 
     def __str__(self) -> str:
-        """Say that the photos are in order, and how that was found."""
+        """Return the sentence about the order and its evidence."""
         count = len(self.order) - 1
         return (
             f"the photos were taken in sequence: sorted by {self.by}, {self.alike} of {count} have the next one among "
@@ -108,9 +109,9 @@ def successors_alike(described: Float32[np.ndarray, "n d"]) -> int:
 def by_chance(count: int) -> int:
     """Return the largest number of `successors_alike` that a random order reaches with a probability above `CHANCE`.
 
-    Draw the order photo by photo. When m photos are left, the next one is any of them with probability 1/m, and at most
-    `FIRST` of them count, whatever came before: the conditional probability is at most min(1, FIRST / m). The number
-    is therefore stochastically at most the sum of independent variables that are 1 with these probabilities.
+    Draw the order photo by photo. If m photos are left, each is next with probability 1/m, and at most `FIRST` of them
+    count, for any earlier draws: the conditional probability is at most min(1, FIRST / m). The number is therefore
+    stochastically at most the sum of independent variables that are 1 with these probabilities.
 
     Args:
         count: Number of photos.

@@ -130,7 +130,7 @@ def _check_run(folder: Path) -> None:
 
 
 def _holds_others(out: Path) -> bool:
-    """Return whether the output folder holds files of other origin that a run would move away.
+    """Return whether the output folder holds files that no run wrote and that a run would move away.
 
     Masks next to a run's capture do not count, because they stay.
     """

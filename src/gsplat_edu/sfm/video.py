@@ -40,10 +40,10 @@ MOTION_SIDE = 160
 """Longest side for measuring motion, px."""
 
 STILL = 0.0002
-"""Motion between frames, relative to the longest side, below which the camera counts as still; noise moves too."""
+"""The camera is still if the motion between frames is below this, relative to the longest side; noise causes some."""
 
 DIFFERENT = 0.005
-"""Motion, relative to the longest side, from which two frames count as different photos."""
+"""Two frames are different photos if the motion between them is at least this, relative to the longest side."""
 
 FRAME_QUALITY = 97
 """JPEG quality of the selected frames."""
@@ -100,7 +100,7 @@ def choose_frames(path: Path, count: int, progress: Progress) -> list[int]:
 
 
 def write_frames(path: Path, chosen: Sequence[int], folder: Path, progress: Progress) -> list[Path]:
-    """Write frames as upright photos, skipping those that show the same as the previous one.
+    """Write frames as upright photos; skip frames that equal the previous one.
 
     Args:
         path: The video.

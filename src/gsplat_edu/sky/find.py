@@ -1,9 +1,9 @@
-"""Which pixels of a capture's photos show the sky.
+"""Find the pixels of a capture's photos that show the sky.
 
-A single photo cannot tell: a smooth region at its upper edge may be a wall. What is at infinity has the same colour in
-the same direction of the world in every photo, wherever it was taken; what is near has its colour at the same place.
-Both are tested: the colours are compared across photos by direction, and by the place where each ray meets a sphere
-around the cameras, for spheres of several sizes.
+One photo is not enough: a smooth region at its upper edge may be a wall. An object at infinity has the same colour in
+one direction of the world, in every photo. A near object has the same colour at one place. Both hypotheses are tested:
+the colours are compared across photos by direction, and by the place where each ray meets a sphere around the cameras,
+for spheres of several sizes.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ SMOOTH = 6.0
 """Largest slope of a channel in the sky, grey levels per px of such an image; soft clouds stay below."""
 
 POINT_RADIUS = 2
-"""px around the image of a point that are not sky."""
+"""Radius around the image of a point within which no pixel is sky, px."""
 
 HORIZON = np.sin(np.radians(-2.0))
 """Sine of the lowest elevation of the sky; the up direction is a few degrees wrong."""
 
 BELOW = np.sin(np.radians(-8.0))
-"""Sine of the elevation below which a region at the photo's upper edge speaks against sky."""
+"""Sine of the elevation below which smooth pixels at a photo's upper edge are evidence against a sky."""
 
 MOST_BELOW = 0.25
-"""Largest share of such pixels in the regions at the upper edges."""
+"""Largest fraction of the smooth regions at the upper edges that may lie below `BELOW`."""
 
 LEAST_SHARE = 0.02
 """Least share of the sky among all pixels of the photos."""
@@ -59,29 +59,28 @@ SPHERES = (2.0, 1.25, 3.5)
 """Radii of the spheres, in sizes of the scene."""
 
 QUANTILE = 0.75
-"""Quantile of the differences between photos that is compared. The median is that of the plain parts of a sky, where
-noise hides the parallax; the mean is that of pixels that are no sky."""
+"""Quantile of the differences between photos by which the hypotheses are compared. The median is dominated by the plain
+parts of a sky, where noise hides the parallax, and the mean by pixels that are not sky."""
 
 CLEAR = 0.8
-"""Between photos, the sky's colours must differ less than this multiple of what they differ on the best of the spheres.
-Traced skies have 0.27 to 0.36, with noise of 4 grey levels 0.75; what is smooth at the edges of three captures 1.17 to
-2.8; a dome 1.3 to 6.6 (`benchmarks/sky.py`)."""
+"""It is a sky if spread < CLEAR * spread_near. Traced skies have a ratio of 0.27 to 0.36, or 0.75 with noise of 4 grey
+levels; smooth regions at the edges of three captures have 1.17 to 2.8, a dome 1.3 to 6.6 (`benchmarks/sky.py`)."""
 
 DARK = 0.04
-"""Added to colours, 0 to 1, before their logarithm is taken, in which an exposure is a shift."""
+"""Added to colours, 0 to 1, before the logarithm, which turns exposures into shifts."""
 
 PLAIN, WHITE = 2.0, 225.0
-"""A sky of one colour has no parallax. If colours differ less than `PLAIN` %, it counts if it is as bright as `WHITE`,
-grey levels."""
+"""A sky of one colour shows no parallax to test. If its colours differ by less than `PLAIN` %, it is accepted if it is
+at least as bright as `WHITE`, grey levels."""
 
 MOST_POINTS = 0.9
-"""Share of the points that the size of a scene includes; the others may be wrong or far."""
+"""Fraction of the points that count for the size of a scene; the others may be wrong or far."""
 
 SAMPLES, COMPARED = 500, 200
-"""Pixels per photo whose colours are compared, and number of photos, at most."""
+"""Largest number of pixels per photo, and of photos, whose colours are compared."""
 
 ALIGNED = 0.7
-"""Least length of the mean of the cameras' right axes for cameras held in portrait."""
+"""Smallest length of the mean right axis at which cameras may have been held in portrait."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +93,11 @@ class Sky:
         colors: (M, 3) their colours, 0 to 1.
         photo: (M,) index of each one's photo.
         share: Their share among all pixels.
-        below: Share of the smooth regions at the upper edges that lies well below the horizon.
-        spread: Upper quartile of the differences of the photos' colours in one direction, %; infinite if
-            none could be compared, or the sky is too small or reaches below the horizon.
-        spread_near: The same at one place, on the sphere on which it is smallest; if none is much larger, not all were
-            tried.
+        below: Fraction of the smooth regions at the upper edges that lies below `BELOW`.
+        spread: Upper quartile of the differences between photos' colours in one direction, %; infinite if nothing can
+            be compared, or if the sky is too small or reaches below the horizon.
+        spread_near: Smallest such quartile at one place, over the trial spheres; an upper bound if the search stopped
+            early.
         pixel: Angle between neighbouring pixels of the searched images, radians.
     """
 
@@ -118,16 +117,16 @@ class Sky:
         return len(np.unique(self.photo))
 
     @property
-    def moves(self) -> bool:
-        """Whether its colours follow the direction, not the place, from photo to photo."""
+    def lies_at_infinity(self) -> bool:
+        """Whether the photos' colours agree in one direction and differ at one place."""
         return self.spread < CLEAR * self.spread_near
 
     @property
     def is_certain(self) -> bool:
-        """Whether the photos leave no doubt that it is a sky."""
+        """Whether the evidence for a sky is beyond doubt."""
         if self.share < LEAST_SHARE or self.photos < LEAST_PHOTOS or self.below > MOST_BELOW:
             return False
-        if self.moves:
+        if self.lies_at_infinity:
             return True
         white = float(255 * np.median(self.colors.min(axis=1))) > WHITE
         return white and max(self.spread, self.spread_near) < PLAIN
@@ -274,7 +273,7 @@ def _spreads(
     near = math.inf
     for radius in SPHERES:
         if at_infinity >= CLEAR * near:
-            break  # it is no sky, whatever the other spheres say
+            break  # no other sphere can make it a sky
         root = np.sqrt(np.maximum(along**2 - (offsets**2).sum(axis=1) + (radius * size) ** 2, 0))
         hits = offsets + (root - along)[:, None] * rays
         hits /= np.maximum(np.linalg.norm(hits, axis=1, keepdims=True), 1e-300)
@@ -288,8 +287,8 @@ def _spread(
     """Return the upper quartile of the differences between photos' mean colours in a cell and the cell's, %.
 
     Each photo may have its own exposure and tint: shifts s of photos and colours c of cells minimise sum |m - s - c|,
-    by weighted least squares. That is not squared, and the result is a quantile, because some pixels that look like sky
-    belong to something else.
+    by weighted least squares. The absolute difference and the quantile are robust against pixels that look like sky but
+    are not.
     """
     pairs, pair = np.unique(cell * (photo.max() + 1) + photo, return_inverse=True)
     means = np.stack([np.bincount(pair, c) for c in colors.T], axis=1) / np.bincount(pair)[:, None]
@@ -310,7 +309,7 @@ def _spread(
         middle = np.stack([np.bincount(group, weights * c) for c in shifted.T], axis=1)
         left = shifted - (middle / np.bincount(group, weights)[:, None])[group]
         weights = 1 / np.maximum(np.sqrt(np.square(left).mean(axis=1)), LEAST_DIFFERENCE)
-    # cells that few photos see would seem to vary less
+    # without the correction, cells that few photos see would seem to vary less
     factor = np.sqrt(number / np.maximum(number - 1, 1))[group]
     differences = factor * np.sqrt(np.square(left).mean(axis=1))
     return float(np.quantile(differences[number[group] > 1], QUANTILE))

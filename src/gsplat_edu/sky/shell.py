@@ -21,12 +21,14 @@ FINEST = math.radians(1.0)
 """Smallest distance of neighbouring splats at the start."""
 
 SPLAT_WIDTH, FLATNESS = 0.65, 0.1
-"""Standard deviation of a splat, in distances of neighbours: along the shell, and across it relative to that."""
+"""Standard deviation of a splat along the shell, in distances between neighbours; and across the shell, relative to the
+one along it."""
 
 OPACITY = 0.95
 
 MARGIN = 3.0
-"""A direction belongs to the sky within this many px of one of its pixels, or half a splat's distance if larger."""
+"""A direction belongs to the sky if a sky pixel lies within this many px, or within half a splat's distance if that is
+larger."""
 
 VOTES = 64
 """A splat's colour is the median of this many nearest pixels."""

@@ -1,7 +1,7 @@
-"""Which places outside of a library may be reached through links in it: those that the user has adopted here.
+"""The places outside of a library that its links may lead to, because the user has adopted them on this computer.
 
-The list lies in the user's own folder, not in the library. So a library that somebody else made can hold any links, and
-none of them is followed.
+The list lies in the user's own folder, not in the library, so that no link in a library that somebody else made is
+followed.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def application(
 
 
 def _web(request: Request, package: str, name: str | None = None) -> Response:
-    """Return a file of a page: one that its folder lists."""
+    """Return a file of the page; only files that its folder lists are served."""
     name = request.path_params["name"] if name is None else name
     folder: Any = files(package) / "web"
     known = {entry.name for entry in folder.iterdir() if Path(entry.name).suffix in TYPES}

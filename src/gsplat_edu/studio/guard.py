@@ -1,7 +1,6 @@
-"""Who may talk to the server: only its own page, with the URL's token, under a name of this computer.
+"""Access control of the server: it answers only its own page, with the URL's token, under a name of this computer.
 
-A browser lets any page send requests to any address. So every request has to pass these checks before anything else
-sees it:
+A browser lets any page send requests to any address. So every request has to pass these checks first:
 
 - Host names this computer (`gsplat_edu.viewer.serve.names_this_computer`); this prevents DNS rebinding.
 - Origin, if there is one, is the server itself, and Sec-Fetch-Site does not say that another site asks.
@@ -9,7 +8,7 @@ sees it:
   or in the header `Authorization: Bearer TOKEN`.
 - A request that changes something has an Origin, or the header; forms of other pages have neither.
 
-No answer has headers for CORS, so no other page can read one.
+No answer has CORS headers, so no other page can read it.
 """
 
 from __future__ import annotations
@@ -53,10 +52,10 @@ HEADERS = {
 
 
 class Guard:
-    """Checks requests, and adds the headers that keep others out.
+    """Checks requests, and adds the security headers to answers.
 
     Args:
-        app: What answers the requests that pass.
+        app: Application that answers the requests that pass.
         token: The token.
         host: Address that the server listens on.
         cookie: Name of the cookie; different for servers on other ports, which share their cookies.
@@ -112,7 +111,7 @@ class Guard:
         return None
 
     def _is_opened(self, scope: Scope) -> bool:
-        """Return whether the page is opened by its URL with the token."""
+        """Return whether the request opens the page by its URL with the token."""
         if scope["type"] != "http" or scope["path"] != "/" or scope["method"] not in READING:
             return False
         query = urllib.parse.parse_qs(scope["query_string"].decode("latin-1"))

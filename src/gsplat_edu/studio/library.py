@@ -36,7 +36,7 @@ KINDS = ("photos", "captures", "runs", "scenes")
 """Kinds of entries, and their folders."""
 
 HIDDEN = ".studio"
-"""Folder of what the studio keeps for itself."""
+"""Folder of the studio's own files."""
 
 PARTS = ("jobs", "trash", "uploads", "cache")
 """Folders in `HIDDEN`."""
@@ -55,8 +55,8 @@ class Extent:
     Args:
         files: Number of files.
         num_bytes: Their size.
-        photos: Number of those that are photos by their endings.
-        videos: Number of those that are videos by their endings.
+        photos: Number of files with a photo's ending.
+        videos: Number of files with a video's ending.
     """
 
     files: int
@@ -70,7 +70,7 @@ class Library:
 
     Args:
         root: The folder; its parts are created if missing.
-        in_use: Returns why a path may not be moved, or None; called with absolute paths.
+        in_use: Called with an absolute path; returns the reason why it may not be moved, or None.
 
     Raises:
         RefusedError: one of the library's own folders is a link or a file.
@@ -86,13 +86,13 @@ class Library:
             (self.root / kind).mkdir(parents=True, exist_ok=True)
         for part in PARTS:
             self.hidden(part).mkdir(parents=True, exist_ok=True)
-        # cached pages may be those of an older version
+        # cached pages may be from an older version
         pages = [self.hidden("cache") / part for part in ("pages", "live")]
         for left in (*self.hidden("uploads").iterdir(), *pages, *_links(self.hidden("cache"))):
             _delete(left)
 
     def hidden(self, part: str) -> Path:
-        """Return a folder of what the studio keeps for itself."""
+        """Return one of the folders of the studio's own files."""
         return self.root / HIDDEN / part
 
     def name(self, path: Path) -> str:
@@ -100,7 +100,7 @@ class Library:
         return legible(path.relative_to(self.root).as_posix())
 
     def identity(self, name: str) -> object:
-        """Return what two names have in common if, by links or by letters of either case, they are one place."""
+        """Return equal values for two names of one place, which differ by links or by the case of letters."""
         path = self.root / as_file_name(name)
         try:
             facts = path.stat()
@@ -198,7 +198,7 @@ class Library:
         return path
 
     def free_name(self, kind: str, name: str) -> str:
-        """Return a name, with a number behind it if it is taken."""
+        """Return the name, or the name with a number appended if it is taken."""
         chosen, copy = name, 2
         while os.path.lexists(self.place(kind, chosen)):
             chosen, copy = f"{name}-{copy}", copy + 1

@@ -1,4 +1,4 @@
-"""Routes of the library: what is in it, taking in, renaming and removing."""
+"""Routes of the library: list, upload, rename and remove entries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsplat_edu.studio.replies import Json, act, answered, content_length, entry
 from gsplat_edu.studio.state import Studio
 
 MOST_LINES = 3
-"""Lines of one trouble that the page shows; of more it shows the number."""
+"""Largest number of lines that the page shows for one problem; beyond it, only their number."""
 
 
 def routes() -> list[BaseRoute]:
@@ -63,7 +63,7 @@ def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
 
 
 def _few(lines: list[str], summary: str) -> list[str]:
-    """Return lines as they are if they are few, else their number."""
+    """Return the lines if they are at most `MOST_LINES`, else a line with their number."""
     return lines if len(lines) <= MOST_LINES else [f"{len(lines)} {summary}"]
 
 

@@ -1,4 +1,4 @@
-"""One entry of the library in a few numbers, as the list of the page shows it."""
+"""Summaries of entries for the page's list."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def scene_bytes(file: Path | None) -> int:
 
 
 def run_facts(path: Path) -> dict[str, Any]:
-    """Return how far a run is and its scores; where a file is damaged, `problem` has the line."""
+    """Return a run's progress and scores; if a file is damaged, `problem` says so in one line."""
     folder = RunFolder(path)
     facts: dict[str, Any] = {
         "planned": None,
@@ -104,7 +104,7 @@ def run_facts(path: Path) -> dict[str, Any]:
 
 
 def last_logged(path: Path) -> dict[str, Any]:
-    """Return figures of the last complete line of a run's log that has them."""
+    """Return the figures from the last complete line of a run's log that contains them."""
     try:
         with path.open("rb") as file:
             file.seek(max(os.fstat(file.fileno()).st_size - 2048, 0))

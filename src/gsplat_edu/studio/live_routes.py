@@ -1,7 +1,7 @@
 """Routes of a training that runs as a job: its page, its state, its newest splats, and pause.
 
 They have the addresses that the live page of `train --view` uses (`gsplat_edu.viewer.live`), but read the files that
-the training writes (`gsplat_edu.viewer.live_folder`), and ask for them only while somebody asks here.
+the training writes (`gsplat_edu.viewer.live_folder`), and make the training write them only while a page asks for them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def routes() -> list[BaseRoute]:
 
 
 def _live(studio: Studio, request: Request) -> tuple[Job, LiveFolder]:
-    """Return the job that trains a run, and its files, after asking for them.
+    """Ask for a training's files; return its job and the files.
 
     Raises:
         RefusedError: no job trains it.
@@ -85,7 +85,7 @@ async def _state(request: Request) -> Response:
 
 
 def _new_state(job: Job, folder: LiveFolder, after: str) -> dict[str, Any] | None:
-    """Return the state with its version, if that is another one than the page has."""
+    """Return the state with its version; None if the page has this version."""
     try:
         version = folder.state.stat().st_mtime_ns // 1_000_000 * 2
         state = folder.read_state()

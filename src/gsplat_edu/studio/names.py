@@ -1,7 +1,7 @@
 """Names that a browser may give to entries of the library and to files in them.
 
-Any script is kept, in Unicode's composed form, and so are characters like < that only matter to a careless page. What
-is refused could leave a folder, hide a file, look like an option of a command or break a line.
+Names may have letters of any script, in Unicode's composed form, and characters such as <, which a correct page
+escapes. A name is refused if it could lead out of a folder, hide a file, look like a command's option or break a line.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LONGEST_FILE = 200
 """Bytes of the name of a file in UTF-8."""
 
 DEEPEST = 8
-"""Folders within folders of an entry."""
+"""Largest depth of folders in an entry."""
 
 RESERVED = frozenset('/\\:*?"|')
 """Characters with a meaning to some file system."""
@@ -29,7 +29,7 @@ def checked_name(what: str, name: object, longest: int = LONGEST) -> str:
     """Check the name of an entry or a file, and return it in Unicode's composed form.
 
     Args:
-        what: What is named, for messages.
+        what: The thing that is named, for messages.
         name: The name.
         longest: Most bytes in UTF-8.
 

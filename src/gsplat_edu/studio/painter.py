@@ -14,17 +14,17 @@ from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.workers import Worker
 
 NICE = 10
-"""Steps by which drawing gives way to a training."""
+"""Niceness of the drawing process, so that a training goes first."""
 
 REST = 24.0
-"""While a training runs, the pause after a picture in multiples of the processor time that it took.
+"""While a training runs, pause after each picture for this multiple of its processor time.
 
-One thread then draws for a twenty-fifth of the time. The training slows by 4 % at most, even if all its threads wait
-for that core.
+One thread then draws for 1/25 of the time, so the training slows by at most 4 %, even if all its threads wait for that
+core.
 """
 
 MOST_WAITING = 4
-"""Requests that wait; each holds a thread of the server."""
+"""Largest number of waiting requests; each holds a thread of the server."""
 
 
 class Painter:
@@ -38,7 +38,7 @@ class Painter:
         self._closed = False
 
     def paint(self, is_training: Callable[[], bool], **task: Any) -> bytes:  # noqa: ANN401
-        """Return a JPEG; waits its turn, and out the pause while a training runs.
+        """Return a JPEG, after earlier requests and, while a training runs, after the pause.
 
         Args:
             is_training: Whether a training runs now.

@@ -1,4 +1,4 @@
-"""How long the server waits for the body of a request, and for the loop between parts of an answer."""
+"""Time limits for the body of a request, and a pause between parts of an answer."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from gsplat_edu.studio.refusal import RefusedError
 
 LEAST_GAIN = 4096
-"""Bytes of a body that count as progress: one byte now and then does not keep a connection."""
+"""Number of new bytes of a body that count as progress, so that single bytes do not keep a connection open."""
 
 
 class Patience:
-    """Gives up bodies that stall, whichever route reads them, and stops to write to connections that are gone.
+    """Aborts requests whose body stalls, in any route, and stops writing to closed connections.
 
-    Only the time in which a route waits for bytes counts, not that in which it writes them to a disk.
+    Only time spent waiting for bytes counts, not time spent writing them to a disk.
 
     Args:
         app: What answers the requests.
-        seconds: Waiting within which `LEAST_GAIN` more bytes of a body, or its end, have to come.
+        seconds: Longest wait for `LEAST_GAIN` more bytes of a body, or for its end.
     """
 
     def __init__(self, app: ASGIApp, seconds: float) -> None:

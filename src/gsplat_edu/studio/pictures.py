@@ -70,7 +70,7 @@ def thumbnail(decoder: Worker, library: Library, entry: Path, name: str, side: s
 
 
 def cache_name(path: Path, facts: os.stat_result) -> str:
-    """Return the name of what is made from a file and cached; it changes with the file."""
+    """Return the name under which a file's derivative is cached; it changes with the file."""
     key = f"{path} {facts.st_size} {facts.st_mtime_ns}"
     digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
     return f"{digest[:2]}/{digest[2:]}"
@@ -82,7 +82,7 @@ def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
     Args:
         photo: The photo's file.
         side: Longest side, px.
-        out: File to write; an existing one is kept, because somebody else may have asked for it.
+        out: File to write; an existing one is kept, because another request may have made it.
 
     Raises:
         DatasetError: the photo cannot be decoded.

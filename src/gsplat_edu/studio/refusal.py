@@ -1,4 +1,4 @@
-"""What the server refuses, with the status that HTTP has for it."""
+"""The error of a refused request, with its HTTP status."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class RefusedError(ArgumentError):
 
 
 def not_found(what: str) -> RefusedError:
-    """Return the refusal of something that does not exist."""
+    """Return the error for a thing that does not exist."""
     return RefusedError(f"{what}: does not exist; it may have been renamed or removed", HTTPStatus.NOT_FOUND)
 
 
 def conflict(message: str) -> RefusedError:
-    """Return the refusal of something that the state of the library does not allow."""
+    """Return the error for a request that the library's state does not allow."""
     return RefusedError(message, HTTPStatus.CONFLICT)
 
 
 def too_large(message: str) -> RefusedError:
-    """Return the refusal of something beyond a limit."""
+    """Return the error for a request that exceeds a limit."""
     return RefusedError(message, HTTPStatus.REQUEST_ENTITY_TOO_LARGE)

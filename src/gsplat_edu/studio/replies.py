@@ -1,4 +1,4 @@
-"""What the routes have in common: bodies that are checked, answers as JSON, and errors as one line."""
+"""Common parts of the routes: checked bodies, JSON answers, and errors of one line."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ CLOSE = {"Connection": "close"}
 """Header of an answer to a request whose body may not have been read to its end."""
 
 MOST_DRAINED = 64 << 20
-"""Bytes of a refused body that are received all the same; see `drain`."""
+"""Largest number of bytes of a refused body that are still received; see `drain`."""
 
 LONGEST_DRAIN = 5.0
-"""Seconds in which they have to come."""
+"""Longest time for receiving them, s."""
 
 
 class Json(JSONResponse):
-    """An answer as JSON, whatever text and numbers a file has put into it.
+    """A JSON answer, valid for any text and numbers from a file.
 
     Text that no encoding accepts is escaped; JSON has no NaN and no infinities, so these become null.
     """
@@ -94,7 +94,7 @@ def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Re
 
 
 async def drain(request: Request, status: HTTPStatus) -> None:
-    """Receive the rest of a body that is refused: a browser that is still sending would lose the answer.
+    """Receive the rest of a refused body, because a browser that is still sending would lose the answer.
 
     A body that is refused for its size or because it stalls, or announced to be larger than `MOST_DRAINED`, is not
     received.
@@ -182,9 +182,9 @@ def file_answer(
     Args:
         request: The request, whose If-None-Match counts.
         path: The file.
-        media_type: Its type; nothing is guessed from its name or contents.
+        media_type: Its type; the server guesses nothing from name or contents.
         download: Name under which the browser saves it; None shows it.
-        version: What its ETag is made of; its size and time if empty.
+        version: Text that its ETag is computed from; its size and time if empty.
     """
     try:
         facts = path.stat()

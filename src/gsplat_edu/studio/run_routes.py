@@ -25,7 +25,7 @@ from gsplat_edu.studio.state import Studio
 REPORT_POLICY = (
     "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'"
 )
-"""Of a run's report, which has its style and pictures inside; scripts do not run, and it belongs to no origin."""
+"""Content-Security-Policy of a run's report, which contains its style and pictures: no scripts, and no origin."""
 
 
 def routes() -> list[BaseRoute]:
@@ -110,7 +110,7 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
 
 
 def _diagnosis(studio: Studio, job: Job, kind: str, entry: Path) -> dict[str, Any]:
-    """Return what a job of the doctor found, with the photos that it means."""
+    """Return the findings of a doctor job, with the affected photos."""
     path = studio.queue.files(job.id).events
     events = [event for _, _, event in events_after(path)]
     starts = [index for index, event in enumerate(events) if isinstance(event, Started)]

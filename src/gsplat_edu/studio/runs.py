@@ -39,15 +39,15 @@ SCORE = ("iteration", "psnr", "ssim")
 
 
 def curves(folder: RunFolder, after: str) -> dict[str, Any]:
-    """Read what a run's log has gained.
+    """Read the new lines of a run's log.
 
     Args:
         folder: The run.
-        after: `next` of the answer before; empty for the whole log.
+        after: `next` of the previous answer; empty for the whole log.
 
     Returns:
-        points and scores as columns; next; reset, whether the log was rewritten, so that earlier points do not count;
-        and more, whether there is more to read at once.
+        points and scores as columns; next; reset, whether the log was rewritten, so that earlier points are void; and
+        more, whether more lines can be read now.
     """
     try:
         with open_file(folder.log_file) as file:
@@ -158,7 +158,7 @@ def make_view_pictures(comparison: str, outs: Mapping[str, str], small: bool) ->
 
     Args:
         comparison: File of the photo beside its render.
-        outs: File to write by picture; nothing is done if all exist, because somebody else may have asked for them.
+        outs: File to write by picture; nothing is done if all exist, because another request may have made them.
         small: See `view_picture`.
 
     Raises:

@@ -35,7 +35,7 @@ KEPT_PAGES = 12
 BINARY = "application/octet-stream"
 
 _storing = threading.Lock()
-"""Edits are compared with the stored version and written by one request at a time."""
+"""Held while a request compares edits with the stored version and writes them."""
 
 
 def routes() -> list[BaseRoute]:
@@ -225,7 +225,7 @@ async def _store_edits(request: Request) -> Response:
 
 
 def _store(studio: Studio, kind: str, entry: Path, data: bytes, expected: str) -> str:
-    """Check edits and store them, unless another tab has stored some since this one read them."""
+    """Check and store edits; refuse them if another tab has stored edits since this one read them."""
     part = studio.library.part(".json")
     try:
         part.write_bytes(data)

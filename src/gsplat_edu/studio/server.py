@@ -1,4 +1,4 @@
-"""Serve the studio: one process, one event loop, and connections that cannot be held open for nothing."""
+"""Serve the studio: one process, one event loop, and time limits for idle connections."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ KEEP_ALIVE = 30
 
 
 class PatientProtocol(H11Protocol):
-    """uvicorn's protocol with a limit on how long the head of a request may take, however slowly it trickles in."""
+    """uvicorn's protocol with a time limit for the whole head of a request, even if bytes keep trickling in."""
 
     _late: asyncio.TimerHandle | None = None
 
@@ -57,7 +57,7 @@ class PatientProtocol(H11Protocol):
             self._heard()
 
     def on_response_complete(self) -> None:
-        """Close a connection whose request was answered although its body has not come: nothing waits for the rest."""
+        """Close a connection whose request was answered before its body arrived, because nothing reads the rest."""
         super().on_response_complete()
         if self.conn.their_state is h11.SEND_BODY and not self.transport.is_closing():
             self.transport.close()
@@ -136,7 +136,7 @@ def _config(app: Any) -> uvicorn.Config:  # noqa: ANN401
 
 
 class _Server(uvicorn.Server):
-    """A server that tells once it listens, and before it waits for its connections to end."""
+    """A server with callbacks: once it listens, and before it waits for its connections to end."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[], None], ending: Callable[[], None]) -> None:
         super().__init__(config)

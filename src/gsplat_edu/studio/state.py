@@ -1,4 +1,4 @@
-"""What the server has open: the library, its jobs, and what watches them."""
+"""State of the server: the library, its jobs, and the stream of their events."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from gsplat_edu.studio.workers import Worker
 from gsplat_edu.viewer.live_folder import LiveFolder
 
 TRAINING = "training"
-"""Stage of `train` in which it looks at the file that lets it wait."""
+"""Stage of `train` that obeys the file `pause`."""
 
 
 MOST_THUMBNAILS = 24
-"""Thumbnails that wait to be made: those of four tabs. Each holds one of the server's 40 threads."""
+"""Largest number of waiting requests for thumbnails: those of four tabs. Each holds one of the server's 40 threads."""
 
 
 class Studio:
@@ -40,7 +40,10 @@ class Studio:
         self.library = Library(folder, self.in_use)
         self.uploads = Uploads(self.library, limits or Limits())
         self.stream = Stream()
-        self.worker, self.prober = Worker(), Worker()  # a measurement must not hold up a page
+        self.worker, self.prober = (
+            Worker(),
+            Worker(),
+        )  # two, so that a measurement does not delay a page
         self.decoder = Worker(waiting=MOST_THUMBNAILS)
         self.painter = Painter()
         jobs = self.library.hidden("jobs")
@@ -77,7 +80,7 @@ class Studio:
             return self.queue.resume(name)
 
     def _check_first(self, work: Work, others: list[Job]) -> None:
-        """Check that no other job does the same, or writes to the same place: the second would find it made.
+        """Check that no other job does the same work or writes to the same place.
 
         Raises:
             RefusedError: one does.
@@ -108,11 +111,11 @@ class Studio:
         self.queue.close()
 
     def is_training(self) -> bool:
-        """Return whether a training runs, and does not wait."""
+        """Return whether a training runs that is not paused."""
         return any(job.state is State.RUNNING and job.work.command == "train" for job in self.queue.jobs())
 
     def _hold(self, job: Job, wait: bool) -> bool:
-        """Let a training wait between two iterations, where its clock stops, if it has come that far."""
+        """Pause a training between two iterations, where its clock stops, if it has started to train."""
         if job.work.command != "train":
             return False
         folder = LiveFolder(self.library.root / job.work.outputs[0])

@@ -20,10 +20,11 @@ from gsplat_edu.jobs.record import ACTIVE, Job
 from gsplat_edu.studio.commands import subject_of, title_of
 
 KEPT = 4_000
-"""Events that a browser may have missed and still gets; after more it reads the list of jobs again."""
+"""Number of events that are kept for browsers that missed them. A browser that missed more reads the list of jobs
+again."""
 
 HEARTBEAT = 15.0
-"""Seconds of silence after which a comment tells whether the browser is still there."""
+"""Seconds of silence after which a comment is sent, to detect closed connections."""
 
 MOST_WATCHING = 64
 """Streams at once."""
@@ -61,10 +62,10 @@ def event_document(number: int, time: float, event: Event) -> dict[str, Any]:
 
 
 class Stream:
-    """Collects what happens to jobs, and hands it to everyone who watches.
+    """Collects events of jobs and sends them to all watchers.
 
     Ids are `BOOT-NUMBER`. If a watcher's last id is too old or from an earlier start of the server, it gets the event
-    `reset`, upon which it reads the list of jobs again.
+    `reset` and reads the list of jobs again.
     """
 
     def __init__(self) -> None:
@@ -128,7 +129,7 @@ class Stream:
                 self._followers.pop(name, None)
 
     async def watch(self, last_id: str | None) -> AsyncIterator[str]:
-        """Yield the stream, from behind an id if it is still known."""
+        """Yield the events after an id, if it is still known."""
         woken = asyncio.Event()
         if len(self._woken) >= MOST_WATCHING:
             yield "event: full\ndata: {}\n\n"
@@ -160,7 +161,7 @@ class Stream:
             self._woken.discard(woken)
 
     def _after(self, last_id: str | None) -> int | None:
-        """Return the number behind which a watcher wants to go on; None if it has to start anew."""
+        """Return the number of the last event that a watcher has; None if it has to start anew."""
         boot, _, text = (last_id or "").partition("-")
         number = whole_of(text)
         if boot != self.boot or number is None:

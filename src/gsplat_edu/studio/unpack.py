@@ -4,9 +4,9 @@ A few kilobytes can claim petabytes, name files outside of the folder, be links,
 the list takes all memory. So the directory of the file is measured before it is read, every name is checked before
 anything is written, and bytes are counted while they are written.
 
-Readers of zip files find the directory in different ways: from the end, by an offset, past data in front or behind. A
-file in which these ways lead to different places is refused, so that `zipfile` reads the directory that was measured,
-whichever way its version goes. The format: PKWARE, APPNOTE.TXT 6.3.10, sections 4.3.12 to 4.3.16.
+Readers of zip files find the directory in different ways: from the end, by an offset, or past data before or after it.
+A file in which these ways lead to different places is refused, so that every version of `zipfile` reads the directory
+that was measured. The format: PKWARE, APPNOTE.TXT 6.3.10, sections 4.3.12 to 4.3.16.
 """
 
 from __future__ import annotations

@@ -36,8 +36,7 @@ class Limits:
         spare: Bytes of the disk that stay free.
         entry_files: Files of one entry.
         zipped: What a zip file may hold.
-        stall: Seconds of waiting after which a body of a request that does not go on is given up
-            (`gsplat_edu.studio.patience`).
+        stall: Seconds after which a request is aborted if its body makes no progress (`gsplat_edu.studio.patience`).
     """
 
     file: int = 4 << 30
@@ -75,7 +74,7 @@ class Uploads:
         self._used: int | None = None
 
     def used(self) -> int:
-        """Return the bytes of the library's own files, counted once and then kept up with uploads."""
+        """Return the bytes of the library's own files, counted once and then updated by uploads."""
         if self._used is None:
             self._used = extent_of(self.library.root).num_bytes
         return self._used
@@ -88,7 +87,8 @@ class Uploads:
         """Return where a file goes.
 
         Raises:
-            RefusedError: a name is not allowed, its ending is not that of what the entry holds, or it is there already.
+            RefusedError: a name is not allowed, its ending does not fit the kind of the entry, or the file exists
+                already.
         """
         wanted = checked_path("file", path)
         self._check_ending(kind, wanted)

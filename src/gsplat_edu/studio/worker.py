@@ -4,7 +4,7 @@
 
 reads requests from standard input and writes answers to standard output, one JSON object per line: {"task": name, ...}
 and {"result": ...} or {"error": one line}. It ends with its input, or after `IDLE` seconds without a request, so that
-the memory of a scene is not held forever. Nothing that it does takes longer than a minute; the rest are jobs.
+the memory of a scene is not held forever. No task takes longer than a minute; longer work is a job.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _opened(source: str) -> tuple[Any, Any]:
 
 
 def _state_of(source: str) -> str:
-    """Return what changes when the file of a scene, or the latest scene of a run, changes."""
+    """Return a value that changes with a scene's file, or with a run's latest scene."""
     from gsplat_edu.io.formats import file_in
     from gsplat_edu.runs.folder import RunFolder
 
@@ -264,11 +264,11 @@ def main(nice: int = 0) -> None:
     """Answer requests until the input ends.
 
     Args:
-        nice: Steps by which the process gives way to others.
+        nice: Niceness of the process.
     """
     os.nice(nice)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # libraries may print to stdout, which is for answers only
     requests = sys.stdin.buffer
     while select.select([requests], [], [], IDLE)[0]:
         line = requests.readline()

@@ -1,4 +1,4 @@
-"""Processes that do short work for the server, which never imports torch and never decodes a photo."""
+"""Worker processes for short tasks, so that the server never imports torch and never decodes a photo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Worker:
     """A worker process, started when it is needed. It may be used from any thread; requests wait for one another.
 
     Args:
-        nice: Steps by which it gives way to other processes.
+        nice: Niceness of the process.
         waiting: Requests that may wait for it; None for `MOST_WAITING`.
     """
 
@@ -38,7 +38,7 @@ class Worker:
         self._process: subprocess.Popen[bytes] | None = None
 
     def ask(self, task: str, **arguments: Any) -> Any:  # noqa: ANN401
-        """Let the worker do something (`gsplat_edu.studio.worker.TASKS`) and return its result.
+        """Run a task (`gsplat_edu.studio.worker.TASKS`) in the worker and return its result.
 
         Raises:
             RefusedError: it failed, has ended, or too many requests are waiting; has the line.
@@ -50,7 +50,9 @@ class Worker:
             )
         try:
             with self._lock:
-                said = self._asked(line) or self._asked(line)  # it may just have ended because nobody asked
+                said = self._asked(line) or self._asked(
+                    line
+                )  # again if it had just ended after `IDLE` seconds
         finally:
             self._room.release()
         if not said:
@@ -64,12 +66,12 @@ class Worker:
         return found["result"]
 
     def close(self) -> None:
-        """End the process, and whatever it does."""
+        """End the process and its task."""
         self._closed = True
         process = self._process
         if process is not None:
             process.kill()
-            with self._lock:  # whoever waits for it gets no answer
+            with self._lock:  # waiting requests get an error
                 self._drop()
 
     def _drop(self) -> None:

@@ -1,8 +1,9 @@
-"""Batches: what the views of a step leave, and the fixed tree in which their gradients are summed.
+"""Batches: the results of a step's views, and the fixed tree in which their gradients are summed.
 
 The sum of floating-point numbers depends on its order. Here the order depends on the size of the batch alone, not on
-who computes which views: neighbouring places are added in pairs, then neighbouring pairs, and so on. Any run of views
-yields partial sums of that tree, at most two per level, and whoever has all of them completes it to the same bits.
+who computes which views: neighbouring places are added in pairs, then neighbouring pairs, and so on. Any run of
+neighbouring views yields partial sums of that tree, at most two per level. Combining all partial sums gives the same
+bits.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Gradients = dict[str, Tensor]
 class PartialSums:
     """The sums of gradients over places of a batch, as nodes of its tree.
 
-    Adding the places in order keeps at most one node per level, beside the one that is added.
+    If places are added in order, at most one node per level is stored.
 
     Args:
         count: Number of views of the batch.
@@ -42,9 +43,9 @@ class PartialSums:
         self._count = count
         self.nodes: dict[Node, Gradients] = {}
 
-    @one_thread()  # a second thread of torch's would wait busily while the kernels' own threads work
+    @one_thread()  # torch's other threads would spin and slow down the kernels' threads
     def add(self, node: Node, gradients: Gradients) -> None:
-        """Add a node, and combine it with its sibling while that is here.
+        """Add a node. Combine it with its sibling if that is stored, and so on up the tree.
 
         Args:
             node: The node: (0, place) for a view.
@@ -76,7 +77,7 @@ class PartialSums:
 
 @dataclass(frozen=True, eq=False)
 class ViewResult:
-    """What the view at one place of a batch leaves beside gradients.
+    """The result of one view of a batch, apart from its gradients.
 
     Args:
         terms: (T,) the objective's terms, in their order.

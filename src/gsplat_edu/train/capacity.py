@@ -1,4 +1,4 @@
-"""What a planned number of Gaussians can show: the size of photos beyond which more pixels only cost time."""
+"""The size of photos that the planned Gaussians can resolve. Larger photos only cost time."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ of the views, but only with the cube root of the pixels, since small photos are 
 PLANNED_PIXELS, PLANNED_VIEWS = 734_580, 85
 
 PIXELS_PER_GAUSSIAN = 16.0
-"""Pixels of a photo for each planned Gaussian up to which photos are worth their size: a Gaussian for 4 x 4 px. At its
-full size, `snowmiku97` has 7.3."""
+"""Largest useful number of pixels of a photo per planned Gaussian: one Gaussian for 4 x 4 px. At its full size,
+`snowmiku97` has 7.3."""
 
 WORTHWHILE = 1.5
-"""Photos are reduced only by at least this factor of their sides; less saves too little."""
+"""Reduce photos only if their sides shrink by at least this factor; less saves too little time."""
 
 LEAST_PLANNED = 1_000
 """fast: smallest planned number of Gaussians, for thumbnails."""

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-MOST = 0.4
-"""Largest share of all Gaussians to which splits may raise those of the shell. Without it, adc splits the sky of
-`benchmarks/sky.py` into 62 % of them."""
+MOST_IN_SHELL = 0.4
+"""Splits may raise the shell's Gaussians to at most this fraction of all. Without the limit, 62 % of the Gaussians of
+`benchmarks/sky.py` become sky with adc."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Shell:
             means: (N, 3) world units.
         """
         far = self.holds(means)
-        room = max(int(MOST * len(means)) - int(far.sum()), 0)
+        room = max(int(MOST_IN_SHELL * len(means)) - int(far.sum()), 0)
         candidates = torch.nonzero(selected & far)[:, 0]
         if len(candidates) <= room:
             return selected

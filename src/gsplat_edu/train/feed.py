@@ -60,7 +60,7 @@ class Target:
         mask: (H, W) true for pixels that count; None if all do.
         opaque: (H, W) `Photo.opaque`; None if the photo has no alpha.
         outside: (H, W) `Photo.excluded` of the capture's own mask, without a margin of a pixel, because the edges of
-            masks are not exact; None if the photo has no mask, or nobody asked.
+            masks are not exact; None if the photo has no mask, or the feed was made without `outside`.
     """
 
     image: UInt8[Tensor, "H W 3"] | Float32[Tensor, "H W 3"]
@@ -89,7 +89,7 @@ class ViewFeed:
         background: Colour behind photos that are not opaque; None for a random colour per draw.
         device: Device of the Gaussians.
         room: Bytes of targets to cache on a GPU; `DEVICE_SHARE` of the free memory if None.
-        outside: Whether targets tell what the capture's masks exclude.
+        outside: Whether targets contain the pixels that the capture's masks exclude.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class ViewFeed:
         """Draw a view, and start reading the photo of a later one. If reading fails, the view remains due.
 
         Args:
-            later: How many draws later the view is whose photo is read, if it is known already.
+            later: Number of draws to look ahead: the photo of that draw is read now, if the draw is known.
         """
         index = self._following()
         ahead, self._ahead = self._ahead, None
@@ -145,7 +145,7 @@ class ViewFeed:
         photo = opaque = None
         if view not in self._kept:
             photo, opaque = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
-        self.skip()  # only now, so that a view whose photo could not be read remains due
+        self.skip()  # after reading, so that a view whose photo cannot be read is drawn again
         if later <= len(self._queue):
             following = self._queue[later - 1]
             after = self.views[following]

@@ -191,7 +191,7 @@ def make_view_model(
 
 
 def make_transients(config: TrainConfig, views: Sequence[View], render: FeatureRenderer) -> Transients | None:
-    """Make what finds things that move in the training views; None if the configuration asks for none.
+    """Make the object that masks moving things in the training views; None if the configuration does not ask for it.
 
     Raises:
         ArgumentError: there are too few views.

@@ -25,9 +25,9 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.feed import Draw, Target
 
-LEAST_SHARE = 0.25
-"""A view that shows less than this share of the Gaussians weighs the opacity of those only. Views of one subject show
-a third and more of the start's Gaussians, those of an aerial capture of a city a tenth
+FEW_VISIBLE = 0.25
+"""Regularise only the visible Gaussians if they are fewer than this fraction of all. Views of one subject show at least
+a third of the start's Gaussians, views of an aerial capture of a city a tenth
 (benchmarks/archive/RESULTS-2026-11.md)."""
 
 OUTSIDE_WEIGHT = 0.3
@@ -126,9 +126,9 @@ def make_objective(
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
     if nothing is outside of masks + weight_e sum_outside(alpha) / (H W)
 
-    For fast, the mean is that of the Gaussians that the view shows if they are few. Adam moves a parameter by its full
-    rate if all its gradients agree, however small they are: where a view shows a twentieth of the scene, the others
-    would fade before a photo needs them. In smaller scenes it is as well that what few photos show fades.
+    For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
+    rate if all its gradients agree, however small they are. If each view shows a twentieth of the scene, invisible
+    Gaussians would fade before a photo needs them. In smaller scenes, Gaussians that few photos show are meant to fade.
 
     Args:
         config: The configuration.
@@ -142,7 +142,7 @@ def make_objective(
         terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
         terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
-        terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, LEAST_SHARE)
+        terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, FEW_VISIBLE)
     if config.outside_masks == "empty":
         terms["outside"] = EmptyOutside(OUTSIDE_WEIGHT)
     return Objective(terms)
@@ -173,7 +173,7 @@ class MeanOpacity:
     Args:
         weight: lambda_o.
         until: The term is 0 from this iteration on; None for the whole run.
-        least_share: If the view shows a smaller share of the Gaussians than this, the mean is that of those it shows.
+        least_share: Average over the visible Gaussians only if they are a smaller fraction than this.
     """
 
     weight: float

@@ -72,7 +72,7 @@ class Adam:
     Attributes:
         groups: The groups by name.
         learning_rates: Rate of the next step by group; `schedule` sets them.
-        steps: Views of all steps taken; B = 1 makes it the number of steps.
+        steps: Number of views in all steps taken; with B = 1, the number of steps.
         first: First moments by group.
         second: Second moments by group.
 

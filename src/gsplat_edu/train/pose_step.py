@@ -10,9 +10,9 @@ and change the render I by -∇I·δp. The step is the Gauss-Newton step of
 
 for the photo P. A photo may be brighter than the scene, so the render first gets the median gain of each channel; what
 is left of it, g, is solved for too and dropped. σ is the spread of
-the residuals, ω gives less weight to large ones. What the scene does not show correctly yet is wrong over whole
-regions, so K pixels count as one observation. d is how far the camera is from its given pose already, and s how far off
-given poses are: where photos say little, the given pose holds.
+the residuals, ω gives less weight to large ones. An unfinished scene is wrong over whole regions, so K pixels count as
+one observation. d is the camera's present deviation from its given pose, and s the standard deviation of given poses,
+which keeps the given pose if the photo determines little.
 
 Unlike Adam, whose steps are as large as its rate even where the pose is right, this step is as large as the error.
 """
@@ -31,19 +31,19 @@ from gsplat_edu.base.validation import check_shape
 from gsplat_edu.scene.camera import Camera
 
 SAMPLES = 1 << 12
-"""Pixels on a grid that a step is measured at."""
+"""Approximate number of grid pixels at which a step is measured."""
 
 FEWEST = 64
-"""Fewer pixels than this say nothing: the pose stays."""
+"""Keep the pose if fewer pixels count."""
 
-TOGETHER = 1000.0
+PIXELS_PER_OBSERVATION = 1000.0
 """K. With 50 the poses of a clean capture drift by 0.3 instead of 0.1 degrees (docs/RECIPE.md)."""
 
-FLOOR = 1e-3
-"""Smallest spread of the residuals, a quarter of a byte's step."""
+LEAST_SIGMA = 1e-3
+"""Lower bound of sigma: a quarter of an 8-bit level."""
 
-FREE = 1e-6
-"""Weight that holds a gain at 0, so that black photos have a solution."""
+GAIN_PRIOR = 1e-6
+"""Weight of the prior that pulls g to 0, so that black photos have a solution."""
 
 
 @torch.no_grad()
@@ -82,11 +82,13 @@ def pose_step(
         if found is None:
             return torch.zeros(6, dtype=torch.float64)
         pixels, z, light, slopes, residual = found
-        sigma = 1.4826 * residual.abs().flatten().median() + FLOOR
-        weights = 1.0 / (1.0 + (residual / (2.0 * sigma)).square()) / (TOGETHER * sigma.square())
+        sigma = 1.4826 * residual.abs().flatten().median() + LEAST_SIGMA
+        weights = (
+            1.0 / (1.0 + (residual / (2.0 * sigma)).square()) / (PIXELS_PER_OBSERVATION * sigma.square())
+        )
         flow = -(_flow(camera, pixels, z) * spread)
         normal, slope = _normal_equations(flow, slopes, light, residual, weights)
-        normal += torch.diag(torch.tensor([1.0] * 6 + [FREE] * 3, dtype=torch.float64))
+        normal += torch.diag(torch.tensor([1.0] * 6 + [GAIN_PRIOR] * 3, dtype=torch.float64))
         slope[:6] += moved / spread
         step: Float64[Tensor, "6"] = -torch.linalg.solve(normal, slope)[:6] * spread
         return step
@@ -121,7 +123,7 @@ def _normal_equations(
 def _samples(
     image: Tensor, depth: Tensor, photo: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None:
-    """Return what counts of a grid of pixels, float64 on the CPU; None if that is too little.
+    """Return the pixels of a grid that count, float64 on the CPU; None if they are fewer than `FEWEST`.
 
     Returns:
         (n, 2) columns and rows, (n,) depths, (n, 3) colours of the render + 0.055 at the exposure of the photo,
@@ -160,7 +162,7 @@ def _samples(
 def _flow(
     camera: Camera, pixels: Float64[Tensor, "n 2"], z: Float64[Tensor, " n"]
 ) -> Float64[Tensor, "n 2 6"]:
-    """Return how many pixels each number of a twist moves what pixels show, to the right and down."""
+    """Return the motion of the image per unit of each component of a twist, px to the right and down."""
     middle = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
     focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
     x, y = ((pixels - middle) / focal).unbind(dim=1)

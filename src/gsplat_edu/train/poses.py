@@ -2,10 +2,10 @@
 
 R_i' = exp([w_i]x) R_i,  eye_i' = eye_i + extent t_i,  with (w, t) = D - Q Qᵀ D
 
-A common move of all cameras and of the scene changes no image, so nothing in the photos holds it. The columns of Q span
-these moves to first order: three shifts, three turns about the cameras' centre, and a change of scale. Subtracting what
-D has of them fixes the gauge: the cameras can move relative to one another, but not all together, and the scene stays
-in the frame of the capture.
+Moving all cameras and the scene together changes no image, so the photos do not determine such moves. The columns of Q
+span them to first order: three shifts, three turns about the cameras' centre, and a change of scale. Subtracting the
+projection of D onto these columns fixes the gauge: the cameras can move relative to one another, but not all together,
+and the scene stays in the frame of the capture.
 
 The poses are measured, not learned by gradient descent: whenever a view is drawn, D moves by the step that its render
 and its photo ask for (`gsplat_edu.train.pose_step`), and the next render of the view uses it.
@@ -38,10 +38,10 @@ TWISTS, LENSES = "twists", "lenses"
 """Names of the parameters."""
 
 WARM_UP = 0.05
-"""Share of the run before the first step of a pose: the scene has to show something."""
+"""Fraction of the run before poses are first moved, because the scene has to take shape first."""
 
 FINAL = 0.01
-"""The rate falls log-linearly to this share, over as many iterations as that of the means; then it is constant."""
+"""Final learning rate as a fraction of the initial one. The rate falls log-linearly until the means' rate is final."""
 
 
 class Refinement(Identity):
@@ -77,7 +77,7 @@ class Refinement(Identity):
         return wanted[self._learns]
 
     def parameters(self) -> Mapping[str, Tensor]:
-        """Return D, (views, 6), and the lenses, (lenses, 4), as far as they are learned."""
+        """Return those of D, (views, 6), and of the lenses, (lenses, 4), that are learned."""
         tensors = {TWISTS: self._twists, LENSES: self._lenses}
         return {name: tensors[name] for name in self._names()}
 
@@ -92,7 +92,7 @@ class Refinement(Identity):
             given = given.moved(self._moved(index))
         if LENSES in self._names():
             given = given.with_intrinsics(refined_intrinsics(given, self._lenses[self._lens_of[index]]))
-        # a camera of numbers spares the kernels its gradient
+        # without tensors, the kernels compute no gradient of the camera
         return given if any(tensor.requires_grad for tensor in given.tensors()) else given.value()
 
     def measure(self, index: int, render: ViewRender, target: Target, iteration: int) -> Rows:

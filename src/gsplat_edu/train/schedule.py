@@ -46,7 +46,7 @@ def means_rate(config: TrainConfig, extent: float, iteration: int) -> float:
 
 
 def decayed_rate(config: TrainConfig, rate: float, iteration: int) -> float:
-    """Return a rate of the fast recipe: constant, then log-linear down to `decay` of it where the means' is final.
+    """Return a learning rate of the fast recipe: constant, then log-linear to `decay` times itself.
 
     Args:
         config: The run.
@@ -91,7 +91,7 @@ def photo_factor(config: TrainConfig, iteration: int) -> float:
 def planned_counts(
     config: TrainConfig, start: int, cap: int, iterations: Int64[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " n"]:
-    """Return the fast recipe's planned numbers of Gaussians: linear from the start's at `densify_start` to the cap.
+    """Return the fast recipe's planned numbers of Gaussians: linear from `start` at `densify_start` to `cap`.
 
     Args:
         config: The run; the cap is reached at `fast.stop`.

@@ -183,12 +183,12 @@ class Stepper(Protocol):
         ...
 
     def take_over(self, loaded: Loaded) -> None:
-        """Go on from a state that `loaded` returned."""
+        """Continue from a state that `loaded` returned."""
         ...
 
 
 class TensorStepper:
-    """Steps on torch's tensors: the backend renders and differentiates, and Adam moves what collects gradients.
+    """Steps on torch's tensors: the backend renders and differentiates, and Adam moves all tensors with gradients.
 
     Args:
         gaussians: The start Gaussians; not changed.
@@ -237,10 +237,10 @@ class TensorStepper:
     def fuses(self) -> bool:
         """Whether the Gaussians may be moved in the backward pass of a single view, with the same bits.
 
-        Not if something needs their gradients: another `reduce` or `adam`, a subclass of `Objective` (it may pass
+        False if something needs their gradients: another `reduce` or `adam`, a subclass of `Objective` (it may pass
         backward more than once), or a density strategy without a true attribute `observes_renders_only`. A render
-        without `RenderOutput.defer` stores its gradients in any case, and so does a batch: its views are rendered
-        from the same Gaussians.
+        without `RenderOutput.defer` stores its gradients in any case, and so does a batch: its views are rendered from
+        the same Gaussians.
         """
         parts = self.parts
         plain = parts.reduce is mean_over_views and parts.adam is None and type(self.objective) is Objective
@@ -291,7 +291,7 @@ class TensorStepper:
     def gradients(self, views: Sequence[StepView], iteration: int) -> Terms:
         """Add the gradients of the objective for these views to the parameters' `grad`.
 
-        Those of several views are summed in the tree of `gsplat_edu.train.batches`.
+        Gradients of several views are summed in the tree of `gsplat_edu.train.batches`.
 
         Args:
             views: Views from the feed; density control observes each of them.
@@ -315,7 +315,7 @@ class TensorStepper:
     def _differentiated(
         self, views: Iterable[StepView], places: range, count: int, iteration: int
     ) -> tuple[Batch, list[str]]:
-        """Render and differentiate views of a batch of `count`; return what they leave, and the terms' names."""
+        """Render and differentiate views of a batch of `count`; return their results, and the terms' names."""
         learned = {name: tensor for name, tensor in self.parameters().items() if name in self._groups}
         batch, names = Batch(count, learned), list[str]()
         alone, listens = len(places) == count, self._density and not getattr(self._density, "is_over", False)
@@ -329,7 +329,7 @@ class TensorStepper:
         return batch, names
 
     def _shared_step(self, views: Iterable[StepView], iteration: int) -> Terms:
-        """Take a step together with other processes, of whose views density control learns from their messages."""
+        """Take a step together with other processes. Density control observes their views through messages."""
         count, team, optimizer = self._batch, self.parts.team, self.optimizer
         assert isinstance(optimizer, SharedAdam)
         batch, names = self._differentiated(views, self.places, count, iteration)

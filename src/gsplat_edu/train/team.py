@@ -22,7 +22,8 @@ from gsplat_edu.train.batches import Batch, Gradients, PartialSums, ViewResult
 from gsplat_edu.train.optimizer import MOMENTS, Adam, ParameterGroup
 
 PAGE = 256
-"""Ranges of Gaussians are multiples of this, so that the kernels' vectors are cut where they are for one process."""
+"""Processes move multiples of this many Gaussians, so that the kernels group them into the same vectors as in one
+process."""
 
 
 @runtime_checkable
@@ -41,10 +42,10 @@ class Team(Protocol):
         """Send a list of tensors to every process, and receive one from each.
 
         Args:
-            outgoing: For each process what it gets; what this process sends itself is passed on as it is.
+            outgoing: A list of tensors for each process; the list for this process is returned unchanged.
 
         Returns:
-            For each process what it sent, with the same bits, dtypes and shapes.
+            The list that each process sent, with the same bits, dtypes and shapes.
         """
         ...
 
@@ -155,7 +156,7 @@ class SharedAdam(Adam):
 
         Args:
             names: Names of the parameters, in the order of the messages.
-            incoming: What each process made by `outgoing` for this one.
+            incoming: The messages to this process that the others made by `outgoing`.
             batch: Number of views of the batch.
         """
         sums = PartialSums(batch)
@@ -168,7 +169,7 @@ class SharedAdam(Adam):
     @torch.no_grad()
     @one_thread()
     def spread(self, parameters: Mapping[str, Tensor]) -> None:
-        """Send the rows that this process has moved to all, and take over theirs, in place."""
+        """Send the rows that this process moved to all others, and copy theirs in place."""
         names = [name for name in parameters if name in self._shared]
         own = self.own(parameters)
         incoming = self._team.exchange([[own[name] for name in names]] * self._team.size)
@@ -212,7 +213,7 @@ class SharedAdam(Adam):
     def load_state(
         self, moments: Mapping[str, Mapping[str, Tensor]], steps: int, parameters: Mapping[str, Tensor]
     ) -> None:
-        """Restore what `state` returned: all Gaussians' moments, of which this process keeps its own."""
+        """Restore what `state` returned: the moments of all Gaussians. This process keeps only its own rows."""
         super().load_state(moments, steps, parameters)
         self._note(parameters)
         for part in MOMENTS:
@@ -224,7 +225,7 @@ class SharedAdam(Adam):
 
 @one_thread()
 def share_results(team: Team, batch: Batch, sums: Sequence[Sequence[Tensor]]) -> list[list[Tensor]]:
-    """Tell all processes what the views of this one left, together with their rows of the partial sums.
+    """Exchange per-view results, together with each process's rows of the partial sums.
 
     Args:
         team: The processes.

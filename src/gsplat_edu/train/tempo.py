@@ -1,8 +1,8 @@
 """The tempo of a training: which iteration of the recipe each iteration of the run stands for.
 
-A recipe is written for a number of iterations. A run with a time limit learns while it trains how many fit, and
-stretches or shrinks what is left of its schedule. Every such decision is kept, so that a repeated or resumed run takes
-the same steps.
+A recipe is written for a number of iterations. A run with a time limit measures during training how many fit, and
+stretches or shrinks the rest of its schedule. Every such change is stored, so that a repeated or resumed run takes the
+same steps.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from gsplat_edu.base.errors import ArgumentError
 
 MOST_CHANGES = 1_000
-"""Most changes of a tempo; more in a file are refused."""
+"""Largest number of changes of a tempo; a file with more is refused."""
 
 
 @dataclass(frozen=True)

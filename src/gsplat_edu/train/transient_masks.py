@@ -4,9 +4,9 @@ e_v(p): norm of the smoothed difference of photo v and its render, at pixel p
 r_s:    for splat s, a quantile over the views of its mean residual  (sum of w e_v) / (sum of w)
 E_v(p): mean r_s of the splats that pixel p shows, weighted by w
 
-E is what the other views let us expect. It is large where the scene is unfinished, shiny, or has detail that it cannot
-show: there it is wrong in many views. A pixel is masked where e exceeds several times E: something that was there in a
-few photos is wrong in these few, and nowhere else.
+E is the error expected from the other views. It is large where the scene is unfinished, shiny or too detailed, because
+many views are wrong there. A pixel is masked where e exceeds several times E: an object that was present in a few
+photos causes errors in these photos only.
 
 Sums are those of NumPy, SciPy and the renderer, so the masks have the same bits for any number of threads.
 """
@@ -37,13 +37,13 @@ SMOOTH = 0.008
 """Sigma of the smoothing, as a fraction of the photo's diagonal."""
 
 RULES = ((0.9, 3.0, 0.1), (0.5, 4.0, 0.2))
-"""Quantile over the views, factor and floor: a pixel stands out if e > factor E + floor by one of the rules. Colours
-range from 0 to 1. The first rule finds faint things in places that fewer than a tenth of the views show otherwise; the
-median alone would also mask highlights, which neighbouring views share. The second finds what differs more than
-highlights do, where things were in front of a place in up to half of the views."""
+"""Each rule: quantile over the views, factor, floor. A pixel stands out if e > factor E + floor for one of the rules;
+colours range from 0 to 1. The first rule finds faint objects that hide a place in fewer than a tenth of the views; with
+the median it would also mask highlights, which neighbouring views share. The second finds differences larger than those
+of highlights, even if objects hide a place in up to half of the views."""
 
 GROW = 0.7
-"""A mask grows from pixels that stand out to connected ones above this share of the limit."""
+"""A mask grows from pixels that stand out to connected pixels whose error exceeds this fraction of the limit."""
 
 SMALLEST = 0.0015
 """Spots smaller than this share of a photo are not masked."""
@@ -52,7 +52,7 @@ MARGIN = 0.008
 """Masks are widened by this, as a fraction of the photo's diagonal."""
 
 LARGEST_SHARE = 0.4
-"""A photo of which more would be masked is left alone: something else is wrong with it, its pose for example."""
+"""Do not mask a photo if more than this fraction would be masked: something else is wrong, for example its pose."""
 
 FEWEST_OTHERS = 3
 """A splat has a base if it shows in at least this many other views."""
@@ -67,7 +67,7 @@ BINS = 40
 """Residuals are counted in this many bins."""
 
 AT_ONCE = 1 << 16
-"""Splats whose quantiles are computed at a time."""
+"""Number of splats whose quantiles are computed at once."""
 
 _EDGES = np.geomspace(0.004, 0.6, BINS - 1).astype(np.float32)
 _VALUES = np.concatenate([_EDGES[:1], np.sqrt(_EDGES[1:] * _EDGES[:-1]), _EDGES[-1:]])
@@ -247,7 +247,7 @@ def _expected(
 ) -> tuple[Float32[np.ndarray, "N rules"], Float32[np.ndarray, " N"]]:
     """Return r of every splat for each of `RULES`, and 1 for splats with a base, else 0.
 
-    The rank of a quantile is rounded down, so that of few views the worst one never counts.
+    The rank of a quantile is rounded down, so that with few views it is never the rank of the worst one.
     """
     usual: Float32[np.ndarray, "N rules"] = np.empty((len(counts), len(RULES)), dtype=np.float32)
     base: Float32[np.ndarray, " N"] = np.empty(len(counts), dtype=np.float32)

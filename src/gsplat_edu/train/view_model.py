@@ -23,7 +23,7 @@ class ViewRender(NamedTuple):
     """The render of a view, as a view model gets it.
 
     Args:
-        image: (H, W, 3) the render, or what models before have made of it.
+        image: (H, W, 3) the render, as corrected by earlier models of a chain.
         transmittance: (H, W) fraction of light that passes all Gaussians.
         background: Colour behind the Gaussians.
         camera: The camera that the render shows; None if no model asks for it.
@@ -91,7 +91,7 @@ class ViewModel(Protocol):
             index: Index into the trainer's views.
             render: The render.
             target: The photo that it is compared with.
-            rows: What `measure` returned for this render; it counts instead of the view's rows in the state.
+            rows: What `measure` returned for this render, to use instead of the view's stored rows.
         """
         ...
 
@@ -126,7 +126,7 @@ class Identity:
 
 
 class Chain:
-    """A chain of view models, each of which corrects what those before it made of a view.
+    """A chain of view models; each corrects the output of the one before it.
 
     Args:
         models: The models; the names of their parameters differ.
@@ -137,7 +137,7 @@ class Chain:
 
     @property
     def needs_depth(self) -> bool:
-        """Return whether a model does."""
+        """Return whether any model needs the depth."""
         return any(model.needs_depth for model in self.models)
 
     def parameters(self) -> Mapping[str, Tensor]:

@@ -1,4 +1,4 @@
-"""What a page gets from edits: the editor's data, or the views of an edited scene."""
+"""The parts of a page that depend on edits: the editor's data, or the views of an edited scene."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def tour_of(source: Source, views: Views, move: Similarity, path: KeyframePath |
     """Return the tour of the page of an edited scene.
 
     Args:
-        source: What is left of the scene, moved.
+        source: The edited scene, after its move.
         views: Start view and named views of the edits.
-        move: What moved the scene since it was opened.
+        move: The transform that the edits applied to the scene.
         path: The camera path, moved already.
     """
     W, H = (source.cameras[0][1].W, source.cameras[0][1].H) if source.cameras else (SIDE, SIDE)

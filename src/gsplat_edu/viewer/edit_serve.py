@@ -1,7 +1,7 @@
 """Serve a page with the editor, and write the edits file that it sends.
 
-`gsplat_edu.viewer.guard` checks every request. A write also has to come from a page that has the newest version of the
-file: another tab or program may have written it in between.
+`gsplat_edu.viewer.guard` checks every request. A write is refused unless the page has the newest version of the file,
+because another tab or program may have written it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class EditServer(PageServer):
         return f"{super().url}?token={self.guard.token}"
 
     def prepare(self, scene: Identity) -> None:
-        """Say which scene is edited, and check the file if it exists.
+        """Set the scene that is edited, and check the file if it exists.
 
         Raises:
             ArgumentError: the file is damaged, or was made for another scene.
@@ -78,7 +78,7 @@ class EditServer(PageServer):
             edits.check_scene(self.scene, self.file.name)
 
     def store(self, data: bytes, expected: str) -> str | None:
-        """Write the file if its version is the expected one, and return the new version; None if it is another.
+        """Write the file and return its new version; return None if its version is not the expected one.
 
         Raises:
             ArgumentError: the data is no valid edits file of this scene.

@@ -1,11 +1,11 @@
-"""Access control for servers that can do something: only their own page, with its token, under this computer's name.
+"""Access control for servers that change things: only their own page, with its token, may send requests.
 
 Browsers let any page send requests to any address. So each request must pass three checks:
 
 - Host names this computer (`gsplat_edu.viewer.serve.names_this_computer`); this prevents DNS rebinding.
-- Origin, required unless the method only reads, has the same host and port: the page was served here. Where the browser
-  says so (Sec-Fetch-Site), a request that reads comes from the own page, too; only the page itself may be opened from
-  elsewhere, with the token.
+- Origin, required unless the method only reads, has the same host and port: the page was served here. A request that
+  only reads must come from the server's own page too, if the browser sends Sec-Fetch-Site. Only the page itself may be
+  opened from elsewhere, with the token.
 - The token, random for each server, is in the URL or in the cookie set when the page was opened with it. The cookie is
   HttpOnly and SameSite=Strict.
 
@@ -46,11 +46,11 @@ class Guard:
 
     @property
     def cookie(self) -> str:
-        """The value of Set-Cookie for whoever opens the page with the token."""
+        """The value of Set-Cookie in the answer to a request for the page with the token."""
         return f"{self._name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
     def fault(self, method: str, target: str, headers: Callable[[str], Sequence[str]]) -> str | None:
-        """Return why a request is refused, in one line for the user; None if it is let in.
+        """Return why a request is refused, in one line for the user; None if it is accepted.
 
         Args:
             method: GET, POST or another.
@@ -79,7 +79,7 @@ class Guard:
         return None
 
     def _given(self, target: str, cookies: Sequence[str]) -> list[str]:
-        """Return the tokens of a request, from its URL and its cookies."""
+        """Return the tokens in a request's URL and cookies."""
         query = urllib.parse.urlsplit(target).query
         return [*urllib.parse.parse_qs(query).get("token", []), *cookie_values(cookies, self._name)]
 

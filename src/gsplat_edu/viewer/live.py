@@ -1,15 +1,15 @@
 """Watch a training in the browser while it runs: our page, from a server on this computer.
 
-The server's threads only record what the page asks for. The training thread packs snapshots and renders pictures
-between two iterations; see `gsplat_edu.viewer.snapshots`. `gsplat_edu.viewer.guard` checks every request.
+The server's threads only record requests. The training thread packs snapshots and renders pictures between two
+iterations; see `gsplat_edu.viewer.snapshots`. `gsplat_edu.viewer.guard` checks every request.
 
     GET  /                   the page; needs the token in the URL or the cookie
     GET  /state?after=V      the state as JSON (`gsplat_edu.viewer.snapshots.state_of`, and `version`) as soon as its
                              version is not V; 204 after `WAIT` seconds without one
     GET  /scene?after=I      the Gaussians (`gsplat_edu.viewer.live_folder`: scene.bin) as soon as their iteration is
-                             not I; 204 after `WAIT` seconds. Nothing is packed unless somebody asks here
+                             not I; 204 after `WAIT` seconds. The training packs Gaussians only after such a request
     POST /control            {"do": "pause" | "resume" | "step"}; 204
-    POST /picture            a camera as in the page's facts; a JPEG of what it sees, for browsers that cannot draw
+    POST /picture a camera as in the page's facts; a JPEG from this camera, for browsers without WebGL2
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class LiveView:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected, or disconnected so recently that it may return."""
+        """Whether a browser is connected, or was within the last `GRACE` seconds."""
         return time.perf_counter() - self._seen_at <= GRACE
 
     def watches(self) -> bool:
@@ -126,7 +126,7 @@ class LiveView:
         return self._shown if waiting else None
 
     def holds(self, iteration: int) -> bool:
-        """Return whether the training has to wait; never if nobody is left to resume it."""
+        """Return whether the training has to wait; false if no browser is connected that could resume it."""
         if self._hold_from != math.inf and not self.watched:
             self._hold_from = math.inf
         return iteration >= self._hold_from
@@ -168,7 +168,7 @@ class LiveView:
     def newer_scene(self, iteration: int) -> bytes | None:
         """Wait for a snapshot of another iteration; None if there is none within `WAIT` seconds.
 
-        A page that has none (-1) gets the last one at once, and asks for a newer one then.
+        A page without a snapshot (-1) gets the last one at once and then asks for a newer one.
         """
         with self._news:
             is_newest = self._shown == self._trainer.iteration
@@ -192,7 +192,7 @@ class LiveView:
         return True
 
     def picture(self, camera: Camera) -> bytes | str:
-        """Return a JPEG from a camera, or why there is none. One page waits at a time."""
+        """Return a JPEG from a camera, or the reason why there is none. Only one request waits at a time."""
         with self._one_picture, self._news:
             self._wanted, self._picture = camera, ""
             self._news.wait_for(lambda: self._picture != "", PICTURE_WAIT)
@@ -266,7 +266,7 @@ class _LiveHandler(PageHandler):
         return fault is None
 
     def _offer(self, body: bytes | None, kind: str) -> None:
-        """Send what there is; without a body, say that there is none."""
+        """Send the body with status 200, or status 204 without one."""
         if body is None:
             self._reply(http.HTTPStatus.NO_CONTENT, b"", "text/plain")
         else:
@@ -302,7 +302,7 @@ class _LiveServer(PageServer):
 
 
 def picture_camera(value: object) -> Camera:
-    """Make a camera of what a browser sent.
+    """Make a camera from a browser's JSON.
 
     Args:
         value: An object with R, eye, fx, fy, cx, cy, W and H, as in the page's facts.

@@ -41,7 +41,7 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import open_file, parse_json, read_text
 
 FRESH = 5.0
-"""Seconds after which a touch of `wanted` no longer counts."""
+"""Seconds for which a touch of `wanted` counts."""
 
 WAIT = 2.0
 """Seconds that a page's request for a state or a scene waits for something new."""
@@ -78,7 +78,7 @@ class LiveFolder:
 
     @property
     def pause(self) -> Path:
-        """Present while the training shall wait."""
+        """Present while the training should wait."""
         return self.path / "pause"
 
     @property
@@ -111,11 +111,11 @@ class LiveFolder:
         self.wanted.touch()
 
     def is_wanted(self) -> bool:
-        """Return whether a watcher asked for the files a short time ago."""
+        """Return whether a watcher asked for the files within the last `FRESH` seconds."""
         return _age(self.wanted) < FRESH
 
     def is_paused(self) -> bool:
-        """Return whether the training shall wait."""
+        """Return whether the training should wait."""
         return self.pause.exists()
 
     def set_paused(self, paused: bool) -> None:

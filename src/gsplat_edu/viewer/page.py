@@ -1,4 +1,4 @@
-"""Export a scene as one HTML file that renders it in any browser with WebGL2, offline.
+"""Export a scene as one HTML file that any browser with WebGL2 renders offline.
 
 The file contains, in this order: our style, shaders and scripts (`viewer/web`), metadata of the scene as JSON, and the
 splats (`viewer/page_data.py`), compressed with gzip, encoded in base64, and split into elements that a browser can
@@ -128,7 +128,7 @@ def html(
         held_out: As for `write`.
         tour: As for `write`.
         editing: Makes it a page with the editor.
-        pictures: Where its server renders for browsers without WebGL2, relative to the page; empty for nowhere.
+        pictures: Relative URL at which its server renders for browsers without WebGL2; empty if it does not.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
@@ -166,7 +166,7 @@ def live_facts(
 
 
 def live_html(facts: dict[str, Any], step: bool = True) -> bytes:
-    """Return a page that shows a training: without splats, which it asks its server for.
+    """Return a page that shows a training. It contains no splats and asks its server for them.
 
     Args:
         facts: From `live_facts`.
@@ -299,7 +299,7 @@ def _facts(
 def _add_subjects(
     facts: dict[str, Any], cameras: Sequence[Camera], first: Camera, points: Float[np.ndarray, "N 3"]
 ) -> None:
-    """Tell the page where the subject is in the images of the capture and of the start."""
+    """Add the position of the subject in the images of the capture and of the start view."""
     *others, start = subjects_of(cameras, [*cameras, first], points)
     facts["start"]["camera"]["subject"] = start
     for entry, subject in zip(facts["cameras"], others, strict=True):

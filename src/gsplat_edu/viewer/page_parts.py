@@ -51,13 +51,13 @@ FINITE = 3e38
 
 @dataclass(frozen=True)
 class Kind:
-    """What a page has beyond the scene.
+    """The extra parts of one kind of page.
 
     Args:
         fact: Entry of the page's facts that only this kind has; empty for the plain page.
         scripts: Its scripts, loaded before `LAST_SCRIPT`.
         styles: Its style sheets, after the common one.
-        workers: Its workers, beside the one that sorts.
+        workers: Its workers, in addition to the one that sorts.
         own_server: Whether it may load from its own server, and save there.
         define: Macro that its shaders are compiled with; empty for none.
     """

@@ -25,28 +25,28 @@ CENTRAL_PART = 0.5
 
 
 MIDDLE_OF = 5
-"""The smallest number of cameras that has a middle."""
+"""Only captures with at least this many cameras have a middle."""
 
 FAR_FROM_MIDDLE = 1.25
-"""A camera is at the edge if its distance from the middle is more than this many times the median distance. In a closed
+"""A camera is at the edge if its distance from the middle exceeds this multiple of the median distance. In a closed
 ring, all distances are about equal."""
 
 
 SUBJECT_PART = 0.9
-"""Central fraction of an image, along each side, that has to hold a point of the subject."""
+"""A camera sees a point if it projects into this central fraction of the image, along each side."""
 
 SEEN_BY = 0.7
-"""Fraction of the cameras that have to see a point of the subject, of what sees the best one; the best one is seen by
-this fraction at least, or there is no subject."""
+"""A point belongs to the subject if it is seen by at least this fraction of the number of cameras that see the best
+point. There is no subject unless at least this fraction of all cameras sees the best point."""
 
 OUTERMOST = 3.0
-"""Percentage of the subject's points on each side of an image that do not count."""
+"""Ignore this percentage of the subject's points at each side of an image."""
 
 LEAST_PART, LEAST_POINTS = 0.1, 16
-"""Smallest side of the subject in an image, as a fraction of the image's, and fewest points of it."""
+"""A subject is at least this fraction of the image wide and high, and has at least this number of points."""
 
 MOST_POINTS, MOST_CAMERAS = 4000, 40
-"""At most this many points and cameras are examined, evenly spaced."""
+"""Examine at most this number of points and of cameras, evenly spaced."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +67,11 @@ class Start:
 
 
 def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
-    """Choose the camera that a page starts at: the first one, unless it stands at the edge of what was photographed.
+    """Choose the camera that a page starts at: the first one, unless it is at the edge of the photographed area.
 
-    Beyond the edge of a flight over fields, or of an arc around something, there is nothing that a photo saw; a window
-    wider than the photo shows it at once, and a drag soon does. A camera at such an edge, as the first one often is,
-    gives way to the one nearest to the middle. A walk through rooms starts where it started.
+    No photo shows the area beyond the edge of a flight over fields or of an arc around an object. A window wider than
+    the photo shows it at once, and a drag soon does. If the first camera is at such an edge, as it often is, the page
+    starts at the camera nearest to the middle. A walk through rooms starts at its first camera.
 
     Args:
         cameras: Those of the capture, at least one.
@@ -94,7 +94,7 @@ def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
 def subjects_of(
     cameras: Sequence[Camera], shown: Sequence[Camera], points: Float[np.ndarray, "N 3"]
 ) -> list[list[float] | None]:
-    """Find the subject in images: what most cameras of a capture see. A narrow window shows at least that.
+    """Find the subject, the part that most cameras see, in images. A narrow window shows at least the subject.
 
     Args:
         cameras: Those of the capture; without any, every point belongs to the subject.

@@ -1,4 +1,4 @@
-"""Serve one page from memory to browsers on this computer, and files that were listed before; no others."""
+"""Serve one page from memory, and a fixed list of files, to browsers on this computer."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ PATIENCE = 30.0
 """Seconds allowed for each chunk of the page."""
 
 REQUEST_SECONDS = 10.0
-"""Seconds within which a whole request must arrive, however slowly it trickles in."""
+"""Time limit for a whole request, s, even if bytes keep trickling in."""
 
 REQUEST_BYTES = 64 << 10
 """Longest request. Browsers send one or two KB; bodies are never read."""
 
 MOST_CONNECTIONS = 128
-"""Connections, with a thread each, that are served at once. Further ones are closed without an answer."""
+"""Largest number of open connections, each with a thread. Further ones are closed without an answer."""
 
 PRIVATE_SUFFIXES = (".local", ".localdomain", ".lan", ".home", ".home.arpa", ".internal")
 """Suffixes of names that only a local network can assign; no external page can have such a name."""
@@ -294,7 +294,7 @@ def free_port(host: str, port: int, names: tuple[str, str]) -> int:
     """
     family, address = checked_address(host, port, names)
     with socket.socket(family, socket.SOCK_STREAM) as probe:
-        if os.name == "posix":  # as servers do: a port whose last connections are closing counts as free
+        if os.name == "posix":  # like a server: a port whose last connections are closing counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(address)
@@ -345,7 +345,7 @@ def exposure(host: str, what: str, token: bool = False) -> str | None:
 
     Args:
         host: Address that the server listens on.
-        what: What others can do with it, as a verb phrase.
+        what: What other computers can do with the server, as a verb phrase.
         token: Whether the server requires the token in its URL.
     """
     if is_loopback(host):

@@ -1,9 +1,8 @@
-"""Shows a training to those who watch it, between two iterations and for a small part of the time.
+"""Shows a training to its watchers between two iterations, within a small fraction of the time.
 
 A `Watcher` is a page on this program's own server (`gsplat_edu.viewer.live`), or another process that reads files
-(`FolderWatcher`, see `gsplat_edu.viewer.live_folder`). The training thread asks it after every iteration whether it
-wants anything. Packing the Gaussians and measuring changes nothing, so a watched training gives the same bits as an
-unwatched one.
+(`FolderWatcher`, see `gsplat_edu.viewer.live_folder`). The training thread asks it after every iteration what it needs.
+Packing the Gaussians and measuring changes nothing, so a watched training gives the same bits as an unwatched one.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ from gsplat_edu.viewer.live_folder import LiveFolder, framed
 from gsplat_edu.viewer.page import live_facts, live_html
 
 SHARE = 0.02
-"""Largest fraction of the training's time spent on snapshots and figures. The page spends some of the same processor on
-drawing them, and asks accordingly seldom."""
+"""Largest fraction of the training's time spent on snapshots and figures. The page draws them on the same processor and
+adapts the rate of its requests."""
 
 PICTURE_SHARE = 0.2
-"""Largest fraction of the training's time spent on pictures for browsers that cannot draw."""
+"""Largest fraction of the training's time spent on pictures for browsers without WebGL2."""
 
 STATE_EVERY = 0.5
 """Seconds between two states."""
@@ -50,14 +49,14 @@ MOST_POINTS = 240
 
 @runtime_checkable
 class Watcher(Protocol):
-    """Somebody who watches a training. Its methods are called in the training thread, after every iteration."""
+    """A watcher of a training. Its methods are called in the training thread, after every iteration."""
 
     def watches(self) -> bool:
         """Return whether it wants to know the state now."""
         ...
 
     def shown(self) -> int | None:
-        """Return the iteration of the scene that it has, -1 for none; None if it wants no other now."""
+        """Return the iteration of the scene that it has, -1 for none; None if it needs no newer scene now."""
         ...
 
     def holds(self, iteration: int) -> bool:
@@ -73,7 +72,7 @@ class Watcher(Protocol):
         ...
 
     def camera(self) -> Camera | None:
-        """Return the camera of a picture that it waits for; None if it waits for none."""
+        """Return the camera of the picture that it waits for, or None."""
         ...
 
     def take_picture(self, output: RenderOutput | str) -> None:
@@ -84,7 +83,7 @@ class Watcher(Protocol):
 class FolderWatcher:
     """Another process that watches by the files of `gsplat_edu.viewer.live_folder`.
 
-    An error while writing ends the watching and is said once; the training continues.
+    If a file cannot be written, it reports this once and stops writing; the training continues.
 
     Args:
         run: The run's folder.
@@ -99,7 +98,7 @@ class FolderWatcher:
         self._looked_at, self._wanted, self._paused = -math.inf, False, False
         self._has_page = self._failed = False
         self._shown, self._version = -1, 0
-        self._try(self._folder.clear)  # what a killed training left
+        self._try(self._folder.clear)  # files of a killed training
 
     def watches(self) -> bool:
         """Return whether the files were asked for a short time ago."""
@@ -136,7 +135,7 @@ class FolderWatcher:
         self._shown = iteration
 
     def camera(self) -> Camera | None:
-        """Return None: who reads files draws by itself."""
+        """Return None, because readers of the files draw by themselves."""
         return None
 
     def take_picture(self, output: RenderOutput | str) -> None:
@@ -166,12 +165,12 @@ class FolderWatcher:
 
 
 class Broadcast:
-    """Tells the watchers of a training what they want to know, and lets them pause it.
+    """Serves the watchers of a training, and lets them pause it.
 
     Args:
         capture: The run.
         stop: Returns whether the program should end; ends a pause.
-        watchers: Those who may watch.
+        watchers: The watchers.
     """
 
     def __init__(self, capture: CaptureRun, stop: Callable[[], bool], watchers: Sequence[Watcher]) -> None:
@@ -204,15 +203,15 @@ class Broadcast:
         """Serve the watchers if their next turn has come.
 
         Args:
-            state: What the program does now, for the watchers.
+            state: What the program is doing, as for `state_of`.
         """
         self._serve(state, waiting=False)
 
     def stay(self, watched: Callable[[], bool]) -> None:
-        """Show the finished scene until nobody watches or the program should end.
+        """Show the finished scene until `watched` is false or the program should end.
 
         Args:
-            watched: Returns whether somebody watches.
+            watched: Returns whether a watcher is connected.
         """
         while watched() and not self._stop():
             self._serve("finished", waiting=True)
@@ -276,7 +275,7 @@ class Broadcast:
 
 
 class Figures:
-    """The figures of a training over time, and how fast it is.
+    """The loss, PSNR, number of Gaussians and speed of a training over time.
 
     Args:
         trainer: The trainer.
@@ -291,7 +290,7 @@ class Figures:
         self.photo_factor = 1.0
         self.speed: float | None = None  # images per second
         self.points: list[tuple[int, float | None, float | None, int]] = []
-        self._apart, self._step = 1, 0  # every so many measurements become a point
+        self._apart, self._step = 1, 0  # number of measurements per point of the curves
         self._event: StepEvent | None = None
         self._since: tuple[float, int] | None = (time.perf_counter(), trainer.iteration)
 
@@ -326,7 +325,7 @@ class Figures:
 def state_of(
     trainer: Trainer, figures: Figures, state: str, seconds: float, failure: str = ""
 ) -> dict[str, Any]:
-    """Describe a training for those who watch it.
+    """Describe a training for its watchers.
 
         state         "training", "paused", "evaluating" or "finished"
         iteration     images trained on, of `iterations`

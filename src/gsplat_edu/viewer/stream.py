@@ -17,7 +17,7 @@ def folder_page(path: Path, title: str, budget: int | None = None) -> tuple[byte
     Args:
         path: The lod-meta.json.
         title: Heading of the page.
-        budget: Most splats that the page draws at once; None lets it decide by the machine that it runs on.
+        budget: Largest number of splats that the page draws at once; None lets it choose for its machine.
 
     Returns:
         The page, and the files to serve with it, by their address on the server.
@@ -34,7 +34,7 @@ def folder_page(path: Path, title: str, budget: int | None = None) -> tuple[byte
 
 
 def described(path: Path, index: LodMeta, budget: int | None) -> dict[str, Any]:
-    """Return what the page needs to know of the regions.
+    """Return the description of the regions for the page.
 
     Args:
         path: The lod-meta.json.

@@ -1,4 +1,4 @@
-"""PlayCanvas' streamed SOG: a scene at several levels of detail, in files that a viewer loads as it needs them.
+"""PlayCanvas' streamed SOG: a scene at several levels of detail, in files that a viewer loads on demand.
 
     FOLDER/lod-meta.json     the tree of regions, and where the splats of each region and level are
     FOLDER/0_0/meta.json ... an unzipped SOG: level 0, the finest, file 0
@@ -6,11 +6,11 @@
 A file has splats of one level, and those of a leaf of the tree are consecutive, in Morton order. The name lod-meta.json
 is fixed; other names come from the list in it. `gsplat_edu.io.lod.levels` makes the levels and their errors.
 
-Boxes enclose the ellipsoids of one standard deviation of all levels, as those of PlayCanvas' own converter do. Axes and
-values are those of SOG. A scene read back is its finest level, with the environment (splats that are always drawn) of
-files of other programs.
+Boxes enclose the ellipsoids of one standard deviation of all levels, as PlayCanvas' converter does. Axes and values are
+those of SOG. A scene read back is its finest level, with the environment (splats that are always drawn) of files of
+other programs.
 
-Source: PlayCanvas' specification of streamed SOG, version 1; its splat-transform, for what a box encloses.
+Source: PlayCanvas' specification of streamed SOG, version 1; its splat-transform, for the boxes.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The tree halves the Gaussians by the median along the axis in which most of them
 `leaf` of them; such a region is a leaf. Levels are made leaf by leaf, so a pair never crosses the border of a leaf, and
 all levels of a leaf cover the same region. A leaf of n Gaussians has ceil(n / 2^k) at level k. Level 0 is the scene.
 
-The error of a level in a leaf is a length: how far its Gaussians moved from the finest ones that they stand for,
+The error of a level in a leaf is a length: the distance between its Gaussians and the finest ones that they replace,
 
     e_k = sqrt(sum_i m_i |mu_i - mu_owner(i)|^2 / sum_i m_i),   m_i: the weights of `gsplat_edu.io.lod.merge`
 
@@ -32,13 +32,14 @@ LEAF = 32 * 1024
 """Most splats of the finest level in a leaf."""
 
 SMALLEST = 1_000_000
-"""The coarsest level has at most this many splats: what a phone draws."""
+"""The coarsest level has at most this number of splats, which a phone can draw."""
 
 MOST_LEVELS = 32
-"""Levels are halved at most this many times."""
+"""Largest number of halvings."""
 
 INNER = (0.05, 0.95)
-"""Quantiles of the coordinates between which the spread of a region is measured: strays do not choose the axis."""
+"""Quantiles of the coordinates between which the spread of a region is measured, so that stray Gaussians do not
+decide."""
 
 CELLS = np.iinfo(np.uint16).max
 """Cells of a leaf's Morton curve along each axis, less one."""

@@ -38,10 +38,10 @@ NEIGHBOURS = 8
 """Neighbours of a Gaussian that may become its partner."""
 
 PASSES = 3
-"""Passes over the pairs of a round; more need fewer rounds, but leave less choice."""
+"""Passes over the pairs of a round. More passes need fewer rounds, but choose worse partners."""
 
 COLOR_WEIGHT = 16.0
-"""Price of a squared difference of colours (0 to 1 a channel) relative to the shape term."""
+"""Weight of the squared difference of colours (0 to 1 per channel) relative to the shape term."""
 
 LARGEST_LOG = 60.0
 """Logarithms of scales are clamped to +- this, so that products of four scales stay inside float64."""
@@ -94,7 +94,7 @@ def areas(covariances: Float64[np.ndarray, "N 3 3"]) -> Float64[np.ndarray, " N"
         covariances: N covariances, world units squared.
 
     Returns:
-        What each covers, world units squared.
+        Area of each Gaussian, world units squared.
     """
     a, b, c = (covariances[:, i, i] for i in range(3))
     d, e, f = covariances[:, 0, 1], covariances[:, 0, 2], covariances[:, 1, 2]
@@ -184,8 +184,8 @@ def halved(gaussians: Gaussians) -> tuple[Gaussians, Int64[np.ndarray, " N"]]:
         gaussians: N finite Gaussians.
 
     Returns:
-        The merged ones, float32; those without a partner keep their bits. And for each of the N the index of the one
-        that it became part of.
+        The merged Gaussians, float32; Gaussians without a partner keep their bits. And for each of the N, the index of
+        the result that contains it.
     """
     count = len(gaussians)
     owners = np.arange(count)
@@ -228,7 +228,7 @@ def _contracted(
 def _partners(blobs: Blobs) -> tuple[Int64[np.ndarray, " P"], Int64[np.ndarray, " P"]]:
     """Return disjoint pairs, at least one, cheapest first: each is the cheapest partner of the other.
 
-    Those that are left without one look again among themselves, `PASSES` times in all. The cheapest pair always
+    Gaussians without a partner are matched again among themselves, in `PASSES` passes in all. The cheapest pair always
     qualifies, so there is progress in every round.
     """
     count = len(blobs.means)
@@ -236,7 +236,7 @@ def _partners(blobs: Blobs) -> tuple[Int64[np.ndarray, " P"], Int64[np.ndarray, 
     _, found = cKDTree(blobs.means).query(blobs.means, k=near)
     rows = np.repeat(np.arange(count), near)
     ends = np.sort(np.stack([rows, found.reshape(-1)], axis=1), axis=1)
-    ends = ends[ends[:, 0] != ends[:, 1]]  # itself; of many equal points it need not be the first
+    ends = ends[ends[:, 0] != ends[:, 1]]  # skip the point itself, which need not be first among equal points
     codes = np.sort(ends[:, 0].astype(np.int64) * count + ends[:, 1])
     codes = codes[np.diff(codes, prepend=-1) > 0]
     i, j = codes // count, codes % count
@@ -261,7 +261,7 @@ def _partners(blobs: Blobs) -> tuple[Int64[np.ndarray, " P"], Int64[np.ndarray, 
 def _prices(
     blobs: Blobs, i: Int64[np.ndarray, " E"], j: Int64[np.ndarray, " E"]
 ) -> Float64[np.ndarray, " E"]:
-    """Return what each merge of rows i and j costs."""
+    """Return the price of each merge of rows i and j."""
     covered, weights = blobs.areas, blobs.weights
     colors = C0 * blobs.sh[:, :3]
     total = weights[i] + weights[j]

@@ -9,15 +9,15 @@ root whose coarsest level has more have no content.
 
     geometric error = 16 max e      over the leaves below, e: error of the level shown
 
-Cesium refines a tile whose geometric error exceeds 16 pixels, so by default it shows levels whose splats have moved by
-about a pixel. Nodes without content have the diagonal of their box, so that they are always refined.
+By default, Cesium refines tiles whose geometric error exceeds 16 pixels, and thus shows levels whose splats have moved
+by about a pixel. Nodes without content have the diagonal of their box, so that they are always refined.
 
 The tileset requires 3DTILES_content_gltf, and of glTF both KHR_gaussian_splatting and its compression_spz_2, which is
 how Cesium knows splats. Accessors describe the unpacked values and have no buffer views.
 
 Axes: SPZ and glTF right, up, back; tiles right, forward, up, because glTF's y becomes 3D Tiles' z. CesiumJS takes the
 coordinates of the SPZ as they are, and so do we. The draft of the extension would turn them by half a turn about y on
-unpacking; a program that does shows the scene turned about the vertical. The root's transform turns the scene's up
+unpacking; a program that does so shows the scene turned about the vertical. The root's transform turns the scene's up
 direction to +z. It does not place the scene on the globe: no capture here stores where on Earth it is.
 
 Source: OGC, "3D Tiles 1.1"; Khronos, KHR_gaussian_splatting_compression_spz_2 (draft); CesiumJS' loader, for the axes

@@ -23,7 +23,7 @@ from .lenses import Kin, refined, simplified
 from .mappers import Options, Tell, all_at_once, incremental, repaired, without_doubtful
 
 BLOCK = 64
-"""Pairs matched between two writes to the database: the most that is lost if the program is interrupted."""
+"""Number of pairs matched between two writes to the database: an interruption loses at most these."""
 
 FOCAL = 0.85
 """Initial focal length if EXIF gives none, as a fraction of the longer side. The main cameras of phones have 0.69 to
@@ -34,8 +34,8 @@ FIRST_LENS = "SIMPLE_RADIAL"
 """Lens model for mapping if the user gives none; see `lenses`."""
 
 FREE_LENS = "OPENCV"
-"""Lens model for mapping if `FIRST_LENS` places too few photos, as it does for strong wide angles. Its result is
-then dropped, and held-out photos decide how much of the lens is refined, as in the other attempts."""
+"""Lens model for mapping if `FIRST_LENS` places too few photos, as it does for strong wide angles. The lens that it
+finds is then dropped, and held-out photos decide how much of the lens is refined, as in the other attempts."""
 
 
 def features(
@@ -197,7 +197,7 @@ def _judged(
     attempt: dict[str, Any],
     options: Options,
 ) -> dict[str, Any] | None:
-    """Keep the photos of a mapper's model whose pose counts, refine it, and write it; None if nothing remains."""
+    """Remove photos whose pose does not count from a mapper's model, refine and write it; None if nothing remains."""
     auto, per_photo = attempt["model"] == "auto", attempt["per_photo"]
     placed, kin, unclear = _names(mapped_model), dict[int, Kin](), list[str]()
     model = repaired(mapped_model, database, photos, folder, options)
@@ -230,7 +230,8 @@ def _written(
         model: The model.
         database: Database with the matches.
         folder: Its folder.
-        known: The photos that the mapper placed, those of ambiguous focal length, and the lens of each camera.
+        known: The photos that the mapper placed, the photos with an ambiguous focal length, and the lens of each
+            camera.
     """
     placed, unclear, lenses = known
     model.write_binary(folder)

@@ -1,4 +1,4 @@
-"""Decide which poses count: those that enough points determine and the photos' matches do not contradict."""
+"""Decide which poses count: enough points must determine a pose, and the photo's matches must not contradict it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ SUPPORT = 30
 """Smallest number of points that determine a pose: COLMAP's own bound for registering a photo."""
 
 STEADY = 15
-"""Of these, smallest number that are also seen by two photos whose pose counts. A point seen by only one other
-photo does not determine the distance between the two photos; half the support may be of this kind."""
+"""Smallest number of the supporting points that two other photos with a counting pose see. A point seen by only one
+other photo does not determine the distance between the two photos; up to half of the points may be of this kind."""
 
 LEAST_POINT_SPREAD = 0.02
 """Smallest standard deviation of the supporting points in the photo, along any direction, as a fraction of the longer
@@ -24,7 +24,8 @@ REPROJECTED = 4.0
 """Largest reprojection error of a point that supports a pose, px: COLMAP's own bound when it filters points."""
 
 AGREED = 4.0
-"""Largest distance of a match from the epipolar line at which it agrees with two poses, px, as in its verification."""
+"""A match agrees with two poses if its distance from the epipolar line is at most this, px, as in COLMAP's
+verification."""
 
 CONTRADICTED = 0.3
 """Smallest fraction of a photo's matches that have to agree with its pose."""
@@ -39,7 +40,7 @@ A zoom lens lies in between."""
 
 
 class Agreement(NamedTuple):
-    """Number of verified matches, and of those that agree with the poses, by photo."""
+    """Number of verified matches, and number of matches that agree with the poses, by photo."""
 
     agree: dict[int, int]
     total: dict[int, int]
@@ -80,7 +81,7 @@ def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
         model: The model.
 
     Returns:
-        For each of these photos, by number, how many points it shares with photos whose poses count.
+        By number of each such photo, the number of points that it shares with photos whose poses count.
     """
     photos = frames(model)
     seen = {frame: _together(model, images) for frame, images in photos.items()}
@@ -155,7 +156,7 @@ def _observations(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarr
 
 
 def _together(model: pycolmap.Reconstruction, images: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same for a frame, each point once; the photos of a frame lie side by side, in px."""
+    """Return the observations of a frame, each point once; the photos of a frame lie side by side, in px."""
     found = [_observations(model, image) for image in images]
     if len(found) == 1:
         return found[0]
@@ -231,7 +232,7 @@ def _sampson(relative: pycolmap.Rigid3d, a: np.ndarray, b: np.ndarray) -> np.nda
 
 
 def take_out(model: pycolmap.Reconstruction, images: set[int]) -> None:
-    """Remove photos from a model, with the others of their frames, and the points that are no longer supported.
+    """Remove photos, the other photos of their frames, and points without support from a model.
 
     Args:
         model: The model; changed in place.

@@ -1,9 +1,9 @@
 """Photos of other sizes: scaled or cropped photos of the main camera, or photos of another lens.
 
-Photos of one size share a camera. A few photos of another size determine a focal length poorly: with a wrong one, the
-mapper places them nearer or farther, and every point they see still fits. They are therefore registered again, against
-the photos of the main camera only, with each focal length that scaling or cropping would give them, and with the one
-that fits them best.
+Photos of one size share a camera. A few photos of another size determine their focal length poorly: the mapper
+compensates a wrong one by placing them nearer or farther, and every point still fits. They are therefore registered
+again, against the photos of the main camera only, with each focal length that scaling or cropping would give them, and
+with the one that fits them best.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from .lenses import Kin, adjust
 from .mappers import Options
 
 OWN = 10
-"""Number of photos from which a camera's own focal length is trusted."""
+"""Trust a camera's own focal length if it has at least this number of photos."""
 
 LEAST = 5
-"""Smallest number of photos with trusted cameras that the others are compared with."""
+"""Compare the other photos with trusted cameras only if these have at least this number of photos."""
 
 PLACED = 15
 """Smallest number of points that register a photo here; `judge` decides later whether its pose counts."""
@@ -34,13 +34,13 @@ INLIER = 4.0
 """Largest reprojection error of a point, px, as in `judge.REPROJECTED`."""
 
 AS_GOOD = 0.95
-"""Another focal length explains the photos equally well from this fraction of the best one's score."""
+"""Another focal length explains the photos equally well if its score is at least this fraction of the best score."""
 
 NEARLY_AS_GOOD = 0.9
-"""The same for focal lengths fitted to the photos themselves, which always explain them slightly better."""
+"""The fraction if the best focal length was fitted to the photos themselves, which always scores slightly higher."""
 
 APART = 1.1
-"""Smallest ratio at which two focal lengths count as different."""
+"""Two focal lengths are different if their ratio is at least this."""
 
 ROUNDS = 3
 """Rounds of registration: photos that overlap only with other photos of this kind follow in a later round."""

@@ -18,10 +18,10 @@ import pycolmap
 from .judge import residuals, take_out
 
 WITNESSES = 20
-"""Smallest number of photos of a camera for which freer lens models are considered: ten in each half."""
+"""Consider freer lens models for a camera with at least this number of photos: ten in each half."""
 
 HALF = 30
-"""Largest number of photos in a half: more take time without changing the result."""
+"""Largest number of photos in a half; more cost time and do not change the result."""
 
 SEEN = 30
 """Smallest median number of points seen by a half's photos for the comparison to be meaningful."""
@@ -36,11 +36,11 @@ REFINEMENTS = 30
 """Iterations of the adjustments for cross-validation, which start from the solution of a simpler lens."""
 
 FOLLOWED = 2
-"""Rounds of adjustment in which cameras that follow another one copy its lens."""
+"""Number of rounds in which cameras copy the lens of the camera that they follow and all others are adjusted."""
 
 
 class Rung(NamedTuple):
-    """The parameters of a camera that are refined."""
+    """A step of the ladder: which of a camera's parameters are refined."""
 
     model: str
     centre: bool
@@ -131,7 +131,7 @@ def simplified(model: pycolmap.Reconstruction, name: str, threads: int) -> None:
 
 
 def _follow(model: pycolmap.Reconstruction, kin: dict[int, Kin]) -> None:
-    """Copy to cameras the lens of the one they follow, at their scale; the principal point's offset scales too."""
+    """Copy each camera's lens from the camera that it follows, scaled to its size with the principal point."""
     for number, one in kin.items():
         camera, main = model.camera(number), model.camera(one.main)
         params = np.array(main.params)

@@ -44,7 +44,7 @@ def incremental(
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = common.threads, common.seed
-    options.min_model_size = 3  # photos may be few, and the best model is used anyway
+    options.min_model_size = 3  # accept small models, because the caller uses the best one
     options.multiple_models = not begin
     if common.known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
@@ -110,7 +110,7 @@ def repaired(
         options: Thresholds, threads and seed.
 
     Returns:
-        A model in which all poses are reliable: the given one or its successor.
+        A model in which all poses are reliable: the given one or a new one.
     """
     if not without_doubtful(model, database) or model.num_reg_images() < 2:
         return model

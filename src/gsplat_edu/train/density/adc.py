@@ -64,7 +64,7 @@ class AdaptiveDensityControl:
         """Add this view's gradient norms to the sums of the Gaussians it shows."""
         if self.is_over:
             return
-        # Each index occurs once. To read, add and write back would take four times as long as these passes.
+        # Each index occurs once. `sums[visible] += norms` would take four times as long.
         visible, norms = output.visible, output.means2d_grad_norms()
         self.norm_sums.index_add_(0, visible, norms)
         self.times_visible.index_add_(0, visible, norms.new_ones(1).expand(len(visible)))
@@ -123,7 +123,7 @@ class AdaptiveDensityControl:
     def _within_cap(
         self, mean_norms: Tensor, selected: Bool[Tensor, " N"], num_kept: int
     ) -> Bool[Tensor, " N"]:
-        """Keep as many as the cap allows, those with the largest gradients; a clone or a split adds one Gaussian."""
+        """Select as many Gaussians as the cap allows, largest gradients first: a clone or a split adds one."""
         room = (
             len(mean_norms)
             if self.config.max_gaussians is None

@@ -22,10 +22,10 @@ class DensityStrategy(Protocol):
     The trainer calls `observe` and `update` with torch on one thread, so that their results do not depend on the
     number of threads.
 
-    A strategy whose `observe` reads nothing but its `output` says so by a true attribute `observes_renders_only`. The
-    Gaussians may then move in the backward pass (`TensorStepper.fuses`): before `observe`, and without `grad`.
-    Processes that share a step tell one another what such a strategy observes, unless its attribute `is_over` is true:
-    then it ignores renders from now on.
+    Set `observes_renders_only` to true if `observe` reads only its `output`. The Gaussians may then move in the
+    backward pass (`TensorStepper.fuses`), before `observe` and without `grad`. Processes that share a step exchange
+    what such a strategy observes until its attribute `is_over` is true, which means that it ignores all further
+    renders.
     """
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
