@@ -194,7 +194,7 @@ def test_a_network_without_tls_gets_a_warning():
     for safe in ("tcp://127.0.0.1:8786", "localhost:8786", "tls://10.0.0.5:8786"):
         assert exposed(safe) is None
     for open_to_others in ("tcp://10.0.0.5:8786", "host:8786"):
-        assert "whoever reaches it can run programs" in exposed(open_to_others)
+        assert "anyone who can connect can run programs" in exposed(open_to_others)
 
 
 def test_main_without_a_scheduler_is_one_line(city, split, tmp_path, capsys):

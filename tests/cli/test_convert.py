@@ -167,7 +167,7 @@ def sorted_by_angle(named):
         (["IN", "out.glb", "--verify", "--backend", "abacus"], "abacus"),
         (
             ["IN", "out.ply", "--path", "IN"],
-            "--path: only a page can play a camera path; out.ply is none, use .html",
+            "--path: only a page can play a camera path; out.ply is not a page, use .html",
         ),
         (["IN", "out.html", "--path", "IN"], "in.ply: is not JSON"),
         (["IN", "out.html", "--path", "gone.json"], "gone.json"),

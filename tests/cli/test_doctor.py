@@ -227,7 +227,8 @@ def test_a_run_is_examined(doctor, run):
     lines = said.splitlines()
     assert code == 0 and len(lines) <= 24 and lines[-4] == "what to do:"
     assert (
-        "30 iterations, 200 splats" in said and "unfinished: the scene is that of iteration 30 of 70" in said
+        "30 iterations, 200 splats" in said
+        and "unfinished: the scene was saved at iteration 30 of 70" in said
     )
     assert "4 views, PSNR" in said and "20 views, PSNR" in said
 

@@ -72,7 +72,9 @@ def test_poses_of_upright_pixels_turn_the_photo(tmp_path, orientation):
     for image in found.values():
         np.testing.assert_array_equal(image, quarters())
     (note,) = [note for note in map(str, load_dataset(folder, EVERYTHING).notes) if "EXIF" in note]
-    assert note.startswith("1 of 2 photos are turned as EXIF says") and note.endswith("first images/a.png")
+    assert note.startswith("1 of 2 photos are turned by their EXIF orientation") and note.endswith(
+        "first images/a.png"
+    )
     assert [shot.size for shot in prepare(CaptureReader(folder)).shots] == [(64, 48), (64, 48)]
     np.testing.assert_array_equal(prepare(CaptureReader(folder)).shots[0].stats.thumbnail, quarters())
 

@@ -187,7 +187,7 @@ def test_a_capture_of_colmaps_panoramas_is_read_as_faces(tmp_path, resolution, s
 
 def test_colmaps_panoramas_of_another_shape_are_refused(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 300 100 300 100\n")
-    with pytest.raises(DatasetError, match="size 300x100 is not that of a panorama"):
+    with pytest.raises(DatasetError, match="size 300x100 is not a panorama's"):
         read_cameras(tmp_path / "cameras.txt")
 
 

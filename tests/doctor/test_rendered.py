@@ -42,10 +42,10 @@ def test_the_background_is_named_and_the_usual_one(tmp_path, cut_out):
         return next(note for note in notes if "alpha channel" in note)
 
     black = said("blender", (0.0, 0.0, 0.0))
-    assert black.startswith("6 of 6 photos have an alpha channel: behind them is black")
+    assert black.startswith("6 of 6 photos have an alpha channel: their background is black")
     assert "on white, as with --white-background" in black
-    assert said("blender", WHITE).endswith("behind them is white")
-    assert said("colmap", (0.0, 0.0, 0.0)).endswith("behind them is black")
+    assert said("blender", WHITE).endswith("their background is white")
+    assert said("colmap", (0.0, 0.0, 0.0)).endswith("their background is black")
     facts = dict.fromkeys(value for _, value in examine(prepare(CaptureReader(tmp_path / "blender"))).facts)
     assert black in facts
 

@@ -202,7 +202,7 @@ def exposed(address: str) -> str | None:
     if parts.scheme == "tls" or (parts.hostname or "") in (LOOPBACK, "localhost", "::1"):
         return None
     return (
-        f"{address}: is not encrypted, and whoever reaches it can run programs on every machine of the cluster; use"
+        f"{address}: is not encrypted, and anyone who can connect can run programs on every machine of the cluster; use"
         " it in a network that you trust, or tls:// (docs/SCALE.md)"
     )
 

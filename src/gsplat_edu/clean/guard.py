@@ -111,7 +111,7 @@ def clean(
     if len(gaussians) and verdict.removed.all():
         raise ArgumentError(
             f"scene: none of its {len(gaussians):,} splats is supported by the photos; check that the capture"
-            " is that of the scene"
+            " belongs to the scene"
         )
     guards = test or train
     score = functools.partial(_score, gaussians, views=guards, settings=settings, backend=backend)

@@ -1,4 +1,4 @@
-"""Command-line parsing; a mistake is reported in one line instead of a page."""
+"""Command-line parsing; errors take one line instead of a page."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ LESS_MEMORY = {
     "train_3d.py": "close other programs, or reduce --size or --cap",
     "demo": "close other programs, or reduce --size or --cap",
 }
-"""Advice for commands that run out of memory; the other commands have no option that needs less."""
+"""Advice for commands that run out of memory; other commands have no option that reduces it."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -84,9 +84,9 @@ class OneLineParser(argparse.ArgumentParser):
         return super().format_help()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
-        """Refuse an unknown option before argparse misses others, and say which one is spelled alike."""
+        """Refuse an unknown option before argparse reports missing ones, and suggest the most similar option."""
         words = sys.argv[1:] if args is None else list(args)
-        if self._subparsers is None:  # else the words belong to a command, whose parser gets them next
+        if self._subparsers is None:  # otherwise the words belong to a command, whose parser reads them next
             for word in itertools.takewhile(lambda word: word != "--", words):
                 flag = word.partition("=")[0]
                 if flag.startswith("--") and flag not in self._option_string_actions:

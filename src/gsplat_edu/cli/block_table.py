@@ -1,4 +1,4 @@
-"""A table of the progress of all blocks, wherever they are trained."""
+"""A table of the progress of all blocks, on this or other computers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.status import BlockStatus, statuses
 
 SHOWN = 40
-"""Most rows of the table; finished blocks are left out first, then those that wait."""
+"""Largest number of rows; finished blocks are left out first, then waiting ones."""
 
 
 class BlockTable:
-    """Shows the state of every block while they train; without a terminal, a line for each that is finished.
+    """Shows the state of every block during training; without a terminal, prints a line for each finished block.
 
     Args:
         console: The terminal.
@@ -41,7 +41,7 @@ class BlockTable:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Take the table away."""
+        """Remove the table."""
         if self._live is not None:
             self._live.stop()
 

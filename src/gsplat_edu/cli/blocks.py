@@ -81,7 +81,7 @@ def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> Bloc
     """Return the plan of a run in blocks; train the coarse model and split the capture if there is none yet.
 
     Raises:
-        CheckpointError: the folder holds another run, or the options are not those of its plan.
+        CheckpointError: the folder holds another run, or the options differ from its plan.
     """
     folder = BlocksFolder(arguments.out)
     of_block, of_coarse = parts_of_blocks(arguments)
@@ -117,7 +117,7 @@ def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> Bloc
 
 
 def _chosen_before(coarse: RunOptions, of_block: argparse.Namespace) -> dict[str, object]:
-    """Return what the coarse run, which was interrupted, chose for the settings that were left open."""
+    """Return the values that an interrupted coarse run chose for open settings."""
     stored = coarse.folder.read_config().get("train", {})
     names = [name for name in OPEN if name != "sky" and getattr(of_block, name) in (None, "auto")]
     return {name: stored[name] for name in names if name in stored}
@@ -152,7 +152,7 @@ def _train_here(folder: BlocksFolder, planned: BlockPlan, table: BlockTable) -> 
 def _train_there(
     folder: BlocksFolder, planned: BlockPlan, cluster: ClusterOptions, table: BlockTable, say: Say
 ) -> None:
-    """Train the blocks that are not finished on a cluster, those with the most views first."""
+    """Train the unfinished blocks on a cluster, blocks with the most views first."""
     digest = planned.digest()
     rest = [n for n in range(len(planned.blocks)) if folder.read_done(n, digest) is None]
     rest.sort(key=lambda number: (-len(planned.blocks[number].train), number))

@@ -1,4 +1,4 @@
-"""`gsplat-edu clean`: remove floaters and what no camera supports."""
+"""`gsplat-edu clean`: remove floaters and splats that no camera supports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsplat_edu.viewer import export
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Judge the scene, report, and write what was asked for."""
+    """Judge the scene, report, and write the requested files."""
     console = Terminal()
     scene = open_source(arguments.source).path
     out = arguments.out or default_target(scene)

@@ -132,13 +132,13 @@ def _measured(measure: Measure, scale: float, unit: str | None) -> str:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Check OUT and the options that do not suit every OUT."""
+    """Check OUT, and the options that need certain formats of OUT."""
     export.check_target("OUT", arguments.out)
     if len(arguments.sources) > 1 and not arguments.merge:
         raise ArgumentError("IN: several scenes given; add --merge to join them, or convert one at a time")
     if arguments.path is not None and arguments.out.suffix.lower() != export.PAGE:
         raise ArgumentError(
-            f"--path: only a page can play a camera path; {arguments.out} is none, use {export.PAGE}"
+            f"--path: only a page can play a camera path; {arguments.out} is not a page, use {export.PAGE}"
         )
     _check_refining(arguments)
 
@@ -161,7 +161,7 @@ def _levels(arguments: argparse.Namespace) -> LodOptions:
 
 
 def _check_refining(arguments: argparse.Namespace) -> None:
-    """Reject --lod-refine for what has no levels or no longer matches its photos."""
+    """Reject --lod-refine for formats without levels and for scenes that no longer match their photos."""
     if arguments.lod_refine is None:
         return
     if arguments.lod_refine < 1:

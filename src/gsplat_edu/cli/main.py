@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: Words after the program's name; those of the process where None.
+        arguments: Words after the program's name; None takes the words of this process.
 
     Returns:
         Exit code: 0; 2 for bad input; 130 when interrupted.
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if num_processes() > 1 and parsed.command != "train":
             parser.error(f"{parsed.command}: runs in one process; torchrun is for train")
         return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
-    except KeyboardInterrupt:  # while the options were still being imported
+    except KeyboardInterrupt:  # interrupted while the options were imported
         complain("gsplat-edu: interrupted")
         emitter.emit(Interrupted("gsplat-edu: interrupted"))
         return EXIT_INTERRUPTED
@@ -83,7 +83,7 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
 
 def _run(name: str, arguments: argparse.Namespace) -> None:
-    """Check the options, then import the command, which takes seconds where it needs torch, and run it."""
+    """Check the options, import the command, which takes seconds if it needs torch, and run it."""
     if "backend" in arguments:
         check_backend(arguments.backend)
     options = importlib.import_module(f"gsplat_edu.cli.options.{name}")

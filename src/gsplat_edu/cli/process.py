@@ -1,4 +1,4 @@
-"""How long this process has been running: a limit of time counts from the start of the command."""
+"""Age of this process, because a time limit counts from the start of the command."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def process_age() -> float:
-    """Return the seconds since this process began, where the system tells; else since Python's clock did."""
+    """Return the seconds since this process began; if the system cannot tell, since Python's clock began."""
     try:
         fields = Path("/proc/self/stat").read_text("ascii", errors="replace").rpartition(")")[2].split()
         up = float(Path("/proc/uptime").read_text("ascii").split()[0])

@@ -1,4 +1,4 @@
-"""Which of `torchrun`'s processes this one is, and which of them reports a failure. Imports no torch until one does."""
+"""The rank of this process under `torchrun`, and which process reports a failure. Imports torch only for a failure."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import os
 from datetime import timedelta
 
 VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
-"""What torchrun sets for each process."""
+"""Environment variables that torchrun sets for each process."""
 
 PATIENCE = timedelta(seconds=10)
-"""How long to wait for torchrun's table of values."""
+"""Time limit for a connection to torchrun's store."""
 
 
 def num_processes() -> int:
@@ -29,7 +29,7 @@ def restarts_are_allowed() -> bool:
 
 
 def speaks_for_all() -> bool:
-    """Return whether this process reports a failure: the first that asks does, since one failure ends all of them."""
+    """Return whether this process reports a failure: only the first to ask, since one failure ends all."""
     if num_processes() == 1:
         return True
     import torch.distributed as dist

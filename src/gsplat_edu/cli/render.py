@@ -45,7 +45,7 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 
 MOST_FRAMES = 100_000
-"""Most frames of a path unless --frames asks for more: an hour at 28 frames per second."""
+"""Largest number of frames of a path unless --frames gives more: an hour at 28 frames per second."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _save_path(arguments: argparse.Namespace, shot: Shot, orbit: bool) -> str:
 
 
 def _path_of(arguments: argparse.Namespace, origin: Sequence[float], views: Views) -> KeyframePath | None:
-    """Return the path of --path, or that of the edits, in the edited scene; its origin was subtracted."""
+    """Return the path of --path or of the edits, in the coordinates of the edited scene, minus its origin."""
     path = views.path if arguments.path is None else read_path(arguments.path, origin)
     if path is None or views.move is IDENTITY:
         return path
@@ -274,7 +274,7 @@ def _settings(settings: RenderSettings, arguments: argparse.Namespace) -> Render
 
 
 def _depth(gaussians: Gaussians, camera: Camera) -> float:
-    """Return the median depth of the Gaussians in front of a camera, not of a sky: about its subject's distance."""
+    """Return the median depth of the Gaussians in front of a camera, without a sky: about its subject's distance."""
     means = gaussians.means.numpy(force=True)
     depths = camera.world_to_cam(means[~far_shell(means)])[:, 2]
     ahead = depths[depths > 0]

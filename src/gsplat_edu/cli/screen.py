@@ -1,4 +1,4 @@
-"""Whether there is a screen to open a browser on, and how it is opened without showing a token to other users."""
+"""Detect a screen for a browser, and open one without showing a token to other users."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsplat_edu.base.files import described
 from gsplat_edu.cli.printing import complain
 
 REDIRECT_SECONDS = 60.0
-"""Seconds after which the file that leads a browser to its page is removed; a browser that starts takes a few."""
+"""Seconds after which the file that redirects a browser to its page is removed; a browser takes a few to start."""
 
 
 def has_screen() -> bool:
@@ -31,8 +31,8 @@ def has_screen() -> bool:
 def open_in_browser(url: str) -> None:
     """Open a page in the user's browser, in a thread: some browsers have to exit before `webbrowser` returns.
 
-    All users of a computer can read the words with which a program was started. So the browser gets no URL with a
-    token, but a file that only this user can read, which leads to the page. It is removed after
+    All users of a computer can read the command lines of its programs. The browser therefore does not get the URL with
+    its token, but a file that only this user can read and that redirects to the page. It is removed after
     `REDIRECT_SECONDS`, or at the end of this process. Where a browser may not read it, the printed URL remains.
 
     Args:
@@ -43,14 +43,14 @@ def open_in_browser(url: str) -> None:
 
 def _open(url: str) -> None:
     try:
-        webbrowser.open(_way_to(url) if urllib.parse.urlsplit(url).query else url)
+        webbrowser.open(_redirect_file(url) if urllib.parse.urlsplit(url).query else url)
     except OSError as error:
         complain(f"no browser was opened ({described(error)}); open the URL above in one")
 
 
-def _way_to(url: str) -> str:
-    """Return the address of a file that leads to a URL; it is removed later."""
-    folder = Path(tempfile.mkdtemp(prefix="gsplat-edu-"))  # only its owner can look into it
+def _redirect_file(url: str) -> str:
+    """Return the address of a file that redirects to a URL; it is removed later."""
+    folder = Path(tempfile.mkdtemp(prefix="gsplat-edu-"))  # only its owner can read it
 
     def remove() -> None:
         shutil.rmtree(folder, ignore_errors=True)

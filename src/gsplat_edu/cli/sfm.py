@@ -17,7 +17,7 @@ from gsplat_edu.jobs import emitter
 from gsplat_edu.sfm.reconstruct import reconstruct
 
 UNSTEADY = "mapping"
-"""The stage whose speed forecasts nothing: each photo takes longer than the last, and it may start over."""
+"""The stage without a forecast: each photo takes longer than the last, and it may start over."""
 
 
 def run(arguments: argparse.Namespace) -> None:

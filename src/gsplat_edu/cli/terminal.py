@@ -78,7 +78,7 @@ class Bar(Progress):
         return elapsed - self._told.get(task_id, 0.0) >= max(LINE_SECONDS, LINE_SHARE * elapsed)
 
     def times(self, task_id: TaskID) -> str:
-        """Return for how long a task has run, and how long it will.
+        """Return the time that a task has run, and its time left.
 
         The time left is missing if no column of the bars forecasts it, or if the task's field "steady" is false.
         """
@@ -98,7 +98,7 @@ class Bar(Progress):
         if not self.console.is_terminal and task.fields.get("lines", True) and self.due(task_id):
             total = "" if task.total is None else f" of {task.total:,.0f}"
             line = f"{task.description}: {task.completed:,.0f}{total}, {self.times(task_id)}"
-            # not Terminal.print: a job has reported this as progress, and needs no message
+            # not Terminal.print: a job reports this as progress already
             Console.print(self.console, printable(line), markup=False, emoji=False, soft_wrap=True)
 
 
@@ -118,14 +118,14 @@ def clock(seconds: float) -> str:
 
 
 class Field(TextColumn):
-    """A progress bar column whose text may quote names from files. Where the line is too narrow, it is cut first.
+    """A progress bar column whose text may quote names from files. If the line is too long, this column is cut first.
 
     Args:
         text: As for rich's `TextColumn`: "{task.description}", for example.
     """
 
     def __init__(self, text: str) -> None:
-        super().__init__(text, markup=False, table_column=Column())  # rich's own does not give way
+        super().__init__(text, markup=False, table_column=Column())  # rich's own column does not shrink
 
     def render(self, task: Task) -> Text:
         """Return a task's text, escaped."""

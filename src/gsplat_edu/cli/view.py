@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
             "--edit: levels of detail cannot be edited; edit the scene, then convert it again"
         )
     does = "sees the scene and changes its edits" if editing else "sees the scene"
-    # first: report a port in use before loading the scene
+    # before loading the scene, so that a port in use is reported at once
     with _server(arguments, levels) as server:
         (_prepare_levels if levels else _prepare)(server, console, arguments)
         if warning := exposure(arguments.host, does, token=editing):

@@ -28,7 +28,7 @@ def quat_scale_to_covar_preci(
         triu: Whether to return upper triangles, (..., 6), instead of (..., 3, 3).
 
     Returns:
-        Covariances and inverses; None for what was not asked for.
+        Covariances and inverses; None for each that was not requested.
 
     Raises:
         ShapeError: a shape differs.

@@ -146,7 +146,7 @@ class UnevenFocalLengths:
 
 @dataclass(frozen=True)
 class TurnedPhotos:
-    """Photos that are turned by their EXIF orientation, because their poses are those of upright photos.
+    """Photos that are turned by their EXIF orientation, because their poses refer to upright photos.
 
     Args:
         photos: Number of such photos.
@@ -161,8 +161,8 @@ class TurnedPhotos:
     def __str__(self) -> str:
         """Return the sentence."""
         return (
-            f"{self.photos} of {self.total} photos are turned as EXIF says, because their poses are those of upright "
-            f"photos, first {self.first}"
+            f"{self.photos} of {self.total} photos are turned by their EXIF orientation, because their poses refer to "
+            f"upright photos, first {self.first}"
         )
 
 

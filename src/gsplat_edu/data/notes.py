@@ -216,8 +216,8 @@ class Background:
         names = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
         color = self.color or (0.0, 0.0, 0.0)
         spelled = names.get(color, "RGB " + " ".join(f"{value:g}" for value in color))
-        behind = "the background of the training" if self.color is None else spelled
-        said = f"{self.photos} of {self.total} photos have an alpha channel: behind them is {behind}"
+        background = "that of the training" if self.color is None else spelled
+        said = f"{self.photos} of {self.total} photos have an alpha channel: their background is {background}"
         if not self.usually_white or self.color in (None, (1.0, 1.0, 1.0)):
             return said
         return f"{said}; published scores of Blender scenes are on white, as with --white-background"

@@ -1,4 +1,4 @@
-"""Decide which photos of a capture are turned as EXIF says: those whose poses refer to upright pixels."""
+"""Decide which photos of a capture are turned by EXIF: those whose poses refer to upright pixels."""
 
 from __future__ import annotations
 

@@ -67,11 +67,11 @@ class FaceLens(Lens):
         """Return the lens of a face of a panorama.
 
         Raises:
-            DatasetError: the size is not that of a panorama.
+            DatasetError: the size is not a panorama's.
         """
         if not is_panorama_size(W, H):
             raise DatasetError(
-                f"size {W}x{H} is not that of a panorama, 2:1 and narrower than {MAX_REMAPPED} px"
+                f"size {W}x{H} is not a panorama's, which is 2:1 and narrower than {MAX_REMAPPED} px"
             )
         focal = W / (2.0 * math.pi)  # px per radian
         return cls(W, H, focal, focal, (W - 1) / 2, (H - 1) / 2, (), PANORAMIC, number)

@@ -237,7 +237,7 @@ def _mean(views: Sequence[Residual]) -> float:
 
 def _length(run: Trained) -> list[Finding]:
     if run.planned is not None and run.reached < run.planned:
-        what = f"the scene is that of iteration {run.reached:,} of {run.planned:,}"
+        what = f"the scene was saved at iteration {run.reached:,} of {run.planned:,}"
         advice = "finish the training: repeat its command with --resume"
         return [Finding("unfinished", Severity.WARNING, what, advice)]
     if run.reached >= run.usual:

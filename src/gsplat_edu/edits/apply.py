@@ -19,7 +19,7 @@ from gsplat_edu.scene.camera import WORLD_UP
 from gsplat_edu.scene.gaussians import Gaussians
 
 SELECTED, HIDDEN, DELETED = 1, 2, 4
-"""States of a splat; at most one at a time. 0 is a splat that is merely there."""
+"""States of a splat, one at a time; 0 for none of these."""
 
 OPPOSITE = -1.0 + 1e-9
 """Cosine below which the floor is upside down, so that its shortest turn has no definite axis."""
@@ -29,11 +29,11 @@ Flags = UInt8[np.ndarray, " N"]
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The operations that change no splat, as they stand at the end of a file.
+    """The result of the operations that change no splat.
 
     Args:
         move: Turns the floor level and scales the scene.
-        unit: What a unit is then; None if no operation says.
+        unit: The unit after `scale`; None if no operation sets it.
         upright: Whether the floor was levelled.
         start: The view in which a page opens.
         named: The named views, in the order in which they were first named.
@@ -115,7 +115,7 @@ def views_after(operations: Sequence[ops.Operation]) -> Views:
 
 
 def placed(scene: Scene, views: Views) -> Scene:
-    """Return a scene turned and scaled; its up direction and unit are then known as far as the operations say."""
+    """Return a scene turned and scaled; its up direction and unit are set if an operation sets them."""
     if views.move is IDENTITY:
         return scene
     moved = views.move.scene(scene)

@@ -1,4 +1,4 @@
-"""Which scene an edits file was made for."""
+"""The identity of the scene that an edits file was made for."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ FARTHEST_ORIGIN = 1e30
 
 @dataclass(frozen=True)
 class Identity:
-    """What distinguishes a scene.
+    """The facts that identify a scene.
 
     Args:
         count: Number of splats.
-        sha256: Of its parameters; see `identity_of`.
+        sha256: Digest of its parameters; see `identity_of`.
         origin: Subtracted from the coordinates of the scene's file.
     """
 

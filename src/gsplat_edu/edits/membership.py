@@ -1,8 +1,8 @@
-"""Which splats a region holds: exactly the same ones as in the page (`viewer/web/edit_member.js`).
+"""Find the splats in a region: exactly the same ones as in the page (`viewer/web/edit_member.js`).
 
 Both sides compute with the float32 parameters converted to float64, by +, -, *, / and comparisons only, in the order
-written here. IEEE 754 defines the result of each to the bit, so both find the same splats. Nothing may be summed by a
-library (its order is its own) and no product fused with a sum. NaN belongs to no region.
+written here. IEEE 754 defines the result of each to the bit, so both find the same splats. No library may compute a
+sum, because its order is unspecified, and no product may be fused with a sum. NaN belongs to no region.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ class Everything:
 Region: TypeAlias = PictureRectangle | Lasso | Brush | Sphere | Box | Color | Opacity | Size | Everything
 
 BY_VALUE = (Color, Opacity, Size)
-"""Regions that depend on more than where splats are."""
+"""Regions that depend on more than the positions of splats."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""An edits file on a server: how large it may be, and which version of it a page has. Imports nothing slow."""
+"""An edits file on a server: its largest size, and its versions. Imports nothing slow."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ NO_FILE = "none"
 
 
 def version_of(data: bytes | None) -> str:
-    """Return the version of a file's content, which tells two tabs that both write it apart; None: no file."""
+    """Return the version of a file's content, which detects concurrent writes by two tabs; None means no file."""
     return NO_FILE if data is None else hashlib.sha256(data).hexdigest()

@@ -203,7 +203,7 @@ def _collect(calls: Sequence[_Call], means: Tensor, errors: Tensor | None) -> Ca
         if not tables:
             raise ArgumentError("collect: there is nothing yet; call backward on a loss of this image first")
         total = tables[0].index_select(0, calls[0].visible)
-        for table in tables[1:]:  # absgrad adds up; what weights and errors give is the same in every pass
+        for table in tables[1:]:  # absgrad accumulates; weights and errors are the same in every pass
             total[:, :2] += table.index_select(0, calls[0].visible)[:, :2]
         return total
 
@@ -211,7 +211,7 @@ def _collect(calls: Sequence[_Call], means: Tensor, errors: Tensor | None) -> Ca
 
 
 def _collected(call: _Call, means: Tensor) -> Any:  # noqa: ANN401
-    """Return where a backward pass writes the statistics that were asked for; None if none were."""
+    """Return the array for the requested statistics of a backward pass; None without a request."""
     if not call.collecting:
         return None
     call.statistics = reusable_tensor((len(means), len(STATISTICS)), means)

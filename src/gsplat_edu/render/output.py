@@ -26,7 +26,7 @@ COLLECTED = {
     "pixels": ("pixels",),
     "error_sum": ("error_sum",),
 }
-"""What `RenderOutput.collect` collects, by name, and its columns."""
+"""The statistics of `RenderOutput.collect` by name, and their columns."""
 
 
 class Extra(NamedTuple):
@@ -114,8 +114,8 @@ class RenderOutput:
         """Ask the backward pass for statistics of the visible Gaussians. Call it before that pass.
 
         Each statistic is a sum or maximum over the pixels of this image, with w = T alpha. They have the same bits for
-        any number of threads. After several passes they are those of the last one. With more than 32 features,
-        "absgrad" is the sum over groups of 32 of them: at least the sum of the absolute values.
+        any number of threads. After several passes, they describe the last one. With more than 32 features, "absgrad"
+        is the sum over groups of 32 of them: at least the sum of the absolute values.
 
         Args:
             names: "absgrad": (M, 2) sums of |d loss / d mean in the image|, each pixel's by itself (AbsGS); per px.

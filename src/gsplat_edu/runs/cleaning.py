@@ -149,7 +149,7 @@ def report_lines(cleaning: Cleaning) -> list[str]:
     text += [f"  {count:9,}  {reason.sentence}" for reason, count in counts.items()]
     which = "held-out" if cleaning.held_out else "training"
     if not cleaning.held_out:
-        text.append("no view is held out, so the training views guard: a fall of their PSNR says less")
+        text.append("no view is held out, so the training views guard, whose PSNR is weaker evidence")
     if cleaning.before is None or cleaning.after is None:
         text.append("PSNR: no view has a pixel that counts")
         return text

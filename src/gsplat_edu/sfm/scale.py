@@ -31,7 +31,7 @@ LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """East, north and up become +x, +z and -y."""
 
 NEAR = 1.0
-"""Warn if the median distance from the cameras to the points is below this, in units: renderers may clip near
+"""Warn if the median distance of the cameras from their mean is below this, in units: renderers may clip near
 splats."""
 
 
@@ -211,7 +211,7 @@ def _check_near(cameras: Sequence[Camera], s: float, unit: str, say: Callable[[s
     if spread < NEAR and unit != "mm":
         smaller = "cm" if unit == "m" else "mm"
         say(
-            f"the cameras are {spread:.2g} {unit} from their mean, and renderers cut off what is nearer than 0.2 "
+            f"the cameras are {spread:.2g} {unit} from their mean, and renderers clip splats nearer than 0.2 "
             f"units; give the distance in {smaller}, so that a unit is 1 {smaller}"
         )
 

@@ -102,7 +102,7 @@ def _empty_trash(studio: Studio, request: Request, body: Any) -> dict[str, Any]:
 def _photos(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     kind, entry = entry_of(studio, request)
     if kind not in ("photos", "captures"):
-        raise RefusedError(f"{kind}: have no photos of their own; ask for those of a capture")
+        raise RefusedError(f"{kind}: have no photos of their own; request the photos of a capture")
     return {"photos": photo_list(entry)}
 
 

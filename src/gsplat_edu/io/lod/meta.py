@@ -274,4 +274,4 @@ def _check(path: Path, document: dict[str, Any], meta: LodMeta) -> None:
             _refuse(path, f"has {end:,} splats in {name}, but a file has at most {MOST_SPLATS:,}")
     counts = meta.counts()
     if document.get("counts", counts) != counts or document.get("count", sum(counts)) != sum(counts):
-        _refuse(path, "has counts that differ from those of its leaves")
+        _refuse(path, "has counts that differ from the sums over its leaves")
