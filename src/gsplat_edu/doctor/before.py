@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from gsplat_edu.base.text import short_number
-from gsplat_edu.data.notes import Background, MissingPhotos
+from gsplat_edu.data.notes import Background, MissingPhotos, Note
 from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure
 from gsplat_edu.doctor.cameras import (
     check_away,
@@ -75,7 +75,8 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
             fine.append(name)
     if "--resolution" not in options and any(finding.name == "resolution" for finding in findings):
         options = (*options, "--resolution", "auto")
-    return Diagnosis(_facts(survey), tuple(findings), tuple(fine), _otherwise(survey, options))
+    advice = _otherwise(survey, options)
+    return Diagnosis(_facts(survey), tuple(findings), tuple(fine), advice, _notes(survey))
 
 
 def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
@@ -90,10 +91,16 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
         facts.append(("cameras", _arrangement(survey)))
-    if survey.layout == "Blender" and (clear := sum(shot.stats.transparent for shot in survey.shots)):
-        facts.append(("", str(Background(clear, len(survey.shots), TrainConfig.background, True))))
-    # `check_missing` reports the photos that have no file
-    return (*facts, *(("", str(note)) for note in survey.notes if not isinstance(note, MissingPhotos)))
+    return tuple(facts)
+
+
+def _notes(survey: Survey) -> tuple[Note, ...]:
+    """Return the notes to show; `check_missing` reports the photos that have no file."""
+    others = [note for note in survey.notes if not isinstance(note, MissingPhotos)]
+    clear = sum(shot.stats.transparent for shot in survey.shots) if survey.layout == "Blender" else 0
+    if clear:
+        others.insert(0, Background(clear, len(survey.shots), TrainConfig.background, True))
+    return tuple(others)
 
 
 def _arrangement(survey: Survey) -> str:

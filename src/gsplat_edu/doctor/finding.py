@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 
+from gsplat_edu.data.notes import Note
+
 ADVICE = 3
 """Number of pieces of advice at the end of a diagnosis; users do not follow more than three."""
 
@@ -72,16 +74,23 @@ class Diagnosis:
     """The result of all checks.
 
     Args:
-        facts: (name, value) pairs that describe the capture or run.
+        described: (name, value) pairs that describe the capture or run.
         findings: In the order of the checks, most harmful kind first.
         fine: Names of the checks that found nothing.
         otherwise: Advice to add if the warnings give fewer than three pieces; the first is the next step.
+        notes: Notes about the capture.
     """
 
-    facts: tuple[tuple[str, str], ...]
+    described: tuple[tuple[str, str], ...]
     findings: tuple[Finding, ...]
     fine: tuple[str, ...]
     otherwise: tuple[str, ...]
+    notes: tuple[Note, ...] = ()
+
+    @property
+    def facts(self) -> tuple[tuple[str, str], ...]:
+        """The rows to show: `described`, then a sentence for each note, without a name."""
+        return (*self.described, *(("", str(note)) for note in self.notes))
 
     @property
     def hopeless(self) -> bool:
