@@ -222,10 +222,11 @@ def test_a_strangers_library_runs_nothing_until_a_click_that_shows_what(tmp_path
             # the click: exactly the command that was shown runs
             assert server.client.post("/api/jobs/000031/resume").json()["state"] == "queued"
             end = time.monotonic() + 20
-            while not children(server.process.pid):
+            # until it executes its program, a forked child has the server's command line
+            while not (found := children(server.process.pid)) or " studio " in found[0]:
                 assert time.monotonic() < end
                 time.sleep(0.01)
-            (child,) = children(server.process.pid)
+            (child,) = found
             assert child.split(" ", 3)[3] == f"doctor {library}/captures/box --no-forecast "
             server.client.post("/api/jobs/000031/cancel")
         finally:
