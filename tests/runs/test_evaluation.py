@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsplat_edu.data.loading_notes import OnlyOnePhoto
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
@@ -34,7 +35,7 @@ def test_a_run_is_evaluated_and_everything_is_written(capture, folder):
     gaussians = splats_on(points, colors)
     folder.write_metrics({"seconds": 12.5, "num_gaussians": 1, "mine": "kept"})
     progress = []
-    judged = ScoredViews(views[:2], views[2:], notes=["a note"])
+    judged = ScoredViews(views[:2], views[2:], notes=[OnlyOnePhoto()])
     result = evaluate_run(
         folder,
         judged,
@@ -64,7 +65,7 @@ def test_a_run_is_evaluated_and_everything_is_written(capture, folder):
     )
     assert sorted(p.name for p in (folder.renders / "test").iterdir()) == ["view_000.png", "view_001.png"]
     page = folder.report.read_text()
-    assert "view_001.png" in page and "a note" in page
+    assert "view_001.png" in page and "the capture has only one photo" in page
 
 
 def test_a_run_without_test_views_is_evaluated(capture, folder):
