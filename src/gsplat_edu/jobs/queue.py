@@ -278,7 +278,7 @@ class JobQueue:
             ]
             if states == self._settled:
                 return
-            room = self.at_once - len(first)
+            room, started = self.at_once - len(first), False
             for job in sorted(waiting, key=lambda job: self._turns[job.id]):
                 before = [(other.id, collision(job.work, other.work, self._identify)) for other in first]
                 waits_for = tuple((name, place) for name, place in before if place is not None)
@@ -286,9 +286,10 @@ class JobQueue:
                     self._note(replace(job, waits_for=waits_for))
                 if room > 0 and not waits_for:
                     self._start(self._jobs[job.id])
-                    room -= 1
+                    room, started = room - 1, True
                 first.append(job)
-            self._settled = states
+            # A started job may end and be put back with the same turn before the next look.
+            self._settled = None if started else states
 
     def _look(self) -> None:
         """Note which processes have ended, and send the next signal of cancellations."""
