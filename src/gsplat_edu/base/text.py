@@ -159,3 +159,14 @@ def as_file_name(name: str) -> str:
 def install_command(extra: str) -> str:
     """Return the command that adds an extra, in a clone of the repository; there is no published package yet."""
     return f'pip install -c constraints.txt ".[{extra}]"'
+
+
+def easily_read(count: int) -> int:
+    """Round down to two digits, or to three if the first is 1, so that a number is easy to read and type.
+
+    Args:
+        count: The number, at least 0.
+    """
+    digits = 3 if str(count).startswith("1") else 2
+    step = int(10 ** max(len(str(count)) - digits, 0))
+    return count // step * step

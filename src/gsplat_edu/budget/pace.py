@@ -75,9 +75,8 @@ class Pace:
         self._due = [part * deadline.seconds for part in REMEASURE_AT]
         self._next_decision = 0.0
         self._costs = deque[tuple[float, float, float]](maxlen=3)
-        self._marks = deque(
-            [(0.0, 0.0, deadline.spent)]
-        )  # after each step: seconds by the model, of steps, spent
+        # After each step: seconds by the model, seconds of the steps, and seconds since the command began.
+        self._marks = deque([(0.0, 0.0, deadline.spent)])
         self._last = deadline.spent
         self._aside = 0.0  # seconds between steps: density, evaluations, checkpoints
         self._planned = self._told = run.options.config.iterations

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
-from gsplat_edu.base.text import spelled_seconds
+from gsplat_edu.base.text import easily_read, spelled_seconds
 from gsplat_edu.budget.costs import (
     LATER,
     Facts,
@@ -178,12 +178,12 @@ class Request:
             config = with_iterations(config, iterations, self.given, rescale=self.rescale)
         if "max_gaussians" in self.given:
             return config
-        caps = [] if cap is None else [max(_rounded(cap), self.least)]
+        caps = [] if cap is None else [max(easily_read(cap), self.least)]
         if config.strategy in ("mcmc", "fast") or (self.by_time and config.strategy == "adc"):
             facts = self.facts.smaller(factor)
             wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
             guarded = config.strategy == "adc"
-            caps.append(_rounded(math.ceil(GUARD * wanted)) if guarded else max(wanted, self.least))
+            caps.append(easily_read(math.ceil(GUARD * wanted)) if guarded else max(wanted, self.least))
         return dataclasses.replace(config, max_gaussians=min(caps) if caps else None)
 
 
@@ -228,21 +228,21 @@ def plan(
         SceneFormatError: the start scene cannot be read.
         CheckpointError: the config.json of a run to resume is damaged.
     """
-    reader, told = reader_for(options.data, reader), tuple[str, ...]()
+    reader, first_sentences = reader_for(options.data, reader), tuple[str, ...]()
     if quality is not None:
         options, said = with_planned_length(
             options, quality, reader, given, rescale=rescale, progress=progress
         )
-        given, told = (*given, "iterations"), (said,)
+        given, first_sentences = (*given, "iterations"), (said,)
     if options.resume and options.folder.exists():
         said = f"{limits}: a resumed run keeps the values of its config.json; memory is not planned again"
         return Plan(taken_up(options, given), sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
         found = _with_planned_count(options, reader)
-        return dataclasses.replace(found, sentences=(*told, *found.sentences))
+        return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
     request, measured = _measured(options, limits, given, rescale, reader)
     found = choose(request, measured, 0.0 if limits.time is None else limits.time.spent)
-    return dataclasses.replace(found, sentences=(*told, *found.sentences))
+    return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
 
 
 def _measured(
@@ -406,7 +406,7 @@ def _within_time(
             f"--time-limit {spelled_seconds(limit)}: is too short: startup, reading and evaluation leave no time to "
             f"train; give at least {spelled_seconds(5 * math.ceil(least / 5))}"
         )
-    return _rounded(found), choice.factor
+    return easily_read(found), choice.factor
 
 
 def _predicted(request: Request, measured: Measurements, choice: _Choice, config: TrainConfig) -> Forecast:
@@ -416,13 +416,6 @@ def _predicted(request: Request, measured: Measurements, choice: _Choice, config
 
 def _resolution(request: Request, factor: float) -> float | None:
     return request.options.data_settings.resolution if factor == 1.0 else factor
-
-
-def _rounded(count: int) -> int:
-    """Round down to two digits, or to three if the first is 1, so that numbers are easy to read and type."""
-    digits = 3 if str(count).startswith("1") else 2
-    step = int(10 ** max(len(str(count)) - digits, 0))
-    return count // step * step
 
 
 def _sentences(request: Request, plan: Plan, at_cap: int) -> tuple[str, ...]:

@@ -12,9 +12,8 @@ from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.sfm.triangulate import LONGEST_SIDE, triangulate
+from gsplat_edu.sfm.triangulate import triangulate
 
 NAME = "points.ply"
 """File of the triangulated points in a run's folder, in the capture's coordinates."""
@@ -70,9 +69,9 @@ def with_start_points(
     if time_limit is not None and _expected_seconds(len(dataset.train)) > TIME_SHARE * time_limit:
         say("the time limit is too short to triangulate start points; the run starts from random ones")
         return options
-    size = max(max(view.camera.W, view.camera.H) for view in Dataset.of(reader, _sized(options, None)).train)
-    photos = Dataset.of(reader, _sized(options, float(LONGEST_SIDE) if size > LONGEST_SIDE else None))
-    cloud = triangulate(photos.train, options.folder.path / "points", progress)
+    # At the size of the files, which `triangulate` reduces, and without keeping them in memory.
+    settings = dataclasses.replace(options.data_settings, resolution=None, image_memory=0)
+    cloud = triangulate(Dataset.of(reader, settings).train, options.folder.path / "points", progress)
     if cloud is None:
         say("the photos match too little to triangulate start points from them")
         return options
@@ -85,7 +84,3 @@ def with_start_points(
 
 def _expected_seconds(photos: int) -> float:
     return CORE_SECONDS * photos / (os.cpu_count() or 1)
-
-
-def _sized(options: RunOptions, resolution: float | None) -> DataSettings:
-    return dataclasses.replace(options.data_settings, resolution=resolution)

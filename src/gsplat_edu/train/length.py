@@ -6,6 +6,7 @@ surface. A photo that is shown very often is learned by heart.
 
 from __future__ import annotations
 
+from gsplat_edu.base.text import easily_read
 from gsplat_edu.base.validation import one_of, whole_number
 from gsplat_edu.train.capacity import PLANNED_VIEWS
 
@@ -59,8 +60,7 @@ def planned_iterations(quality: str, views: int, measured: bool = True, batch: i
     """
     one_of("quality", quality, tuple(QUALITIES))
     whole = min(QUALITIES[quality] * unit_iterations(views, measured), LONGEST)
-    step = 10 ** max(len(str(int(whole))) - (3 if str(int(whole)).startswith("1") else 2), 0)
-    rounded = int(whole // step * step)
+    rounded = easily_read(int(whole))
     return rounded + -rounded % batch
 
 
