@@ -198,7 +198,7 @@ def main() -> int:
     if options.smoke:
         options.capture, options.photos, options.width, options.gaussians = None, 32, 32, 2_000
         options.blocks, options.iterations, options.min_views = 2, 80, 4
-        options.words = ["--min-opacity", "0.005"]
+        options.words = ["--set", "min_opacity=0.005"]
 
     def run() -> None:
         with tempfile.TemporaryDirectory() as scratch:

@@ -25,8 +25,10 @@ from captures import capture
 
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
-FILLING = "--strategy adc --iterations 300 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20"
-FILLING += " --densify-stop 250 --reset-every 0 --grad-threshold 2e-6 --eval-every 200 --save-every 100"
+FILLING = "--strategy adc --iterations 300 --no-rescale --set sh_every=20 --set densify_start=10 --set densify_every=20"
+FILLING += (
+    " --set densify_stop=250 --set reset_every=0 --set grad_threshold=2e-6 --eval-every 200 --save-every 100"
+)
 """Options that grow a scene to its cap in a few hundred iterations. The scene itself is useless."""
 
 UNITS = {"h": 3600.0, "min": 60.0, "s": 1.0}

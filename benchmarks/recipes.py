@@ -108,16 +108,16 @@ class Piece:
     density: type[PlannedDensity] | None = None
 
 
-HALF_RATES = ("--quats-rate", "1e-3", "--scales-rate", "5e-3", "--sh0-rate", "2.5e-3")
-HALF_RATES += ("--sh-rest-rate", "1.25e-4", "--opacities-rate", "5e-2")
+HALF_RATES = ("--set", "quats_rate=1e-3", "--set", "scales_rate=5e-3", "--set", "sh0_rate=2.5e-3")
+HALF_RATES += ("--set", "sh_rest_rate=1.25e-4", "--set", "opacities_rate=5e-2")
 
 PIECES = {
-    "small-photos": Piece(("--fast-start-factor", "1")),
-    "late-decay": Piece(("--fast-decay", "1")),
+    "small-photos": Piece(("--set", "fast_start_factor=1")),
+    "late-decay": Piece(("--set", "fast_decay=1")),
     "score": Piece(density=Uniform),
-    "opacity-term": Piece(("--fast-opacity-weight", "0")),
+    "opacity-term": Piece(("--set", "fast_opacity_weight=0")),
     "doubled-rates": Piece(HALF_RATES),
-    "late-means": Piece(("--means-rate-final", "1.6e-6")),
+    "late-means": Piece(("--set", "means_rate_final=1.6e-6")),
 }
 """The pieces of the fast recipe by name."""
 

@@ -18,7 +18,7 @@ from gsplat_edu.train.trainer import Trainer
 
 SCHEDULE = {"densify_start": 0, "densify_every": 2, "densify_stop": 60, "mcmc_stop": 60, "sh_every": 2}
 CONFIGS = {
-    "adc": recipe(64, reset_every=3, max_gaussians=40, prune_screen_size=9.0, sh_degree=1, **SCHEDULE),
+    "adc": recipe(64, reset_every=3, max_gaussians=40, sh_degree=1, **SCHEDULE),
     "mcmc": recipe(64, strategy="mcmc", max_gaussians=40, sh_degree=1, random_background=True, **SCHEDULE),
     "fast": recipe(64, strategy="fast", max_gaussians=60, sh_degree=1, fast_stop=60, **SCHEDULE),
 }

@@ -21,11 +21,20 @@ from gsplat_edu.viewer.snapshots import Broadcast
 PATIENCE = 60.0
 """Seconds after which a wait fails."""
 
-GROWING = ["--max-gaussians", "600", "--densify-start", "5", "--densify-every", "10"]
+GROWING = ["--max-gaussians", "600", "--set", "densify_start=5", "densify_every=10"]
 STRATEGIES = {
-    "adc": ["--strategy", "adc", "--densify-stop", "150", "--grad-threshold", "1e-4", "--reset-every", "60"],
-    "mcmc": ["--strategy", "mcmc", "--mcmc-stop", "150"],
-    "fast": ["--fast-full-size", "150", "--fast-start-factor", "1.5"],
+    "adc": [
+        "--strategy",
+        "adc",
+        "--set",
+        "densify_stop=150",
+        "--set",
+        "grad_threshold=1e-4",
+        "--set",
+        "reset_every=60",
+    ],
+    "mcmc": ["--strategy", "mcmc", "--set", "mcmc_stop=150"],
+    "fast": ["--set", "fast_full_size=150", "fast_start_factor=1.5"],
 }
 
 

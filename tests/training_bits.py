@@ -52,8 +52,8 @@ def train_capture(config, events, size=40) -> tuple[Trainer, TrainResult]:
 
 
 def train_adc(events):
-    """Clone, split, and prune by opacity, scale and size in the image, with two resets and random backgrounds."""
-    numbers = {"reset_every": 40, "grad_threshold": 5e-5, "prune_screen_size": 40.0, "min_opacity": 0.02}
+    """Clone, split, and prune by opacity and scale, with two resets and random backgrounds."""
+    numbers = {"reset_every": 40, "grad_threshold": 5e-5, "min_opacity": 0.02}
     return train_capture(recipe(120, random_background=True, **numbers, **SCHEDULE), events)
 
 

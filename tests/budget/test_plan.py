@@ -348,10 +348,10 @@ def test_a_damaged_config_is_one_line(capture, tmp_path, stored, named):
 def test_flags_include_milestones_that_differ_from_the_recipe():
     config = dataclasses.replace(recipe(3_400), iterations=4_000)
     words = flags(dataclasses.replace(OPTIONS, config=config))
-    assert words.startswith("--iterations 4000 --means-rate-iterations 3400 ")
+    assert words.startswith("--iterations 4000 --set means_rate_iterations=3400 ")
     assert flags(dataclasses.replace(OPTIONS, config=recipe(4_000))) == "--iterations 4000"
     stretched = recipe(3_400).changed(iterations=4_000, tempo="3400,200:4000")
-    words = "--iterations 4000 --tempo 3400,200:4000"
+    words = "--iterations 4000 --set tempo=3400,200:4000"
     assert flags(dataclasses.replace(OPTIONS, config=stretched)) == words, "the milestones are those of 3,400"
 
 

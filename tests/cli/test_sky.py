@@ -136,8 +136,18 @@ def trained(capture, out, threads, *words):
 @pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", ["fast", "adc", "mcmc"])
 def test_threads_do_not_change_the_bits(outdoors, tmp_path, strategy):
-    words = [*SHORT, "--strategy", strategy, "--sky", "shell", "--densify-start", "4", "--densify-every", "5"]
-    words += {"fast": [], "adc": ["--reset-every", "8"], "mcmc": []}[strategy]
+    words = [
+        *SHORT,
+        "--strategy",
+        strategy,
+        "--sky",
+        "shell",
+        "--set",
+        "densify_start=4",
+        "--set",
+        "densify_every=5",
+    ]
+    words += {"fast": [], "adc": ["--set", "reset_every=8"], "mcmc": []}[strategy]
     before = torch.get_num_threads()
     try:
         found = [trained(outdoors, tmp_path / f"run{n}", n, *words) for n in (1, 2, 5)]
@@ -167,9 +177,18 @@ def test_a_run_from_a_scene_keeps_its_sky_also_when_it_is_resumed(outdoors, tmp_
     threads = torch.get_num_threads()
     trained(outdoors, tmp_path / "first", threads, *SHORT, "--sky", "shell")
     before = far_shell(read_scene(scene(tmp_path / "first")).gaussians.means.numpy()).sum()
-    words = ["--strategy", "adc", "--densify-start", "2", "--densify-every", "3"]
-    words += ["--densify-stop", "12", "--reset-every", "4"]
-    words += ["--reset-opacity", "0.5", "--eval-every", "0", "--save-every", "5", "--max-gaussians", "1500"]
+    words = ["--strategy", "adc", "--set", "densify_start=2", "densify_every=3"]
+    words += ["--set", "densify_stop=12", "reset_every=4"]
+    words += [
+        "--set",
+        "reset_opacity=0.5",
+        "--eval-every",
+        "0",
+        "--save-every",
+        "5",
+        "--max-gaussians",
+        "1500",
+    ]
     start = ["--from", str(scene(tmp_path / "first"))]
     whole = trained(outdoors, tmp_path / "whole", threads, *words, *start, "--iterations", "12")
     after = far_shell(read_scene(scene(tmp_path / "whole")).gaussians.means.numpy()).sum()

@@ -17,6 +17,7 @@ from gsplat_edu.runs.identity import check_options
 from gsplat_edu.runs.training import document
 from gsplat_edu.train.config import SETTINGS, TrainConfig, recipe
 from gsplat_edu.train.length import QUALITIES
+from gsplat_edu.train.setting import COURSE_ONLY
 
 
 def parsed(words):
@@ -44,7 +45,7 @@ def test_the_other_recipes_are_those_of_their_papers():
 
 def test_options_reach_the_recipe():
     words = "--iterations 7000 --strategy mcmc --max-gaussians 500 --seed 3 --antialiased --white-background"
-    words += " --mcmc-stop 4000 --jacobian-limit none --random-background --view-order random --opacities-rate 0.025"
+    words += " --set mcmc_stop=4000 jacobian_limit=none --random-background --set opacities_rate=0.025"
     chosen = options(*words.split())
     assert chosen.config == recipe(
         7_000,
@@ -56,16 +57,20 @@ def test_options_reach_the_recipe():
         mcmc_stop=4_000,
         jacobian_limit=None,
         random_background=True,
-        view_order="random",
         opacities_rate=0.025,
     )
     assert chosen.data_settings.background is None, "photos keep their alpha for backgrounds drawn later"
 
 
+def test_set_takes_several_settings_and_the_last_value_counts():
+    words = ["--set", "sh-every=7", "min_opacity=0.03", "--set", "sh_every=9"]
+    assert options(*words).config == recipe(3_000, strategy="fast", sh_every=9, min_opacity=0.03)
+
+
 def test_the_other_strategies_and_colours():
     assert options("--strategy", "none").config.strategy == "none"
     assert options("--background", "0.1", "0.2", "0.3").config.background == (0.1, 0.2, 0.3)
-    window = ["--no-rescale", "--densify-start", "26000", "--densify-stop", "28000"]
+    window = ["--no-rescale", "--set", "densify_start=26000", "densify_stop=28000"]
     late = options("--strategy", "adc", *window).config
     assert late.adc.densify_stop == 28_000, "the other strategy's window is not checked"
 
@@ -82,19 +87,20 @@ def test_the_quality_is_the_length_of_the_fast_recipe():
         (["--strategy", "adc", "--quality", "high"], "--quality: is the length of --strategy fast"),
         (["--quality", "high", "--iterations", "9"], "--quality: --iterations or --time-limit"),
         (["--quality", "high", "--time-limit", "9m"], "--quality: --iterations or --time-limit"),
-        (["--strategy", "adc", "--fast-stop", "9"], "--fast-stop: only --strategy fast uses it"),
-        (["--densify-stop", "9"], "--densify-stop: only --strategy adc uses it"),
+        (["--strategy", "adc", "--set", "fast_stop=9"], "--set fast_stop: only --strategy fast uses it"),
+        (["--set", "densify_stop=9"], "--set densify_stop: only --strategy adc uses it"),
     ):
         with pytest.raises(ArgumentError, match=said):
             options(*words)
 
 
-def test_every_field_of_the_recipe_has_an_option(capsys):
+def test_the_help_names_every_setting_and_how_to_give_it(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help-all"])
     said = capsys.readouterr().out
-    for field in SETTINGS:
-        assert f"--{field.name.replace('_', '-')}" in said, field.name
+    for setting in SETTINGS:
+        way = f"  {setting.name}=" if setting.settable else f"--{setting.name.replace('_', '-')}"
+        assert (way in said) == (setting.name not in COURSE_ONLY), setting.name
     assert "example: gsplat-edu train" in said
 
 
@@ -108,11 +114,11 @@ def test_config_json_has_flat_names(tmp_path):
         "background": [1.0, 1.0, 1.0], "random_background": False, "antialiased": False, "jacobian_limit": 1.3,
         "start_opacity": 0.1, "start_scale": 1.0, "strategy": "mcmc", "max_gaussians": 90, "over_cap": "strongest",
         "densify_start": 12, "densify_stop": 350, "densify_every": 100, "grad_threshold": 0.0002, "percent_dense": 0.01,
-        "split_shrink": 1.6, "min_opacity": 0.005, "prune_scale": 0.1, "prune_screen_size": 0.0, "reset_every": 0,
+        "split_shrink": 1.6, "min_opacity": 0.005, "prune_scale": 0.1, "reset_every": 0,
         "reset_opacity": 0.01, "mcmc_stop": 583, "mcmc_start_opacity": 0.5, "mcmc_start_scale": 0.1, "mcmc_growth": 1.1,
         "mcmc_noise": 500000.0, "mcmc_opacity_weight": 0.01, "mcmc_scale_weight": 0.01,
     }  # fmt: skip
-    words = "--iterations 700 --strategy mcmc --max-gaussians 90 --mcmc-growth 1.1 --white-background"
+    words = "--iterations 700 --strategy mcmc --max-gaussians 90 --set mcmc_growth=1.1 --white-background"
     found = json.loads(json.dumps(document(options(*words.split()))))
     newer = {name for name in found["train"] if name.startswith("fast_")} | {
         "appearance",
@@ -168,19 +174,27 @@ def test_sizes(text, size):
         (["--resolution", "-2"], "resolution"),
         (["--test-every", "1"], "test_every"),
         (["--backend", "gpu"], "backend"),
-        (["--max-gaussians", "0"], "max_gaussians"),
-        (["--densify-start", "20000"], "fast_stop"),
-        (["--strategy", "adc", "--densify-start", "20000"], "densify_stop"),
+        (["--max-gaussians", "0"], "--max-gaussians: "),
+        (["--set", "densify_start=20000"], "--set fast_stop: "),
+        (["--strategy", "adc", "--set", "densify_start=20000"], "densify_stop"),
         (["--image-memory", "1e400"], "--image-memory"),
-        (["--means-rate", "none"], "--means-rate"),
-        (["--mcmc-noise", "1"], "--mcmc-noise"),
+        (["--set", "means_rate=none"], "--set: means_rate: 'none' is not a number"),
+        (["--set", "mcmc_noise=1"], "--set mcmc_noise"),
         (
-            ["--grad-threshold", "1e-4"],
-            "--grad-threshold: only --strategy adc uses it; leave it out or choose",
+            ["--set", "grad_threshold=1e-4"],
+            "--set grad_threshold: only --strategy adc uses it; leave it out or choose",
         ),
-        (["--strategy", "none", "--reset-every", "5"], "--reset-every"),
+        (["--strategy", "none", "--set", "reset_every=5"], "--set reset_every"),
         (["--background", "1", "1", "2", "--white-background"], "--background"),
-        (["--opacities-rate", "fast"], "--opacities-rate"),
+        (["--set", "grad_treshold=1"], "'grad_treshold' is not a setting; did you mean grad_threshold?"),
+        (["--set", "warp=1"], "'warp' is not a setting; --help-all lists the settings"),
+        (["--set", "sh_every"], "'sh_every' is not NAME=VALUE"),
+        (["--set", "sh_every=2.5"], "sh_every: '2.5' is not a whole number"),
+        (["--set", "batch=2"], "batch has an option: give --batch"),
+        (["--set", "over_cap=cut"], "only the course's trainings change over_cap"),
+        (["--set", "min_opacity=3"], "--set min_opacity: is 3"),
+        (["--sh-every", "9"], "did you mean --set sh_every=VALUE?"),
+        (["--set", "opacities_rate=fast"], "--set: opacities_rate"),
     ],
 )
 @pytest.mark.usefixtures("as_shipped")

@@ -24,13 +24,14 @@ from gsplat_edu.runs.training import CaptureRun, is_finished
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import StepEvent
+from gsplat_edu.train.setting import option_with
 
-BASE = ["--eval-every", "0", "--save-every", "5", "--densify-start", "1", "--densify-every", "4"]
-ADC = ["--strategy", "adc", "--grad-threshold", "5e-5"]
+BASE = ["--eval-every", "0", "--save-every", "5", "--set", "densify_start=1", "densify_every=4"]
+ADC = ["--strategy", "adc", "--set", "grad_threshold=5e-5"]
 STRATEGIES = {
     "fast": [],  # the default
     "adc": ADC,
-    "mcmc": ["--strategy", "mcmc", "--max-gaussians", "70", "--mcmc-growth", "1.1"],
+    "mcmc": ["--strategy", "mcmc", "--max-gaussians", "70", "--set", "mcmc_growth=1.1"],
     "none": ["--strategy", "none"],
 }
 VIEWS = 6
@@ -87,7 +88,7 @@ def whole(capture, tmp_path_factory):
     """A run of 30 iterations at once, with the milestones for 20."""
     short, words = recipe(20), []
     for name in ("means_rate_iterations", "sh_every", "densify_stop", "reset_every"):
-        words += [f"--{name.replace('_', '-')}", str(short.flat()[name])]
+        words += option_with(name, short.flat()[name]).split()
     out = tmp_path_factory.mktemp("whole") / "egg"
     assert train(capture, out, "--iterations", "30", *words) == 0
     return out
@@ -112,12 +113,12 @@ def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, t
     """Both relocate (opacities start at 0.5) and grow until the shorter schedule ends, then only add noise."""
 
     def mcmc(out, *words):
-        numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--min-opacity", "0.58", *BASE, *words]
+        numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--set", "min_opacity=0.58", *BASE, *words]
         assert main(["train", str(capture), "--out", str(tmp_path / out), *numbers]) == 0
 
     short = recipe(20).flat()
     names = ("means_rate_iterations", "sh_every", "mcmc_stop")
-    given = [word for name in names for word in (f"--{name.replace('_', '-')}", str(short[name]))]
+    given = [word for name in names for word in option_with(name, short[name]).split()]
     mcmc("extended", "--iterations", "20")
     mcmc("extended", "--iterations", "30", "--resume")
     mcmc("whole", "--iterations", "30", *given)
@@ -144,8 +145,8 @@ def test_a_run_is_resumed_with_its_own_strategy_unless_another_is_named(capture,
     error = capsys.readouterr().err
     assert f"was started with strategy = {strategy}, not {other}" in error and error.count("\n") == 1
     if strategy != "adc":
-        assert run(out, "--grad-threshold", "5e-5", "--resume") == 2
-        assert "--grad-threshold: only --strategy adc uses it" in capsys.readouterr().err
+        assert run(out, "--set", "grad_threshold=5e-5", "--resume") == 2
+        assert "--set grad_threshold: only --strategy adc uses it" in capsys.readouterr().err
     assert run(out, *unnamed, "--resume") == 0
     assert ply(out, 20) == ply(whole, 20)
     assert RunFolder(out).read_config()["train"] == RunFolder(whole).read_config()["train"]
@@ -216,8 +217,9 @@ def _taken_up(capture, out, *words):
     from gsplat_edu.budget.plan import taken_up
 
     given = [
-        name for name in ("iterations", "densify_start") if f"--{name.replace('_', '-')}" in (*BASE, *words)
-    ]
+        "densify_start",
+        *(["iterations"] if "--iterations" in words else []),
+    ]  # BASE gives densify_start
     return taken_up(options(capture, out, *words), given)
 
 
@@ -337,7 +339,7 @@ def test_mismatched_antialiasing_is_reported(capture, finished, tmp_path):
     [
         (["--max-gaussians", "10"], "more than max_gaussians = 10"),
         (["--points", "x.ply"], "not allowed with argument"),
-        (["--start-opacity", "0.2"], "--start-opacity: only a start from points uses it"),
+        (["--set", "start_opacity=0.2"], "--set start_opacity: only a start from points uses it"),
     ],
 )
 @pytest.mark.usefixtures("as_shipped")
@@ -450,5 +452,7 @@ def test_the_defaults_of_a_start_from_a_scene_are_in_the_help(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "--from SCENE|RUN" in said and "--means-rate is 1.6e-05 unless given" in said
+    assert "--from SCENE|RUN" in said and "means_rate is 1.6e-05 unless --set gives it" in " ".join(
+        said.split()
+    )
     assert TrainConfig().means_rate == 1.6e-4

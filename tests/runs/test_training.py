@@ -24,17 +24,17 @@ from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.training import CaptureRun
 from processes import Program
 
-SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--densify-start", "5"]
-SHORT += ["--densify-every", "10"]
+SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--set", "densify_start=5"]
+SHORT += ["--set", "densify_every=10"]
 
 # Long enough to be killed midway: about two seconds.
-LONG = ["--iterations", "600", "--eval-every", "150", "--save-every", "40", "--densify-start", "20"]
-LONG += ["--densify-every", "20", "--sh-every", "100"]
-ADC = ["--strategy", "adc", "--densify-stop", "500", "--grad-threshold", "5e-5"]
+LONG = ["--iterations", "600", "--eval-every", "150", "--save-every", "40", "--set", "densify_start=20"]
+LONG += ["--set", "densify_every=20", "sh_every=100"]
+ADC = ["--strategy", "adc", "--set", "densify_stop=500", "grad_threshold=5e-5"]
 STRATEGIES = {
     "fast": [],  # the default
-    "adc": [*ADC, "--reset-every", "100", "--max-gaussians", "1500", "--random-background"],
-    "mcmc": ["--strategy", "mcmc", "--max-gaussians", "1200", "--mcmc-stop", "500"],
+    "adc": [*ADC, "--set", "reset_every=100", "--max-gaussians", "1500", "--random-background"],
+    "mcmc": ["--strategy", "mcmc", "--max-gaussians", "1200", "--set", "mcmc_stop=500"],
 }
 TRAIN = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
@@ -295,7 +295,7 @@ def test_a_damaged_run_folder_costs_one_line(capture, tmp_path, capsys, name, ch
 
 
 def test_a_scene_that_is_pruned_away_is_reported(capture, tmp_path, capsys):
-    assert train(capture, tmp_path / "run", *SHORT, "--min-opacity", "1") == 2
+    assert train(capture, tmp_path / "run", *SHORT, "--set", "min_opacity=1") == 2
     assert "every Gaussian was pruned" in capsys.readouterr().err
 
 

@@ -200,6 +200,25 @@ def test_the_resolution_may_be_chosen_by_the_command(library):
         begun(library, {"command": "train", "subject": "captures/a", "options": {"resolution": "big"}})
 
 
+def test_settings_of_the_recipe_reach_the_training(library):
+    def words(settings):
+        return begun(library, {"command": "train", "subject": "captures/a", "options": {"set": settings}})
+
+    assert parsed(words({"sh_every": 300, "min_opacity": 0.01})).settings == {
+        "sh_every": 300,
+        "min_opacity": 0.01,
+    }
+    for settings, said in (
+        ({"out": "/"}, "set.out: is not a setting"),
+        ({"over_cap": "cut"}, "set.over_cap: is not a setting"),
+        ({"sh_every": True}, "set.sh_every: has to be a number or a short word"),
+        ({"sh_every": "9\n"}, "set.sh_every: has to be"),
+        (["sh_every=9"], "set: has to be an object"),
+    ):
+        with pytest.raises(RefusedError, match=said):
+            words(settings)
+
+
 @pytest.mark.parametrize("command", SAMPLES)
 def test_values_reach_the_command(library, command):
     options = SAMPLES[command]

@@ -30,7 +30,7 @@ from steps import step_views
 
 SCHEDULE = {"densify_start": 3, "densify_every": 10, "sh_every": 20, "random_background": True}
 CONFIGS = {
-    "adc": {"densify_stop": 70, "reset_every": 30, "grad_threshold": 1e-5, "prune_screen_size": 40.0},
+    "adc": {"densify_stop": 70, "reset_every": 30, "grad_threshold": 1e-5},
     "mcmc": {"strategy": "mcmc", "max_gaussians": 700, "mcmc_stop": 70, "min_opacity": 0.05},
     "fast": {"strategy": "fast", "max_gaussians": 700},
 }

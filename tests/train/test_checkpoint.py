@@ -18,9 +18,7 @@ from gsplat_edu.train.trainer import Trainer
 
 COMMON = {"densify_start": 5, "densify_every": 10, "densify_stop": 60, "mcmc_stop": 60, "sh_every": 15}
 CONFIGS = {
-    "adc": recipe(
-        64, reset_every=20, grad_threshold=5e-5, prune_screen_size=40.0, random_background=True, **COMMON
-    ),
+    "adc": recipe(64, reset_every=20, grad_threshold=5e-5, random_background=True, **COMMON),
     "mcmc": recipe(64, strategy="mcmc", max_gaussians=400, **COMMON),
     "with replacement": recipe(64, view_order="random", **COMMON),
 }

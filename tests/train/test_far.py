@@ -34,10 +34,9 @@ def test_membership_is_by_distance():
 
 @pytest.mark.parametrize(("shell", "left"), [(SHELL, [0.0, 2.0]), (None, [0.0])])
 def test_adc_prunes_faint_splats_of_the_shell_but_not_large_ones(shell, left):
-    config = recipe(densify_start=99, densify_stop=600, reset_every=50, prune_screen_size=20.0)
+    config = recipe(densify_start=99, densify_stop=600, reset_every=50)
     gaussians = scene()
     control = AdaptiveDensityControl(config, 3.0, torch.Generator().manual_seed(0), gaussians, shell)
-    control.largest_radii[:] = torch.tensor([1.0, 50.0, 50.0, 50.0])
     changed, _ = control.update(200, gaussians, Adam(gaussians.tensors(), {"means": 1e-3}))
     assert sorted(changed.sh0[:, 0, 0].tolist()) == left
 

@@ -41,7 +41,6 @@ def test_the_defaults_match_the_papers():
         "split_shrink": 1.6,
         "min_opacity": 0.005,
         "prune_scale": 0.1,
-        "prune_screen_size": 0.0,
         "reset_every": 3_000,
         "reset_opacity": 0.01,
         "view_order": "shuffled",
@@ -162,15 +161,6 @@ def test_large_gaussians_are_pruned_once_opacities_have_been_reset():
             iteration, gaussians, Adam(gaussians.tensors(), config.learning_rates)
         )
         assert len(changed) == left and events[0].num_pruned == 50 - left
-
-
-def test_pruning_by_screen_size_is_off_by_default():
-    for limit, left in ((0.0, 50), (20.0, 49)):
-        config, gaussians = recipe(prune_scale=0.0, prune_screen_size=limit), scene()
-        control = AdaptiveDensityControl(config, 1.0, torch.Generator(), gaussians)
-        control.largest_radii[3] = 21.0
-        changed, _ = control.update(3_100, gaussians, Adam(gaussians.tensors(), config.learning_rates))
-        assert len(changed) == left
 
 
 @pytest.mark.parametrize("cap", [50, 53, 60])

@@ -22,7 +22,7 @@ from gsplat_edu.viewer.live_folder import LiveFolder, header_of
 from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, page_facts, snapshot_of
 from live_clients import until
 
-GROWING = ["--max-gaussians", "300", "--densify-start", "5", "--densify-every", "10", "--seed", "3"]
+GROWING = ["--max-gaussians", "300", "--set", "densify_start=5", "densify_every=10", "--seed", "3"]
 
 
 @pytest.fixture(scope="module")

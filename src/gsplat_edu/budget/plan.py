@@ -37,6 +37,7 @@ from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.start import scene_start
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
+from gsplat_edu.train.setting import option_with
 
 PLANNED = ("iterations", "tempo", *MILESTONES, "densify_every", "max_gaussians", "resolution", "image_memory")
 """Settings that a plan may choose; `given` lists those that the user set."""
@@ -453,11 +454,11 @@ def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = Fa
         )
         idle = {name for key, names in ONLY_FOR.items() if key != config.strategy for name in names}
         words += [
-            f"--{name.replace('_', '-')} {chosen[name]}"
+            option_with(name, chosen[name])
             for name in MILESTONES
             if name not in {*given, *idle} and chosen[name] != scaled[name]
         ]
-        words += [f"--tempo {config.tempo}"] if config.tempo else []
+        words += [option_with("tempo", config.tempo)] if config.tempo else []
     return " ".join(words)
 
 

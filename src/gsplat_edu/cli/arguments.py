@@ -12,7 +12,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
@@ -54,13 +54,18 @@ class OneLineParser(argparse.ArgumentParser):
     def __init__(self, **options: Any) -> None:  # noqa: ANN401
         super().__init__(allow_abbrev=False, **options)
         self._common: frozenset[str] | None = None
+        self._appendix: Callable[[], str] = str
+        self.explain_unknown: Callable[[str, Sequence[str]], str | None] = lambda *_: None
+        """Given an unknown option and the known ones, says what to write instead, or returns None."""
 
-    def show_in_help(self, names: Iterable[str]) -> None:
+    def show_in_help(self, names: Iterable[str], appendix: Callable[[], str] = str) -> None:
         """Make --help show only these options, and add --help-all, which shows every option.
 
         Args:
             names: Destinations of the options, for example "max_gaussians".
+            appendix: Returns what --help-all prints below the options.
         """
+        self._appendix = appendix
         self.add_argument("--help-all", action=_HelpAll, nargs=0, help="show every option and exit")
         self._common = frozenset({"help", "help_all", *names})
 
@@ -80,8 +85,8 @@ class OneLineParser(argparse.ArgumentParser):
                 action.help = text
 
     def format_help_all(self) -> str:
-        """Return the text of --help-all: every option."""
-        return super().format_help()
+        """Return the text of --help-all: every option, and what lies below them."""
+        return super().format_help() + self._appendix()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
         """Refuse an unknown option before argparse reports missing ones, and suggest the most similar option."""
@@ -95,6 +100,8 @@ class OneLineParser(argparse.ArgumentParser):
 
     def _unknown(self, flag: str) -> str:
         known = [option for option in self._option_string_actions if option.startswith("--")]
+        if said := self.explain_unknown(flag, known):
+            return f"unrecognized argument {flag}: {said}"
         alike = difflib.get_close_matches(flag, known, n=1)
         meant = f"did you mean {alike[0]}?" if alike else "it is not known"
         return f"unrecognized argument {flag}: {meant}"

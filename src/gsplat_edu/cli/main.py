@@ -17,6 +17,7 @@ from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Interrupted
 from gsplat_edu.render.settings import check_backend
 from gsplat_edu.train.config import SETTINGS
+from gsplat_edu.train.setting import option_of
 
 COMMANDS = {
     "demo": "train a sphere from 24 renders of it and evaluate the result with a held-out camera",
@@ -77,7 +78,8 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
         options.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="print the traceback of an error")
         if hasattr(options, "COMMON"):
-            command.show_in_help(options.COMMON)
+            command.show_in_help(options.COMMON, options.appendix)
+            command.explain_unknown = options.explain_unknown
         command.set_defaults(run=functools.partial(_run, name))
     return parser
 
@@ -87,10 +89,10 @@ def _run(name: str, arguments: argparse.Namespace) -> None:
     if "backend" in arguments:
         check_backend(arguments.backend)
     options = importlib.import_module(f"gsplat_edu.cli.options.{name}")
-    if hasattr(options, "check"):
-        options.check(arguments)
-    module = options.runner(arguments) if hasattr(options, "runner") else name
     try:
+        if hasattr(options, "check"):
+            options.check(arguments)
+        module = options.runner(arguments) if hasattr(options, "runner") else name
         importlib.import_module(f"gsplat_edu.cli.{module}").run(arguments)
     except ArgumentError as error:
         if (told := _as_option(str(error))) == str(error):
@@ -102,5 +104,5 @@ def _as_option(message: str) -> str:
     """Name the option of a setting that an error of the library names: "batch: is" becomes "--batch: is"."""
     name, colon, rest = message.partition(": ")
     if colon and name in {setting.name for setting in SETTINGS}:
-        return f"--{name.replace('_', '-')}: {rest}"
+        return f"{option_of(name)}: {rest}"
     return message

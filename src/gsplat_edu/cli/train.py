@@ -23,6 +23,7 @@ from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.length import quality_of
+from gsplat_edu.cli.options.settings import given
 from gsplat_edu.cli.options.train import AUTO, RANDOM_POINTS, left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
@@ -273,7 +274,7 @@ def _planned(
         options = _with_resolution(options, reader, say)
     options = with_choices(options, reader, left_open(arguments), console, say)
     limits = Limits(arguments.max_memory, deadline)
-    given = [name for name in PLANNED if getattr(arguments, name) is not None]
+    fixed = given(arguments, PLANNED)
     with progress_bar(console, "") as bar:
         task = bar.add_task("trials of lengths", total=sum(LENGTHS), visible=False)
 
@@ -282,7 +283,7 @@ def _planned(
 
         quality, rescale = quality_of(arguments), not arguments.no_rescale
         chosen = plan(
-            options, limits, given, rescale=rescale, reader=reader, quality=quality, progress=progress
+            options, limits, fixed, rescale=rescale, reader=reader, quality=quality, progress=progress
         )
     for sentence in chosen.sentences:
         say(sentence)

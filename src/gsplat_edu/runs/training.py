@@ -438,5 +438,5 @@ class CaptureRun:
             self._log.record(event, self.elapsed)
         if not trainer.stepper.count:
             raise ArgumentError(
-                f"iteration {trainer.iteration}: every Gaussian was pruned; lower --min-opacity or the learning rates"
+                f"iteration {trainer.iteration}: every Gaussian was pruned; lower min_opacity or the learning rates"
             )

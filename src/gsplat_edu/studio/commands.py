@@ -18,7 +18,7 @@ from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import Library, files_within, scene_file
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
-from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SKIES, STRATEGIES
+from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SETTABLE, SKIES, STRATEGIES
 from gsplat_edu.train.length import QUALITIES
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
 
@@ -99,6 +99,26 @@ def _text(name: str, value: Any) -> Words:  # noqa: ANN401
     return [_flag(name), value]
 
 
+def _set(name: str, value: Any) -> Words:  # noqa: ANN401
+    """Pass settings of the recipe on, given as an object of names and numbers or words."""
+    if not isinstance(value, dict):
+        raise RefusedError(f'{name}: has to be an object, for example {{"sh_every": 300}}')
+    words: Words = []
+    for setting, given in value.items():
+        if setting not in SETTABLE:
+            raise RefusedError(
+                f"{name}.{shortened(str(setting))}: is not a setting; docs/RECIPE.md lists them"
+            )
+        if (
+            type(given) not in (int, float, str)
+            or not str(given).isprintable()
+            or len(str(given)) > LONGEST_TEXT
+        ):
+            raise RefusedError(f"{name}.{setting}: has to be a number or a short word")
+        words += [_flag(name), f"{setting}={given}"]
+    return words
+
+
 def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
@@ -133,11 +153,13 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "scale": _text,
     "seed": _whole(0, 2**31 - 1),
     "batch": _whole(1, 1_024),
+    "sh_degree": _whole(0, 3),
     "eval_every": _whole(0, 1_000_000),
     "save_every": _whole(0, 1_000_000),
     "antialiased": _switch,
     "white_background": _switch,
     "random_background": _switch,
+    "set": _set,
     "clean": _switch,
     "resume": _switch,
 }

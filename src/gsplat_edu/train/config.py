@@ -4,7 +4,8 @@ The defaults are those of Kerbl et al. 2023's code ("2023" below), and of Kherad
 those of the strategy fast are ours. Iterations count from 0: "at iteration i" means with or after step i + 1.
 
 `TrainConfig` holds the settings common to all runs; `AdcConfig`, `McmcConfig` and `FastConfig` hold those of one
-strategy. Options, config.json and docs/RECIPE.md use one flat list of them, `SETTINGS`, made from the fields' metadata.
+strategy. The command line, config.json and docs/RECIPE.md use one flat list of them, `SETTINGS`, made from the fields'
+metadata.
 """
 
 from __future__ import annotations
@@ -123,13 +124,6 @@ class AdcConfig:
         "Fraction of the extent: once opacities have been reset, Gaussians of a larger scale are pruned; 0 prunes"
         " none.",
         "2023",
-    )
-    prune_screen_size: float = _number(
-        0.0,
-        _not_negative,
-        "px: once opacities have been reset, Gaussians whose ellipse had a larger half axis in an image are pruned; 0"
-        " prunes none.",
-        "2023 has 20, which never took effect there",
     )
     reset_every: int = _number(
         3_000,
@@ -435,6 +429,9 @@ SETTINGS: tuple[Setting, ...] = (
     *_settings(FastConfig, "fast", "fast_"),
 )
 """All settings of a training."""
+
+SETTABLE = {setting.name: setting for setting in SETTINGS if setting.settable}
+"""The settings that `gsplat-edu train --set` gives, by name."""
 
 ONLY_FOR = {
     strategy: tuple(setting.name for setting in SETTINGS if setting.strategy == strategy)

@@ -15,6 +15,17 @@ TRANSIENTS = ("none", "mask")
 OUTSIDE_MASKS = ("ignore", "empty")
 """What the scene shows where the capture's masks exclude pixels: anything, or nothing."""
 
+WITH_OPTION = frozenset(
+    {
+        *("iterations", "batch", "seed", "sh_degree", "strategy", "max_gaussians", "antialiased"),
+        *("appearance", "sky", "refine", "transients", "outside_masks", "background", "random_background"),
+    }
+)
+"""Settings that `gsplat-edu train` has an option for; the others are given by `--set NAME=VALUE`."""
+
+COURSE_ONLY = frozenset({"over_cap", "view_order"})
+"""Settings that only the course's trainings change (`gsplat_edu.train.course`); `gsplat-edu train` has none of them."""
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -45,3 +56,18 @@ class Setting:
         """The help text for --help and tables: it starts in lower case, after the strategy that uses the setting."""
         only = f"{self.strategy}: " if self.strategy else ""
         return f"{only}{self.help[0].lower()}{self.help[1:].rstrip('.')}"
+
+    @property
+    def settable(self) -> bool:
+        """Whether `--set NAME=VALUE` gives it."""
+        return self.name not in WITH_OPTION | COURSE_ONLY
+
+
+def option_of(name: str) -> str:
+    """Return how the command line names a setting: "--batch", or "--set sh_every" where it has no option."""
+    return f"--{name.replace('_', '-')}" if name in WITH_OPTION else f"--set {name}"
+
+
+def option_with(name: str, value: object) -> str:
+    """Return the words of the command line that give a setting: "--batch 4", or "--set sh_every=300"."""
+    return f"{option_of(name)}{' ' if name in WITH_OPTION else '='}{value}"

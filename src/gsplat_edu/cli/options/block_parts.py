@@ -23,10 +23,9 @@ def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, 
     """
     of_block = argparse.Namespace(**vars(arguments))
     of_block.resume, of_block.scene = False, arguments.scene or arguments.out
-    for name in FOR_POINTS:
-        setattr(of_block, name, None)
-    if arguments.means_rate is None:
-        of_block.means_rate = TrainConfig.means_rate  # a coarse model is not in place yet
+    kept = {name: value for name, value in arguments.settings.items() if name not in FOR_POINTS}
+    of_block.settings = {"means_rate": TrainConfig.means_rate, **kept}  # a coarse model is not in place yet
+    of_block.sky = None
     coarse = argparse.Namespace(**vars(arguments))
     if arguments.scene is not None:
         return of_block, None

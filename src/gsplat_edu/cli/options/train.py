@@ -12,6 +12,11 @@ from gsplat_edu.base.validation import one_of
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.cli.options.length import length_of, strategy_of
+from gsplat_edu.cli.options.settings import (
+    add_settings,
+    appendix as appendix,
+    explain_unknown as explain_unknown,
+)
 from gsplat_edu.cli.options.several import check_several
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
 from gsplat_edu.data.settings import DataSettings
@@ -24,7 +29,6 @@ from gsplat_edu.train.config import (
     APPEARANCES,
     DEFAULT_STRATEGY,
     FAST_FROM_SCENE,
-    FOR_FAST,
     FROM_SCENE,
     ONLY_FOR,
     RECIPE_ITERATIONS,
@@ -32,12 +36,11 @@ from gsplat_edu.train.config import (
     SETTINGS,
     SKIES,
     STRATEGIES,
-    Setting,
     TrainConfig,
     recipe,
 )
 from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, UNIT
-from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
+from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, WITH_OPTION, option_of
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
 
@@ -62,12 +65,11 @@ COMMON = (
         "appearance",
         "sky",
         "white_background",
-        "antialiased",
         "seed",
         "backend",
         "debug",
     ),
-    *("eval_every", "save_every", "clean", "export", "view"),
+    *("eval_every", "save_every", "clean", "export", "view", "settings"),
 )
 """What `--help` shows; `--help-all` shows the other options too."""
 
@@ -85,9 +87,6 @@ OPEN = {
 
 OPEN_FOR_FAST = ("appearance", "sky", "outside_masks")
 """Those that the strategy fast leaves open unless they are given."""
-
-NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background", *OPEN)
-"""Settings whose options are declared below; those of the others come from `SETTINGS`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -129,16 +128,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add_scale(photos)
     _add_results(parser.add_argument_group("results"))
     _add_view(parser.add_argument_group("live view"))
-    group = parser.add_argument_group(
-        "training parameters",
-        "docs/RECIPE.md explains them. Defaults are those of 30,000 iterations; milestones scale with --iterations.",
-    )
-    group.add_argument(
-        "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
-    )
-    for setting in SETTINGS:
-        if setting.name not in NAMED:
-            _add_setting(group, setting)
+    _add_recipe(parser.add_argument_group("recipe", "docs/RECIPE.md explains it."))
 
 
 def _add_number(group: argparse._ActionsContainer, flag: str, text: str, default: int | None = None) -> None:
@@ -152,7 +142,7 @@ def _add_start(start: argparse._MutuallyExclusiveGroup) -> None:
         type=Path,
         metavar="SCENE|RUN",
         help="start from the Gaussians of a trained scene, or of a run's latest one, instead of points; all harmonics"
-        f" are in use from the first iteration, and --means-rate is {FROM_SCENE['means_rate']:g} unless given",
+        f" are in use from the first iteration, and means_rate is {FROM_SCENE['means_rate']:g} unless --set gives it",
     )
     start.add_argument(
         "--points",
@@ -302,31 +292,32 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         help='"shell" places splats far away wherever photos show the sky; "none" does not; "auto" lets the photos'
         " decide (default: auto for the strategy fast, none for the others)",
     )
+    _add_background(group)
+
+
+def _add_background(group: argparse._ArgumentGroup) -> None:
     behind = group.add_mutually_exclusive_group()
     behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
     behind.add_argument(
         "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="background colour, 0 to 1"
     )
+    group.add_argument(
+        "--random-background",
+        action="store_true",
+        default=None,
+        help="draw a new background colour for every iteration",
+    )
 
 
-def _add_setting(group: argparse._ArgumentGroup, setting: Setting) -> None:
-    name, default = setting.name, setting.default
-    flag = f"--{name.replace('_', '-')}"
-    fast = f"; fast: {FOR_FAST[name]:g}" if name in FOR_FAST else ""
-    text = f"{setting.meaning.replace('%', '%%')} (default: {default}{fast})"
-    if isinstance(default, bool):
-        group.add_argument(flag, action="store_true", default=None, help=text)
-    elif isinstance(default, str):
-        group.add_argument(flag, metavar="NAME", help=text)
-    elif isinstance(default, int):
-        group.add_argument(flag, type=whole_number_text, metavar="N", help=text)
-    else:
-        kind = _number_or_none if name == "jacobian_limit" else _number
-        group.add_argument(flag, type=kind, metavar="X", help=text)
-
-
-def _number_or_none(text: str) -> float | str:
-    return text if text == "none" else _number(text)
+def _add_recipe(group: argparse._ArgumentGroup) -> None:
+    meanings = {setting.name: setting.meaning for setting in SETTINGS}
+    group.add_argument(
+        "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
+    )
+    for name in ("batch", "sh_degree"):
+        text = f"{meanings[name]} (default: {getattr(TrainConfig, name)})"
+        _add_number(group, f"--{name.replace('_', '-')}", text)
+    add_settings(group)
 
 
 def _number_or_auto(text: str) -> float | str:
@@ -412,26 +403,26 @@ def _resolution(arguments: argparse.Namespace) -> float | None:
 def _config(arguments: argparse.Namespace) -> TrainConfig:
     strategy = strategy_of(arguments)
     changes: dict[str, Any] = {"strategy": strategy}
-    for setting in SETTINGS:
-        name = setting.name
-        given = getattr(arguments, name, None)
-        if given is not None and name not in ("iterations", "background"):
-            changes[name] = None if name == "jacobian_limit" and given == "none" else given
+    changes |= {
+        name: getattr(arguments, name)
+        for name in WITH_OPTION - {"iterations", "background"}
+        if getattr(arguments, name) is not None
+    }
+    changes |= arguments.settings
     changes |= {name: _given_or_stored(arguments, name) for name in OPEN}
     if arguments.white_background or arguments.background:
         changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
     for only, names in ONLY_FOR.items():
         if only != strategy and (idle := [name for name in names if name in changes]):
-            flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(
-                f"{flag}: only --strategy {only} uses it; leave it out or choose that strategy"
+                f"{option_of(idle[0])}: only --strategy {only} uses it; leave it out or choose that strategy"
             )
     planned = arguments.max_memory is not None or (
         arguments.time_limit is not None and arguments.iterations is None
     )
     if _starts_from_scene(arguments):
         if idle := [name for name in FOR_POINTS if changes.get(name, "none") != "none"]:
-            flag = f"--{idle[0].replace('_', '-')}"
+            flag = option_of(idle[0])
             raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
         changes = FROM_SCENE | (FAST_FROM_SCENE if strategy == "fast" else {}) | changes
     iterations = length_of(arguments, strategy)
@@ -445,7 +436,7 @@ def _given_or_stored(arguments: argparse.Namespace, name: str) -> str:
     """Return the value of one of `OPEN`: given, of the run to resume, or the first value (see `left_open`)."""
     given = getattr(arguments, name)
     if given is not None:
-        one_of(f"--{name.replace('_', '-')}", given, (*OPEN[name], AUTO))
+        one_of(option_of(name), given, (*OPEN[name], AUTO))
     if given not in (None, AUTO):
         return str(given)
     folder = RunFolder(arguments.out)

@@ -25,7 +25,7 @@ from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import check_entries, check_flag, check_statistics, check_torch_generator
 from gsplat_edu.train.schedule import milestone
 
-STATISTICS = ("norm_sums", "times_visible", "largest_radii")
+STATISTICS = ("norm_sums", "times_visible")
 """Statistics collected for each Gaussian since the last densification."""
 
 
@@ -68,9 +68,6 @@ class AdaptiveDensityControl:
         visible, norms = output.visible, output.means2d_grad_norms()
         self.norm_sums.index_add_(0, visible, norms)
         self.times_visible.index_add_(0, visible, norms.new_ones(1).expand(len(visible)))
-        if self.config.adc.prune_screen_size:
-            largest = torch.maximum(*output.radii.unbind(dim=-1))
-            self.largest_radii.scatter_reduce_(0, visible, largest, "amax")
 
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
@@ -97,13 +94,9 @@ class AdaptiveDensityControl:
         mean_norms = self.norm_sums / self.times_visible.clamp(min=1)
         size = gaussians.scales.amax(dim=-1)
         keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
-        if config.adc.reset_every and iteration > config.adc.reset_every:
-            right = torch.ones_like(keep)
-            if config.adc.prune_scale:
-                right &= size <= config.adc.prune_scale * self.extent
-            if config.adc.prune_screen_size:
-                right &= self.largest_radii <= config.adc.prune_screen_size
-            keep &= right if self.shell is None else right | self.shell.holds(gaussians.means)
+        if config.adc.prune_scale and config.adc.reset_every and iteration > config.adc.reset_every:
+            small = size <= config.adc.prune_scale * self.extent
+            keep &= small if self.shell is None else small | self.shell.holds(gaussians.means)
         selected = keep & (mean_norms > config.adc.grad_threshold)
         if self.shell is not None:
             selected = self.shell.within_quota(selected, mean_norms, gaussians.means)
@@ -149,7 +142,6 @@ class AdaptiveDensityControl:
     def _forget(self, gaussians: Gaussians) -> None:
         self.norm_sums = torch.zeros_like(gaussians.logit_opacities, requires_grad=False)
         self.times_visible = torch.zeros_like(self.norm_sums)
-        self.largest_radii = torch.zeros_like(self.norm_sums)
 
     def state(self) -> State:
         """Return the statistics since the last densification, and the generator."""
