@@ -21,7 +21,8 @@ from gsplat_edu.budget.costs import (
     wanted_gaussians,
 )
 from gsplat_edu.budget.deadline import Deadline
-from gsplat_edu.budget.plan import Limits, Request, choose, flags, plan, taken_up
+from gsplat_edu.budget.plan import Limits, Request, choose, plan
+from gsplat_edu.budget.planned import flags, taken_up
 from gsplat_edu.budget.probe import resident_bytes
 from gsplat_edu.cli.arguments import bytes_text, seconds_text
 from gsplat_edu.cli.main import build_parser

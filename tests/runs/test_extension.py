@@ -214,7 +214,7 @@ def test_an_unfinished_run_is_extended_and_no_run_is_shortened(capture, whole, t
 
 
 def _taken_up(capture, out, *words):
-    from gsplat_edu.budget.plan import taken_up
+    from gsplat_edu.budget.planned import taken_up
 
     given = [
         "densify_start",

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from gsplat_edu.budget.costs import Facts
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import ending_seconds, saving_seconds
-from gsplat_edu.budget.plan import flags
+from gsplat_edu.budget.planned import flags
 from gsplat_edu.budget.probe import judging_seconds
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.config import RECIPE_ITERATIONS

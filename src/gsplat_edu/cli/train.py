@@ -19,7 +19,8 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.locks import locked
 from gsplat_edu.budget.deadline import Deadline, stopwatch
 from gsplat_edu.budget.pace import Pace
-from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
+from gsplat_edu.budget.plan import Limits, Plan, plan
+from gsplat_edu.budget.planned import PLANNED
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.length import quality_of
