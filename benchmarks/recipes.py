@@ -84,12 +84,14 @@ class Recipe:
         iterations: Length of the run, before `--length`.
         options: Further options of `gsplat-edu train`.
         density: Replaces the density control of the fast recipe.
+        quality: Lets the plan choose the length from the capture, unless `--length` scales `iterations`.
     """
 
     strategy: str
     iterations: int
     options: tuple[str, ...] = ()
     density: type[PlannedDensity] | None = None
+    quality: str | None = None
 
 
 STANDARD = QUALITIES["standard"] * UNIT
@@ -135,7 +137,7 @@ RECIPES = {
     "adc-7k": Recipe("adc", 7_000),
     "mcmc-7k": Recipe("mcmc", 7_000),
     "adc-30k": Recipe("adc", 30_000),
-    **{f"fast-{name}": Recipe("fast", share * UNIT) for name, share in QUALITIES.items()},
+    **{f"fast-{name}": Recipe("fast", share * UNIT, quality=name) for name, share in QUALITIES.items()},
     **{f"without-{name}": without(name) for name in PIECES},
     **{f"only-{name}": without(*(other for other in PIECES if other != name)) for name in PIECES},
     "no-piece": without(*PIECES),
@@ -208,8 +210,13 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
         results: Earlier runs; mcmc takes its cap from those of adc.
     """
     recipe = RECIPES[name]
-    iterations = max(1, round(recipe.iterations * arguments.length))
-    words = ["--strategy", recipe.strategy, "--iterations", str(iterations), "--seed", str(seed)]
+    quality = recipe.quality if arguments.length == 1 else None
+    length = (
+        ["--quality", quality]
+        if quality
+        else ["--iterations", str(max(1, round(recipe.iterations * arguments.length)))]
+    )
+    words = ["--strategy", recipe.strategy, *length, "--seed", str(seed)]
     words += [*recipe.options, "--eval-every", "0", "--save-every", "0"]
     if arguments.resolution is not None:
         words += ["--resolution", str(arguments.resolution)]
@@ -221,7 +228,7 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
     with tempfile.TemporaryDirectory() as scratch:
         folder = str(Path(scratch) / "run")
         options = command.options_from(parser.parse_args([str(arguments.data), *words, "--out", folder]))
-        run = CaptureRun(plan(options, Limits()).options)
+        run = CaptureRun(plan(options, Limits(), quality=quality).options)
         if recipe.density is not None:
             run.trainer.density = recipe.density(run.options.config, run.trainer.gaussians)
         config = settings_of(run)
