@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.data.dataset import DataSettings
 from gsplat_edu.data.procedural import procedural_capture
@@ -87,3 +88,19 @@ def test_only_thin_captures_from_points_are_tried(given, monkeypatch):
     resumed = dataclasses.replace(options, resume=True)
     assert plan(resumed, Limits(), reader=reader, quality="draft").iterations == 1_000
     shutil.rmtree(options.out, ignore_errors=True)
+
+
+@pytest.mark.parametrize("longest", [100, None])
+def test_a_time_limit_does_not_train_longer_than_the_trial(given, monkeypatch, longest):
+    _, options, reader = given
+    trial = ThinTrial(longest, {100: 20.0, 200: 19.0}, 2)
+    monkeypatch.setattr("gsplat_edu.budget.length.try_lengths", lambda *_: trial)
+    generous = Limits(time=Deadline(600.0, lambda: 1.0))
+    found = plan(options, generous, reader=reader)
+    said = [sentence for sentence in found.sentences if "before the limit" in sentence]
+    if longest is None:
+        assert found.by_time and found.iterations > 1_000 and not said
+    else:
+        assert found.iterations == longest and not found.by_time and found.profile is None
+        assert "longer trainings make photos worse" in said[0]
+    assert plan(options, generous, ["iterations"], reader=reader).iterations == options.config.iterations

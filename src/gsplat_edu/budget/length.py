@@ -8,7 +8,7 @@ from dataclasses import replace
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.runs.thin import needs_trial, try_lengths
+from gsplat_edu.runs.thin import ThinTrial, needs_trial, try_lengths
 from gsplat_edu.train.config import MILESTONES, TrainConfig, recipe
 from gsplat_edu.train.length import planned_iterations, reasons
 
@@ -28,6 +28,26 @@ def with_iterations(
     fresh = recipe(iterations, rescale=rescale, strategy=config.strategy).flat()
     scaled = {name: fresh[name] for name in (*MILESTONES, "densify_every") if name not in given}
     return config.changed(iterations=iterations, **scaled)
+
+
+def tried(
+    options: RunOptions, reader: CaptureReader, views: int, progress: Callable[[], None] = lambda: None
+) -> ThinTrial | None:
+    """Try how long a training by the recipe fast may be; None if there are enough photos, or too few to try.
+
+    Args:
+        options: The run; one that is resumed, starts from a scene, or has another recipe is not tried.
+        reader: The run's capture.
+        views: Number of training views.
+        progress: Called after every iteration of a trial.
+
+    Raises:
+        DatasetError: one of the photos cannot be read.
+    """
+    fresh = options.scene is None and not options.resume
+    if options.config.strategy != "fast" or not fresh or not needs_trial(views):
+        return None
+    return try_lengths(options, reader, progress)
 
 
 def with_planned_length(
@@ -60,10 +80,9 @@ def with_planned_length(
     measured = dataset.measured or options.scene is not None
     iterations = planned_iterations(quality, views, measured, options.config.batch)
     why = reasons(views, measured)
-    if options.scene is None and not options.resume and needs_trial(views):
-        trial = try_lengths(options, reader, progress)
-        if trial.longest is not None and trial.longest < iterations:
-            iterations, why = trial.longest + -trial.longest % options.config.batch, str(trial)
+    trial = tried(options, reader, views, progress)
+    if trial is not None and trial.longest is not None and trial.longest < iterations:
+        iterations, why = trial.longest + -trial.longest % options.config.batch, str(trial)
     config = with_iterations(options.config, iterations, given, rescale=rescale)
     said = f"{quality} is {config.iterations:,} iterations ({why}); --iterations changes that"
     return replace(options, config=config), said

@@ -29,13 +29,14 @@ from gsplat_edu.budget.costs import (
 )
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
-from gsplat_edu.budget.length import with_iterations, with_planned_length
+from gsplat_edu.budget.length import tried, with_iterations, with_planned_length
 from gsplat_edu.budget.planned import flags, taken_up
 from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.start import scene_start
+from gsplat_edu.runs.thin import ThinTrial
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import RECIPE_ITERATIONS, TrainConfig
 
@@ -100,7 +101,7 @@ class Plan:
 
     Args:
         options: The run with the chosen values.
-        by_time: Whether the iterations were chosen; `gsplat_edu.budget.pace.Pace` then lets them follow the machine.
+        by_time: Whether the time limit chose the iterations; `gsplat_edu.budget.pace` then fits them to the machine.
         forecast: Expected time and memory; None if nothing had to be chosen.
         sentences: Explanation for the user.
         profile: Expected seconds of every iteration if `by_time`.
@@ -144,6 +145,7 @@ class Request:
         rescale: Whether milestones that are not given stretch with the iterations.
         facts: The capture at the size given by the user, or at the size of its files.
         factors: Allowed downscaling factors, ascending.
+        trial: Of a capture with few photos; its longest training bounds the iterations.
     """
 
     options: RunOptions
@@ -152,6 +154,13 @@ class Request:
     rescale: bool
     facts: Facts
     factors: tuple[float, ...] = (1.0,)
+    trial: ThinTrial | None = None
+
+    @property
+    def most_iterations(self) -> int:
+        """Bound of the iterations that a time limit chooses."""
+        longest = None if self.trial is None else self.trial.longest
+        return RECIPE_ITERATIONS if longest is None else longest
 
     @property
     def least(self) -> int:
@@ -239,6 +248,8 @@ def plan(
         found = _with_planned_count(options, reader)
         return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
     request, measured = _measured(options, limits, given, rescale, reader)
+    if request.by_time:
+        request = dataclasses.replace(request, trial=tried(options, reader, request.facts.train, progress))
     found = choose(request, measured, 0.0 if limits.time is None else limits.time.spent)
     return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
 
@@ -318,10 +329,11 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     options = dataclasses.replace(request.options, config=config, data_settings=settings)
     facts = request.facts.smaller(choice.factor)
     profile = None
-    if request.by_time:
+    by_time = request.by_time and (request.trial is None or length != request.trial.longest)
+    if by_time:
         profile = step_profile(config, request.facts.smaller(choice.factor), measured.speed)
     forecast = _predicted(request, measured, choice, config)
-    found = Plan(options, request.by_time, forecast, profile=profile)
+    found = Plan(options, by_time, forecast, profile=profile)
     at_cap = Footprint(
         facts, process + reduced_bytes(config, facts), pairs, config.sh_degree, config.batch
     ).peak(found.max_gaussians or 0, found.image_memory)
@@ -391,13 +403,13 @@ def _within_time(
     for factor in (f for f in request.factors if f >= choice.factor):
         smaller = dataclasses.replace(choice, factor=factor)
         least = takes(LEAST_ITERATIONS, smaller)
-        low, high = LEAST_ITERATIONS - 1, RECIPE_ITERATIONS + 1
+        low, high = LEAST_ITERATIONS - 1, request.most_iterations + 1
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if takes(middle, smaller) <= limit else (low, middle)
         found, choice = low, smaller
         pixels = request.facts.smaller(factor).pixels
-        if found >= WORTHWHILE_ITERATIONS or pixels < 2 * WORTHWHILE_PIXELS:
+        if found >= min(WORTHWHILE_ITERATIONS, request.most_iterations) or pixels < 2 * WORTHWHILE_PIXELS:
             break
     if found < LEAST_ITERATIONS:
         raise ArgumentError(
@@ -420,6 +432,8 @@ def _sentences(request: Request, plan: Plan, at_cap: int) -> tuple[str, ...]:
     found, cap = plan.forecast, plan.max_gaussians
     chosen = flags(plan.options, request.given, photos=request.limits.memory is not None)
     sentences = [f"{request.limits}: chosen {chosen or 'nothing, because every option was given'}"]
+    if request.by_time and not plan.by_time:
+        sentences.append(f"the training ends before the limit: {request.trial}")
     if found is not None:
         sentences += [f"forecast: {line}" for line in found.lines()]
         if cap is not None and cap > found.gaussians[1]:
