@@ -94,6 +94,16 @@ def test_a_run_starts_from_triangulated_points_and_resumes_with_them(views, tmp_
     assert stored.read_bytes() == before and RunFolder(tmp_path / "run").read_metrics()["iterations"] == 9
 
 
+def test_the_coarse_model_of_blocks_starts_from_triangulated_points(views, tmp_path, capsys):
+    write_transforms(tmp_path / "capture", views)
+    words = ["train", str(tmp_path / "capture"), "--out", str(tmp_path / "run"), "--blocks", "1", *GIVEN]
+    words += ["--iterations", "8", "--min-views", "1", "--until", "split"]
+    assert main(words) == 0
+    assert "start points from the given poses" in capsys.readouterr().out
+    assert (tmp_path / "run" / "coarse" / "points.ply").is_file()
+    assert main([*words, "--resume"]) == 0, "the points are taken from the folder"
+
+
 def test_random_points_on_request_and_without_the_extra(views, tmp_path, capsys, monkeypatch):
     write_transforms(tmp_path / "capture", views)
     run = ["train", str(tmp_path / "capture"), *GIVEN, "--iterations", "2", "--out"]

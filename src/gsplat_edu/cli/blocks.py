@@ -33,6 +33,7 @@ from gsplat_edu.cli.train import (
     progress_bar,
     train_with_bar,
     with_choices,
+    with_points,
     with_poses,
 )
 from gsplat_edu.data.reader import CaptureReader
@@ -103,6 +104,7 @@ def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> Bloc
     reader = CaptureReader(options.data)
     if of_coarse is not None:
         coarse = replace(options_from(of_coarse), data=options.data)
+        coarse = with_points(coarse, reader, None, console, say)
         if not coarse.resume:
             names = left_open(of_coarse)
             coarse = with_choices(coarse, reader, names, console, say)

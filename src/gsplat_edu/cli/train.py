@@ -131,7 +131,7 @@ def _run(
     options = with_poses(options_from(arguments), arguments, console, say)
     reader = CaptureReader(options.data)
     if team.size == 1 and arguments.points is None:
-        options = _with_points(options, reader, seconds, console, say)
+        options = with_points(options, reader, seconds, console, say)
     chosen = _planned(arguments, options, reader, deadline, console, say)
     with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:
         options = chosen.options
@@ -182,7 +182,7 @@ def _run(
             broadcast.stay(lambda: view.watched)
 
 
-def _with_points(
+def with_points(
     options: RunOptions,
     reader: CaptureReader,
     time_limit: float | None,
