@@ -11,7 +11,7 @@ from gsplat_edu.ops.recolor import recolored_natively
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.exposure import NAME, SPREAD, Exposure
+from gsplat_edu.train.exposure import NAME, VIGNETTING_ERROR, Exposure
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.view_model import ViewRender
 from test_exposure import photographed
@@ -72,11 +72,11 @@ def model_with(ks, measured=None):
 
 
 def test_photos_of_one_lens_are_corrected_alike_and_others_are_not():
-    alike = model_with([-0.3, -0.3 + SPREAD, -0.3 - SPREAD, -0.3]).vignetting()
+    alike = model_with([-0.3, -0.3 + VIGNETTING_ERROR, -0.3 - VIGNETTING_ERROR, -0.3]).vignetting()
     np.testing.assert_allclose(alike.numpy(), -0.3, atol=1e-12)
     apart = np.array([-0.6, -0.1, -0.2, -0.4])
     found = model_with(apart).vignetting().numpy()
-    share = 1 - SPREAD**2 / apart.var()
+    share = 1 - VIGNETTING_ERROR**2 / apart.var()
     np.testing.assert_allclose(found, apart.mean() + share * (apart - apart.mean()), rtol=1e-12)
 
 

@@ -48,8 +48,8 @@ PROBE_SECONDS = 1.5
 SMALL = 32
 """Views are halved for a trial only if their sides stay at least this long, px."""
 
-SPREAD = 1.2
-"""Factor on the measured pairs, since other views may have more. In fox, views differ by 11 %."""
+PAIRS_MARGIN = 1.2
+"""Factor on the measured pairs: views that were not measured may have more. The views of fox differ by 11 %."""
 
 GROWN = (125_000, 250_000)
 """The probe grows the start scene to at most this many Gaussians: with several doublings, and with one."""
@@ -149,7 +149,7 @@ def _pairs_at_first(config: TrainConfig, pairs: float, gaussians: int) -> int:
         pairs: Most pairs in one of the measured photos, at full size.
         gaussians: Number of Gaussians of the start scene; a small one still has a pair.
     """
-    most = SPREAD * pairs
+    most = PAIRS_MARGIN * pairs
     return math.ceil(max(most / photo_factor(config, 0) ** 2, min(most, gaussians)))
 
 

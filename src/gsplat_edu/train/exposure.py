@@ -44,12 +44,10 @@ OPAQUE = 0.05
 """Only pixels of a lower transmittance count: elsewhere the render is dark because the scene is not finished."""
 
 NEWEST = 0.3
-"""Weight of a measurement against those before it; 1, 1/2, 1/3 for the first ones of a photo."""
+"""Smallest weight of a new measurement in a photo's running mean; its first measurements weigh 1, 1/2 and 1/3."""
 
-
-SPREAD = 0.05
-"""Standard deviation of the k that are measured for photos of one vignetting
-(benchmarks/archive/RESULTS-2026-11.md)."""
+VIGNETTING_ERROR = 0.05
+"""Standard error of one photo's measured k (benchmarks/archive/RESULTS-2026-11.md)."""
 
 
 class Exposure(Identity):
@@ -104,7 +102,7 @@ class Exposure(Identity):
     def vignetting(self) -> Float[Tensor, " views"]:
         """Return k of every view, drawn towards the mean m of the measured ones; 0 without `vignetting`.
 
-        min(0, m + f (k_i - m)),  f = max(0, 1 - SPREAD^2 / var(k))
+        min(0, m + f (k_i - m)),  f = max(0, 1 - VIGNETTING_ERROR^2 / var(k))
 
         Photos of one lens differ by errors of the measurement only, and are then corrected alike. No lens makes corners
         brighter.
@@ -140,5 +138,5 @@ def _vignetting(state: Float[Tensor, "views 5"]) -> Float[Tensor, " views"]:
     if not bool(measured.any()):
         return torch.zeros_like(k)
     mean = k[measured].mean()
-    share = (1.0 - SPREAD**2 / k[measured].var(correction=0)).clamp_min(0.0)
+    share = (1.0 - VIGNETTING_ERROR**2 / k[measured].var(correction=0)).clamp_min(0.0)
     return torch.where(measured, mean + share * (k - mean), mean).clamp_max(0.0)
