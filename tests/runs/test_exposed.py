@@ -1,5 +1,7 @@
 """Photos at the exposure of the scene: a scaled photo comes back, masks count, and `clean` judges by them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.ops.exposure import falloff
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.cleaning import open_subject
 from gsplat_edu.runs.exposed import at_exposure_of_scene
@@ -88,7 +91,15 @@ def test_clean_judges_a_corrected_run_at_its_exposure(tmp_path, appearance, caps
         appearance,
     ]
     assert main([*words, "--max-gaussians", "400"]) == 0
-    photos = [view.read().image for view in open_subject(run, None).dataset.train]
+    backend, renders = load_backend("cpu"), []
+
+    def counted(*arguments):
+        renders.append(arguments)
+        return backend.rasterize(*arguments)
+
+    dataset = open_subject(run, None, dataclasses.replace(backend, rasterize=counted)).dataset
+    assert len(renders) == (0 if appearance == "none" else len(views)), "the given backend measures exposures"
+    photos = [view.read().image for view in dataset.train]
     given = [view.read().image for view in load_dataset(tmp_path / "capture").train]
     same = all(np.array_equal(a, b) for a, b in zip(photos, given, strict=True))
     assert same == (appearance == "none")

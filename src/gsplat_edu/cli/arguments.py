@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
-from gsplat_edu.base.constants import LOOPBACK
+from gsplat_edu.base.constants import AUTO, LOOPBACK
 from gsplat_edu.base.errors import BackendWarning, SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.headroom import shortage
@@ -126,11 +126,21 @@ class _HelpAll(argparse.Action):
         parser.exit()
 
 
-def add_backend(parser: argparse._ActionsContainer) -> None:
-    """Add the option --backend."""
-    names = ", ".join(("auto", *BACKENDS))
-    text = f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu (default: auto)"
-    parser.add_argument("--backend", default="auto", metavar="NAME", help=text)
+def add_backend(parser: argparse._ActionsContainer, default: str = AUTO) -> None:
+    """Add the option --backend.
+
+    Args:
+        parser: Receives the option.
+        default: The default backend.
+    """
+    names = ", ".join((AUTO, *BACKENDS))
+    parser.add_argument(
+        "--backend",
+        default=default,
+        metavar="NAME",
+        help=f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu"
+        " (default: %(default)s)",
+    )
 
 
 def add_address(parser: argparse.ArgumentParser, port: int) -> None:

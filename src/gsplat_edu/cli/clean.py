@@ -9,11 +9,13 @@ from pathlib import Path
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.clean.evidence import judging_backend
 from gsplat_edu.clean.guard import clean
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.io.formats import format_of
 from gsplat_edu.io.ply import ORIGIN, save_ply
 from gsplat_edu.jobs import emitter
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import SIGNALS, default_target, open_subject, preview, report_lines
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
@@ -30,7 +32,8 @@ def run(arguments: argparse.Namespace) -> None:
             raise ArgumentError(f"--out: {out} is the scene itself; give another file")
     if arguments.preview is not None:
         export.check_target("--preview", arguments.preview)
-    subject = open_subject(arguments.source, arguments.dataset)
+    backend = judging_backend(load_backend(arguments.backend))
+    subject = open_subject(arguments.source, arguments.dataset, backend)
     for note in subject.dataset.notes:
         console.print(str(note), soft_wrap=True)
     source, dataset = subject.source, subject.dataset
@@ -48,6 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
             dataset.test,
             source.settings,
             arguments.max_loss,
+            backend,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     console.print(*report_lines(cleaning), sep="\n", soft_wrap=True)

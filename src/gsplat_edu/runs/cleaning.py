@@ -17,6 +17,8 @@ from gsplat_edu.clean.judge import Reason
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import appearance_of, run_dataset
 from gsplat_edu.runs.exposed import at_exposure_of_scene
@@ -52,12 +54,13 @@ class Subject:
     dataset: Dataset
 
 
-def open_subject(path: Path, dataset: Path | None) -> Subject:
+def open_subject(path: Path, dataset: Path | None, backend: Backend) -> Subject:
     """Read a scene or a run with its capture.
 
     Args:
         path: Scene file or run folder.
         dataset: The capture; None for that of the run.
+        backend: What renders the scene to measure the exposure of each photo.
 
     Raises:
         ArgumentError: the path names no scene, a scene file has no capture, or the capture is not that of the run.
@@ -81,7 +84,8 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
         if found := capture_difference(run, capture):
             raise ArgumentError(f"{capture.path} is not the capture of {run.path}: {found}")
         gaussians = source.scene.gaussians
-        capture = _at_exposure(capture, gaussians, source.settings, appearance_of(run.read_config()))
+        appearance = appearance_of(run.read_config())
+        capture = _at_exposure(capture, gaussians, source.settings, appearance, backend)
     cameras = _cameras(capture)
     up = source.scene.up or scene_up([camera for _, camera in cameras])
     x, y, z = capture.origin.tolist()
@@ -93,12 +97,12 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
 
 
 def _at_exposure(
-    dataset: Dataset, gaussians: Gaussians, settings: RenderSettings, appearance: str
+    dataset: Dataset, gaussians: Gaussians, settings: RenderSettings, appearance: str, backend: Backend
 ) -> Dataset:
     """Return the dataset with photos at the scene's exposure; unchanged if the training corrected no exposures."""
     if appearance == "none":
         return dataset
-    shown = functools.partial(render, settings=settings, backend="cpu")
+    shown = functools.partial(render, settings=settings, backend=backend)
     vignetting = appearance == "vignetting"
     return at_exposure_of_scene(dataset, gaussians, shown, settings.background, vignetting=vignetting)
 
@@ -114,11 +118,12 @@ def cleaner(
         appearance: The training's setting `appearance`. Unless it is "none", photos are converted to the scene's
             exposure first.
     """
+    backend = load_backend("cpu")
 
     def cleaned(gaussians: Gaussians, dataset: Dataset) -> tuple[Gaussians, dict[str, Any]]:
         here = gaussians.to(torch.device("cpu"))
-        photos = _at_exposure(dataset, here, settings, appearance)
-        cleaning = clean(here, photos.train, photos.test, settings)
+        photos = _at_exposure(dataset, here, settings, appearance, backend)
+        cleaning = clean(here, photos.train, photos.test, settings, backend=backend)
         for line in report_lines(cleaning):
             say(line)
         return cleaning.apply(gaussians), document(cleaning)
