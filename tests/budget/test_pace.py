@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_edu.budget.costs import Facts, Speed, step_profile
 from gsplat_edu.budget.deadline import Deadline
-from gsplat_edu.budget.forecast import ENDING
+from gsplat_edu.budget.forecast import ENDING_SECONDS
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import DataSettings
@@ -67,7 +67,7 @@ def paced(chosen, limit, slowness=lambda seconds: 1.0, *, stretches=True, **argu
     pace = Pace(run, Deadline(limit, clock), profile=profile if stretches else None)
     run.train(pace.over, [clock, pace])
     run.finish()
-    return run, clock.seconds + ENDING, pace
+    return run, clock.seconds + ENDING_SECONDS, pace
 
 
 SPEEDS = {
@@ -90,7 +90,7 @@ SPEEDS = {
 def test_between_92_and_100_percent_of_the_limit_are_used(capture, tmp_path, speed, strategy):
     chosen = options(capture, tmp_path / "run", 200, strategy)
     facts = Facts.of(CaptureRun(chosen).dataset)
-    limit = 1.1 * (float(step_profile(chosen.config, facts, SPEED).sum()) + BEFORE + ENDING)
+    limit = 1.1 * (float(step_profile(chosen.config, facts, SPEED).sum()) + BEFORE + ENDING_SECONDS)
     run, used, _ = paced(dataclasses.replace(chosen, resume=True), limit, SPEEDS[speed](limit))
     assert 0.92 * limit <= used <= limit
     done = run.trainer.iteration

@@ -58,7 +58,7 @@ LATER = 150 * 2**20
 
 
 Amount = TypeVar("Amount", float, np.ndarray)
-"""A number, or one for each iteration."""
+"""A number, or an array with one number for each iteration."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
 
 
 def pixel_share(config: TrainConfig) -> float:
-    """Return the mean over the iterations, or over a thousand of them, of the fraction of pixels that are rendered."""
+    """Return the mean fraction of the pixels that an iteration renders, sampled at about 1,000 iterations."""
     some = range(0, config.iterations, max(config.iterations // 1_000, 1))
     return float(np.mean([photo_factor(config, iteration) ** -2 for iteration in some]))
 
@@ -219,7 +219,7 @@ def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.
     Args:
         config: The run, with the schedule of its recipe.
         facts: The capture at training size.
-        speed: This machine's.
+        speed: The speed of this machine.
     """
     counts = expected_counts(config, facts.points, facts.pixels)
     factors = np.array([photo_factor(config, iteration) for iteration in range(config.iterations)])
@@ -227,10 +227,11 @@ def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.
 
 
 def reduced_bytes(config: TrainConfig, facts: Facts) -> int:
-    """Return by how much photos of reduced size raise the peak of memory.
+    """Return how many bytes the reduced copies of photos add to the peak memory.
 
-    Only training photos are reduced, to at most half of their pixels, and their copies are freed before a photo has its
-    full size again. So they do not add to what the evaluation takes for images, but to half of it.
+    Only training photos have reduced copies, with at most half of their pixels. All copies are freed before training
+    uses full size. While they exist, a step therefore takes at most half of the memory that the evaluation takes for
+    images, and only what exceeds the other half raises the peak.
 
     Args:
         config: The run.

@@ -21,18 +21,19 @@ from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.schedule import photo_factor
 
-SAVING = 4e8
+BYTES_SAVED_PER_SECOND = 4e8
 """Write speed of checkpoints, bytes per second."""
 
-ENDING = 6.0
-"""Seconds to write the scene file, the report and the last checkpoint's bookkeeping on a slow machine; a fast one takes
-2.5, with which a slow and busy machine exceeded a limit of two minutes by 3 s."""
+ENDING_SECONDS = 6.0
+"""Seconds to write the scene file, the report and the last checkpoint's bookkeeping on a slow machine. A fast machine
+takes 2.5 s; a slow and busy one that planned with 2.5 s exceeded a limit of two minutes by 3 s."""
 
-SURE = 1.6
-"""The time of a whole training is known within this factor on a quiet machine: the number of Gaussians that a scene
-needs, and their layout, are unknown beforehand."""
+TIME_UNCERTAINTY = 1.6
+"""Factor within which the forecast time holds on a quiet machine. The number of Gaussians that a scene needs, and
+their layout, are unknown beforehand."""
 
-SURE_OF_MEMORY = 1.25
+MEMORY_UNCERTAINTY = 1.25
+"""Factor within which the forecast memory holds."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,8 @@ class Forecast:
             + (f" ({parts})" if parts else ""),
             f"an iteration: {first} ms at first, {last} ms at the end; {grown} Gaussians",
             f"memory: up to {spelled_bytes(self.peak)} ({held})",
-            f"accuracy: time within a factor of {self.factor:.1f}, memory within {SURE_OF_MEMORY}; measured just now, "
-            "with whatever else is running",
+            f"accuracy: time within a factor of {self.factor:.1f}, memory within {MEMORY_UNCERTAINTY}; "
+            "measured just now, with whatever else is running",
         ]
 
 
@@ -134,7 +135,7 @@ def predict(
             "ending": ending_seconds(facts, measured.score, measured.picture) + 2 * saving,
         },
         memory=footprint.parts(int(counts.max()), image_memory),
-        factor=SURE * min(measured.noise, 2.0),
+        factor=TIME_UNCERTAINTY * min(measured.noise, 2.0),
     )
 
 
@@ -146,7 +147,7 @@ def ending_seconds(facts: Facts, score: float, picture: float) -> float:
         score: Seconds per pixel to score a view.
         picture: Seconds per pixel to write a test view's pictures.
     """
-    return ENDING + ((facts.train + facts.test) * score + facts.test * picture) * facts.pixels
+    return ENDING_SECONDS + ((facts.train + facts.test) * score + facts.test * picture) * facts.pixels
 
 
 def saving_seconds(gaussians: float, sh_degree: int) -> float:
@@ -156,7 +157,7 @@ def saving_seconds(gaussians: float, sh_degree: int) -> float:
         gaussians: Number of Gaussians.
         sh_degree: Their SH degree.
     """
-    return gaussians * 12 * (11 + 3 * (sh_degree + 1) ** 2) / SAVING
+    return gaussians * 12 * (11 + 3 * (sh_degree + 1) ** 2) / BYTES_SAVED_PER_SECOND
 
 
 def forecast(

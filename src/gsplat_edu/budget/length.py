@@ -1,4 +1,4 @@
-"""Choose the length of a run from its capture: units of the capture's own, fewer where more would hurt."""
+"""Choose the iterations of a run from its capture: more for more photos, fewer if a trial overfits."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ def with_planned_length(
     rescale: bool = True,
     progress: Callable[[], None] = lambda: None,
 ) -> tuple[RunOptions, str]:
-    """Choose the iterations of a run by the recipe fast.
+    """Choose the iterations of a run of the recipe fast.
 
     Args:
         options: The run.
-        quality: Of `gsplat_edu.train.length.QUALITIES`.
+        quality: A key of `gsplat_edu.train.length.QUALITIES`.
         reader: The run's capture.
         given: Names of settings that the user gave, which stay.
         rescale: Whether milestones that are not given stretch with the iterations.
-        progress: Called after every iteration of a trial.
+        progress: Called after every iteration of a trial; captures of few photos are tried.
 
     Returns:
         The run with its length, and a sentence that says how long it is and why.

@@ -34,19 +34,19 @@ LEAST_STEPS = 10
 DEAD_BAND = 0.01
 """A decision changes the schedule only if the remaining iterations differ by more than this fraction."""
 
-CAREFUL = 0.985
+PLANNED_FRACTION = 0.985
 """Fraction of the remaining time that a decision plans to use."""
 
-MARGIN = 1.3
+RESERVE_FACTOR = 1.3
 """Factor on the estimated time after training, since the views that are not measured may take longer, and the process
 takes a moment to exit. Without it, a quiet but slow machine exceeded a limit of two minutes by 0.2 s."""
 
-WORTH_SAYING = 0.2
+REPORTED_CHANGE = 0.2
 """Tell the user about a change of the number of iterations by more than this fraction."""
 
 
 class Pace:
-    """Keeps a run within a time limit, from the start of the command to its end, and uses the time.
+    """Keeps a command within its time limit, and uses nearly all of the time.
 
     It is a callback of the trainer, which calls `over` after every iteration. With `profile`, the number of iterations
     follows the machine: at regular times, the rest of the schedule is stretched or shrunk to what still fits (see
@@ -56,7 +56,7 @@ class Pace:
     Args:
         run: The run, with its dataset loaded.
         deadline: The limit and its clock, which also times the evaluation.
-        profile: Expected seconds of each iteration of the recipe, of which only ratios count; None to keep the
+        profile: Expected seconds of each iteration of the recipe; only their ratios matter. None to keep the
             schedule.
         say: Called with sentences for the user.
     """
@@ -82,7 +82,7 @@ class Pace:
         self._planned = self._told = run.options.config.iterations
 
     def over(self) -> bool:
-        """Return whether training has to end now."""
+        """Return whether training has to stop now."""
         now = self._deadline.spent
         self._aside, self._last = self._aside + now - self._last, now
         late = self._deadline.seconds - now <= self._reserve
@@ -118,7 +118,7 @@ class Pace:
         self._last = self._deadline.spent
 
     def _mark(self, trainer: Trainer, now: float) -> None:
-        """Remember how long the step took, and how long the model says."""
+        """Record the measured and the expected duration of the step."""
         expected = 1.0
         if self._profile is not None:
             position = trainer.tempo.position(trainer.iteration - trainer.config.batch)
@@ -132,7 +132,7 @@ class Pace:
 
     @property
     def _slowness(self) -> float:
-        """Measured over modelled time of the steps in the window; 1 before the first step."""
+        """Ratio of the measured to the expected time of the steps in the window; 1 before the first step."""
         (modelled, stepped, _), (last, now, _) = self._marks[0], self._marks[-1]
         return (now - stepped) / (last - modelled) if last > modelled and now > stepped else 1.0
 
@@ -147,10 +147,10 @@ class Pace:
         count, degree = trainer.stepper.count, trainer.config.sh_degree
         ending = ending_seconds(self._facts, score, picture) + 2 * saving_seconds(count, degree)
         slower = self._slowness / slowness if self._profile is not None else 1.0
-        return MARGIN * ending * max(slower, 1.0)
+        return RESERVE_FACTOR * ending * max(slower, 1.0)
 
     def _measure(self, trainer: Trainer) -> None:
-        """Score a view, which tells what the end of the run takes."""
+        """Score a view to estimate the time that the end of the run takes."""
         dataset, options = self._run.dataset, self._run.options
         view = (dataset.test or dataset.train)[0]
         clock = self._deadline.clock
@@ -158,13 +158,13 @@ class Pace:
         self._costs.append((*found, self._slowness))
 
     def _decide(self, trainer: Trainer, profile: Float64[np.ndarray, " iterations"]) -> None:
-        """Change the number of iterations to what fits, if it differs enough."""
+        """Change the number of iterations to the one that fits, if the difference exceeds `DEAD_BAND`."""
         done, config, tempo = trainer.iteration, trainer.config, trainer.tempo
         if len(self._marks) <= LEAST_STEPS:
             return
         rest = profile[min(tempo.position(done), len(profile) - 1) :]
         share_of_steps = self._marks[-1][1] / (self._marks[-1][1] + self._aside)
-        left = CAREFUL * (self._deadline.left - self._reserve) * share_of_steps
+        left = PLANNED_FRACTION * (self._deadline.left - self._reserve) * share_of_steps
         fitting = min(int(left / (self._slowness * float(rest.mean()))), RECIPE_ITERATIONS - done)
         fitting -= fitting % config.batch
         remaining = config.iterations - done
@@ -172,7 +172,7 @@ class Pace:
             return
         total = done + fitting
         self._settle(total, str(tempo.changed(done, total)))
-        if abs(total - self._told) > WORTH_SAYING * self._told:
+        if abs(total - self._told) > REPORTED_CHANGE * self._told:
             self._say(f"iteration {done}: the time is enough for {total} iterations, instead of {self._told}")
             self._told = total
 

@@ -43,23 +43,23 @@ Bytes = UInt8[np.ndarray, "H W 3"]
 
 PROBE_STEPS = 9
 PROBE_SECONDS = 1.5
-"""A probe ends after this many steps or seconds, but not before its third step; the first is not counted."""
+"""A trial ends after this many steps or seconds, but not before its third step. Its first step is not timed."""
 
-SMALL = 32
-"""Views are halved for a trial only if their sides stay at least this long, px."""
+SMALLEST_HALVED_SIDE = 32
+"""Views are halved for a trial only if their sides are at least this long afterwards, px."""
 
 PAIRS_MARGIN = 1.2
 """Factor on the measured pairs: views that were not measured may have more. The views of fox differ by 11 %."""
 
-GROWN = (125_000, 250_000)
-"""The probe grows the start scene to at most this many Gaussians: with several doublings, and with one."""
+GROWN_LIMITS = (125_000, 250_000)
+"""Largest number of Gaussians that the start scene is grown to: by several doublings, and by a single one."""
 
-ASSUMED = 400 * 2**20
+ASSUMED_BYTES = 400 * 2**20
 """Assumed bytes of a process that has loaded torch, if the system does not report them."""
 
 
 def resident_bytes() -> int:
-    """Return the memory this process holds now, in bytes; if unknown, its peak so far, or else `ASSUMED`."""
+    """Return the resident memory of this process, bytes; its peak if unknown, or else `ASSUMED_BYTES`."""
     try:
         for line in Path("/proc/self/status").read_text("ascii", errors="replace").splitlines():
             if line.startswith("VmRSS:"):
@@ -69,7 +69,7 @@ def resident_bytes() -> int:
     try:
         import resource
     except ImportError:  # Windows
-        return ASSUMED
+        return ASSUMED_BYTES
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else 1024 * most
 
@@ -108,7 +108,9 @@ def probe(
         photo = view.read()
         reading.append(time.perf_counter() - began)
         photos.append(View(view.camera, photo.image, alpha=photo.alpha, mask=photo.mask, name=view.name))
-    plain = replace(config, strategy="none")  # mcmc starts fainter and smaller than it stays
+    plain = replace(
+        config, strategy="none"
+    )  # mcmc starts with fainter and smaller Gaussians than it has later
     start, usual = (
         scene or from_points(dataset.points, dataset.colors, settings) for settings in (config, plain)
     )
@@ -120,7 +122,7 @@ def probe(
     trial = functools.partial(_trial, config=config, extent=extent, name=backend)
     small = [_halved(view) for view in photos]
     trials = [trial(start, photos), trial(grown, photos)]
-    if min(min(view.camera.W, view.camera.H) for view in small) >= SMALL:
+    if min(min(view.camera.W, view.camera.H) for view in small) >= SMALLEST_HALVED_SIDE:
         trials.append(trial(start, small))
     score, picture = judging_seconds(grown, photos[:2], config, backend)
     pairs = _pairs_at_first(config, trials[0].pairs * len(usual) / len(start), len(usual))
@@ -142,12 +144,13 @@ def probe(
 def _pairs_at_first(config: TrainConfig, pairs: float, gaussians: int) -> int:
     """Return the pairs of the start scene in photos of the size with which the run starts.
 
-    Large Gaussians of a random start cover fewer tiles there, and have shrunk before photos have their full size.
+    The large Gaussians of a random start cover fewer tiles in reduced photos, and have shrunk before training uses the
+    full size.
 
     Args:
         config: The run.
-        pairs: Most pairs in one of the measured photos, at full size.
-        gaussians: Number of Gaussians of the start scene; a small one still has a pair.
+        pairs: Largest number of pairs in one of the measured photos, at full size.
+        gaussians: Number of Gaussians of the start scene; even a small Gaussian has a pair.
     """
     most = PAIRS_MARGIN * pairs
     return math.ceil(max(most / photo_factor(config, 0) ** 2, min(most, gaussians)))
@@ -155,7 +158,14 @@ def _pairs_at_first(config: TrainConfig, pairs: float, gaussians: int) -> int:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A few steps: Gaussians, mean pixels of the views, most pairs in a view, seconds of each step but the first."""
+    """Measurements of a few steps.
+
+    Args:
+        gaussians: Number of Gaussians.
+        pixels: Mean number of pixels of a view.
+        pairs: Largest number of pairs in a view.
+        seconds: Duration of each step except the first.
+    """
 
     gaussians: int
     pixels: float
@@ -166,10 +176,10 @@ class _Trial:
 def _grown(start: Gaussians, wanted: int) -> Gaussians:
     """Split every Gaussian until there are about as many as wanted; their total area in the image is unchanged."""
     generator = torch.Generator().manual_seed(0)
-    most = GROWN[1]
+    most = GROWN_LIMITS[1]
     while 2 * len(start) <= min(most, 1.5 * wanted):
         parts = [split_children(start, math.sqrt(2.0), generator) for _ in range(2)]
-        start, most = Gaussians.concatenated(parts), GROWN[0]
+        start, most = Gaussians.concatenated(parts), GROWN_LIMITS[0]
     half = torch.zeros_like(start.logit_opacities)
     return Gaussians(**(start.tensors() | {"logit_opacities": half}))
 
@@ -222,7 +232,7 @@ def _until(moments: Sequence[float]) -> Callable[[], bool]:
 
 
 def _halved(view: View) -> View:
-    """Return a view of half the size; which pixels it keeps is irrelevant here."""
+    """Return a view of half the size, made of every second pixel, because only the time of a step matters."""
     camera, photo = view.camera, view.read()
     image, alpha, mask = (
         None if plane is None else np.ascontiguousarray(plane[::2, ::2])
@@ -245,7 +255,7 @@ def judging_seconds(
 
     Args:
         gaussians: The scene; it is not changed.
-        views: Views to score, at least one; the fastest counts.
+        views: Views to score, at least one; the fastest one determines the result.
         config: Rendering settings.
         backend: Name of the rendering backend.
         clock: Returns seconds.

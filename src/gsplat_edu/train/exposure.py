@@ -35,10 +35,12 @@ from gsplat_edu.train.view_model import Identity, Rows, ViewRender
 NAME = "exposures"
 """Name of the state, as in checkpoints."""
 
-WARM_UP, LATER = 0.015, 0.3
-"""Shares of the run before the first measurement of a gain, and of vignetting. The scene has to show something. An
-unfinished scene differs from the photos in their corners more than in their middle, and where all cameras look at one
-subject, a common vignetting that it seems to need would hardly be unlearned."""
+GAINS_START, VIGNETTING_START = 0.015, 0.3
+"""Fractions of the run before gains, or gains and vignetting, are measured for the first time.
+
+A gain needs a scene that resembles the photo. Vignetting needs a scene that is finished in the corners of the photos as
+well as in their middle: if all cameras look at one subject, a false vignetting common to all photos hardly ever
+disappears again."""
 
 OPAQUE = 0.05
 """Only pixels of a lower transmittance count: elsewhere the render is dark because the scene is not finished."""
@@ -68,7 +70,7 @@ class Exposure(Identity):
         self, count: int, iterations: int, like: Tensor, recolor: RecolorKernel, vignetting: bool = False
     ) -> None:
         self._state = like.new_zeros(count, 5 if vignetting else 4)
-        self._begin = (LATER if vignetting else WARM_UP) * iterations
+        self._begin = (VIGNETTING_START if vignetting else GAINS_START) * iterations
         self._recolor, self._vignetting = recolor, vignetting
 
     def parameters(self) -> Mapping[str, Tensor]:
