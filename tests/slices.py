@@ -84,7 +84,7 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/train/test_exposure_alpha.py::test_exposures_of_transparent_photos_come_back": (7, 1),
     "tests/sfm/test_wrong_poses.py": (7, 1),
     "tests/sfm/test_phone_photos.py::test_photos_of_a_phone_become_an_upright_capture_in_srgb": (6, 1),
-    "tests/blocks/test_cluster.py::test_a_killed_worker_and_a_killed_scheduler_lose_nothing": (6, 1),
+    "tests/blocks/test_cluster.py::test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler": (6, 1),
     "tests/compat/test_rasterization.py::test_finite_differences": (6, 2),
     "tests/sfm/test_lenses.py": (5, 1),
     "tests/clean/test_judge.py::test_the_same_bits_on_any_number_of_threads": (5, 2),

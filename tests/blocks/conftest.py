@@ -27,7 +27,7 @@ def split(city, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def serial(city, tmp_path_factory) -> Path:
-    """One command: split, the blocks one after the other in one process, merged."""
+    """The run of one command that splits the capture, trains the blocks one after the other, and merges them."""
     folder = tmp_path_factory.mktemp("serial") / "run"
     assert main(["train", str(city), "--out", str(folder), "--blocks", "4", *RECIPE]) == 0
     return folder

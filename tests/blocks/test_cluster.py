@@ -1,4 +1,4 @@
-"""Blocks on dask.distributed: whoever is lost, the merged scene has the bytes of the serial run."""
+"""Blocks on dask.distributed: the merged scene has the bytes of the serial run, even if processes are killed."""
 
 import contextlib
 import random
@@ -24,7 +24,7 @@ WORKER = "from distributed.cli.dask_worker import main; main()"
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 PATIENCE = 180.0
-"""Seconds after which a test gives up waiting for what has to come."""
+"""Longest time that a test waits for an event, seconds."""
 
 
 def scene(folder):
@@ -32,7 +32,7 @@ def scene(folder):
 
 
 class Cluster:
-    """A scheduler and workers in processes of their own, on the loopback interface; the end kills what is left."""
+    """A scheduler and workers in processes of their own, on the loopback interface; leaving the context kills them."""
 
     def __init__(self, folder):
         self.folder, self.started = folder, 0
@@ -91,12 +91,12 @@ def answers(port):
 def wait_for(condition):
     until = time.monotonic() + PATIENCE
     while not condition():
-        assert time.monotonic() < until, "what has to come does not come"
+        assert time.monotonic() < until, "the awaited event did not occur"
         time.sleep(0.02)
 
 
 @pytest.mark.sliced(1, group="several processes")
-def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(city, split, serial, tmp_path):
+def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, serial, tmp_path):
     draw = random.Random(SEED)
     moments = sorted(draw.sample(range(5, 140), 2))
     run = tmp_path / "run"
@@ -122,9 +122,11 @@ def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(city, split, serial
         assert f"{cluster.address}: the scheduler was lost; finished blocks and checkpoints are kept" in err
         assert len(err.splitlines()) == 1
     finished = {n: folder.record(n).stat().st_mtime_ns for n in range(4) if folder.record(n).is_file()}
-    assert len(finished) < 4, "the scheduler was killed before the end"
+    assert len(finished) < 4, "the scheduler was killed before the blocks were finished"
     before = steps()
-    assert before >= moments[0] - 20, "a checkpoint every 10 steps, and two workers"
+    assert before >= moments[0] - 20, (
+        "each of two workers loses at most the 10 steps since its last checkpoint"
+    )
     with Cluster(tmp_path / "second") as cluster:
         cluster.scheduler()
         for _ in range(2):
@@ -132,11 +134,11 @@ def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(city, split, serial
         code, _, err = cluster.start(COMMAND, *words, cluster.address).ended()
         assert code == 0, err
     assert scene(run) == scene(serial), f"moments {moments}"
-    assert {n: folder.record(n).stat().st_mtime_ns for n in finished} == finished, "nothing is done again"
+    assert {n: folder.record(n).stat().st_mtime_ns for n in finished} == finished, "trained once"
 
 
 @pytest.mark.sliced(1, group="several processes")
-def test_a_local_cluster_gives_the_bytes_too_and_names_what_fails(city, split, serial, tmp_path):
+def test_a_local_cluster_gives_the_same_bytes_and_names_the_missing_photo(city, split, serial, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(split, run)
     plan = BlockPlan.read(run)
@@ -155,7 +157,7 @@ def test_a_local_cluster_gives_the_bytes_too_and_names_what_fails(city, split, s
     assert f"{len(needs[name])} of 4 blocks failed; finished blocks and checkpoints are kept" in err
     folder, digest = BlocksFolder(run), plan.digest()
     assert [n for n in range(4) if folder.read_done(n, digest) is None] == needs[name], (
-        "the others are trained"
+        "the other blocks are trained"
     )
     for number in needs[name]:
         assert main(["block", str(run), str(number)]) == 0
@@ -181,13 +183,13 @@ def test_no_scheduler_no_workers_and_lost_workers_are_one_line(split, tmp_path):
             run_on_cluster(run, [0], options)
         worker = cluster.worker()
 
-        def lose_it():
+        def kill_the_worker_once_it_trains():
             if log.exists() and worker.runs:
                 kill(worker)
 
         waiting = ClusterOptions(cluster.address, patience=20.0)
         with pytest.raises(CheckpointError, match="all workers were lost; start some, and finished blocks"):
-            run_on_cluster(run, [0], waiting, watch=lose_it)
+            run_on_cluster(run, [0], waiting, watch=kill_the_worker_once_it_trains)
 
 
 def test_a_network_without_tls_gets_a_warning():

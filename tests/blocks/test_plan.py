@@ -44,13 +44,13 @@ def test_every_place_lies_in_one_cell(count):
     on_edges = np.concatenate([anywhere, corners[np.isfinite(corners).all(axis=1)]])
     assert (sum(cell.holds(on_edges).astype(int) for cell in cells) == 1).all()
     weights = np.array([cell.holds(area.ground.coordinates(points)).mean() for cell in cells])
-    # points and cameras weigh alike; a cell's mean share is 1 / count, and one row of cameras more or less is 9 of 54
+    # Points and cameras have equal weight. A cell holds 1 / count of them on average; one row of cameras is 9 of 54.
     eyes = area.ground.coordinates(np.stack([camera.eye for camera in cameras]))
     weights = (weights + np.array([cell.holds(eyes).mean() for cell in cells])) / 2
     assert np.abs(weights - 1 / count).max() < 9 / 54 / 2 + 0.02
 
 
-def test_the_axes_follow_the_flight_and_the_cut_its_longer_side():
+def test_the_axes_are_parallel_to_the_flight_and_the_cut_halves_the_longer_side():
     cameras = flight(4, 16, turn=0.5)
     points = under(cameras, np.random.default_rng(0))
     area = measured_area(cameras, points)
@@ -60,7 +60,7 @@ def test_the_axes_follow_the_flight_and_the_cut_its_longer_side():
     longer = int(sides[1] > sides[0])
     along = np.array(area.ground.axes[longer])
     assert abs(along @ [math.cos(0.5), 0, math.sin(0.5)]) > math.cos(math.radians(1.0)), (
-        "a degree is the step"
+        "axes are searched in steps of one degree"
     )
     (one, _) = halved(area, cameras, points, 2)
     assert math.isfinite(one.high[longer]) and math.isinf(one.high[1 - longer])

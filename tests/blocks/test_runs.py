@@ -1,4 +1,4 @@
-"""A run in blocks: the same bytes whoever trains them, ordinary run folders, and one line for each mistake."""
+"""Runs in blocks: the bytes do not depend on who trains a block, blocks are ordinary runs, mistakes are one line."""
 
 import json
 import resource
@@ -65,7 +65,7 @@ def test_each_block_keeps_the_gaussians_of_its_cell(serial):
         trained = load_ply(folder.scene(number, done.iterations)).means.numpy()
         inside = block.core.holds(plan.area.ground.coordinates(trained))
         np.testing.assert_array_equal(part, trained[inside])
-        assert 0 < inside.sum() < len(trained), "a block also has what its views show around it"
+        assert 0 < inside.sum() < len(trained), "a block also trains Gaussians around its cell"
         first += cell["gaussians"]
 
 
@@ -86,7 +86,7 @@ def test_merged_run_and_blocks_are_ordinary_runs(serial, tmp_path):
     assert "<h2>Blocks</h2>" in report and "Along the cuts" in report
 
 
-def test_a_merged_run_is_not_continued_as_if_it_were_one(city, serial, capsys):
+def test_a_merged_run_cannot_be_resumed(city, serial, capsys):
     assert main(["train", str(city), "--out", str(serial), "--resume", "--iterations", "90"]) == 2
     assert "is merged from blocks" in capsys.readouterr().err
 
@@ -176,9 +176,9 @@ def test_a_plan_or_a_record_from_elsewhere_opens_no_other_file(serial, tmp_path,
     assert "recipe is damaged (backend: is" in capsys.readouterr().err
 
 
-def test_a_full_disk_is_one_line_and_the_block_goes_on(run, serial, capsys):
+def test_a_full_disk_is_one_line_and_the_block_can_be_resumed(run, serial, capsys):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))  # too little for a checkpoint
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))  # a checkpoint is larger
     try:
         assert main(["block", str(run), "2"]) == 2
     finally:
@@ -193,7 +193,7 @@ def test_a_full_disk_is_one_line_and_the_block_goes_on(run, serial, capsys):
     assert done.sha256 == known.sha256
 
 
-def test_what_was_changed_or_damaged_is_named(serial, tmp_path, capsys):
+def test_changed_or_damaged_files_are_named(serial, tmp_path, capsys):
     copy = tmp_path / "copy"
     shutil.copytree(serial, copy)
     folder = BlocksFolder(copy)
@@ -254,7 +254,7 @@ def test_other_options_are_refused_on_resuming(city, run, capsys):
     assert "was made with train.seed = 0, not 7" in capsys.readouterr().err
 
 
-def test_blocks_with_few_views_join(city, serial, tmp_path, capsys):
+def test_fewer_blocks_are_made_if_they_would_have_too_few_views(city, serial, tmp_path, capsys):
     words = ["train", str(city), "--out", str(tmp_path / "run"), "--from", str(serial), "--until", "split"]
     arguments = [*words, "--strategy", "adc", "--iterations", "10", "--blocks", "6", "--min-views", "25"]
     assert main(arguments) == 0
@@ -267,7 +267,7 @@ def test_blocks_with_few_views_join(city, serial, tmp_path, capsys):
 
 
 def test_merging_keeps_the_cap_of_the_whole_scene(serial):
-    """A cap below what the blocks have together: what covers least goes, and the order stays."""
+    """If the blocks exceed the cap together, the Gaussians that cover least are removed; the others keep their order."""
     plan, folder = BlockPlan.read(serial), BlocksFolder(serial)
     records = finished_blocks(folder, plan)
     whole, counts = merged(folder, plan, records)
@@ -286,7 +286,7 @@ def test_merging_keeps_the_cap_of_the_whole_scene(serial):
     assert gone.max() <= covers[1].min() + 1e-6
 
 
-def test_each_block_is_as_long_as_its_own_views_need(city, tmp_path, monkeypatch):
+def test_each_block_has_the_length_that_follows_from_its_views(city, tmp_path, monkeypatch):
     monkeypatch.setattr("gsplat_edu.train.length.UNIT", 16)
     monkeypatch.setattr("gsplat_edu.train.length.PLANNED_VIEWS", 10)
     out = tmp_path / "run"

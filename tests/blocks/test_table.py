@@ -1,4 +1,4 @@
-"""The table of all blocks tells their state from their files alone."""
+"""The table of all blocks shows their state, which it reads from their files alone."""
 
 import io
 import shutil

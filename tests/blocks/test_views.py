@@ -1,4 +1,4 @@
-"""How much of an image a cell covers, by its airspace and by a coarse model; which Gaussians a camera may show."""
+"""The share of an image that a cell covers, by its airspace and by a coarse model, and the Gaussians in any view."""
 
 import math
 
@@ -46,21 +46,20 @@ def shows(gaussians, cameras, cells=HALVES):
 
 @pytest.mark.parametrize("x", [0.0, 1.0, -2.0, 9.0])
 def test_both_measures_agree_on_flat_ground(x):
-    # From 5 above, the image is 64 / 40 * 5 = 8 wide: the edge at 0 is 4 + x from its left side.
+    # Seen from 5 above, the image is 64 / 40 * 5 = 8 wide, and its left side is at x - 4.
     left = np.clip((4 - x) / 8, 0, 1)
     (air,) = airspace_shares(AREA, [downwards(x)], HALVES)
-    # 16 columns of rays; at 9 the ground ends inside of the image
+    # There are 16 columns of rays. At x = 9, the ground ends inside the image.
     assert air[0] == pytest.approx(left, abs=1 / 16)
     if x < 9:
         (seen,) = shows(carpet(), [downwards(x)])
         assert seen[0] == pytest.approx(left, abs=0.03) and seen.sum() == pytest.approx(1, abs=0.03)
 
 
-def test_what_is_hidden_is_not_seen():
-    roof = carpet(y=-2.0, low=-8.0, high=0.0)  # all of it in the left half, higher than the ground of both
+def test_hidden_ground_does_not_count():
+    roof = carpet(y=-2.0, low=-8.0, high=0.0)  # over the left half only, above the ground
     camera = downwards(-4.0)
-    # The roof, 3 below the camera, ends 4 to its right: beyond the image. Half of the image would show the ground at
-    # the right of 0 if the roof were not there.
+    # The roof is 3 below the camera and ends 4 to its right, outside the image, so it hides all ground.
     ground = carpet(low=-2.0)
     cells = [
         Cell((-math.inf, -math.inf), (-2.0, math.inf)),
@@ -70,11 +69,11 @@ def test_what_is_hidden_is_not_seen():
     (bare,) = shows(carpet(), [camera], cells)
     (hidden,) = shows(Gaussians.concatenated([roof, ground]), [camera], cells)
     np.testing.assert_allclose(bare, [0.75, 0.25, 0.0], atol=0.03)
-    # seen from 3 above the roof, its part at the left of -2 covers (2 + 2.4) of 4.8 units
+    # The image shows 4.8 units of the roof, from -6.4 to -1.6; the part left of -2 is 4.4 of them.
     np.testing.assert_allclose(hidden, [4.4 / 4.8, 0.4 / 4.8, 0.0], atol=0.04)
 
 
-def test_more_cells_than_channels_are_measured_in_parts():
+def test_more_cells_than_channels_take_several_renders():
     strips = [Cell((a, -math.inf), (a + 0.5, math.inf)) for a in np.arange(-10, 10, 0.5)]
     (shares,) = shows(carpet(), [downwards(0.0)], strips)
     assert len(strips) == 40 and shares.sum() == pytest.approx(1, abs=0.03)
@@ -88,9 +87,7 @@ def test_only_gaussians_beside_the_view_are_left_out():
     shown = in_any_view(scene, cameras)
     assert 0.2 < shown.mean() < 0.9
     kept = scene.map(lambda t: t[torch.from_numpy(shown)])
-    for (
-        camera
-    ) in cameras:  # a Gaussian ends where its alpha falls below 1/255: within 3.4 standard deviations
+    for camera in cameras:  # alpha falls below 1/255 within 3.4 standard deviations
         whole, part = (render(g, camera, backend="cpu").image for g in (scene, kept))
         assert float((whole - part).abs().max()) < 0.01
     drawn = np.zeros(len(scene), dtype=bool)

@@ -19,5 +19,5 @@ def test_a_stopwatch_counts_from_when_it_was_made(monkeypatch):
 
 
 def test_the_budget_does_not_use_the_age_of_the_process():
-    """Only the command line counts it: a program that has run for hours may plan a training of minutes."""
+    """Only the command line counts from the start of the process; a program that has run for hours may plan minutes."""
     assert not any(hasattr(module, "process_age") for module in (deadline, pace, plan, probe))

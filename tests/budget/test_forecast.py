@@ -1,4 +1,4 @@
-"""Forecast arithmetic: measurements are given, so no clock affects a test."""
+"""The arithmetic of forecasts. The tests pass measurements in, so no clock affects them."""
 
 import dataclasses
 import math
@@ -60,25 +60,26 @@ def test_the_fit_finds_the_law_behind_steps():
     places = [(25_784, 7e5), (206_272, 7e5), (25_784, 1.8e5)]
     fitted = Speed.fitted([(n, p, law.seconds(n, p)) for n, p in places])
     for part, known in zip(dataclasses.astuple(fitted), dataclasses.astuple(law), strict=True):
-        # float64 with columns scaled to 1: a few ulp times the system's condition number, which is below 1e3
+        # The error is a few ulp of float64 times the condition number, which is below 1e3 with columns
+        # scaled to 1.0
         assert part == pytest.approx(known, rel=1e-10)
 
 
 def test_no_part_of_the_fit_is_negative():
-    """More Gaussians measured faster, as can happen on a busy machine, so they are taken to cost nothing."""
+    """On a busy machine, a step with more Gaussians may measure faster. The fit then assigns Gaussians no cost."""
     fitted = Speed.fitted([(1_000, 1e5, 0.030), (2_000, 1e5, 0.020), (1_000, 2.5e4, 0.010)])
     assert fitted.per_gaussian == 0.0 and fitted.fixed >= 0.0 and fitted.per_pixel > 0.0
-    assert fitted.seconds(1_500, 1e5) == pytest.approx(0.025), "the mean of the two is then the best fit"
+    assert fitted.seconds(1_500, 1e5) == pytest.approx(0.025), "the best fit is the mean of the two steps"
 
 
-def test_adc_is_expected_to_grow_when_it_densifies():
+def test_the_expected_counts_of_adc_grow_at_its_densifications():
     config = recipe(7_000)  # densifies after iterations 200, 300, ... 3,400
     counts = expected_counts(config, 25_784, 734_580)
     grown = np.flatnonzero(np.diff(counts)) + 1
     assert len(counts) == 7_000 and counts[0] == 25_784
     assert (grown - 1).tolist() == list(range(200, 3_500, 100))
     assert wanted_gaussians(config, 25_784, 734_580) == counts[-1]
-    # benchmarks/RESULTS.md: 163,950 at the end. The forecast only claims to be within a factor of two.
+    # The run in benchmarks/RESULTS.md ended with 163,950. The forecast claims to be right within a factor of two.
     assert 0.5 < counts[-1] / 163_950 < 2.0
     capped = expected_counts(recipe(7_000, max_gaussians=40_000), 25_784, 734_580)
     assert capped.max() == 40_000
@@ -89,8 +90,8 @@ def test_without_a_strategy_nothing_grows():
     assert set(expected_counts(PLAIN, 1_000, 1e6)) == {1_000}
 
 
-def test_mcmc_is_expected_to_grow_as_it_does():
-    """Compared with the strategy itself: the same counts at the same iterations."""
+def test_the_expected_counts_of_mcmc_are_those_of_the_strategy():
+    """The strategy itself has the same counts at the same iterations."""
     config = recipe(400, strategy="mcmc", max_gaussians=135, densify_every=20)
     shapes = {"means": (100, 3), "quats": (100, 4), "log_scales": (100, 3), "sh0": (100, 1, 3)}
     shapes |= {"sh_rest": (100, 0, 3), "logit_opacities": (100,)}
@@ -105,8 +106,8 @@ def test_mcmc_is_expected_to_grow_as_it_does():
     assert counts[-1] == 135
 
 
-def test_fast_is_expected_to_grow_as_it_plans():
-    """The plan at every densification; between two of them the forecast interpolates. Nothing is pruned here."""
+def test_the_expected_counts_of_fast_are_those_of_its_plan():
+    """The counts agree at every densification; between two of them the forecast interpolates. Nothing is pruned here."""
     config = recipe(1_000, strategy="fast", max_gaussians=500, densify_every=20, min_opacity=0.0)
     counts = expected_counts(config, 100, 1e4)
     gaussians = random_ball(100, torch.Generator().manual_seed(0)).trainable()
@@ -118,13 +119,15 @@ def test_fast_is_expected_to_grow_as_it_plans():
             assert len(gaussians) == counts[iteration], iteration
     assert (counts[0], counts[-1]) == (100, 500) and (np.diff(counts) >= 0).all()
     assert wanted_gaussians(config, 100, 734_580, 85) == 100_000
-    assert wanted_gaussians(config, 9, 734_580, 340) == 200_000, "twice for four times as many views"
-    assert wanted_gaussians(config, 9, 8 * 734_580, 85) == 200_000, "twice for eight times as many pixels"
+    assert wanted_gaussians(config, 9, 734_580, 340) == 200_000, "four times as many views need twice as many"
+    assert wanted_gaussians(config, 9, 8 * 734_580, 85) == 200_000, (
+        "eight times as many pixels need twice as many"
+    )
     assert wanted_gaussians(config, 9, 16, 1) == 1_000
 
 
 def test_small_photos_are_cheaper_in_the_forecast():
-    """Over 60 % of the run, in four equal steps, an image has 1/16, 1/8, 1/4 and 1/2 of its pixels."""
+    """In four equal parts of the first 60 % of the run, an image has 1/16, 1/8, 1/4 and 1/2 of its pixels."""
     config = recipe(1_000, strategy="fast", max_gaussians=FACTS.points)
     share = 0.15 * (1 / 16 + 1 / 8 + 1 / 4 + 1 / 2) + 0.4
     assert pixel_share(config) == pytest.approx(share, rel=1e-12) and pixel_share(PLAIN) == 1.0
@@ -133,13 +136,14 @@ def test_small_photos_are_cheaper_in_the_forecast():
     assert full.seconds["training"] - found.seconds["training"] == pytest.approx(1_000 * saved)
     assert full.steps[0] - found.steps[0] == pytest.approx(15 / 16 * MEASURED.speed.per_pixel * FACTS.pixels)
     assert found.steps[1] == full.steps[1]
-    # 80 of 100 photos are reduced, at most to half; their copies and half an image meet a whole one at the end
+    # 80 of 100 photos are reduced, at most to half. Half of what an evaluation takes for an image covers part of
+    # that.
     copies = 80 * FACTS.photo_bytes // 200 - 180 * FACTS.largest // 2
-    assert found.memory["program"] - full.memory["program"] == copies, "photos of reduced size"
+    assert found.memory["program"] - full.memory["program"] == copies, "bytes of the reduced copies"
 
 
-def test_photos_held_out_have_no_copies_of_reduced_size():
-    """The RGBA benchmark has 200 test photos beside 100: the copies of all 300 were forecast, 183 MiB too many."""
+def test_held_out_photos_have_no_copies_of_reduced_size():
+    """The RGBA benchmark has 200 test and 100 training photos; forecasting copies of all 300 took 183 MiB too many."""
     config, photo = recipe(1_000, strategy="fast", max_gaussians=9), 3 * 640_000
     facts = Facts(100, 200, 9, 640_000.0, 640_000.0, 640_000.0, 300 * photo, 2)
     assert reduced_bytes(config, facts) == 50 * photo - 180 * 640_000 // 2
@@ -147,7 +151,7 @@ def test_photos_held_out_have_no_copies_of_reduced_size():
     assert reduced_bytes(PLAIN, facts) == 0
 
 
-def test_the_large_splats_of_a_random_start_are_seen_in_small_photos():
+def test_pairs_are_forecast_at_the_photo_size_with_which_the_run_starts():
     fast, plain = recipe(1_000, strategy="fast", max_gaussians=9), PLAIN
     assert _pairs_at_first(plain, 1e6, 1_000) == math.ceil(1.2e6)
     assert _pairs_at_first(fast, 1e6, 1_000) == math.ceil(1.2e6 / 16)
@@ -157,10 +161,10 @@ def test_the_large_splats_of_a_random_start_are_seen_in_small_photos():
 def test_the_time_of_a_run_is_the_sum_of_its_parts():
     found = predict(FACTS, MEASURED, PLAIN, eval_every=1_000, save_every=500)
     each = 0.001 + 1e-7 * 1e4 + 1e-6 * 1_000
-    assert found.seconds["reading"] == pytest.approx(0.02 * 100 / 2), "two photos at a time"
+    assert found.seconds["reading"] == pytest.approx(0.02 * 100 / 2), "two photos are read at a time"
     assert found.seconds["training"] == pytest.approx(3_000 * each)
     assert found.seconds["judging"] == pytest.approx(2 * 20 * 2e-6 * 1e4), (
-        "after 1,000 and 2,000; not at the end"
+        "evaluations after 1,000 and 2,000 iterations; the one at the end counts as ending"
     )
     assert found.seconds["ending"] > (100 * 2e-6 + 20 * 3e-6) * 1e4
     assert found.total == pytest.approx(sum(found.seconds.values()))
@@ -168,12 +172,12 @@ def test_the_time_of_a_run_is_the_sum_of_its_parts():
     assert silent.seconds["judging"] == silent.seconds["saving"] == 0.0
 
 
-def test_growth_is_integrated():
+def test_the_training_time_is_the_sum_over_growing_counts():
     config = recipe(3_000)
     counts = expected_counts(config, FACTS.points, FACTS.pixels)
     found = predict(FACTS, MEASURED, config)
     steps = [MEASURED.speed.seconds(count, FACTS.pixels) for count in counts.tolist()]
-    # The sum of 3,000 float64 values and 3,000 times their mean differ by rounding.
+    # The sum of 3,000 float64 values and 3,000 times their mean differ by rounding only.
     assert found.seconds["training"] == pytest.approx(math.fsum(steps), rel=1e-12)
     assert found.gaussians == (1_000, counts[-1]) and found.steps[1] > found.steps[0]
 
@@ -197,7 +201,7 @@ def test_memory_follows_gaussians_pixels_and_degree():
     assert flat.peak(100_000, 0) < one
     larger = dataclasses.replace(footprint, facts=dataclasses.replace(FACTS, largest=1e7))
     assert larger.peak(0, 0) - footprint.peak(0, 0) == pytest.approx(180 * (1e7 - 1e4))
-    assert footprint.parts(0, 10**9)["photos"] == 3_000_000, "no more than all photos take"
+    assert footprint.parts(0, 10**9)["photos"] == 3_000_000, "never more than all photos take"
 
 
 @pytest.mark.parametrize("kept", [0, 1_000_000, 3_000_000])
@@ -210,7 +214,7 @@ def test_the_most_gaussians_fit_and_one_more_does_not(limit, kept):
 
 @pytest.mark.parametrize("limit", [1_450, 2_000])
 def test_gaussians_may_use_the_memory_that_reading_needed(limit):
-    """Photos of 12 MP, eight decoded at once: without Gaussians, the peak is that of reading the photos."""
+    """Eight photos of 12 MP are decoded at once, so without Gaussians the peak occurs while reading photos."""
     large = dataclasses.replace(FACTS, full=12e6, workers=8)
     footprint = Footprint(large, 400 * 2**20, 4_000, sh_degree=3)
     most = footprint.most_gaussians(limit * 2**20, 0)
@@ -222,7 +226,7 @@ def test_a_limit_below_the_fixed_costs_allows_no_gaussians():
     assert Footprint(FACTS, 400 * 2**20, 4_000, sh_degree=3).most_gaussians(100 * 2**20, 0) == -1
 
 
-def test_the_lines_state_numbers():
+def test_the_lines_show_time_memory_and_uncertainty():
     found = predict(FACTS, MEASURED, recipe(3_000))
     time, iteration, memory, certainty = found.lines()
     assert "3,000 iterations on cpu" in time and spelled_seconds(found.total) in time

@@ -1,6 +1,5 @@
-"""A run with a time limit uses the time and no more, however the machine's speed changes while it trains.
-
-The clock is simulated: every step takes what the model says, times a factor that changes in mid-run.
+"""A run with a time limit uses nearly all of the time and never more, also if the machine's speed changes in mid-run.
+The clock is simulated: a step takes the modelled seconds times a factor that changes during the run.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import StepEvent
 
 SPEED = Speed(fixed=0.4, per_pixel=2e-4, per_gaussian=1e-3)
-"""The simulated machine's, at the speed that the plan expected."""
+"""Speed of the simulated machine, as the plan expects it."""
 
 BEFORE = 20.0
 """Seconds that the command has taken before it trains."""
@@ -30,7 +29,7 @@ BEFORE = 20.0
 
 GIVEN = ["--save-every", "0", "--eval-every", "0", "--sh-degree", "0"]
 GIVEN += [f"--{name}=none" for name in ("appearance", "sky", "transients", "refine")]
-"""Options of the command line that `options` sets."""
+"""The command-line options that stand for what `options` sets."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def capture(tmp_path_factory):
 
 
 class SimulatedClock:
-    """Counts the seconds of a machine whose steps take `slowness(seconds)` times what the model says."""
+    """Counts the seconds of a machine whose steps take `slowness(seconds)` times the modelled seconds."""
 
     def __init__(self, profile, slowness=lambda seconds: 1.0):
         self.profile, self.slowness, self.seconds = profile, slowness, BEFORE
@@ -60,7 +59,7 @@ def options(capture, out, iterations, strategy="fast", **changes):
 
 
 def paced(chosen, limit, slowness=lambda seconds: 1.0, *, stretches=True, **arguments):
-    """Train under a limit; return the run, the seconds of the whole command, and the pace."""
+    """Train within a limit; return the run, the seconds of the whole command, and the pace."""
     run = CaptureRun(chosen, **arguments)
     profile = step_profile(chosen.config, Facts.of(run.dataset), SPEED)
     clock = SimulatedClock(profile, slowness)
@@ -95,7 +94,7 @@ def test_between_92_and_100_percent_of_the_limit_are_used(capture, tmp_path, spe
     assert 0.92 * limit <= used <= limit
     done = run.trainer.iteration
     assert run.folder.read_metrics()["iterations"] == run.folder.read_config()["train"]["iterations"] == done
-    assert run.trainer.position >= 0.9 * 200, "the schedule comes to its end, in fewer or more iterations"
+    assert run.trainer.position >= 0.9 * 200, "the schedule is completed in fewer or more iterations"
     assert is_finished(dataclasses.replace(run.options, resume=True))
 
 
@@ -123,7 +122,7 @@ def test_the_printed_options_repeat_the_run_exactly(capture, tmp_path):
 
 
 def test_a_killed_run_repeats_its_decisions_when_resumed(capture, tmp_path):
-    """The checkpoint is from before the last decisions; config.json has them all."""
+    """The checkpoint is older than the last decisions, all of which are in config.json."""
 
     def slowness(now):
         return 3.0 if now > 120 else 1.0
@@ -148,7 +147,7 @@ def test_a_killed_run_repeats_its_decisions_when_resumed(capture, tmp_path):
     resumed = ["train", str(capture), "--out", str(tmp_path / "run"), "--resume"]
     assert main([*resumed, *GIVEN, "--max-gaussians", "400"]) == 0
     first, second = (RunFolder(tmp_path / name).read_config()["train"]["tempo"] for name in ("run", "whole"))
-    assert second.startswith(first), "the decisions up to the kill are those of the whole run"
+    assert second.startswith(first), "the decisions before the kill are those of the uninterrupted run"
     assert RunFolder(tmp_path / "run").read_metrics()["iterations"] == stored["iterations"]
 
 

@@ -1,4 +1,4 @@
-"""Plans obey their limits according to the model. One small run obeys them according to the system's counters."""
+"""Plans keep their limits by the model, and one small run keeps its memory limit by the system's counters."""
 
 import dataclasses
 import itertools
@@ -81,7 +81,7 @@ def chosen(*arguments, **options):
 
 
 def peak(found):
-    """The model's peak memory for a plan with all the Gaussians it allows."""
+    """Return the modelled peak memory of a plan with as many Gaussians as it allows."""
     facts, config = FACTS.smaller(found.resolution or 1.0), found.options.config
     process = MEASURED.process + reduced_bytes(config, facts)
     footprint = Footprint(facts, process, MEASURED.pairs, config.sh_degree)
@@ -89,7 +89,7 @@ def peak(found):
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc", "fast"])
-def test_memory_holds_for_any_limit_and_more_memory_is_never_worse(strategy):
+def test_any_memory_limit_is_kept_and_more_memory_is_never_worse(strategy):
     plans = [
         chosen(limit, strategy=strategy) for limit in (560, 640, 800, 1_024, 1_500, 2_048, 4_096, 16_384)
     ]
@@ -104,7 +104,7 @@ def test_memory_holds_for_any_limit_and_more_memory_is_never_worse(strategy):
     assert all(found.iterations == 30_000 and not found.by_time for found in plans)
 
 
-def test_time_holds_for_any_limit_and_more_time_is_never_worse():
+def test_any_time_limit_is_kept_and_more_time_is_never_worse():
     limits = (40, 60, 120, 240, 600, 1_800, 7_200, 36_000)
     plans = [chosen(None, seconds) for seconds in limits]
     for seconds, found in zip(limits, plans, strict=True):
@@ -114,11 +114,11 @@ def test_time_holds_for_any_limit_and_more_time_is_never_worse():
     assert plans[-1].iterations == 30_000, "the recipe's maximum"
     sizes = [found.resolution or 1.0 for found in plans]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.0 and sizes[-1] == 1.0
-    # The schedule uses most of the time: rounding down to two digits loses up to 9 %, and so does rounding the cap.
+    # The schedule uses most of the time. Rounding the iterations down to two digits loses up to 9 %, as does the cap.
     assert plans[4].forecast.total + SPENT > 0.7 * 600
 
 
-def test_both_limits_hold_together():
+def test_both_limits_are_kept_together():
     found = chosen(700, 300.0)
     assert peak(found) <= 700 * MIB and found.forecast.total + SPENT <= 300
 
@@ -199,7 +199,7 @@ def test_the_options_in_the_sentence_give_the_same_run():
 
 
 def test_large_photos_leave_a_useful_cap_and_are_kept_if_that_is_cheaper():
-    """60 photos of 12 MP: once downscaled, all of them take less memory than decoding one of them again."""
+    """Once 60 photos of 12 MP are downscaled, keeping all of them takes less memory than decoding one of them again."""
     facts = dataclasses.replace(
         FACTS, train=52, test=8, pixels=12e6, largest=12e6, full=12e6, photo_bytes=60 * 36_000_000
     )
@@ -213,8 +213,8 @@ def test_large_photos_leave_a_useful_cap_and_are_kept_if_that_is_cheaper():
         assert found.max_gaussians >= 1_000
 
 
-def test_nothing_is_planned_without_a_need(tmp_path):
-    """The capture does not exist, so reading it would fail. It is not read."""
+def test_a_capture_is_not_read_if_nothing_has_to_be_planned(tmp_path):
+    """The capture does not exist, so reading it would fail."""
     options = dataclasses.replace(OPTIONS, data=tmp_path / "nothing")
     assert plan(options, Limits()).options is options
     assert plan(options, Limits(time=Deadline(3.0)), ["iterations"]).options is options
@@ -240,7 +240,7 @@ def trained(run, callbacks=(), stop=lambda: False):
 
 
 def test_a_capture_is_planned_from_its_files(capture, tmp_path):
-    """Read, measure and choose. The numbers depend on this machine's speed; the bounds hold on any machine."""
+    """The chosen values depend on this machine's speed; the asserted bounds hold on any machine."""
     found = plan(
         dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), Limits(2**32, Deadline(3_600.0))
     )
@@ -262,12 +262,12 @@ def test_a_start_scene_is_planned_with_its_own_gaussians(strategy, limits, captu
 
 
 def test_the_fast_recipe_plans_its_number_without_limits_and_a_resumed_run_keeps_it(capture, tmp_path):
-    """As many as the pixels and views ask for, at least those of a start scene; a given number stays."""
+    """The number follows from pixels and views, but is at least that of a start scene. A given number is kept."""
     run = dataclasses.replace(options(capture, tmp_path / "run", 20), config=recipe(20, strategy="fast"))
     found = plan(run, Limits())
     facts = Facts.of(load_dataset(capture))
     assert found.max_gaussians == wanted_gaussians(run.config, facts.points, facts.pixels, facts.train)
-    assert found.max_gaussians == 64 * 48 and found.iterations == 20, "one per pixel of these thumbnails"
+    assert found.max_gaussians == 64 * 48 and found.iterations == 20, "at most one Gaussian per pixel"
     assert found.sentences == (
         f"the recipe plans {found.max_gaussians:,} Gaussians; --max-gaussians changes that",
     )
@@ -282,7 +282,7 @@ def test_the_fast_recipe_plans_its_number_without_limits_and_a_resumed_run_keeps
     assert plan(fixed, Limits()).options == fixed and not plan(fixed, Limits()).sentences
 
 
-def test_the_planned_number_grows_with_pixels_and_views_from_a_least_number_on():
+def test_the_planned_number_grows_with_pixels_and_views_and_has_a_minimum():
     def wanted(pixels, views):
         return wanted_gaussians(recipe(20, strategy="fast"), 200, pixels, views)
 
@@ -290,12 +290,12 @@ def test_the_planned_number_grows_with_pixels_and_views_from_a_least_number_on()
     assert (
         wanted(8 * PLANNED_PIXELS, PLANNED_VIEWS) == wanted(PLANNED_PIXELS, 4 * PLANNED_VIEWS) == 2 * PLANNED
     )
-    assert wanted(64 * 48, 14) == 64 * 48, "never more than one per pixel"
+    assert wanted(64 * 48, 14) == 64 * 48, "never more than one Gaussian per pixel"
     assert wanted(1, 1) == LEAST_PLANNED
 
 
 def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):
-    """The capture's points would fit this limit, at least in part. The far larger start scene does not."""
+    """The capture's points would fit this limit, at least in part; the far larger start scene does not."""
     scene = tmp_path / "scene.ply"
     save_ply(scene, random_ball(200_000, torch.Generator().manual_seed(0)))
     run = options(capture, tmp_path / "run", strategy="none")
@@ -305,8 +305,8 @@ def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):
         plan(dataclasses.replace(run, scene=scene), limits)
 
 
-def test_what_was_spent_before_the_plan_counts(capture, tmp_path):
-    """An hour is enough for any plan, but only its last second is left."""
+def test_the_time_before_the_plan_counts(capture, tmp_path):
+    """An hour is enough for any plan, but all of it except one second is spent."""
     late = Limits(time=Deadline(3_600.0, lambda: 3_599.0))
     with pytest.raises(ArgumentError, match="--time-limit 1 h 0 min: is too short"):
         plan(dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), late)
@@ -324,7 +324,7 @@ def test_a_resumed_run_keeps_the_numbers_of_its_config(capture, tmp_path):
     assert len(again.sentences) == 1 and "memory is not planned again" in again.sentences[0]
     assert plan(plain, Limits(time=Deadline(100.0))).sentences == ()
     assert not is_finished(taken_up(plain, ["iterations"])), (
-        "more iterations than its config has extend a run"
+        "a run is extended by more iterations than its config has"
     )
 
 
@@ -353,7 +353,7 @@ def test_flags_include_milestones_that_differ_from_the_recipe():
     assert flags(dataclasses.replace(OPTIONS, config=recipe(4_000))) == "--iterations 4000"
     stretched = recipe(3_400).changed(iterations=4_000, tempo="3400,200:4000")
     words = "--iterations 4000 --set tempo=3400,200:4000"
-    assert flags(dataclasses.replace(OPTIONS, config=stretched)) == words, "the milestones are those of 3,400"
+    assert flags(dataclasses.replace(OPTIONS, config=stretched)) == words, "milestones of 3,400 iterations"
 
 
 RUN = """
@@ -378,14 +378,14 @@ _, status, usage = os.wait4(child, 0)
 print(usage.ru_maxrss * 1024)
 sys.exit(os.waitstatus_to_exitcode(status))
 """
-"""The child gets a small parent of its own, because Linux includes the parent's memory in the child's peak."""
+"""The training gets a small parent process, because Linux includes the parent's memory in the child's peak."""
 
 
 @pytest.mark.own_process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss is in KiB on Linux")
 @pytest.mark.sliced(1, group="memory of a long run")
 def test_a_training_stays_below_its_memory_limit_as_the_system_counts_it(capture, tmp_path):
-    """Every Gaussian is cloned or split, so the run reaches the chosen cap and really uses the memory."""
+    """Every Gaussian is cloned or split, so the run reaches the chosen cap and uses the memory that was planned."""
     limit = 560 * MIB
     words = [sys.executable, "-c", MEASURE, RUN, str(capture), str(tmp_path / "run"), str(limit)]
     done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=300)
