@@ -267,7 +267,7 @@ def test_fewer_blocks_are_made_if_they_would_have_too_few_views(city, serial, tm
 
 
 def test_merging_keeps_the_cap_of_the_whole_scene(serial):
-    """If the blocks exceed the cap together, the Gaussians that cover least are removed; the others keep their order."""
+    """If the blocks exceed the cap, the Gaussians that cover least are removed, and the others keep their order."""
     plan, folder = BlockPlan.read(serial), BlocksFolder(serial)
     records = finished_blocks(folder, plan)
     whole, counts = merged(folder, plan, records)

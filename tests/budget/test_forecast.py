@@ -107,7 +107,7 @@ def test_the_expected_counts_of_mcmc_are_those_of_the_strategy():
 
 
 def test_the_expected_counts_of_fast_are_those_of_its_plan():
-    """The counts agree at every densification; between two of them the forecast interpolates. Nothing is pruned here."""
+    """The counts agree at every densification; the forecast interpolates between them. Nothing is pruned here."""
     config = recipe(1_000, strategy="fast", max_gaussians=500, densify_every=20, min_opacity=0.0)
     counts = expected_counts(config, 100, 1e4)
     gaussians = random_ball(100, torch.Generator().manual_seed(0)).trainable()

@@ -71,13 +71,13 @@ def rings() -> tuple[list[View], list[View]]:
 
 @pytest.fixture(scope="session")
 def planted(room, rings):
-    """The room with 60 floaters, which come last."""
+    """The room with 60 floaters as its last rows."""
     return Gaussians.concatenated([room, floaters(room, rings[0], SETTINGS, 60, seed=3)])
 
 
 @pytest.fixture
 def set_threads():
-    """Set the number of threads; afterwards it is what it was."""
+    """Set the number of threads; the old number is restored after the test."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""The evidence against brute force: weights of the NumPy reference, and renders without a splat."""
+"""The evidence equals brute force: the NumPy reference's weights, and renders without one splat."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ COUNT, REPEATS = 20, 100
 
 @pytest.fixture(scope="module")
 def scene():
-    """Twenty large, half transparent splats of float64, none of which reaches the clamp of alpha or ends a tile."""
+    """Twenty large, half transparent float64 splats. None reaches the clamp of alpha, and no tile stops early."""
     rng = np.random.default_rng(5)
     return Gaussians(
         means=torch.tensor(
@@ -72,7 +72,7 @@ def without(gaussians, i) -> Gaussians:
 
 
 def test_weights_and_gaps_are_those_of_the_reference(scene, photo):
-    """float64 kernels and the reference differ by rounding only: 1e-9 of sums over 1,435 pixels."""
+    """The float64 kernels and the reference differ by rounding only, at most 1e-9 of a sum over 1,435 pixels."""
     found = gather(scene, [View(CAMERA, photo)], SETTINGS, CPU)
     weights = reference_weights(scene)
     np.testing.assert_allclose(found.weight, weights.sum(axis=(1, 2)), rtol=1e-9)
@@ -90,7 +90,7 @@ def test_weights_and_gaps_are_those_of_the_reference(scene, photo):
 
 
 def test_the_gain_is_the_change_of_the_error_without_the_splat(scene, photo):
-    """Photos are grey in the mean and the render stays within 0 to 1, so that no pixel is clamped.
+    """The render stays within 0 to 1, so no pixel is clamped.
 
     The square term is a mean over random signs. A sum of random signs has a square of mean S and standard deviation
     at most sqrt(2) S, so the mean of 100 views is off by 0.14 S at one sigma; 5 sigma are allowed.
@@ -107,7 +107,8 @@ def test_the_gain_is_the_change_of_the_error_without_the_splat(scene, photo):
 
 
 def test_a_splat_that_is_removed_is_judged_by_what_it_would_add(scene, photo):
-    """It is drawn at 0.02, whose core holds 80 % of the linear and 96 % of the square term: alpha ends at 1/255."""
+    """Drawn at 0.02, a splat ends where alpha is 1/255. That core holds 80 % of the linear and 96 % of the square
+    term."""
     removed = np.zeros(COUNT, dtype=bool)
     removed[7] = True
     found = gather(scene, [View(CAMERA, photo)] * (REDRAWN_EVERY * REPEATS), SETTINGS, CPU, removed)
@@ -121,7 +122,7 @@ def test_a_splat_that_is_removed_is_judged_by_what_it_would_add(scene, photo):
     assert FAINT < MOST_OPAQUE
 
 
-def test_masked_pixels_say_nothing(scene, photo):
+def test_masked_pixels_are_no_evidence(scene, photo):
     mask = np.zeros((CAMERA.H, CAMERA.W), dtype=bool)
     mask[:, :20] = True
     other = photo.copy()
@@ -135,7 +136,7 @@ def test_masked_pixels_say_nothing(scene, photo):
     assert one.error == pytest.approx(squared_error(scene, photo, mask))
 
 
-def test_peak_weights_are_those_of_the_evidence(scene, photo):
+def test_peak_weights_equal_the_peaks_of_the_evidence(scene, photo):
     found = gather(scene, [View(CAMERA, photo)], SETTINGS, CPU)
     np.testing.assert_allclose(
         peak_weights(scene, [View(CAMERA, photo)], SETTINGS, CPU), found.peak, rtol=1e-6

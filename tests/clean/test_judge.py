@@ -1,4 +1,4 @@
-"""Floaters planted in a known scene are found; what the photos say nothing about stays."""
+"""Floaters planted in a known scene are found; splats without evidence stay."""
 
 from dataclasses import replace
 
@@ -34,8 +34,8 @@ def cleaning(room, planted, rings):
     return clean(planted, photographed(room, train), photographed(room, test), SETTINGS)
 
 
-def test_planted_floaters_are_found_and_little_else(room, planted, cleaning):
-    """Unseen splats of the room count for neither: no photo changes without them."""
+def test_planted_floaters_are_found_and_few_others_removed(room, planted, cleaning):
+    """Unseen splats of the room are not counted, because no photo changes without them."""
     floaters = np.isin(cleaning.reasons, (Reason.IN_FRONT, Reason.REFUTED))
     own, found = floaters[: len(room)].sum(), (cleaning.reasons != Reason.KEPT)[len(room) :].sum()
     assert found >= 0.95 * (len(planted) - len(room))
@@ -45,7 +45,7 @@ def test_planted_floaters_are_found_and_little_else(room, planted, cleaning):
 
 
 def test_unseen_splats_change_no_pixel_by_more_than_a_byte(room, planted, cleaning, rings):
-    """Each has a weight below 1/255 in every pixel, and there are few over each other."""
+    """Each has a weight below 1/255 in every pixel, and few of them overlap."""
     kept = torch.from_numpy(cleaning.reasons != Reason.UNSEEN)
     fewer = planted.map(lambda tensor: tensor[kept])
     assert len(fewer) < len(planted)
@@ -55,14 +55,14 @@ def test_unseen_splats_change_no_pixel_by_more_than_a_byte(room, planted, cleani
 
 
 def test_a_clean_scene_keeps_what_is_seen(room, rings):
-    """One of its splats may be hardly visible, by accident in front of an edge, and missed by nothing."""
+    """At most one splat is removed: hardly visible, in front of an edge by chance, and not missed by any photo."""
     found = clean(room, photographed(room, rings[0]), photographed(room, rings[1]), SETTINGS)
     assert (found.reasons > Reason.UNSEEN).sum() <= 1
     assert found.before - found.after < 0.05
 
 
 def test_the_judgement_is_scale_free(planted, room, rings, cleaning):
-    """A power of two scales every float exactly; the near plane does not matter here."""
+    """Multiplying by a power of two is exact in floating point; no splat is near the near plane."""
     factor = 4.0
     views = photographed(room, rings[0])
     larger = [
@@ -116,8 +116,8 @@ def test_a_scene_that_no_photo_supports_is_refused(room, rings):
         clean(far, photographed(room, rings[0]), [], SETTINGS)
 
 
-def test_all_photos_of_an_ordinary_capture_judge_a_scene_by_adc():
-    """36 of 84 views found 94.6 % of the planted floaters of such a scene, all of them 96.2 %, in as many steps."""
+def test_all_photos_of_an_ordinary_capture_judge():
+    """In a scene of this size, 36 of the 84 views found 94.6 % of the planted floaters; all views found 96.2 %."""
     splats, views = 164_000, 84
     assert views_of_round(splats, views) == views
 
@@ -146,7 +146,7 @@ def test_a_backend_without_statistics_is_refused_before_any_photo_is_read(room):
         clean(room, [], [], SETTINGS, backend=load_backend("torch"))
 
 
-def test_the_backend_that_is_given_renders(room, rings):
+def test_the_given_backend_renders(room, rings):
     calls = []
 
     def rasterize(*arguments):
@@ -168,7 +168,7 @@ def test_an_empty_scene_stays_empty(room, rings):
 
 class TestGuard:
     def test_held_out_photos_that_show_the_floaters_keep_them(self, room, planted, rings):
-        """The held-out photos are of the planted scene: only what no view sees can go."""
+        """The held-out photos show the floaters, so only splats that no view sees may be removed."""
         found = clean(planted, photographed(room, rings[0]), photographed(planted, rings[1]), SETTINGS)
         assert (found.judged != Reason.KEPT).sum() > 50
         assert found.all_removed < found.before - 0.05
@@ -176,15 +176,15 @@ class TestGuard:
         assert found.before - found.after <= 0.05
 
     def test_a_loss_of_zero_can_keep_everything(self, room, rings):
-        """The held-out photos are exactly those of a scene whose faintest splats the training views do not see."""
+        """The held-out photos show splats that the training views do not see, so removing them costs PSNR."""
         train, test = photographed(room, rings[0][:2]), photographed(room, [*rings[0][2:], *rings[1]])
         found = clean(room, train, test, SETTINGS, max_loss=0.0)
         assert (found.judged == Reason.UNSEEN).sum() > 100
         assert found.kept.all()
         assert found.after == found.before
 
-    def test_it_takes_back_only_what_is_too_much(self, room, planted, rings):
-        """Every removal of a floater costs PSNR here. The loss of all is not allowed: the less certain half stays."""
+    def test_the_guard_keeps_only_the_less_certain_half(self, room, planted, rings):
+        """Removing any floater costs PSNR here. Removing all of them costs too much, so the less certain half stays."""
         train, test = photographed(room, rings[0]), photographed(planted, rings[1])
         whole = clean(planted, train, test, SETTINGS, max_loss=100.0)
         loss = whole.before - whole.after
@@ -201,13 +201,13 @@ class TestGuard:
         assert found.guards == len(rings[0])
         assert found.after > found.before
 
-    def test_the_loss_has_to_be_a_number_from_zero(self, room, rings):
+    def test_a_negative_loss_is_refused(self, room, rings):
         with pytest.raises(ArgumentError, match="max_loss"):
             clean(room, photographed(room, rings[0]), [], SETTINGS, max_loss=-1.0)
 
 
 def test_photos_with_alpha_are_judged_over_the_background(rings):
-    """An object over a white background: floaters in front of nothing are in free space."""
+    """An object over a white background; floaters beside the object are in free space."""
     ball = shell(400, 0.7, 0.07, 1)
     white = replace(SETTINGS, background=(1.0, 1.0, 1.0))
     views = []
@@ -220,5 +220,5 @@ def test_photos_with_alpha_are_judged_over_the_background(rings):
         views.append(View(one, pixels, alpha=opacity, name=f"view_{k}.png"))
     dark = replace(shell(30, 1.2, 0.08, 4), sh0=torch.full((30, 1, 3), -1.0))
     found = judge(Gaussians.concatenated([ball, dark]), views, white)
-    assert (found.reasons[400:] != Reason.KEPT).mean() >= 0.75  # far ones are behind the ball in some views
+    assert (found.reasons[400:] != Reason.KEPT).mean() >= 0.75  # some views see the far ones behind the ball
     assert np.isin(found.reasons[:400], (Reason.IN_FRONT, Reason.REFUTED)).mean() <= 0.02

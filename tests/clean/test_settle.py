@@ -1,4 +1,4 @@
-"""The opacities of doubtful splats, fitted together."""
+"""The opacities of doubtful splats are fitted together."""
 
 from dataclasses import replace
 
@@ -26,13 +26,13 @@ def error(gaussians, doubtful, logits, view):
 
 
 def test_the_gradient_is_that_of_the_error(planted, rings):
-    """Smooth: no alpha reaches the clamp, and so small a step moves hardly any alpha across 1/255."""
+    """The error is smooth: no alpha reaches the clamp, and a step of 1e-6 moves hardly any alpha across 1/255."""
     some = planted.map(lambda tensor: tensor.double())
     faint = replace(some, logit_opacities=some.logit_opacities.clamp(max=1.0))
     view = photographed(planted, rings[0][:1])[0]
     doubtful = np.r_[np.arange(40), np.arange(1300, 1360)]
     logits = np.random.default_rng(0).normal(size=len(doubtful))
-    # The price's part is added by a closed form, so that it cancels here.
+    # The gradient of the price has a closed form, which is subtracted here.
     price = 0.3
     factor = 1.0 / (1.0 + np.exp(-logits))
     found = _slope(
@@ -41,13 +41,13 @@ def test_the_gradient_is_that_of_the_error(planted, rings):
     direction = np.random.default_rng(1).normal(size=len(doubtful))
     step = 1e-6
     up, down = (error(faint, doubtful, logits + s * step * direction, view) for s in (1, -1))
-    # Differences of an error of about 100 carry rounding of 100 * 2^-52 / 2e-6 = 1e-8.
+    # The error is about 100, so its differences have a rounding error of 100 * 2^-52 / 2e-6 = 1e-8.
     assert float(found @ direction) == pytest.approx((up - down) / (2 * step), rel=1e-5, abs=1e-6)
     assert np.abs(found).max() > 1e-2
 
 
-def test_of_two_that_fill_one_hole_the_one_that_the_photos_show_stays(room, rings):
-    """Alone, each would be missed while both are gone."""
+def test_of_two_splats_that_fill_one_hole_the_one_in_the_photos_stays(room, rings):
+    """While both are removed, the photos miss either of them."""
     views = photographed(room, rings[0])
     hole = 25
     red = torch.zeros(1, 1, 3)
@@ -62,8 +62,8 @@ def test_of_two_that_fill_one_hole_the_one_that_the_photos_show_stays(room, ring
     assert logits[1] < -1.5
 
 
-def test_what_no_photo_shows_stays_where_it_was(room, rings):
-    """The price alone moves it, by less than its own share of a unit per step."""
+def test_a_splat_in_no_photo_is_moved_by_its_price_only(room, rings):
+    """A price of 0.01 units moves the logit by less than 0.1 in 40 steps."""
     one = room.map(lambda tensor: tensor[:1])
     far = replace(one, means=one.means + torch.tensor([0.0, 1e3, 0.0]))
     both = Gaussians.concatenated([room, far])

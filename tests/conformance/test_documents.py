@@ -1,4 +1,4 @@
-"""The kit's documents name what exists, and the example of its README runs."""
+"""The kit's documents name existing cases and arrays, and the example of its README runs."""
 
 import re
 import sys
@@ -29,8 +29,8 @@ def test_the_documents_state_the_runner_s_numbers():
     assert run.EPSILON == {"float32": 2.0**-23, "float64": 2.0**-52} and run.T_STOP == 1e-4
 
 
-def test_the_specification_stays_about_a_page():
-    """Without its appendix on another project."""
+def test_the_specification_is_about_a_page_long():
+    """The appendix on gsplat does not count."""
     conventions = SPECIFICATION.partition("## gsplat")[0]
     assert len(conventions.split()) <= 1100
 

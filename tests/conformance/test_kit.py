@@ -60,7 +60,7 @@ OUTPUT_BREAKS = {
     "pixel centre of the only pixel at a half": ("one_pixel", {"pixel_offset": 0.5}),
     "empty scenes refused": ("no_gaussians", {"refuses_empty": True}),
 }
-"""What is broken: the case that has to catch it, and the change."""
+"""Broken conventions by name: the case that has to catch it, and the change of the renderer."""
 
 GRADIENT_BREAKS = {
     "direction detached": ("gradient_smooth", {"direction_detached": True}),
@@ -73,7 +73,7 @@ GRADIENT_BREAKS = {
     "gradient passes the floor of colours": ("gradient_colour_floor", {"floor_passes": True}),
     "gradient passes the cut-off": ("gradient_random", {"cut_passes": True}),
 }
-"""The same for breaks that leave every output as it is."""
+"""Broken gradients by name, which leave every output unchanged."""
 
 
 def checked(names, **changes):
@@ -111,7 +111,7 @@ WRONG_RESULTS = {
     "gradient_sh_degree_1": lambda found: found | {"sh": found["sh"] + 1e-3},
     "gradient_needles": lambda found: found | {"quats": found["quats"].astype(np.float16)},
 }
-"""Changes of a right gradient, for the cases that no convention breaks alone."""
+"""Errors in correct gradients, for the cases that no broken convention alone makes fail."""
 
 
 @pytest.mark.parametrize("name", WRONG_RESULTS)
@@ -130,7 +130,7 @@ def test_every_case_catches_something():
 
 @pytest.mark.parametrize("name", [*run.OUTPUTS, *(f"gradient.{name}" for name in run.GRADIENTS)])
 def test_every_compared_array_can_fail(name):
-    """Off by twice its tolerance at the worst place, an array fails, and it alone."""
+    """An array that is off by twice its tolerance fails, and no other array does."""
     (case,) = run.load_cases(["gradient_smooth"])
     renderer = SimpleRenderer()
     prefix, _, array = name.rpartition(".")
@@ -154,7 +154,7 @@ def test_every_compared_array_can_fail(name):
         (lambda truth: None, "is missing"),
     ],
 )
-def test_what_cannot_be_compared_fails_and_says_why(result, says):
+def test_an_array_that_cannot_be_compared_fails_with_a_reason(result, says):
     cases = run.load_cases(["random"])
     renderer = SimpleRenderer()
 
@@ -186,7 +186,7 @@ def test_a_renderer_that_writes_into_its_inputs_cannot_change_the_case():
     np.testing.assert_array_equal(cases[0].gaussians["means"], before)
 
 
-def test_nothing_compared_is_no_pass():
+def test_a_check_without_cases_does_not_pass():
     assert not run.check(SimpleRenderer().render, cases=[]).passed
 
 
@@ -199,8 +199,8 @@ def test_unknown_names_are_refused():
         run.load_cases(["no such case"])
 
 
-def test_the_tolerance_behind_a_stop_is_that_of_the_stop_only():
-    """Before T falls below 1e-4, a pixel of that case has no more tolerance than any other."""
+def test_only_pixels_that_may_stop_early_have_the_tolerance_of_the_stop():
+    """Pixels whose transmittance stays at 1e-4 or above have the usual tolerance."""
     (case,) = run.load_cases(["opaque_tiles_stop"])
     stopped = case.truth["transmittance"] < run.T_STOP
     assert stopped.any() and not stopped.all()
@@ -223,7 +223,7 @@ def test_the_command_line(capsys):
 
 
 def test_a_failure_exits_with_1(capsys, tmp_path, monkeypatch):
-    """A case whose truth is damaged fails."""
+    """The stored truth of a case is changed, so the case fails."""
     path = next(run.CASES.glob("one_pixel.safetensors"))
     with run.safe_open(path, framework="numpy") as file:
         arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118

@@ -1,4 +1,4 @@
-"""Our backends pass the kit, and its files are those that make.py makes today. tests/gpu has the kernels for GPUs."""
+"""Our backends pass the kit, and make.py still makes its files. tests/gpu tests the GPU kernels."""
 
 import ast
 import dataclasses
@@ -34,8 +34,8 @@ def test_the_dense_renderer(dtype):
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_the_inputs_are_those_that_are_made_today(name):
-    """Up to a float32 rounding: another C library may round exp, log and sin differently."""
+def test_make_reproduces_the_inputs(name):
+    """They agree up to a float32 rounding, because another C library may round exp, log and sin differently."""
     (case,), plan = run.load_cases([name]), PLANS[name]
     assert (case.name, case.shows, case.hint) == (plan.name, plan.shows, plan.hint)
     for stored, made in (
@@ -52,8 +52,8 @@ def test_the_inputs_are_those_that_are_made_today(name):
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_the_results_are_those_that_are_made_today(name):
-    """From the stored inputs, within the tolerance of float64; sensitivities to 1 %."""
+def test_make_reproduces_the_results(name):
+    """From the stored inputs, results agree within the float64 tolerance and sensitivities within 1 %."""
     (case,) = run.load_cases([name])
     stored = {"gaussians": case.gaussians, "camera": case.camera, "settings": case.settings}
     arrays, about = make.build(dataclasses.replace(PLANS[name], **stored))
@@ -77,14 +77,14 @@ def test_the_results_are_those_that_are_made_today(name):
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_the_cases_hold_what_they_promise(name):
-    """Gradients, of which every 17th number is tested, are those of finite differences; no rounding decides a pixel."""
+def test_gradients_are_finite_differences_and_rounding_decides_no_pixel(name):
+    """Every 17th number of the gradients is compared with a finite difference."""
     make.verify(PLANS[name], every=17)
     make.agrees(PLANS[name], run.CASES)
 
 
 def test_a_case_that_rounding_decides_is_not_written():
-    """A mean on the rim: one opacity is exactly at the cut-off."""
+    """The near plane lies within a rounding of the mean, so rounding decides whether the Gaussian is drawn."""
     plan = PLANS["one_gaussian"]
     depth = plan.camera["R"][2] @ (plan.gaussians["means"][0] - plan.camera["eye"])
     near = float(np.float32(depth * (1 - 1e-7)))

@@ -1,4 +1,4 @@
-"""What operations leave of a scene, and how they turn it."""
+"""Operations select, hide and delete splats, and turn and scale the scene."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def row(n=6):
 
 
 def between(low, high, how="replace"):
-    """Select splats of `row` from one x to another."""
+    """Select the splats of `row` with low <= x <= high."""
     middle, half = (low + high) / 2, (high - low) / 2 + 0.1
     return ops.Select(how, ops.Box((middle, 0.0, 0.0), AXES, (half, 1.0, 1.0)))
 
@@ -65,7 +65,7 @@ S, H, D = SELECTED, HIDDEN, DELETED
         ([ops.Delete(), ops.Hide(), ops.Show()], [0] * 6),
     ],
 )  # fmt: skip
-def test_the_states_after_operations(operations, flags):
+def test_operations_give_these_states(operations, flags):
     assert flags_after(operations, row()).tolist() == flags
     left = edited(Scene(row()), operations).gaussians
     assert left.means[:, 0].tolist() == [float(i) for i, flag in enumerate(flags) if flag in (0, S)]
@@ -92,7 +92,7 @@ def test_the_identity_depends_on_every_parameter_and_the_origin():
 
 
 def floor(normal_turn, swap=False):
-    """Three points of a floor y = 1 seen from above, turned: counterclockwise around (0, -1, 0)."""
+    """Return three points of the floor y = 1, counterclockwise seen from above, rotated by `normal_turn`."""
     points = np.array([(0.0, 1.0, 0.0), (0.0, 1.0, 3.0), (2.0, 1.0, 0.0)])  # (b - a) x (c - a) = (0, 6, 0)
     points = points[[0, 2, 1]] @ normal_turn.T
     chosen = points[[0, 2, 1]] if swap else points
@@ -107,13 +107,15 @@ def turned(axis, angle):
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 2.0, 3.1, np.pi])
 def test_the_floor_becomes_horizontal(angle):
-    tilt = turned((0.3, 0.0, 1.0), angle)  # about a horizontal axis: the way back is the shortest turn
+    tilt = turned(
+        (0.3, 0.0, 1.0), angle
+    )  # about a horizontal axis, so the shortest rotation back is the inverse
     R = upright_rotation(floor(tilt))
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
     np.testing.assert_allclose(R @ tilt @ (0.0, -1.0, 0.0), (0.0, -1.0, 0.0), atol=1e-9)
     if angle < 3.0:
-        # rounding of 1e-16 in the points is enlarged by 1 / (1 + cos) at most
+        # the points are rounded to 1e-16, which 1 / (1 + cos) at most amplifies
         np.testing.assert_allclose(R, tilt.T, atol=1e-12)
 
 
@@ -123,7 +125,7 @@ def test_points_seen_clockwise_turn_the_scene_upside_down():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_turned_and_scaled_scene_looks_the_same_to_the_turned_view(degree):
-    """Rendered in float64, so that differences are roundings: the harmonics turn with the scene."""
+    """The harmonics turn with the scene. Renders in float64 differ by rounding only."""
     made = native_scenes.random(40)
     scene = Scene(Filter(sh_degree=degree).apply(made.gaussians()))
     points = ((0.1, 0.0, 0.0), (0.9, 0.4, -0.2), (-0.2, 0.3, 0.8))
@@ -143,7 +145,7 @@ def test_the_turned_and_scaled_scene_looks_the_same_to_the_turned_view(degree):
     there = placed_view(view, views.move)
     before = image(scene, Camera(view.R, view.eye, 40.0, 40.0, 23.5, 15.5, 32, 48))
     moved = image(after, Camera(there.R, there.eye, 40.0, 40.0, 23.5, 15.5, 32, 48))
-    # twice as large and twice as far; only the dilation of 0.3 px² stays, in both
+    # twice as large at twice the distance; the dilation of 0.3 px² is the same in both
     assert (before - moved).abs().max() < 1e-11
     assert (
         before - image(after, Camera(view.R, view.eye, 40.0, 40.0, 23.5, 15.5, 32, 48))

@@ -1,4 +1,4 @@
-"""Edits files: everything in them is read, and whatever is damaged is one line that names its place."""
+"""Every field of an edits file is read, and damage is reported in one line that names its place."""
 
 import json
 import math
@@ -91,7 +91,7 @@ def test_every_missing_and_every_unknown_field_is_named():
         for key in operation:
             less = {name: value for name, value in operation.items() if name != key}
             if operation.get("by") == "size":
-                continue  # one of its ends may be missing
+                continue  # an interval may be open at one end
             assert f"operations[{index}]: lacks '{key}'" in refused(document(*EVERY[:index], less))
         more = {**operation, "extra": 1}
         assert f'operations[{index}]: has an unknown key "extra"' in refused(document(*EVERY[:index], more))
@@ -110,7 +110,7 @@ def numbers_in(value, place=()):
 
 
 def replaced(value, place, other):
-    value = json.loads(json.dumps(value))  # no parts in common
+    value = json.loads(json.dumps(value))  # a deep copy
     inside = value
     for key in place[:-1]:
         inside = inside[key]
@@ -119,7 +119,7 @@ def replaced(value, place, other):
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e200, "1", None, True, [], 10**400])
-def test_no_number_may_be_anything_else(wrong):
+def test_anything_but_a_finite_number_in_place_of_a_number_is_refused(wrong):
     whole = document(*EVERY)
     places = numbers_in(whole)
     assert len(places) > 150
@@ -196,7 +196,7 @@ def test_cutting_a_file_anywhere_is_one_line(tmp_path):
             read_edits(tmp_path / "cut.json")
 
 
-def test_another_scene_is_one_line_and_positions_carry_over_on_demand():
+def test_another_scene_is_refused_in_one_line_unless_positions_suffice():
     places = parsed(document(select("sphere", center=[0, 0, 0], radius=1), {"op": "delete"}))
     values = parsed(document({"op": "invert"}, select("opacity", low=0)))
     other = Identity(8, "cd" * 32, SCENE.origin)

@@ -1,4 +1,4 @@
-"""Which splats a region holds, on scenes where the answer is plain."""
+"""Regions contain the right splats, in scenes where the answer is obvious."""
 
 import itertools
 
@@ -15,7 +15,7 @@ from gsplat_edu.scene.gaussians import Gaussians
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FRONT = ops.Picture((0.0, 0.0, -1.0), AXES, 10.0, 20.0, 5.0, 6.0)
-"""At depth 1, the point (x, y, 0) is seen at (10 x + 5, 20 y + 6)."""
+"""The point (x, y, 0) is at depth 1 and appears at pixel (10 x + 5, 20 y + 6)."""
 
 
 def values_at(*points, log_scales=None, logits=None, sh0=None):
@@ -37,13 +37,13 @@ def test_a_rectangle_holds_its_border_and_nothing_behind_the_camera():
     values = values_at(
         (0, 0, 0), (0.5, 0.2, 0), (0.6, 0, 0), (0, 0.25, 0), (0, 0, -3), (0, 0, -1 + 0.99 * NEAR), (0, 0, 9)
     )
-    # seen at (5, 6), (10, 10), (11, 6), (5, 11); behind; before the near plane; (5, 6) from far away
+    # at (5, 6), (10, 10), (11, 6) and (5, 11); behind the camera; before the near plane; far away at (5, 6)
     region = ops.PictureRectangle(FRONT, (5.0, 6.0, 10.0, 10.0))
     assert held(region, values) == [True, True, False, False, False, False, True]
 
 
 def test_a_turned_picture_sees_along_its_axes():
-    """A camera that looks along +x, with its right along -z: rows (right, down, forward)."""
+    """The camera looks along +x and its right is -z; the rows are right, down, forward."""
     picture = ops.Picture(
         (0.0, 0.0, 0.0), ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), 1.0, 1.0, 0.0, 0.0
     )
@@ -57,14 +57,14 @@ def seen(u, v):
 
 
 def test_a_lasso_follows_the_even_odd_rule():
-    """A bow tie: two triangles that share the point (10, 10). Between them above and below is outside."""
+    """The lasso is a bow tie of two triangles that share the point (10, 10); above and below that point is outside."""
     bow = ops.Lasso(FRONT, ((0.0, 0.0), (20.0, 20.0), (20.0, 0.0), (0.0, 20.0)))
     values = values_at(seen(3, 10), seen(17, 10), seen(10, 3), seen(10, 17), seen(-1, 10))
     assert held(bow, values) == [True, True, False, False, False]
 
 
 def test_a_lasso_around_a_square_with_a_hole_leaves_the_hole():
-    """The outline of a square, then that of an inner square: inside of both is crossed twice."""
+    """The lasso is the outline of a square, then that of an inner square, which encloses the hole twice."""
     outer, inner = ((0, 0), (9, 0), (9, 9), (0, 9), (0, 0)), ((3, 3), (6, 3), (6, 6), (3, 6), (3, 3))
     region = ops.Lasso(FRONT, tuple((float(u), float(v)) for u, v in (*outer, *inner)))
     values = values_at(seen(1.5, 4.5), seen(4.5, 4.5), seen(7.5, 4.5), seen(4.5, 10))
@@ -72,7 +72,8 @@ def test_a_lasso_around_a_square_with_a_hole_leaves_the_hole():
 
 
 def test_a_brush_is_a_rounded_band():
-    """From (0, 0) to (8, 0), radius 2: a capsule. The corner of its bounds (-1.9, 1.9) is 2.7 from the end."""
+    """A stroke from (0, 0) to (8, 0) of radius 2 is a capsule; (-1.9, 1.9), inside its bounding box, is 2.7 from the
+    end."""
     stroke = ops.Brush(FRONT, 2.0, ((0.0, 0.0), (8.0, 0.0)))
     values = values_at(
         seen(4, 1.9), seen(4, 2.1), seen(-1.9, 0), seen(-1.9, 1.9), seen(9.4, 1.4), seen(9.5, 1.5)
@@ -130,7 +131,7 @@ def test_nan_belongs_to_no_region_and_infinity_is_compared():
 
 @pytest.mark.parametrize("n", [0, 3])
 def test_values_are_those_of_float32(n):
-    """A float64 scene is compared as the float32 numbers that a page has."""
+    """A float64 scene is rounded to float32 before comparing, because the page stores float32."""
     third = torch.full((n, 3), 1.0 / 3.0, dtype=torch.float64)
     gaussians = Gaussians(
         third, torch.ones(n, 4).double(), third, third[:, None], torch.zeros(n, 0, 3).double(), third[:, 0]
@@ -143,15 +144,15 @@ def test_values_are_those_of_float32(n):
 
 
 def picture_points(rng, n):
-    """Splats seen at random places of a picture, among them many at one place and some on one line."""
+    """Splats at random pixels of a picture, many of them at one pixel and some on one line."""
     u, v = rng.uniform(-40, 340, (2, n))
     u[: n // 4], v[: n // 4] = 100.0, 50.0
     u[n // 4 : n // 3] = 200.0
     return values_at(*np.stack([(u - 5) / 10, (v - 6) / 20, np.zeros(n)], axis=1))
 
 
-def test_cells_change_no_answer_of_a_lasso_or_a_stroke():
-    """The same tests without cells: every splat against every edge and segment, as the format defines them."""
+def test_lassos_and_strokes_select_the_same_splats_without_cells():
+    """The expected answers come from every splat against every edge and segment, as the format defines them."""
     rng, n = np.random.default_rng(3), 500
     values = picture_points(rng, n)
     picture = FRONT
@@ -179,7 +180,7 @@ def test_cells_change_no_answer_of_a_lasso_or_a_stroke():
 
 @pytest.mark.parametrize("kind", ["lasso", "brush"])
 def test_a_long_stroke_compares_each_part_with_the_splats_near_it(kind):
-    """20,000 points round a circle over 20,000 splats: each part touches about two of 64 rows of cells."""
+    """Each part of a circle of 20,000 points over 20,000 splats touches about two of 64 rows of cells."""
     rng = np.random.default_rng(4)
     values = picture_points(rng, 20_000)
     turn = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
@@ -192,7 +193,7 @@ def test_a_long_stroke_compares_each_part_with_the_splats_near_it(kind):
 
 
 def test_operations_that_take_too_many_tests_are_refused_before_they_are_made():
-    """Strokes across the whole picture, back and forth: the cells cannot help, so the number of tests is bounded."""
+    """Cells do not help with strokes back and forth across the whole picture, so the number of tests is limited."""
     values = picture_points(np.random.default_rng(5), 1000)
     zigzag = tuple((0.0, 0.0) if i % 2 else (300.0, 200.0) for i in range(20_000))
     for region in (ops.Lasso(FRONT, zigzag), ops.Brush(FRONT, 1e-9, zigzag)):
