@@ -78,7 +78,7 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/sfm/test_training.py::test_one_command": (10, 2),
     "tests/studio/test_page_pictures.py::test_a_training_is_drawn_while_it_runs": (9, 1),
     "tests/sfm/test_reconstruct.py::test_an_interrupted_run_resumes_after_the_last_completed_stage": (9, 1),
-    "tests/cli/test_view.py::test_the_browser_opens_for_a_user_at_a_screen": (7, 1),
+    "tests/cli/test_view.py::test_the_browser_opens_only_on_a_terminal_with_a_screen": (7, 1),
     "tests/gpu/test_training.py::test_a_training_is_reproducible": (7, 1),
     "tests/train/test_exposure.py::test_exposures_come_back_and_the_held_out_quality_with_them": (7, 1),
     "tests/train/test_exposure_alpha.py::test_exposures_of_transparent_photos_come_back": (7, 1),

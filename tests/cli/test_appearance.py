@@ -1,4 +1,4 @@
-"""`--appearance`: what the photos decide, what a resumed run keeps, and photos that are refused."""
+"""`--appearance`: `auto` decides by the photos, a resumed run keeps the decision, and unknown names are refused."""
 
 import json
 
@@ -28,7 +28,7 @@ def stored(run):
     return json.loads((run / "config.json").read_text())["train"]["appearance"]
 
 
-def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(uneven, tmp_path, capsys):
+def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(uneven, tmp_path, capsys):
     run = tmp_path / "run"
     words = ["train", str(uneven), "--out", str(run), "--iterations", "6", "--resolution", "2"]
     assert main(words) == 0
@@ -47,7 +47,7 @@ def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(uneven, tmp_path, ca
 
 
 @pytest.mark.parametrize("words", [["--appearance", "none"], ["--strategy", "adc"]])
-def test_the_references_and_none_stay_as_they_are(uneven, tmp_path, capsys, words):
+def test_adc_and_none_correct_nothing(uneven, tmp_path, capsys, words):
     run = tmp_path / "run"
     assert (
         main(["train", str(uneven), "--out", str(run), "--iterations", "3", "--resolution", "2", *words]) == 0
@@ -78,7 +78,7 @@ def test_transparent_photos_are_corrected_and_unknown_names_are_refused(tmp_path
     words[3] = str(run)
     assert main([*words, "exposure"]) == 0
     photo = run_dataset(RunFolder(run).read_config()).train[0].read()
-    assert photo.alpha is not None and photo.alpha.min() == 0, "the background is added after the correction"
+    assert photo.alpha is not None and photo.alpha.min() == 0, "the correction comes before the background"
     assert main(["eval", str(run)]) == 0 and main(["doctor", str(run)]) == 0
     assert main([*words, "exposure", "--resume"]) == 0
 
@@ -95,4 +95,4 @@ def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, t
     said = capsys.readouterr().out
     assert "each render was given its photo's exposure first" in said
     assert "brighter or darker" not in said and "--appearance exposure" not in said
-    assert ("--appearance vignetting" in said) == (appearance == "vignetting"), "the advice repeats it"
+    assert ("--appearance vignetting" in said) == (appearance == "vignetting"), "the advice keeps the setting"

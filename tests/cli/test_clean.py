@@ -67,7 +67,7 @@ def test_a_run_is_cleaned_into_a_new_file(made, cli, capsys):
     removed = own + 8 - len(read_scene(written).gaussians)
     assert (
         removed >= 4
-    )  # of 8 floaters; the scene is not trained, so that the photos judge with a large error
+    )  # half of the 8 floaters: the scene is not trained, so the photos judge it with a large error
     assert f"removed {removed:,} of {own + 8:,} splats, judged by 12 views" in printed
     assert "PSNR of 4 held-out views: " in printed
     assert f"wrote {written}: {own + 8 - removed:,} splats" in printed

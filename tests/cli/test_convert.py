@@ -47,7 +47,7 @@ def test_every_format_is_written_and_verified_from_the_runs_cameras(convert, tmp
     figures = re.search(r"PSNR ([\d.]+) dB over 5 views, worst ([\d.]+) \((.*)\.jpg\); ([\d,]+) bytes", said)
     assert int(figures[4].replace(",", "")) == out.stat().st_size
 
-    # Render both scenes again here to check the printed figures.
+    # The test renders both scenes itself to check the printed figures.
     source, written = open_source(folder.path), read_back(out)
     with torch.no_grad():
         scores = [
@@ -61,7 +61,9 @@ def test_every_format_is_written_and_verified_from_the_runs_cameras(convert, tmp
         ]
     assert float(figures[1]) == pytest.approx(np.mean(scores), abs=0.006)
     assert float(figures[2]) == pytest.approx(min(scores), abs=0.006)
-    assert np.mean(scores) > (15 if suffix == ".splat" else 35), "a wrong axis or sign is far below"
+    assert np.mean(scores) > (15 if suffix == ".splat" else 35), (
+        "with a wrong axis or sign, PSNR is far lower"
+    )
     if suffix == ".ply":
         assert float(figures[1]) == 100.0
 
@@ -98,7 +100,7 @@ def test_filters_and_transforms_are_applied_in_order(convert, plain, tmp_path):
 
 
 def test_a_known_distance_sets_the_unit(convert, plain, tmp_path):
-    """Two points that are 2.1 units apart after the transform become 1.2 m apart; the scales of Gaussians follow."""
+    """Two points that are 2.1 units apart after the transform become 1.2 m apart, and Gaussians scale accordingly."""
     out, before = tmp_path / "metres.ply", read_scene(plain).gaussians
     said = convert(plain, out, "--transform", "move=1,0,0", "--scale", "-0.5,1,2 -0.5,1,4.1 1.20m")
     assert "1 unit of metres.ply = 1 m; it was 1.75 units before" in said
@@ -122,7 +124,7 @@ def test_scenes_are_joined_on_request(convert, plain, tmp_path):
 
 
 def test_a_page_gets_a_path_that_moves_with_the_scene(convert, tmp_path):
-    """The file has the run's coordinates; the page has those of its scene, and knows the difference unless it moved."""
+    """The file has the run's coordinates. The page has those of its scene, and their origin unless the scene moved."""
     origin = (40000.0, 300.0, 7.0)
     folder, _, cameras = make_run(tmp_path / "run", origin)
     path = KeyframePath(tuple(map(Keyframe.of_camera, cameras[:3])), True, 4.0)
@@ -141,7 +143,7 @@ def test_a_page_gets_a_path_that_moves_with_the_scene(convert, tmp_path):
 
 
 def sorted_by_angle(named):
-    """The run's cameras in the order of their angles; the first is the test view, which `make_run` returns last."""
+    """Return the run's cameras ordered by angle. The first is the test view, which `make_run` returns last."""
     return sorted(named.items(), key=lambda item: float(item[0].removesuffix(".jpg")))
 
 

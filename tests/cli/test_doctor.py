@@ -56,7 +56,7 @@ def test_a_clean_capture_fits_on_a_screen_and_ends_with_advice(doctor, capture):
 
 
 def test_the_recommended_training_uses_the_given_options(doctor, capture):
-    """A forecast for 800 iterations at half size used to end with the command for 30,000 at full size."""
+    """A forecast for 800 iterations at half size used to end with the command for 30,000 iterations at full size."""
     folder, *_ = capture
     code, said = doctor(folder, "--no-forecast", "--iterations", "800", "--resolution", "2")
     words = next(line for line in said.splitlines() if "train: " in line).partition("train: ")[2]
@@ -119,7 +119,8 @@ def test_the_forecast_comes_before_the_advice(doctor, capture):
 
 
 def test_the_forecast_is_that_of_a_training_without_options(doctor, capture, tmp_path):
-    """Without --iterations it forecasts the fast recipe's standard length, with the number that `train` plans."""
+    """Without --iterations, doctor forecasts the standard length of the fast recipe, and as many Gaussians as `train`
+    plans."""
     code, said = doctor(capture[0])
     assert code == 0
     assert "for 3,000 iterations on cpu" in said and f"200 to {64 * 48:,} Gaussians" in said
@@ -183,12 +184,12 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     renders = next(words for words in commands if words[0] == "render")
     assert command_line.main([*renders, "--frames", "2"]) == 0 and Path("orbit.mp4").is_file()
     longer = next(words for words in commands if "10000" in words)
-    assert "--strategy" not in longer, "a default"
+    assert "--strategy" not in longer, "the default is left out"
     assert longer[longer.index("--resolution") + 1] == "40"
-    assert longer[longer.index("--test-every") + 1] == "0", "0 is a value, too"
+    assert longer[longer.index("--test-every") + 1] == "0", "an option of value 0 is kept"
     assert longer[longer.index("--background") + 1 :][:3] == ["1", "1", "1"]
     assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_10000").is_dir()
-    # A run of another recipe is repeated with that. The oldest runs do not name their recipe, which was adc.
+    # The advice repeats the recipe of the run. A run without a stored recipe was trained by adc.
     for changes, strategy in (
         ({"strategy": "mcmc", "max_gaussians": 300}, "mcmc"),
         ({"strategy": None}, "adc"),
@@ -206,7 +207,7 @@ def test_the_proposed_output_folder_does_not_exist_yet(doctor, capture, tmp_path
 
 
 def test_an_exposure_jump_is_named_before_and_after_training(doctor, capture, run, tmp_path):
-    """One photo is 0.7 stops brighter. The warning used to disappear once a trained scene fitted it."""
+    """One photo is 0.7 stops brighter. The warning used to disappear once a trained scene fitted that photo."""
     _, views, points, colors = capture
     jumped = [
         View(v.camera, np.clip(v.image * (1.25 if i == 3 else 1.0), 0, 255).astype(np.uint8), name=v.name)
@@ -241,7 +242,7 @@ def test_a_dataset_that_moved_is_named(doctor, run, capture, tmp_path):
     config = run.read_config()
     moved = RunFolder(tmp_path / "moved")
     moved.write_config({**config, "data": {**config["data"], "path": "/gone"}})
-    assert doctor(moved.path)[0] == 2, "there is no scene"
+    assert doctor(moved.path)[0] == 2, "a run without a scene is an error"
     moved.scene(5).parent.mkdir(parents=True)
     moved.scene(5).write_bytes(run.scene(30).read_bytes())
     code, said = doctor(moved.path)
@@ -277,7 +278,7 @@ def test_fox(doctor):
 
 
 def test_truck11(doctor):
-    """Its focal lengths are wrong; with the right ones, about 385 px, every point would be visible."""
+    """Its focal lengths are wrong; with the correct ones, about 385 px, every point would be visible."""
     code, said = doctor(real("truck11"), "--no-forecast")
     assert code == 0 and said.count("warning") == 3
     for words in (
@@ -293,8 +294,8 @@ def test_help_shows_an_example(doctor, capsys):
     assert code == 0 and "example: gsplat-edu doctor " in said
 
 
-def test_captures_far_from_the_origin_are_checked_alike(doctor, capture, tmp_path):
-    """Map coordinates are kept in float64, so the checks give the same results."""
+def test_the_findings_do_not_depend_on_the_distance_from_the_origin(doctor, capture, tmp_path):
+    """Map coordinates stay in float64, so the findings are the same."""
     _, views, points, colors = capture
     away = np.array([431000.0, 5400000.0, 300.0])
     moved = [

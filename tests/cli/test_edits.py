@@ -1,4 +1,4 @@
-"""`convert --edits` and `render --edits`, and what `view --edit` is asked for."""
+"""`convert --edits`, `render --edits`, and the arguments of `view --edit`."""
 
 import json
 
@@ -63,15 +63,15 @@ def plain(tmp_path):
 
 
 def outside(gaussians):
-    """The splats that DELETE leaves."""
+    """Return the splats that the operations DELETE keep."""
     stays = gaussians.means.double().pow(2).sum(dim=1) > 0.36
     assert 0 < int(stays.sum()) < len(gaussians)
     return gaussians.map(lambda tensor: tensor[stays])
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_holds_what_is_left(run, edits, plain, tmp_path, suffix):
-    """The bytes are those of the scene of which only the rest was ever there."""
+def test_every_format_holds_the_remaining_splats(run, edits, plain, tmp_path, suffix):
+    """The bytes are those of converting a scene that never had the deleted splats."""
     said = run("convert", plain, "--edits", edits(plain, *DELETE), tmp_path / f"out{suffix}")
     scene = read_scene(plain)
     left = outside(scene.gaussians)
@@ -95,7 +95,7 @@ def test_edits_come_before_filters_and_transforms(run, edits, plain, tmp_path):
     first, after = (read_scene(tmp_path / f"{name}.ply") for name in ("at once", "after"))
     assert first.gaussians.sh_degree == 1
     for name, tensor in first.gaussians.tensors().items():
-        # rounded to float32 once more on the way
+        # the intermediate file rounds to float32 once more
         torch.testing.assert_close(tensor, after.gaussians.tensors()[name], rtol=1e-6, atol=1e-6)
     assert read_scene(tmp_path / "first.ply").unit == "cm"
 
@@ -105,7 +105,7 @@ def facts_of(path):
 
 
 def test_a_page_opens_in_the_start_view_with_named_views_and_the_path(run, edits, tmp_path):
-    """In a run with an origin, turned and scaled: everything moves with the scene, by the same formula."""
+    """The run has an origin, and its scene is rotated and scaled; views, path and pivot move with the scene."""
     folder, *_ = make_run(tmp_path / "run", origin=(500.0, 0.0, -20.0))
     path = KeyframePath(
         (Keyframe(np.zeros(3), np.eye(3), 50.0), Keyframe(np.ones(3), np.eye(3), 50.0)), False
@@ -118,7 +118,7 @@ def test_a_page_opens_in_the_start_view_with_named_views_and_the_path(run, edits
     ]
     run("convert", folder.path, "--edits", edits(folder.path, *views), tmp_path / "plain.html")
     said = run("convert", folder.path, "--edits", edits(folder.path, *views, *TILT), tmp_path / "tilted.html")
-    assert "measured 100 cm: door" in said, "50 cm for 2 units"
+    assert "measured 100 cm: door" in said, "2 units are 50 cm, so 4 are 100 cm"
     before, after = facts_of(tmp_path / "plain.html"), facts_of(tmp_path / "tilted.html")
     assert before["origin"] == [500.0, 0.0, -20.0] and after["origin"] == [0.0, 0.0, 0.0]
     assert before["start"]["pivot"] == [0.0, 1.0, 2.0] and before["start"]["index"] == -1
@@ -126,7 +126,7 @@ def test_a_page_opens_in_the_start_view_with_named_views_and_the_path(run, edits
     assert after["cameras"][0]["name"] == "<b> & door"
     assert [entry.get("saved") for entry in after["cameras"]] == [True, *[None] * (len(after["cameras"]) - 1)]
     assert after["start"]["up"] == after["up"] == [0.0, -1.0, 0.0]
-    R = np.array(after["start"]["camera"]["R"]).T  # the start view's axes were those of the world
+    R = np.array(after["start"]["camera"]["R"]).T  # the start view had the axes of the world
     normal = np.cross([1, 0.2, 0], [0, 0.1, 1])
     np.testing.assert_allclose(
         R @ normal / np.linalg.norm(normal), [0, -1 if normal[1] < 0 else 1, 0], atol=1e-9
@@ -173,7 +173,7 @@ def test_another_scene_and_an_empty_result_are_one_line(run, edits, plain, tmp_p
 
 
 def test_render_follows_the_path_of_the_edits(run, edits, plain, tmp_path):
-    """The same pictures as of the scene and path that convert writes."""
+    """The frames equal renders of the scene and path that convert writes."""
     path = {
         "format": "gsplat_edu path", "version": 1, "loop": False,
         "keyframes": [VIEW, {**VIEW, "position": [0.5, 0.0, -2.0]}],

@@ -93,14 +93,14 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def other(tmp_path_factory):
-    """A capture with as many views of the same names, seen from elsewhere: only the cameras differ."""
+    """A capture whose views have the same names and photos, but other cameras."""
     views, points, colors = procedural_capture(size=32, count=6)
     folder = tmp_path_factory.mktemp("other") / "capture"
-    write_colmap(folder, [rotated(view) for view in views], points, colors)
+    write_colmap(folder, [moved_away(view) for view in views], points, colors)
     return folder
 
 
-def rotated(view):
+def moved_away(view):
     camera = view.camera
     values = {field.name: getattr(camera, field.name) for field in dataclasses.fields(camera)}
     return type(view)(type(camera)(**(values | {"eye": camera.eye * 1.1})), view.image, name=view.name)
@@ -124,7 +124,7 @@ def test_another_dataset_is_scored_only_into_a_separate_folder(run, other, cli, 
     assert error.count("\n") == 1 and contents(run.path) == before
     words = ["eval", str(run.path), "--dataset", str(other), "--out", str(tmp_path / "apart")]
     (tmp_path / "apart").mkdir()
-    (tmp_path / "apart" / LOCK).touch()  # an evaluation was killed here
+    (tmp_path / "apart" / LOCK).touch()  # left by a killed evaluation
     for _ in range(2):  # an evaluation may be repeated
         assert cli(words) == 0
         assert "the scores are written to" in capsys.readouterr().out.replace("\n", " ")
@@ -145,7 +145,7 @@ def test_an_evaluation_overwrites_neither_runs_nor_other_files(run, cli, capsys,
         assert says in error and error.count("\n") == 1 and contents(place) == before
 
 
-def test_a_copy_of_the_capture_is_the_same_and_a_changed_photo_is_named(made, run, cli, capsys, tmp_path):
+def test_a_copy_of_the_capture_is_accepted_and_a_changed_photo_is_named(made, run, cli, capsys, tmp_path):
     dataset = load_dataset(made[1], DataSettings(test_every=3))
     run.write_photos(photo_digests(dataset))
     copy = tmp_path / "copy"
@@ -159,7 +159,7 @@ def test_a_copy_of_the_capture_is_the_same_and_a_changed_photo_is_named(made, ru
 
 @pytest.mark.parametrize("place", ["//server/share", "\\\\server\\share\\x", "a\0b", ""])
 def test_a_run_that_names_another_computer_opens_no_connection(run, cli, capsys, place):
-    """On Windows, opening a network share logs in there with the user's name; the run may come from anybody."""
+    """On Windows, opening a network share sends the user's name to its server, and a run may come from anybody."""
     config = run.read_config()
     run.write_config(config | {"data": config["data"] | {"path": place}})
     assert cli(["eval", str(run.path)]) == 2

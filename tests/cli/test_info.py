@@ -95,7 +95,7 @@ def test_a_dataset_is_described_and_no_photo_is_decoded(info, tmp_path, monkeypa
         assert words in said, words
 
 
-def test_an_unknown_kind_of_path_is_a_one_line_error(info, tmp_path):
+def test_a_path_of_an_unknown_kind_is_a_one_line_error(info, tmp_path):
     assert "does not exist; give a dataset folder" in info(tmp_path / "gone", code=2)
     assert "is not a capture" in info(tmp_path, code=2)
     (tmp_path / "a.txt").write_text("hello")

@@ -13,13 +13,13 @@ TINY = ["demo", "--iters", "2", "--k0", "5", "--cap", "8", "--size", "16"]
 def test_demo_writes_figure_curves_and_scene(tmp_path, capsys):
     assert main([*TINY, "--out", str(tmp_path / "a" / "s.png")]) == 0
     printed = capsys.readouterr().out
-    assert "2/2" in printed, "the progress bar reached its end"
+    assert "2/2" in printed, "the progress bar was completed"
     assert re.search(r"held-out L1: init 0\.\d{4} -> final 0\.\d{4}", printed)
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["s.ply", "s.png", "s_curves.png"]
 
 
 def test_signal_handlers_not_installed_by_python_are_tolerated(monkeypatch):
-    """`signal.signal` then returns None for the old handler, but does not accept None to restore it."""
+    """`signal.signal` returns None for a handler that C installed, but does not accept None to restore it."""
     table = dict.fromkeys((signal.SIGINT, signal.SIGTERM))
 
     def install(number, handler):
@@ -49,12 +49,12 @@ def test_the_seed_decides_the_run(tmp_path, capsys):
     assert scenes[0] == scenes[1] != scenes[2]
 
 
-def test_options_left_out_of_the_budget_are_chosen_by_the_backend(tmp_path, capsys):
+def test_the_backend_determines_the_budget_that_is_not_given(tmp_path, capsys):
     arguments = ["demo", "--iters", "1", "--size", "16", "--k0", "5", "--out", str(tmp_path / "s.png")]
     assert main([*arguments, "--backend", "torch"]) == 0
     assert "reduced to --cap 800 (the chapter uses --cap 1600)" in capsys.readouterr().out
     assert main(arguments) == 0
-    assert "reduced" not in capsys.readouterr().out, "the kernels use the chapter's budget"
+    assert "reduced" not in capsys.readouterr().out, "the backend cpu uses the chapter's budget"
 
 
 @pytest.mark.parametrize(

@@ -55,14 +55,14 @@ def png(path: Path, W: int, H: int) -> Path:
         + chunk(b"IHDR", header)
         + chunk(b"IDAT", data)
         + chunk(b"IEND", b"")
-        # as many bytes as a photo of that size has
+        # padding to the size that a compressed photo has
         + bytes(W * H // 200)
     )
     return path
 
 
 def screens(path: Path, count: int) -> Path:
-    """Write splats so large that each covers every tile of an image."""
+    """Write splats that each cover every tile of an image."""
     gaussians = Gaussians(
         means=torch.rand(count, 3),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
@@ -90,7 +90,7 @@ def test_a_process_with_little_memory_left(tmp_path):
     assert ended.returncode == 0, ended.stderr
     codes = [
         line for line in ended.stdout.splitlines() if line.isdigit()
-    ]  # render also prints which camera path it takes
+    ]  # render also prints its camera path
     assert codes == ["2", "2", "2"], ended.stderr
     first, second, third = ended.stderr.splitlines()
     assert re.fullmatch(
@@ -150,7 +150,7 @@ def test_free_memory_is_the_minimum_over_the_machine_and_its_cgroups(tmp_path, m
     """Reads a container's limit from the files of cgroups v1 and v2, and counts its file cache as free."""
     monkeypatch.setattr(headroom, "PROC", tmp_path / "proc")
     monkeypatch.setattr(headroom, "CGROUPS", tmp_path / "groups")
-    assert available_memory() is None, "this system does not report it"
+    assert available_memory() is None, "this system does not report its free memory"
     (tmp_path / "proc" / "self").mkdir(parents=True)
     (tmp_path / "proc" / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    4000 kB\n")
     assert available_memory() == 4000 * 1024

@@ -1,4 +1,4 @@
-"""Names that are not UTF-8, that contain terminal escape codes, or that meet an ASCII-only locale."""
+"""Names that are not UTF-8 or contain terminal escape codes, and any names in an ASCII-only locale."""
 
 import json
 import os
@@ -84,7 +84,9 @@ def test_every_command_accepts_odd_names_in_an_ascii_locale(odd_capture, tmp_pat
 def test_names_as_text():
     assert legible("plain π") == "plain π"
     assert legible(os.fsdecode(b"a\xff")) == r"a\xff"
-    assert legible("π".encode().decode("ascii", "surrogateescape")) == "π", "as read under LC_ALL=C"
+    assert legible("π".encode().decode("ascii", "surrogateescape")) == "π", (
+        "the name as Python reads it under LC_ALL=C"
+    )
     assert legible("\ud800\udcff") == r"\ud800\xff"
     for text in ("\x1b[2J", "a\nb", "\r", "\x9b1m", "\u202e", "\ud800", "\x00", "\x7f"):
         shown = printable(text)
@@ -95,7 +97,7 @@ def test_names_as_text():
 
 
 def test_the_terminal_prints_text_unchanged(capsys):
-    """It interprets no markup, no emoji codes and no escape codes."""
+    """Markup, emoji codes and escape codes are not interpreted."""
     Terminal().print("[red]x[/] :car: \x1b[31m", "b\nc", sep="\n", soft_wrap=True)
     assert capsys.readouterr().out == "[red]x[/] :car: \\x1b[31m\nb\\nc\n"
 
@@ -123,7 +125,7 @@ def test_a_report_takes_any_title(tmp_path):
 
 
 def test_many_images_of_one_name_get_file_names_in_linear_work():
-    """Each name counts on from the last number given out. A quadratic search would need a billion comparisons."""
+    """The search for a free number starts at the last one; starting at 2 would take a billion comparisons."""
     names = image_file_names(["a.png"] * 50_000 + ["A.jpg", "b", "a_7.png"])
     assert names[:3] == ["a.png", "a_2.png", "a_3.png"] and len({name.lower() for name in names}) == 50_003
 
@@ -137,7 +139,7 @@ def test_a_progress_bar_prints_names_unchanged():
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
     [
-        (99.7, 2, "100"),  # a percentage used to print as "1e+02 %"
+        (99.7, 2, "100"),  # this percentage used to print as "1e+02 %"
         (1432.0, 3, "1,432"),
         (-451234.6, 4, "-451,235"),
         (0.0123, 2, "0.012"),
@@ -148,12 +150,12 @@ def test_a_progress_bar_prints_names_unchanged():
         (float("inf"), 3, "inf"),
     ],
 )
-def test_numbers_for_people_have_no_exponent_unless_they_are_absurd(value, digits, text):
+def test_only_huge_numbers_are_printed_with_an_exponent(value, digits, text):
     assert short_number(value, digits) == text
 
 
 def test_a_name_of_any_bytes_is_decoded_on_windows_too(monkeypatch):
-    """Windows decodes strictly; a damaged COLMAP model has such names."""
+    """Windows decodes names strictly, but a damaged COLMAP model may contain any bytes."""
     assert os.fsencode(decode_file_name(b"view\xff.png")) == b"view\xff.png"
     monkeypatch.setattr(names.os, "fsdecode", lambda raw: raw.decode("utf-8", "surrogatepass"))
     assert decode_file_name("né.png".encode()) == "né.png"

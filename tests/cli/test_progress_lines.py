@@ -1,4 +1,4 @@
-"""Lines of progress where output is redirected; on a terminal of 80 columns, the time left is visible."""
+"""Redirected output gets lines of progress; a terminal of 80 columns shows the time left."""
 
 import io
 import re
@@ -64,7 +64,7 @@ def test_the_log_of_a_task_of_hours_stays_short(log):
     assert lines(log)[-1].startswith("rendering\\x1b[2J: 3") and " left" in lines(log)[-1]
 
 
-def test_a_short_task_prints_nothing_and_neither_does_one_with_lines_of_its_own(log):
+def test_short_tasks_and_tasks_that_print_their_own_lines_print_nothing(log):
     time = Time()
     with Bar(console=log, disable=True, get_time=time) as bar:
         short, own = bar.add_task("photos", total=None), bar.add_task("training", total=5, lines=False)
@@ -110,7 +110,7 @@ def test_a_terminal_gets_no_lines():
     assert "elapsed" not in console.file.getvalue()
 
 
-def test_the_time_left_survives_80_columns():
+def test_the_time_left_is_visible_in_80_columns():
     time = Time()
     console = Console(file=io.StringIO(), width=80, force_terminal=True, get_time=time)
     with progress_bar(console, "{task.fields[state]}") as bar:
@@ -121,12 +121,12 @@ def test_the_time_left_survives_80_columns():
         bar.update(task, completed=200_000)
         bar.refresh()
     drawn = console.file.getvalue()
-    assert re.search(r"200000/300000.*0:01:40", drawn), "it is in the visible part of the line"
+    assert re.search(r"200000/300000.*0:01:40", drawn), "the time left is in the visible part of the line"
     assert "loss 0.123" in drawn
 
 
-def test_a_mapper_that_reports_nothing_for_long_is_followed(monkeypatch):
-    """COLMAP's mapper adjusts all poses for minutes between two photos, and after the last one."""
+def test_progress_is_repeated_while_the_mapper_reports_nothing(monkeypatch):
+    """COLMAP's mapper may adjust all poses for minutes between two photos, and after the last photo."""
     monkeypatch.setattr("gsplat_edu.sfm.colmap.PROGRESS_EVERY", 0.001)
     monkeypatch.setattr("gsplat_edu.sfm.colmap.BEAT", 0.0)
     answers, seen = SimpleQueue(), []

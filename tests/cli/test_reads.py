@@ -1,4 +1,4 @@
-"""A command reads its capture once, whatever it chooses, measures and trains."""
+"""A command reads its capture once, also if it chooses settings, measures the machine and trains."""
 
 from collections import Counter
 
@@ -24,7 +24,7 @@ def _counting(counts, name, really):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """Count the calls of what reads a capture and the headers of its photos, by function and path."""
+    """Count the calls of the functions that read a capture and the headers of its photos, by function and path."""
     counts = Counter()
     for module, name in COUNTED:
         monkeypatch.setattr(module, name, _counting(counts, name, getattr(module, name)))

@@ -38,7 +38,7 @@ def test_a_run_writes_the_refined_capture_and_an_aligned_score(capture, tmp_path
 
 
 def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
-    """With `--refine`, the scene stands where the refined cameras see it."""
+    """With `--refine`, the scene fits the refined cameras, not the original ones."""
     from gsplat_edu.runs import cleaning
 
     judged, original = [], cleaning.clean
@@ -56,7 +56,7 @@ def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
 
 
 @pytest.mark.sliced(2, group="resumed with more to learn")
-def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
+def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--refine", "auto"]

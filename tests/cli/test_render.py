@@ -77,7 +77,7 @@ def test_a_datasets_cameras_a_size_and_a_background_can_be_chosen(made, cli, tmp
     assert image.shape == (48, 64, 3) and (image[0, 0] == 255).all()
 
 
-def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, capsys):
+def test_an_orbit_of_a_scene_file_is_centred(made, cli, tmp_path, capsys):
     bare = made[2]
     assert cli(["render", str(bare), "--frames", "2", "--size", "40", "--out", "frames"]) == 0
     assert "has no cameras: using a full circle" in capsys.readouterr().out
@@ -113,7 +113,7 @@ def test_mistakes_are_one_line(made, cli, capsys, tmp_path, arguments, says):
 
 
 def test_cameras_on_one_side_get_no_full_circle(made, cli, capsys, tmp_path):
-    """Three cameras of six, 60 degrees apart: half of a full circle's frames would show what no photo saw."""
+    """Only three of six cameras, 60 degrees apart, exist, so half of a full circle would show what no photo shows."""
     folder, _, bare, views = made
     run = RunFolder(tmp_path / "run")
     run.write_config(folder.read_config() | {"origin": [0.0, 0.0, 0.0]})
@@ -133,7 +133,7 @@ def test_help_shows_an_example(cli, capsys):
 @pytest.mark.own_process
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_render_leaves_no_temporary_file(made, cli, tmp_path, number):
-    """SIGTERM used to leave one. The next render removes what SIGKILL leaves."""
+    """SIGTERM used to leave one. A file that SIGKILL leaves is removed by the next render."""
     folder, program = (
         tmp_path / "videos",
         "import sys; from gsplat_edu.cli.main import main; sys.exit(main())",
@@ -157,7 +157,7 @@ def test_an_interrupted_render_leaves_no_temporary_file(made, cli, tmp_path, num
 
 
 def test_maps_are_written_beside_the_images(made, cli, capsys, tmp_path):
-    """The TIFF has the values, the PNG has them with the scale of maps.json, and a preview shows something."""
+    """The TIFF has the values, the PNG has them scaled as maps.json says, and the preview is not uniform."""
     _, capture, bare, views = made
     words = [
         "--dataset",
@@ -182,7 +182,7 @@ def test_maps_are_written_beside_the_images(made, cli, capsys, tmp_path):
             values, stored = values[..., ::-1], stored[..., ::-1]
         np.testing.assert_array_equal(values, truth)
         scale = listed[f"view_002.{name}.png"]
-        # Half a step, and the rounding of float32 in the product.
+        # half a step, plus the float32 rounding of the product
         np.testing.assert_allclose(
             scale["scale"] * stored + scale["offset"], truth, rtol=0, atol=0.51 * scale["scale"]
         )

@@ -55,7 +55,7 @@ def test_a_run_is_rendered_along_a_path_in_the_captures_coordinates(made, path, 
     write_path(tmp_path / "path.json", path, ORIGIN)
     words = ["--path", "path.json", "--out", "frames", "--fps", "2"]
     assert cli(["render", str(folder.path), *words]) == 0
-    assert "wrote frames/: 5 images of " in capsys.readouterr().out, "two seconds, both ends included"
+    assert "wrote frames/: 5 images of " in capsys.readouterr().out, "two seconds, including both ends"
     curve = PathCurve(path)
     first = views[0].camera
     for i, camera in enumerate(curve.cameras(5, first.W, first.H)):
@@ -104,7 +104,7 @@ def test_the_cameras_become_keyframes(made, cli, tmp_path, capsys, source):
 
 
 def test_a_saved_orbit_is_rendered_as_the_orbit(made, cli, tmp_path, capsys):
-    """At its keyframes it is the very orbit; the loop lasts as long as the orbit's video."""
+    """The path meets the orbit at its keyframes, and the loop lasts as long as the orbit's video."""
     bare = made[2]
     words = ["--frames", "12", "--fps", "6", "--size", "40"]
     assert cli(["render", str(bare), "--save-path", "orbit.json", "--keyframes", "6", *words]) == 0
@@ -115,7 +115,8 @@ def test_a_saved_orbit_is_rendered_as_the_orbit(made, cli, tmp_path, capsys):
     cameras = PathCurve(read_path(tmp_path / "orbit.json")).cameras(12, 40, 40)
     scene = read_scene(bare)
     for i, orbiting in enumerate(orbit_of_scene(scene.gaussians, 12, 40)):
-        # The keyframes are 60 degrees apart; between them, the curve leaves the circle by 3 h⁴ / 128, 3 %, see
+        # The keyframes are 60 degrees apart. Between them, the curve is off the circle by 3 h⁴ / 128, 3 % of the
+        # radius; see
         # tests/evaluate/test_path_curve.py.
         atol = 1e-9 if i % 2 == 0 else 0.03 * np.linalg.norm(orbiting.eye)
         np.testing.assert_allclose(cameras[i].eye, orbiting.eye, atol=atol)

@@ -1,4 +1,4 @@
-"""`--sky`: what the photos decide, the same bits on any number of threads and after a kill, formats, bad input."""
+"""`--sky`: `auto` decides by the photos; bits do not depend on threads or kills; formats keep the sky; bad input."""
 
 import json
 import os
@@ -43,7 +43,7 @@ def scene(run):
 
 
 @pytest.mark.sliced(2, group="resumed with more to learn")
-def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(outdoors, tmp_path, capsys):
+def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(outdoors, tmp_path, capsys):
     run = tmp_path / "run"
     assert main(["train", str(outdoors), "--out", str(run), *SHORT]) == 0
     said = capsys.readouterr().out
@@ -60,7 +60,7 @@ def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(outdoors, tmp_path, 
 
 
 @pytest.mark.parametrize("words", [["--sky", "none"], ["--strategy", "adc"]])
-def test_the_references_and_none_have_no_sky(outdoors, tmp_path, capsys, words):
+def test_adc_and_none_have_no_sky(outdoors, tmp_path, capsys, words):
     run = tmp_path / "run"
     words = ["train", str(outdoors), "--out", str(run), "--iterations", "3", "--resolution", "2", *words]
     assert main(words) == 0
@@ -94,7 +94,7 @@ def test_a_capture_without_points_has_its_sky_too(made, tmp_path, capsys):
 
 
 @pytest.mark.sliced(1, group="captures with and without a sky")
-def test_transparent_and_masked_photos_are_left_alone(made, tmp_path, capsys):
+def test_transparent_and_masked_photos_get_no_sky(made, tmp_path, capsys):
     clear, masked = [], []
     for view, sky in zip(made.views, made.sky, strict=True):
         alpha = np.where(sky, 0, 255).astype(np.uint8)
@@ -124,7 +124,7 @@ def test_bad_input_is_one_line(outdoors, tmp_path, capsys):
         complained = capsys.readouterr().err
         assert said in complained and complained.count("\n") == 1
     assert main([*words[:-1], "--from", str(bare), "--out", str(tmp_path / "other")]) == 0
-    assert stored(tmp_path / "other") == "none", "it has the sky of its scene"
+    assert stored(tmp_path / "other") == "none", "the start scene brings its own sky"
 
 
 def trained(capture, out, threads, *words):
@@ -192,7 +192,7 @@ def test_a_run_from_a_scene_keeps_its_sky_also_when_it_is_resumed(outdoors, tmp_
     start = ["--from", str(scene(tmp_path / "first"))]
     whole = trained(outdoors, tmp_path / "whole", threads, *words, *start, "--iterations", "12")
     after = far_shell(read_scene(scene(tmp_path / "whole")).gaussians.means.numpy()).sum()
-    assert after >= 0.9 * before > 0, "splats are not pruned for being large"
+    assert after >= 0.9 * before > 0, "large splats of the sky are not pruned"
     shutil.copytree(tmp_path / "whole", tmp_path / "again")
     shutil.rmtree(tmp_path / "again" / "point_cloud")
     (tmp_path / "again" / "metrics.json").unlink()

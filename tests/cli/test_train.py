@@ -32,7 +32,7 @@ def test_without_options_the_recipe_is_fast_with_3000_iterations():
     chosen = options()
     assert chosen.config == recipe(3_000, strategy="fast")
     assert (chosen.config.strategy, chosen.config.iterations) == ("fast", 3_000)
-    assert chosen.config.max_gaussians is None, "planned from the capture"
+    assert chosen.config.max_gaussians is None, "the cap is planned from the capture"
     assert chosen.data_settings.background == (0.0, 0.0, 0.0)
     assert options("--iterations", "500").config == recipe(500, strategy="fast")
 
@@ -59,7 +59,7 @@ def test_options_reach_the_recipe():
         random_background=True,
         opacities_rate=0.025,
     )
-    assert chosen.data_settings.background is None, "photos keep their alpha for backgrounds drawn later"
+    assert chosen.data_settings.background is None, "photos keep their alpha for random backgrounds"
 
 
 def test_set_takes_several_settings_and_the_last_value_counts():
@@ -72,12 +72,14 @@ def test_the_other_strategies_and_colours():
     assert options("--background", "0.1", "0.2", "0.3").config.background == (0.1, 0.2, 0.3)
     window = ["--no-rescale", "--set", "densify_start=26000", "densify_stop=28000"]
     late = options("--strategy", "adc", *window).config
-    assert late.adc.densify_stop == 28_000, "the other strategy's window is not checked"
+    assert late.adc.densify_stop == 28_000, "the window of a strategy that is not used is not checked"
 
 
 def test_the_quality_is_the_length_of_the_fast_recipe():
     lengths = {name: options("--quality", name).config.iterations for name in QUALITIES}
-    assert lengths == {"draft": 1_000, "standard": 3_000, "high": 10_000}, "until the capture is read"
+    assert lengths == {"draft": 1_000, "standard": 3_000, "high": 10_000}, (
+        "planned anew once the capture is read"
+    )
     assert options().config == options("--strategy", "fast").config == options("--quality", "standard").config
     config, full = options("--iterations", "300").config, recipe(strategy="fast")
     assert config.iterations == 300 and 100 * config.fast.full_size == full.fast.full_size
@@ -105,7 +107,7 @@ def test_the_help_names_every_setting_and_how_to_give_it(capsys):
 
 
 def test_config_json_has_flat_names(tmp_path):
-    """An `mcmc` config. Resuming compares configurations key by key."""
+    """The config of an `mcmc` run. Resuming compares configurations key by key."""
     flat = {
         "iterations": 700, "tempo": "", "seed": 0,
         "means_rate": 0.00016, "means_rate_final": 1.6e-06, "means_rate_iterations": 700,

@@ -1,4 +1,4 @@
-"""`--transients`: what auto says, masks in the run's folder and in the report, and what is refused."""
+"""`--transients`: the choice of auto, masks in the run's folder and in the report, and refused values."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from passers_by import pasted
 
 @pytest.fixture(scope="module")
 def struck(tmp_path_factory):
-    """A capture with pasted things, and the names of its photos that have some."""
+    """A capture with objects pasted into some photos, and the names of these photos."""
     folder = tmp_path_factory.mktemp("struck")
     views, points, colors = procedural_capture(48, 18, splats=200)
     changed, truth = pasted(views, share=0.2, seed=2)
@@ -26,7 +26,7 @@ def struck(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(struck, tmp_path_factory):
-    """A finished run with masks, and what it said."""
+    """A finished run with masks, and its output."""
     return finished(struck[0], tmp_path_factory.mktemp("runs") / "run", "--transients", "mask")
 
 
@@ -83,7 +83,7 @@ def test_eval_keeps_the_masks_in_the_report(run, tmp_path):
 
 
 @pytest.mark.sliced(2, group="resumed with more to learn")
-def test_auto_says_why_and_a_resumed_run_keeps_it(struck, tmp_path, capsys):
+def test_auto_gives_its_reason_and_a_resumed_run_keeps_its_choice(struck, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "run", "--transients", "auto", iterations=40)
     said = " ".join(capsys.readouterr().out.split())
     assert "--transients mask: 15 training photos are enough to tell what moved" in said
@@ -91,7 +91,9 @@ def test_auto_says_why_and_a_resumed_run_keeps_it(struck, tmp_path, capsys):
     before = sorted(path.name for path in (folder / "transients").glob("*"))
     finished(struck[0], folder, "--resume", iterations=50)
     assert "--transients" not in capsys.readouterr().out and stored(folder) == "mask"
-    assert sorted(path.name for path in (folder / "transients").glob("*")) == before, "milestones stay"
+    assert sorted(path.name for path in (folder / "transients").glob("*")) == before, (
+        "the masks are not computed again"
+    )
     words = ["train", str(struck[0]), "--out", str(folder), "--iterations", "60", "--appearance", "none"]
     assert main([*words, "--resume", "--transients", "none"]) == 2
     assert "was started with transients = mask, not none" in capsys.readouterr().err

@@ -141,7 +141,7 @@ def test_levels_of_detail_are_served_with_their_files(tmp_path):
 @pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")
 @own_process
 @pytest.mark.sliced(1, group="scenes served by a process")
-def test_the_browser_opens_for_a_user_at_a_screen(made, tmp_path):
+def test_the_browser_opens_only_on_a_terminal_with_a_screen(made, tmp_path):
     import pty
 
     _, bare = made

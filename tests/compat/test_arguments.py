@@ -1,4 +1,4 @@
-"""What `rasterization` does not support is refused by name, and so are values of wrong shapes, types and ranges."""
+"""Unsupported arguments of `rasterization`, and wrong shapes, types and ranges, are refused by the argument's name."""
 
 import inspect
 import re
@@ -35,7 +35,7 @@ UNSUPPORTED = {
 
 
 @pytest.mark.parametrize("name", UNSUPPORTED)
-def test_what_is_not_supported_is_refused_by_name(name):
+def test_unsupported_arguments_are_refused_by_name(name):
     with pytest.raises(ArgumentError, match=f"^{name}: .* only .* is supported"):
         rasterization(**arguments(), **{name: UNSUPPORTED[name]})
 
@@ -51,7 +51,7 @@ ADDED = {
     "extra_signals_sh_degree": None,
     "renderer_config": None,
 }
-"""What gsplat's main branch has added, with its defaults."""
+"""Arguments that gsplat's main branch has added, with their defaults."""
 
 
 def test_added_arguments_have_gsplats_defaults():
@@ -61,7 +61,7 @@ def test_added_arguments_have_gsplats_defaults():
     assert torch.equal(plain[0], given[0]) and sorted(plain[2]) == sorted(given[2])
 
 
-def test_gsplats_default_renderer_is_taken_by_its_name():
+def test_the_name_of_gsplats_default_renderer_is_accepted():
     default = type("RendererConfig_MixedBatch", (), {})()
     images = rasterization(**arguments(), renderer_config=default)[0]
     assert torch.equal(images, rasterization(**arguments())[0])
@@ -134,7 +134,7 @@ def test_harmonics_need_a_degree_that_the_coefficients_have(degree):
 
 
 @pytest.mark.parametrize("degree", [2, 5, -1, 1.0])
-def test_harmonics_of_extra_signals_need_a_degree_that_they_have(degree):
+def test_harmonics_of_extra_signals_need_a_degree_that_their_coefficients_have(degree):
     with pytest.raises(ArgumentError, match="^(extra_signals|extra_signals_sh_degree): "):
         rasterization(**arguments(), extra_signals=torch.zeros(N, 4, 2), extra_signals_sh_degree=degree)
 
@@ -153,7 +153,7 @@ def test_extra_signals_need_a_channel():
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+D", "RGB+ED"])
-def test_colors_may_be_missing_where_none_are_returned_only(mode):
+def test_colors_may_be_missing_only_if_none_are_returned(mode):
     with pytest.raises(
         ArgumentError, match=f"^colors: is None, but render_mode '{re.escape(mode)}' returns colours"
     ):
@@ -172,13 +172,13 @@ def test_backgrounds_cover_extra_signals():
             rasterization(**given | {"backgrounds": torch.zeros(C, wrong)})
 
 
-def test_gaussians_need_a_shape():
+def test_quats_and_scales_are_required_without_covars():
     for missing in ("quats", "scales"):
         with pytest.raises(ArgumentError, match=f"^{missing}: is None"):
             rasterization(**arguments(**{missing: None}))
 
 
-def test_arguments_without_an_effect_have_none():
+def test_arguments_for_gsplats_kernels_change_no_image():
     plain = rasterization(**arguments())
     for changes in ({"tile_size": 8}, {"channel_chunk": 1}, {"segmented": True}, {"packed": False}):
         images, alphas, meta = rasterization(**arguments(), **changes)

@@ -1,4 +1,4 @@
-"""Depth supervision by the tracks of a capture that we wrote, through `rasterization`, as gsplat's trainer does it.
+"""Depth supervision through `rasterization`, by the tracks of a capture that we wrote, as in gsplat's trainer.
 
 The trainer reads a COLMAP model with COLMAP's own reader, projects the points that a photo observes, and compares their
 disparities with those of the expected depth there.
@@ -17,7 +17,7 @@ STEPS = 60
 
 
 def observed(model, image):
-    """Pixels and depths of the points that an image observes, by COLMAP's camera."""
+    """Return pixels and depths of the points that an image observes, by COLMAP's camera."""
     pose, marks = image.cam_from_world(), image.get_observation_points2D()
     points = np.stack([pose * model.point3D(mark.point3D_id).xyz for mark in marks])
     pixels = np.stack([image.camera.img_from_cam(point) for point in points])
@@ -25,7 +25,7 @@ def observed(model, image):
 
 
 def sampled(depth, pixels):
-    """Depths (H, W) at pixels whose first centre is (0.5, 0.5), bilinear."""
+    """Sample depths (H, W) bilinearly at pixels; the first pixel's centre is (0.5, 0.5)."""
     size = torch.tensor([depth.shape[1], depth.shape[0]])
     grid = (2 * pixels / size - 1)[None, None]
     found = torch.nn.functional.grid_sample(
@@ -35,8 +35,8 @@ def sampled(depth, pixels):
 
 
 def test_depths_of_tracks_pull_gaussians_to_the_points(tmp_path):
-    """The Gaussians start at the points, pushed away from their centre by a quarter. Only the depths at the tracks are
-    supervised, and the error of these halves."""
+    """The Gaussians start at the points, a quarter farther from their centre. Supervising only the depths at the
+    tracks halves the error of these depths."""
     views, points, colors = procedural_capture(24, 6)
     write_colmap(tmp_path, views, points, colors)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))

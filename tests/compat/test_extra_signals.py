@@ -1,4 +1,4 @@
-"""Extra signals: the weights of the colours, no floor, a key of `meta` of their own; depths without colours."""
+"""Extra signals are weighted like colours, without a floor, and returned in `meta`. Depths need no colours."""
 
 import pytest
 import torch
@@ -38,7 +38,7 @@ def render(tensors, signals, **options):
 
 
 def assert_same_gradients(leaves, mine, theirs):
-    """Gradients of the same weighted sum of all outputs."""
+    """Compare the gradients of the same weighted sum of all outputs."""
     weights = [normal(*output.shape, seed=k) for k, output in enumerate(theirs)]
     found, wanted = (
         torch.autograd.grad(sum((w * o).sum() for w, o in zip(weights, outputs, strict=True)), leaves)
@@ -52,8 +52,8 @@ def assert_same_gradients(leaves, mine, theirs):
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("mode", ["RGB", "RGB+D", "RGB+ED"])
 @pytest.mark.parametrize(("channels", "per_camera"), [(1, False), (5, True), (40, False)])
-def test_they_are_what_the_same_channels_give_as_colours(channels, per_camera, mode, packed):
-    """Against the witness, with colours and signals as the channels of one image, and so the backgrounds."""
+def test_signals_equal_the_same_channels_rendered_as_colours(channels, per_camera, mode, packed):
+    """The witness renders colours and signals, and both backgrounds, as the channels of one image."""
     tensors = scene()
     signals = normal(*((2,) if per_camera else ()), 40, channels).requires_grad_()
     tensors["backgrounds"] = normal(2, 3 + channels, seed=4).requires_grad_()
@@ -75,7 +75,7 @@ def test_they_are_what_the_same_channels_give_as_colours(channels, per_camera, m
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_harmonics_of_signals_are_offset_but_have_no_floor(degree):
-    """gsplat's polynomials in torch, three channels at a time, because they take no other number."""
+    """gsplat's polynomials in torch take three channels, so six channels take two calls."""
     tensors = scene() | {"backgrounds": None}
     coefficients = (3 * normal(40, 16, 6)).requires_grad_()
     images, _, meta = render(tensors, coefficients, extra_signals_sh_degree=degree)
@@ -102,7 +102,7 @@ def test_depths_need_no_colours(mode):
     tensors = scene()
     plain = rasterization(**tensors, width=W, height=H, render_mode=mode)
     without = tensors | {"colors": None}
-    for backgrounds in (tensors["backgrounds"], None, normal(2, 7)):  # which have no effect here
+    for backgrounds in (tensors["backgrounds"], None, normal(2, 7)):  # backgrounds have no effect on depths
         images, alphas, meta = rasterization(
             **without | {"backgrounds": backgrounds}, width=W, height=H, render_mode=mode
         )
@@ -113,7 +113,7 @@ def test_depths_need_no_colours(mode):
 @pytest.mark.parametrize("mode", ["D", "ED"])
 @pytest.mark.parametrize("with_colors", [False, True])
 def test_depths_with_signals(mode, with_colors):
-    """Signals over their own backgrounds, which the colours that are not returned have no part in."""
+    """Backgrounds belong to the signals only, whether or not colours are given, because no colours are returned."""
     tensors = scene()
     signals, behind = normal(40, 4).requires_grad_(), normal(2, 4, seed=4).requires_grad_()
     given = tensors | {"backgrounds": behind} | ({} if with_colors else {"colors": None})
@@ -128,7 +128,8 @@ def test_depths_with_signals(mode, with_colors):
 
 
 def test_signals_may_be_larger_than_colours():
-    """Colours beyond 1e6 are refused, because the kernels skip such Gaussians; signals are features to them."""
+    """Colours beyond 1e6 are refused, because the kernels skip such Gaussians. Signals are features, without this
+    limit."""
     tensors = scene() | {"backgrounds": None}
     signals = normal(40, 2)
     small = render(tensors, signals)[2]["render_extra_signals"]
@@ -154,8 +155,8 @@ def test_scenes_share_coefficients_but_not_channels():
 
 
 def test_finite_differences():
-    """Smooth: the four Gaussians of `gsplat_witness.smooth` are above 1/255 and below the clamps in every pixel, keep
-    their order, and signals have no floor, unlike colours, which are above theirs."""
+    """Renders are smooth in all inputs: the four Gaussians of `gsplat_witness.smooth` are above 1/255 and below the
+    clamps in every pixel and keep their order, colours are above their floor, and signals have no floor."""
     tensors = gsplat_witness.smooth() | {"backgrounds": normal(2, 6).requires_grad_()}
     tensors["extra_signals"] = (0.1 * normal(4, 4, 3)).requires_grad_()
     names, leaves = list(tensors), list(tensors.values())

@@ -1,4 +1,4 @@
-"""Images in float32 against float64: the projection must not lose the digits of thin Gaussians."""
+"""Images in float32 agree with float64: the projection does not lose the digits of thin Gaussians."""
 
 import pytest
 import torch
@@ -7,11 +7,11 @@ from gsplat_edu.compat.gsplat import rasterization
 
 W, H = 64, 48
 BOUND = 1e-5
-"""A centre at up to 64 px is rounded to 4e-6 px, and alpha changes by at most 1.1 per px (0.6 o / sqrt(0.3)), so by
-4e-6; the kernels' own rounding adds 3e-6, what `render` has in these scenes. Colours are at most 1."""
+"""Largest error. A centre at up to 64 px is rounded to 4e-6 px, and alpha changes by at most 1.1 per px (0.6 o /
+sqrt(0.3)), so by 4e-6. The kernels' own rounding adds 3e-6, as measured with `render`. Colours are at most 1."""
 
 SEEDS = (33, 56, 78, 135)
-"""Of 150 scenes, those in which a projection in float32 was off by 1e-5 to 8e-4 without an alpha at 1/255."""
+"""The seeds of 150 for which a projection in float32 was off by 1e-5 to 8e-4 although no alpha was at 1/255."""
 
 
 def scene(seed):
@@ -32,7 +32,7 @@ def drawn(parts, dtype):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_float32_keeps_the_digits(seed):
+def test_float32_agrees_with_float64_for_thin_gaussians(seed):
     parts = scene(seed)
     (image, alpha, meta), (truth, wanted, _) = (
         drawn(parts, dtype) for dtype in (torch.float32, torch.float64)

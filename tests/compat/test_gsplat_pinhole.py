@@ -90,7 +90,7 @@ def test_proj():
 @pytest.mark.parametrize("fused", [False, True])
 @pytest.mark.parametrize("compensated", [False, True])
 def test_projection(fused, compensated):
-    """Fused: from quaternions and scales. Rows with a positive radius on both sides are compared."""
+    """Quaternions and scales give the fused projection. Rows with a positive radius on both sides are compared."""
     tensors, covars = camera_axes()
     upper = covars.detach()[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].requires_grad_()
     cameras = (tensors["viewmats"], tensors["Ks"], W, H)
@@ -162,7 +162,7 @@ def test_isect(sort, tile):
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize(("tile", "channels"), [(4, 3), (16, 40)])
 def test_rasterize_to_pixels(tile, channels, packed):
-    """Against the compositing rules at every pixel, from the same projected Gaussians (tests/gsplat_witness.py)."""
+    """The witness applies the compositing rules at every pixel to the same projected Gaussians."""
     tensors, radii, means2d, depths, conics = projected()
     g = torch.Generator().manual_seed(3)
     draw = lambda *shape: torch.randn(*shape, generator=g, dtype=torch.float64)  # noqa: E731
@@ -236,7 +236,7 @@ def test_rasterization_takes_degree_4():
 
 
 def relocated(o, n):
-    """Equation 9 of the paper, term by term."""
+    """Evaluate equation 9 of the MCMC paper term by term."""
     new = 1 - (1 - o) ** (1 / n)
     total = sum(
         math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
@@ -247,7 +247,7 @@ def relocated(o, n):
 
 
 def test_relocation():
-    """Terms of the sum cancel: the largest is below 300 times the sum, so that 1e-12 has digits to spare."""
+    """Terms of the sum cancel. The largest is below 300 times the sum, so rounding is below 300 * 2^-53 < 1e-12."""
     binoms = torch.tensor(
         [[float(math.comb(n, k)) for k in range(51)] for n in range(51)], dtype=torch.float64
     )

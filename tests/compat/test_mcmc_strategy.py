@@ -1,4 +1,4 @@
-"""gsplat's `MCMCStrategy` on the CPU: with our `compute_relocation` and `quat_scale_to_covar_preci` in its module."""
+"""gsplat's `MCMCStrategy` runs on the CPU with our `compute_relocation` and `quat_scale_to_covar_preci`."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ STEPS, N = 24, 40
 
 @pytest.fixture
 def on_the_cpu(monkeypatch):
-    """Its two CUDA kernels, replaced as docs/GSPLAT.md says; relocations are counted by what comes in."""
+    """Replace the strategy's two CUDA kernels as docs/GSPLAT.md says; return the ratios of each relocation."""
     seen = []
 
     def counted(opacities, scales, ratios, binoms):
@@ -48,12 +48,12 @@ def scene(seed):
 
 
 def test_mcmc_relocates_adds_and_trains(on_the_cpu):
-    torch.manual_seed(0)  # it samples from the global generator
+    torch.manual_seed(0)  # the strategy samples from the global generator
     with torch.no_grad():
         photo = draw(scene(1))[0]
     params = scene(2)
     with torch.no_grad():
-        params["opacities"][:4] = -8.0  # dead: to be relocated
+        params["opacities"][:4] = -8.0  # dead Gaussians, which are relocated
     optimizers = {name: torch.optim.Adam([p], lr=2e-2) for name, p in params.items()}
     strategy = gsplat.MCMCStrategy(
         cap_max=N + 6, refine_start_iter=2, refine_stop_iter=20, refine_every=5, noise_lr=1e2
@@ -70,17 +70,15 @@ def test_mcmc_relocates_adds_and_trains(on_the_cpu):
         strategy.step_post_backward(params, optimizers, state, step, info, lr=1e-5)
         losses.append(loss.item())
     assert len(params["means"]) == N + 6
-    assert (
-        len(on_the_cpu[0]) == 4 and int(on_the_cpu[0].max()) > 1
-    )  # four dead ones took the place of live ones
+    assert len(on_the_cpu[0]) == 4 and int(on_the_cpu[0].max()) > 1  # four dead Gaussians moved to live ones
     assert bool((params["opacities"].sigmoid() > 0.004).all())
     assert losses[-1] < 0.7 * losses[0]
 
 
 @pytest.mark.parametrize("n", [2, 3, 10])
 def test_a_relocation_keeps_the_integral_of_alpha(n):
-    """Along a line through the centre, n new Gaussians on top of each other cover what one did: the sum of
-    1 - (1 - o' g')^n over the line is that of o g. The trapezoidal rule is exact to rounding for Gaussians."""
+    """Along a line through the centre, n new Gaussians at one place cover as much as the old one: the sum of 1 - (1 -
+    o' g')^n over the line is that of o g. The trapezoidal rule is exact to rounding for Gaussians."""
     opacities, scales = torch.tensor([0.8], dtype=torch.float64), torch.full((1, 3), 0.3, dtype=torch.float64)
     binoms = gsplat.MCMCStrategy().initialize_state()["binoms"]
     new, moved = compute_relocation(opacities, scales, torch.tensor([n]), binoms)

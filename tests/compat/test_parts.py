@@ -17,7 +17,7 @@ CLOSE = {"rtol": 1e-10, "atol": 1e-10}
 
 @pytest.mark.parametrize("name", ["rasterization", "fully_fused_projection", "spherical_harmonics"])
 def test_the_signatures_are_gsplats(name):
-    """Positions, names and defaults; what gsplat's main branch has added is given by name only."""
+    """Positions, names and defaults agree; arguments that gsplat's main branch has added are keyword-only."""
 
     def bare(function):
         return [
@@ -63,7 +63,7 @@ def test_the_projection_is_gsplats(covars, limits):
     leaves = [tensors[name] for name in ("means", "quats", "scales", "viewmats", "Ks")]
     used = torch.tensor(
         [[1, 0, 1], [0, 1, 1], [0, 0, 0]]
-    )  # of Ks; gsplat's torch function alone reads a skew
+    )  # entries of Ks that are used; only gsplat's torch function reads a skew
     for one, other in zip(found[1:], wanted[1:], strict=True):
         torch.testing.assert_close(one[drawn], other[drawn], **CLOSE)
         weights = torch.linspace(-1, 1, one[drawn].numel(), dtype=one.dtype).view(one[drawn].shape)
@@ -76,7 +76,7 @@ def test_the_projection_is_gsplats(covars, limits):
             assert float((g - h).abs().max()) <= 1e-9 * max(1.0, float(h.abs().max()))
 
 
-def test_packed_projection_lists_what_has_radii():
+def test_packed_projection_lists_gaussians_with_positive_radii():
     tensors = gsplat_witness.scene()
     dense, _ = projections(tensors, False, False)
     t = tensors

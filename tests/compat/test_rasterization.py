@@ -34,7 +34,7 @@ def weights_like(*tensors, seed=5):
 
 
 def gradients(tensors, *outputs):
-    """Gradients of a weighted sum; the same weights for outputs of the same shapes."""
+    """Return the gradients of a weighted sum, with equal weights for outputs of equal shapes."""
     loss = sum((w * o).sum() for w, o in zip(weights_like(*outputs), outputs, strict=True))
     named = {name: t for name, t in tensors.items() if t is not None and t.requires_grad}
     found = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
@@ -91,7 +91,7 @@ def test_images_and_gradients_are_gsplats(name):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("eps2d", [0.0, 0.1, 0.3, 1.0])
 def test_dilations_of_thin_gaussians_are_gsplats(eps2d, antialiased):
-    """Needles: where eps2d was added as a difference from 0.3, their determinants were negative and clamped."""
+    """The Gaussians are needles, whose determinants became negative if eps2d was added as a difference from 0.3."""
     tensors = gsplat_witness.scene()
     tensors["colors"] = tensors["colors"][:, 0].detach().requires_grad_()
     with torch.no_grad():
@@ -106,7 +106,7 @@ def test_dilations_of_thin_gaussians_are_gsplats(eps2d, antialiased):
 
 @pytest.mark.parametrize(("eps2d", "wanted"), [(0.0, 0.5459), (0.1, 0.5712), (0.3, 0.6126), (1.0, 0.7009)])
 def test_alpha_beside_a_thin_gaussian_is_the_formula(eps2d, wanted):
-    """1.0 x 0.2 px, opacity 0.9: one pixel to the right alpha is 0.9 exp(-1 / (2 (1 + eps2d)))."""
+    """One pixel right of a Gaussian of 1.0 x 0.2 px and opacity 0.9, alpha is 0.9 exp(-1 / (2 (1 + eps2d)))."""
     one = lambda *values: torch.tensor([values], dtype=torch.float64)  # noqa: E731
     K = torch.tensor([[[1.0, 0, 5.5], [0, 1, 5.5], [0, 0, 1]]], dtype=torch.float64)
     view, opacity = torch.eye(4, dtype=torch.float64)[None], one(0.9)[0]
@@ -118,8 +118,8 @@ def test_alpha_beside_a_thin_gaussian_is_the_formula(eps2d, wanted):
     assert abs(float(alpha[6, 5]) - (down if down >= 1 / 255 else 0.0)) < 1e-12
 
 
-def test_a_pixel_ends_where_gsplats_does():
-    """Opaque layers: pixels keep light where gsplat skips a Gaussian that would take their transmittance to 1e-4."""
+def test_a_pixel_stops_at_the_same_gaussian_as_in_gsplat():
+    """Behind opaque layers, a pixel stops before the Gaussian that would take its transmittance to 1e-4."""
     tensors = gsplat_witness.scene(count=60)
     tensors["colors"] = tensors["colors"][:, 0].detach().requires_grad_()
     tensors["opacities"] = torch.full((60,), 1.0, dtype=torch.float64, requires_grad=True)
@@ -127,7 +127,7 @@ def test_a_pixel_ends_where_gsplats_does():
     images, alphas, _ = render(tensors, packed=False)
     wanted = gsplat_witness.rendered(tensors, W, H)
     left = 1.0 - wanted[1].detach()
-    assert float(left.min()) > 1e-4 and float(left.min()) < 0.05  # pixels have ended, with light left
+    assert float(left.min()) > 1e-4 and float(left.min()) < 0.05  # pixels have stopped above 1e-4
     assert_close(images, wanted[0])
     assert_close(alphas, wanted[1])
     assert_same_gradients(tensors, (images, alphas), wanted[:2])
@@ -164,7 +164,7 @@ def test_covariances_take_the_place_of_quaternions_and_scales():
 
 
 def test_the_numpy_reference_agrees():
-    """Opacities below 0.99, where its clamp of alpha begins, and few layers, so that it stops nowhere."""
+    """Opacities are below the clamp of 0.99, and layers are so few that no pixel stops early."""
     tensors = {name: t.detach() for name, t in gsplat_witness.scene(count=25, cameras=1).items()}
     tensors["colors"] = tensors["colors"][:, 0]
     image, alpha, _ = render(tensors)
@@ -190,7 +190,7 @@ def test_the_numpy_reference_agrees():
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("channels", [3, 40])
 def test_gradients_of_means_on_the_screen(packed, channels):
-    """`means2d.grad` is the sum of what the witness finds for each pixel, `absgrad` that of the absolute values."""
+    """`means2d.grad` sums the witness's gradients of all pixels, `absgrad` their absolute values."""
     tensors = gsplat_witness.scene()
     g = torch.Generator().manual_seed(4)
     tensors["colors"] = torch.randn(40, channels, generator=g, dtype=torch.float64, requires_grad=True)
@@ -211,7 +211,7 @@ def test_gradients_of_means_on_the_screen(packed, channels):
     assert_close(meta["means2d"].grad, signed)
     if (
         channels == 3
-    ):  # the pieces of more channels are summed before the absolute values are, see docs/GSPLAT.md
+    ):  # more channels are rendered in several passes, and absolute values taken of their sum; see docs/GSPLAT.md
         assert_close(meta["means2d"].absgrad, absolute)
     else:
         assert bool((meta["means2d"].absgrad >= absolute * (1 - EXACT) - EXACT).all())
@@ -251,7 +251,7 @@ def test_leading_axes_are_scenes():
         assert_close(packed[2]["depths"][rows], own["depths"][at])
 
 
-def test_packed_lists_what_has_radii():
+def test_packed_lists_gaussians_with_positive_radii():
     tensors = gsplat_witness.scene()
     dense, packed = (
         render(tensors, packed=p, sh_degree=1, rasterize_mode="antialiased")[2] for p in (False, True)
@@ -308,8 +308,8 @@ def test_finite_differences(rasterize_mode):
 
 
 def test_float32_agrees_with_float64():
-    """Alpha is 2^p with |p| < 8. A chain of about 30 operations leads to p, so p and alpha are off by less than 30 * 8
-    half roundings, 2^-24 each. Four Gaussians: 4 * 240 * 2^-24 = 6e-5 of the largest channel, doubled for its sum."""
+    """Alpha is 2^p with |p| < 8, and about 30 operations lead to p, so p and alpha are off by at most 30 * 8 * 2^-24.
+    Four Gaussians make 4 * 240 * 2^-24 = 6e-5 of the largest channel, doubled for its sum."""
     exact = {name: t.detach() for name, t in gsplat_witness.smooth().items()}
     single = {name: t.float() for name, t in exact.items()}
     options = {"sh_degree": 3, "render_mode": "RGB+ED"}
@@ -339,7 +339,8 @@ def test_absgrad_adds_up_as_grad_does():
 
 
 def test_no_reference_keeps_an_image_alive():
-    """The hook of absgrad is part of the graph; a circle through it would hold every image until the collector runs."""
+    """The hook of absgrad is part of the graph. A reference cycle through it would keep images until garbage
+    collection."""
     gc.disable()
     try:
         images, alphas, meta = render(gsplat_witness.scene(), sh_degree=0, absgrad=True)

@@ -1,4 +1,4 @@
-"""`skipping_bad_gaussians`: bad rows are left out with zero gradients; the others have the bits they have alone."""
+"""`skipping_bad_gaussians` leaves out bad rows with zero gradients; the others have the bits they have alone."""
 
 import pytest
 import torch

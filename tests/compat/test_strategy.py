@@ -13,7 +13,7 @@ RATES = {"means": 2e-3, "scales": 2e-2, "quats": 2e-2, "opacities": 5e-2, "color
 
 
 def matrices(camera):
-    """gsplat's viewmat and K of one of our cameras: its pixel centres are at +0.5."""
+    """Convert our camera to gsplat's viewmat and K, whose pixel centres are at +0.5."""
     viewmat, K = np.eye(4), np.eye(3)
     viewmat[:3, :3], viewmat[:3, 3] = camera.R, -camera.R @ camera.eye
     K[0, 0], K[1, 1], K[0, 2], K[1, 2] = camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5
@@ -58,7 +58,7 @@ def psnr(image, photo):
 def test_the_default_strategy_trains_through_our_rasterization(packed, absgrad, cameras_at_once):
     """The start points are off by 0.03 world units, 0.26 px at the cameras' distance. An image that is off by that much
     differs from the photo by 0.26 px times its slope. Training starts farther away than that, and has to end closer."""
-    torch.manual_seed(0)  # split draws from it
+    torch.manual_seed(0)  # the strategy's split draws from the global generator
     views, points, colors = procedural_capture(24, 6)
     photos = torch.tensor(np.stack([view.image for view in views]), dtype=torch.float32) / 255
     cameras = [matrices(view.camera) for view in views]
@@ -85,5 +85,5 @@ def test_the_default_strategy_trains_through_our_rasterization(packed, absgrad, 
             optimizer.zero_grad(set_to_none=True)
     with torch.no_grad():
         after = psnr(draw(params, cameras)[0], photos)
-    assert len(params["means"]) > len(points)  # it has grown
+    assert len(params["means"]) > len(points)  # the scene has grown
     assert bool((before < bound).all()) and bool((after > bound).all()), (before, bound, after)

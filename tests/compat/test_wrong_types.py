@@ -1,6 +1,5 @@
-"""Every public function of compat, and `render`, with values of wrong types for each argument: our errors only.
-
-The message begins with the argument's name, or with that of one that was given together with it.
+"""A value of a wrong type raises one of our errors, for each argument of every public function of compat and of
+`render`. The message begins with the argument's name, or with that of an argument it has to match.
 """
 
 import inspect
@@ -136,10 +135,10 @@ TAKEN = {
     "tile_size": {"a large number"},
     "channel_chunk": {"a large number"},
     "binoms": {"booleans"},  # a table of 0 and 1
-    # No Gaussians: then the other arguments are the wrong ones.
+    # Without Gaussians, the other arguments are the wrong ones.
     "compute_relocation opacities": {"an empty tensor"},
 }
-"""Values that are no errors."""
+"""Values that are accepted, by argument and kind."""
 
 
 @pytest.mark.parametrize(("function", "name"), CASES)
