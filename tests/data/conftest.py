@@ -27,7 +27,7 @@ def truth():
 
 @pytest.fixture(scope="session")
 def small():
-    """Nine views of 24x18, for tests that need files but not detail."""
+    """Nine views of 24x18, for tests whose photos need no detail."""
     return procedural_capture(24, 9, splats=60)
 
 

@@ -1,4 +1,4 @@
-"""The city is what it says: cameras, points and photos agree, and a seed determines every byte."""
+"""The cameras, points and photos of the city agree, and a seed determines every byte."""
 
 import hashlib
 import runpy
@@ -72,7 +72,7 @@ def test_the_tool_writes_it(tmp_path, monkeypatch, capsys):
     assert len(list((tmp_path / "city" / "images").iterdir())) == 3
 
 
-def test_the_city_grows_with_the_photos_and_each_place_is_seen_often():
+def test_more_photos_make_a_larger_city_and_show_each_place_as_often():
     small, large = City(photos=36), City(photos=144)
     assert large.side == 2 * small.side
     for city in (small, large):

@@ -1,4 +1,4 @@
-"""COLMAP's files: odd models, refusals by name, photos in folders, and truncated or garbled files."""
+"""Files of COLMAP: unusual models, photos in folders, and unsupported, truncated or garbled files."""
 
 import os
 import shutil
@@ -54,7 +54,7 @@ def test_newer_files_are_ignored(capture, name):
     assert len(load_dataset(capture).train) == 7
 
 
-# Each line of cameras.txt with fx, fy, cx, cy and coefficients worked out by hand from COLMAP's documentation.
+# Lines of cameras.txt, with fx, fy, cx, cy and coefficients derived by hand from COLMAP's documentation.
 READ = [
     ("SIMPLE_PINHOLE 24 18 30 12 9", (30, 30, 11.5, 8.5), (), False),
     ("PINHOLE 24 18 30 31 12 9", (30, 31, 11.5, 8.5), (), False),
@@ -79,7 +79,7 @@ READ = [
     ("line", "intrinsics", "coefficients", "fisheye"), READ, ids=lambda v: str(v).split()[0]
 )
 def test_camera_models(tmp_path, line, intrinsics, coefficients, fisheye):
-    """Both the text and the binary form of a camera. In the binary form, the model id is its index in MODELS."""
+    """Cameras are read from text and from binary files, in which the model id is the index in MODELS."""
     model, W, H, *values = line.split()
     (tmp_path / "cameras.txt").write_text(f"# a comment\n\n7 {line}\n")
     number = [name for name, _ in MODELS].index(model)
@@ -94,7 +94,7 @@ def test_camera_models(tmp_path, line, intrinsics, coefficients, fisheye):
 
 
 def test_the_ids_of_the_models():
-    """The ids are those in COLMAP's documentation; a table in another order would get them wrong."""
+    """The ids are those of COLMAP's documentation."""
     names = [name for name, _ in MODELS]
     assert names[:6] == ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
     assert names[6:9] == ["FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE"]
@@ -220,7 +220,7 @@ def test_without_points_the_start_is_random(capture, how):
 
 
 def test_tracks_and_observations_are_skipped(tmp_path):
-    """Both vary in length from entry to entry. The files are written here by hand, so the expected values are known."""
+    """Their lengths vary from entry to entry. The test writes the files itself, so the expected values are known."""
     data = struct.pack("<Q", 2)
     for i, track in ((3, 2), (9, 0)):
         data += struct.pack("<Q3d3BdQ", i, i, i + 0.5, -i, 255, 0, 51, 0.7, track) + b"\xff" * 8 * track
@@ -239,7 +239,7 @@ def test_tracks_and_observations_are_skipped(tmp_path):
 
 
 def test_observations_are_never_held_in_memory(tmp_path):
-    """Thousands of photos bring gigabytes of them. The file here has a hole of 3 GiB in their place."""
+    """Thousands of photos have gigabytes of observations. This file has a hole of 3 GiB in their place."""
     observed = 2**27
     with (tmp_path / "images.bin").open("wb") as file:
         for i in (4, 8):
@@ -252,7 +252,7 @@ def test_observations_are_never_held_in_memory(tmp_path):
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert [pose.name for pose in poses] == ["4.jpg", "8.jpg"]
-    assert most < 2**20, "the buffer of a file, and two poses"
+    assert most < 2**20, "memory for the file's buffer and two poses"
 
 
 @pytest.mark.parametrize("name", ["points3D", "images"])
@@ -289,10 +289,10 @@ def test_masks_beside_the_images(capture, stem):
 
 @pytest.mark.parametrize("file", MODEL_FILES)
 def test_every_truncation_names_the_file(capture, file):
-    """Wherever a file is cut, the error names it. A truncated file is never read as a complete one."""
+    """The error names the truncated file, which is never read as a complete one."""
     path = capture / "sparse" / "0" / f"{file}.bin"
     data = path.read_bytes()
-    # 7 and the 51 bytes of a point share no factor
+    # 7 is coprime to the 51 bytes of a point
     for end in range(0, len(data), 7 if len(data) > 500 else 1):
         path.write_bytes(data[:end])
         with pytest.raises(DatasetError, match=rf"{file}\.bin"):
@@ -316,7 +316,7 @@ def test_a_count_beyond_the_file_allocates_nothing(capture):
     head=st.booleans(),
 )
 def test_garbled_files_end_in_a_dataset_error_or_a_dataset(capture, file, flips, head):
-    """Whatever bytes are flipped, nothing but DatasetError is raised. Half of the flips are early in the file."""
+    """If bytes are flipped, half of them early in the file, nothing but DatasetError is raised."""
     path = capture / "sparse" / "0" / f"{file}.bin"
     whole = path.read_bytes()
     data = bytearray(whole)
@@ -332,7 +332,7 @@ def test_garbled_files_end_in_a_dataset_error_or_a_dataset(capture, file, flips,
 
 
 def test_the_statue_as_bin_and_as_txt(real, tmp_path):
-    """One model in both forms. The text gives six digits of the camera, and points without rounding."""
+    """One model in both forms. The text has six digits of the camera and unrounded points."""
     folder = real("odd/statue_sparse_bin_and_txt")
     (a,), (b,) = (read_cameras(folder / f"cameras.{s}").values() for s in ("bin", "txt"))
     np.testing.assert_allclose((a.fx, a.fy, a.cx, a.cy), (b.fx, b.fy, b.cx, b.cy), rtol=5e-6)
@@ -365,7 +365,7 @@ def renamed(capture, names):
 
 
 def test_a_bare_name_that_two_images_share_is_not_used(text):
-    """Otherwise one photo would be trained on as two views with two poses."""
+    """Otherwise, training would use one photo as two views with two poses."""
     renamed(text, {"view_001.png": "a/view_000.png"})
     with pytest.raises(DatasetError, match=r"none of the 9 photos"):
         (text / "images").rename(text / "elsewhere")
@@ -402,7 +402,7 @@ def test_a_bare_mask_that_two_images_share_is_reported_and_not_used(text):
 
 @pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17])
 def test_an_unsupported_camera_that_no_image_uses_is_skipped(capture, number):
-    """The parameter count of every model is known, so the cameras after it are read from the right byte."""
+    """The parameter count of every model is known, so the next camera is read from the right offset."""
     path = capture / "sparse" / "0" / "cameras.bin"
     values = range(1, 1 + len(dict(MODELS)[MODELS[number][0]].split()))
     odd = struct.pack(f"<IiQQ{len(values)}d", 99, number, 24, 18, *values)
@@ -466,7 +466,7 @@ def test_a_nonfinite_colour_channel_is_gray(text):
 
 
 def test_a_full_photo_beside_the_model_wins_over_a_smaller_copy(capture):
-    """The photos lie beside the model instead of in images/, and an unrelated images_2 exists."""
+    """The photos lie beside the model instead of in images/, and there is an unrelated images_2."""
     (capture / "images").rename(capture / "images_2")
     for file in (capture / "images_2").iterdir():
         shutil.copy(file, capture)

@@ -1,4 +1,4 @@
-"""Steps shared by all captures: detection, split, origin, start points, settings, preloading."""
+"""The steps that all captures share: detection, split, origin, start points, settings, preloading."""
 
 import json
 import shutil
@@ -137,7 +137,7 @@ def test_far_coordinates_are_moved_to_the_origin(tmp_path, small):
             dataset.origin, np.round(np.mean([v.camera.eye for v in moved], axis=0))
         )
         for view, before in zip(dataset.train, moved, strict=True):
-            # COLMAP stores -R e. Numbers of 2.5e5 are rounded by 3e-11, and three of them are summed twice.
+            # COLMAP stores -R e. Numbers near 2.5e5 are rounded by 3e-11, and three products are summed twice.
             np.testing.assert_allclose(view.camera.eye + dataset.origin, before.camera.eye, rtol=0, atol=1e-9)
             assert np.abs(view.camera.eye).max() < 10
         np.testing.assert_allclose(dataset.points + dataset.origin, points + shift, rtol=0, atol=1e-9)
@@ -216,8 +216,8 @@ def test_a_rotation_with_few_digits_is_made_orthonormal(tmp_path, small):
     for view, truth in zip(load_dataset(tmp_path, DataSettings(test_every=0)).train, small[0], strict=True):
         R = view.camera.R
         np.testing.assert_allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-14)
-        # Nine roundings of at most 5e-4 have a norm of at most 1.5e-3. The true rotation is that near to the rounded
-        # matrix, so the nearest rotation is too.
+        # Nine roundings of at most 5e-4 have a norm of at most 1.5e-3. Since the true rotation is as near to the
+        # rounded matrix, so is the nearest rotation.
         np.testing.assert_allclose(R, truth.camera.R, rtol=0, atol=2 * 1.5e-3)
 
 
@@ -254,7 +254,7 @@ def test_photos_that_do_not_fit_in_memory_are_reported(written):
 
 
 def test_photos_decoded_at_once_are_limited_by_their_size(monkeypatch):
-    """Sixty-four megapixels at a time: five of 12, one of 100."""
+    """At most 64 megapixels are decoded at once: five photos of 12 megapixels, or one of 100."""
     monkeypatch.setattr("os.cpu_count", lambda: 64)
     for W, H, workers in ((4000, 3000, 5), (10_000, 10_000, 1), (100, 100, 64)):
         lens = Lens(W, H, 1000.0, 1000.0, 0.0, 0.0)
@@ -275,15 +275,15 @@ def test_photos_decoded_at_once_are_limited_by_their_size(monkeypatch):
     ],
 )
 def test_memory_for_photos_includes_alpha_that_is_kept(name, mask, background, planes):
-    """A random background changes at every step, so alpha is kept; a JPEG has none. A mask has two planes once reduced:
-    what counts entirely, and what is excluded entirely."""
+    """A random background changes at every step, so alpha is kept, which a JPEG does not have. A reduced mask has two
+    planes: cells that count entirely, and cells that are excluded entirely."""
     source = PhotoFile(Path(name), mask, Lens(40, 20, 30.0, 30.0, 0.0, 0.0), 20, 10, background)
     assert ImageStore(0, [source] * 3).needed == 3 * 20 * 10 * planes
 
 
 @pytest.mark.parametrize("resolution", [None, 2.0])
 def test_ready_made_sizes_are_used_if_there_are_no_full_photos(written, resolution):
-    """Only images_2 and images_4 exist. The files' real sizes decide, and no photo is halved twice."""
+    """Only images_2 and images_4 exist. The sizes of the files decide, so no photo is halved twice."""
     for layout in ("colmap", "transforms"):
         folder = written(layout)
         for factor in (2, 4):
@@ -350,7 +350,8 @@ def test_a_camera_with_uneven_pixels_is_reported(tmp_path):
 
 
 def test_views_with_one_centre_are_held_out_together(tmp_path, small):
-    """Faces of four panoramas, three each, whose names are not in order of place; centres agree to float precision."""
+    """Four panoramas have three faces each, whose names are not ordered by place; their centres agree to float
+    precision."""
     views, points, colors = small
     places = [3, 0, 0, 1, 2, 3, 0, 1, 3]
     moved = [
@@ -364,14 +365,14 @@ def test_views_with_one_centre_are_held_out_together(tmp_path, small):
     write_colmap(tmp_path, moved, points, colors)
     dataset = load_dataset(tmp_path, DataSettings(test_every=2))
     held = {int(view.name[5:8]) for view in dataset.test}
-    # In the order of names, places are numbered 3, 0, 1, 2; every second one of these is held out: 3 and 1.
+    # Ordered by names, the places are 3, 0, 1, 2; every second one is held out, 3 and 1.
     assert held == {0, 3, 5, 7, 8}
     said = "9 photos have 4 centres, like the faces of panoramas: those with one centre are held out together"
     assert said in map(str, dataset.notes)
 
 
 def test_a_single_panorama_is_split_by_faces(tmp_path, small):
-    """All views have one centre: holding them out together would leave nothing to train on."""
+    """All views have one centre, so holding them out together would leave nothing to train on."""
     views, points, colors = small
     moved = [
         View(

@@ -1,4 +1,4 @@
-"""Captures and scenes made to break readers, or merely huge: each gives a one-line error, in bounded work."""
+"""Captures and scenes that are huge or made to break readers end in a one-line error after limited work."""
 
 import json
 import os
@@ -28,7 +28,7 @@ EVERYTHING = DataSettings(test_every=0)
 
 @pytest.fixture
 def no_hang():
-    """Fail a test that hangs on a pipe. A minute is far more than it needs."""
+    """Fail a test that hangs on a pipe; it needs much less than a minute."""
 
     def late(number, frame):
         raise AssertionError("the test hangs")
@@ -41,7 +41,7 @@ def no_hang():
 
 
 def test_only_one_module_opens_image_files():
-    """`image_files.py` holds the list of formats; nothing else opens an image."""
+    """`image_files.py` has the list of allowed formats; no other module opens an image."""
     opens = re.compile(r"Image\.open\(|\bimread\(|imdecode\(|plt\.imread|image_dimensions")
     files = [*(ROOT / "src").rglob("*.py"), *(ROOT / "train").rglob("*.py")]
     found = [path.name for path in files if opens.search(path.read_text(encoding="utf-8"))]
@@ -54,7 +54,7 @@ EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 12\n%%EndComments\nshowpa
 @needs_posix
 @pytest.mark.parametrize("read", [decode, decode_mask, image_size])
 def test_a_drawing_named_like_a_photo_starts_no_other_program(tmp_path, monkeypatch, read):
-    """Pillow runs Ghostscript for an EPS. A stand-in for `gs` leaves a mark if it runs."""
+    """Pillow runs Ghostscript for an EPS. A program named `gs` leaves a mark if it runs."""
     mark, program = tmp_path / "was_run", tmp_path / "bin" / "gs"
     program.parent.mkdir()
     program.write_text(f"#!/bin/sh\ntouch {mark}\n")
@@ -67,7 +67,7 @@ def test_a_drawing_named_like_a_photo_starts_no_other_program(tmp_path, monkeypa
         read(photo)
     assert not mark.exists()
     subprocess.run(["gs"], check=True, env=dict(os.environ))
-    assert mark.exists(), "the stand-in would have been found"
+    assert mark.exists(), "Pillow finds the program `gs`"
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif", "a.bmp", "a.ppm"])
@@ -149,11 +149,11 @@ def test_elements_larger_than_any_file(tmp_path):
         *("element foo 999999999999", *(f"property double a{i}" for i in range(9000))),
         *VERTEX,
     )
-    assert len(read_points_ply(path).points) == 0, "no row is needed, so none is skipped"
+    assert len(read_points_ply(path).points) == 0, "no row is read, so no row has to be skipped"
 
 
 def test_thousands_of_elements_and_properties_are_looked_up_in_tables(tmp_path, monkeypatch):
-    """The names count their comparisons: a few per name, not one with every other name."""
+    """The names count their comparisons, which are a few per name instead of one with every other name."""
     from gsplat_edu.base import ply_table
 
     compared = 0
@@ -196,7 +196,7 @@ def transforms(folder: Path, names, **more) -> Path:
 
 
 def test_many_frames_without_a_photo_need_few_system_calls(tmp_path, monkeypatch):
-    """300,000 of them used to take minutes: each could have 28 endings in 4 folders."""
+    """300,000 frames used to take minutes, because each could have 28 endings in 4 folders."""
     checked = []
     monkeypatch.setattr(
         capture, "is_file", lambda path, really=capture.is_file: checked.append(path) or really(path)
@@ -230,7 +230,7 @@ def test_photos_are_found_under_every_ending_in_any_case(tmp_path):
 
 
 def test_photos_in_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
-    """A folder may allow opening files but not listing them. Then no name can be ruled out."""
+    """A folder may allow opening its files but not listing them; every name then has to be tried."""
 
     def refuse(place, really=os.listdir):
         if Path(place).name.startswith("images"):

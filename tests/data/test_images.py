@@ -1,4 +1,4 @@
-"""Decoding, downscaling, alpha, masks and the sizes of files against the sizes of cameras."""
+"""Decoding, downscaling, alpha, masks, and files whose sizes differ from those of their cameras."""
 
 import json
 import threading
@@ -63,9 +63,9 @@ def test_alpha_is_returned_separately(tmp_path):
 
 
 def test_exif_orientation_is_ignored(tmp_path):
-    """COLMAP uses the pixels as they are stored, so the poses refer to those."""
+    """COLMAP uses the stored pixels, so the poses refer to them."""
     exif = Image.Exif()
-    exif[0x0112] = 6  # turn by 90 degrees for display
+    exif[0x0112] = 6  # rotate by 90 degrees for display
     path = saved(tmp_path, Image.fromarray(NOISE), "a.png", exif=exif)
     assert image_size(path) == (16, 12)
     np.testing.assert_array_equal(decode(path)[0], NOISE)
@@ -85,7 +85,7 @@ def test_cut_short_files_are_named(tmp_path, name):
         image_size(path)
     path.unlink()
     with pytest.raises(FileNotFoundError) as missing:
-        path.stat()  # says why in the words of the system
+        path.stat()  # the reason in the system's words
     with pytest.raises(DatasetError, match=rf"cannot be decoded \({missing.value.strerror}\)"):
         decode(path)
 
@@ -109,10 +109,9 @@ def test_a_broken_photo_among_good_ones(written):
 
 
 def test_downscaling_keeps_the_pixel_convention(one_photo):
-    """A linear ramp, I = column + row: every pixel still shows the value of the place its camera looks at.
-
-    Averaging a whole cell of a ramp gives its value at the cell's centre, where the scaled camera's ray meets the full
-    image. The result is rounded to 8 bits, by at most half a step.
+    """The photo is a linear ramp, I = column + row, of which each new pixel has the value at its ray. The mean of a
+    cell of a ramp is the ramp's value at the cell's centre, where the scaled camera's ray meets the full image. It is
+    rounded to 8 bits, by at most half a step.
     """
     y, x = np.mgrid[:48, :72]
     ramp = np.repeat((x + y).astype(np.uint8)[..., None], 3, axis=2)
@@ -140,7 +139,7 @@ def test_an_impulse_lands_where_its_ray_does(one_photo):
 
 @pytest.mark.parametrize("resolution", [2, 4, 8])
 def test_ready_made_sizes_are_used(one_photo, resolution):
-    """The file's own size and pixels count: images_4/a.png is 17x13, while 64/4 x 48/4 would be 16x12."""
+    """The size of the file counts: images_4/a.png is 17x13, although 64/4 x 48/4 is 16x12."""
     folder = one_photo(np.zeros((48, 64, 3), np.uint8), cx=30.0, cy=20.0)
     W, H = {2: (32, 24), 4: (17, 13), 8: (8, 6)}[resolution]
     pixels = RNG.integers(0, 256, (H, W, 3), dtype=np.uint8)
@@ -200,7 +199,7 @@ def test_sizes_that_differ_by_rounding_are_accepted(one_photo, camera, photo):
 @pytest.mark.parametrize("limit", [150, 50])
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp"])
 def test_large_photos_are_read_and_pillows_limit_stays(tmp_path, name, limit, monkeypatch):
-    """Pillow warns of an attack above its limit and refuses above twice of it. Reading must not change the limit."""
+    """Pillow warns above its limit and refuses above twice the limit, which reading must not change."""
     path = saved(tmp_path, Image.fromarray(NOISE), name, **({"lossless": True} if "webp" in name else {}))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
     found = []
@@ -238,7 +237,7 @@ def test_a_size_that_no_photo_has_is_refused_before_decoding(tmp_path, W, H, say
             read(path)
 
 
-def test_a_large_photo_may_be_compressed_as_photos_are(tmp_path):
+def test_photos_of_usual_compression_are_accepted_at_any_size(tmp_path):
     path = tmp_path / "a.png"
     content = blank_png(16_000, 12_500)  # 200 megapixels, the largest of today's cameras
     path.write_bytes(content + bytes(16_000 * 12_500 // PIXELS_PER_BYTE - len(content)))
@@ -268,17 +267,16 @@ def test_alpha_goes_over_the_background_when_read(one_photo, background):
     folder = one_photo(np.dstack([NOISE, alpha]))
     photo = load_dataset(folder, DataSettings(background=background)).train[0].read()
     expected = NOISE * (alpha / 255.0) + 255.0 * np.array(background) * (1 - alpha / 255.0)
-    # The result is rounded once; float32 inside may round a half the other way.
+    # The result is rounded once, and float32 may round a half in the other direction.
     np.testing.assert_allclose(photo.image, expected, rtol=0, atol=0.5 + 1e-4)
     assert photo.alpha is None
 
 
 @pytest.mark.parametrize("values", [{}, {"k1": -0.1}])
 def test_kept_alpha_downscales_like_the_composite(one_photo, values):
-    """Colour is averaged with alpha as weight, so a background may be chosen before or after downscaling.
-
-    Over any background, the averages of C alpha and of alpha give the average of the composites. Alpha, colour, their
-    composite and each source composite are all rounded by half a step: at most 2 steps.
+    """Colour is averaged with alpha as weight, so a background may be chosen before or after downscaling. Over any
+    background, the averages of C alpha and of alpha give the average of the composites. Alpha, colour, their
+    composite and the source composites are each rounded by half a step, at most 2 steps together.
     """
     alpha = np.kron(RNG.integers(0, 2, (6, 8)), np.ones((4, 4))).astype(np.uint8) * 255
     alpha[3::7] = 90
@@ -313,7 +311,7 @@ def test_a_downscaled_mask_keeps_only_cells_that_count_entirely(one_photo):
 
 
 def test_a_masked_photo_does_not_use_a_ready_made_size(one_photo):
-    """The mask has the size of the full photo. A copy in images_2 would not fit it and is not looked for."""
+    """The mask has the size of the full photo, so a copy in images_2 is not used."""
     folder = with_mask(one_photo(np.zeros((24, 32, 3), np.uint8)), np.full((24, 32), 255, np.uint8))
     (folder / "images_2").mkdir()
     Image.new("RGB", (16, 12), (9, 9, 9)).save(folder / "images_2" / "a.png")
@@ -323,7 +321,7 @@ def test_a_masked_photo_does_not_use_a_ready_made_size(one_photo):
 
 
 def test_a_mask_is_undistorted_with_its_photo(one_photo):
-    """Photo and mask are the same picture, so wherever the photo is clearly black or white, the mask agrees."""
+    """Photo and mask are the same picture, so the mask agrees wherever the photo is clearly black or white."""
     disk = np.where(np.hypot(*(np.mgrid[:48, :64] - np.array([20, 40])[:, None, None])) < 11, 255, 0).astype(
         np.uint8
     )
@@ -352,9 +350,8 @@ def test_a_photo_whose_size_changes_later_is_refused(one_photo):
     "distortion", [{}, {"k1": -0.2, "p1": 0.01}, {"camera_model": "OPENCV_FISHEYE", "k1": 1.0}]
 )
 def test_many_threads_read_the_same_pixels(tmp_path, distortion):
-    """A prefetcher reads in one thread while the trainer reads in another. The memory budget makes no difference.
-
-    Every frame has its own focal length, so nothing can be reused from one frame for the next.
+    """A prefetcher reads in one thread while the trainer reads in another, with any memory budget. Every frame has
+    its own focal length, so undistortion maps cannot be reused.
     """
     camera = Camera(np.eye(3), (0, 0, 0), 60, 60, 31.5, 75, 150, 64)
     pixels = RNG.integers(0, 256, (6, 150, 64, 3), dtype=np.uint8)
@@ -386,9 +383,8 @@ def test_many_threads_read_the_same_pixels(tmp_path, distortion):
 
 @pytest.mark.parametrize("distortion", [{"k1": -0.2}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}])
 def test_undistorting_takes_little_memory_and_keeps_none(one_photo, distortion):
-    """The maps of a whole photo would take 8 bytes a pixel, 96 MB for 12 megapixels, outside the memory budget.
-
-    The photo, the undistorted photo and the mask need 7 bytes a pixel, and 128 of 1500 rows need a little more.
+    """Maps of a whole photo would take 8 bytes per pixel, 96 MB for 12 megapixels, outside the memory budget. The
+    photo, the undistorted photo and the mask take 7 bytes per pixel, and the maps of 128 of 1500 rows a little more.
     """
     folder = one_photo(np.zeros((1500, 2000, 3), np.uint8), **distortion)
     view = load_dataset(folder, DataSettings(image_memory=0)).train[0]

@@ -31,7 +31,7 @@ def diagnosed(tmp_path) -> Callable[..., Diagnosis]:
 
 @pytest.fixture
 def named(diagnosed) -> Callable[..., dict]:
-    """As `diagnosed`, but return the labelled images of every finding above a note, by the finding's name."""
+    """Like `diagnosed`, but return the labelled images of every finding above a note, by the finding's name."""
 
     def warnings(views, points=None, spoil=None) -> dict:
         findings = diagnosed(views, points, spoil).findings

@@ -1,4 +1,4 @@
-"""A textured room, ray traced from cameras in several layouts: clean captures that tests plant faults in."""
+"""Clean captures that tests plant faults in: a textured room, ray traced from cameras in several layouts."""
 
 import functools
 import math
@@ -16,7 +16,7 @@ BALL = 0.9
 """Radius of the ball in the middle of the room."""
 
 OCTAVES = 8
-"""Octaves of the texture. Cells range from 1 down to 1/128, finer than a pixel."""
+"""Octaves of the texture; their cells have sizes from 1 down to 1/128, finer than a pixel."""
 
 COUNT = 24
 """Default number of views."""
@@ -24,12 +24,13 @@ COUNT = 24
 
 @functools.cache
 def noise():
-    """Random numbers on a periodic lattice: one channel for grey and three for colours."""
+    """Return random numbers on a periodic lattice, one channel for grey and three for colours."""
     return np.random.default_rng(0).normal(size=(4, 32, 32, 32)).astype(np.float32)
 
 
 def texture(points, footprint):
-    """Colour of points in space: octaves of noise whose amplitude falls slowly with scale, as on real surfaces.
+    """Return the colour of points in space: octaves of noise whose amplitude falls slowly with scale, as on real
+    surfaces.
 
     Detail finer than what a pixel covers (`footprint`, world units) is smoothed away, as a lens does.
     """
@@ -90,7 +91,7 @@ def placed(layout, i, count):
 
 @functools.cache
 def room(layout="orbit", size=160, count=COUNT, height=None):
-    """Photograph the room: the ball from all round, one wall, or everything from the middle."""
+    """Photograph the ball from all sides, one wall, or the whole room from its middle."""
     ball = layout in ("orbit", "forward")
     views, points = [], []
     rng = np.random.default_rng(1)

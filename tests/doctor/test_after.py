@@ -1,4 +1,4 @@
-"""Faults of a trained scene, each at three severities: a slight one may pass, the two others are reported."""
+"""Faults of a trained scene, each at three severities: the slightest may pass, the two others are reported."""
 
 import functools
 from dataclasses import replace
@@ -121,7 +121,7 @@ def test_test_views_far_below_those_of_training(scene, sigma, is_named):
 
 
 @pytest.mark.parametrize(("sigma", "is_named"), [(0.05, False), (0.2, True), (0.4, True)])
-def test_a_scene_that_explains_nothing(scene, sigma, is_named):
+def test_a_scene_that_fits_no_photo(scene, sigma, is_named):
     gaussians, views = scene
     spoiled = views
     for i in range(12):
@@ -169,7 +169,7 @@ def test_a_scene_that_is_too_dark_as_a_whole_is_not_many_exposure_jumps(scene):
 def in_front(gaussians, camera, share):
     """Add a splat a twentieth of the way to the scene that covers about this share of a camera's image."""
     z = 0.05 * 3.2
-    # A pixel counts as covered from alpha 0.2 on: 0.9 exp(-r²/2) = 0.2 at r = 1.73 standard deviations.
+    # A pixel is covered if alpha is at least 0.2, and 0.9 exp(-r²/2) = 0.2 at r = 1.73 standard deviations.
     pixels = np.sqrt(share * camera.W * camera.H / np.pi) / 1.73
     added = Gaussians(
         means=torch.tensor(camera.eye + z * camera.R[2], dtype=torch.float32)[None],
@@ -214,7 +214,7 @@ def test_splats_larger_than_the_scene(scene, share, is_named):
     assert ("huge splats" in warnings(run)) == is_named
 
 
-def test_a_far_sky_is_neither_haze_nor_makes_floaters_of_the_scene(scene):
+def test_a_far_sky_causes_no_warning(scene):
     gaussians, views = scene
     sky = gaussians.map(lambda tensor: tensor[: len(gaussians) // 2])
     directions = sky.means / sky.means.norm(dim=1, keepdim=True)
@@ -262,13 +262,13 @@ def evaluations(reached, gain, count=8):
         (30_000, 1.0, None, ""),
     ],
 )
-def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
+def test_a_short_training_is_reported(scene, reached, gain, severity, says):
     """1,500 of 30,000 iterations used to give "length: fine" and "a better scene needs better photos"."""
     gaussians, views = scene
     log = [] if gain is None else evaluations(reached, gain)
     run = trained(gaussians, views, reached=reached, planned=reached, log=log, capture=Path("a b/$c"))
     measured = np.mean([view.psnr for view in run.test])
-    assert abs(measured - 34.0) < 0.5, "the gains above assume 34 dB"
+    assert abs(measured - 34.0) < 0.5, "`evaluations` assumes 34 dB"
     diagnosis = examine_run(run)
     found = [finding for finding in diagnosis.findings if finding.name == "short training"]
     assert [finding.severity for finding in found] == ([] if severity is None else [severity])
@@ -293,7 +293,7 @@ def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
     ],
 )
 def test_a_run_of_the_fast_recipe_is_judged_by_its_lengths(scene, reached, is_short, has_longer, gain):
-    """3,000 iterations are its standard, 10,000 its longest. Its PSNR rises to the end of any run."""
+    """Its standard length is 3,000 iterations, its longest 10,000. PSNR rises until the end of a run of any length."""
     gaussians, views = scene
     run = trained(gaussians, views, reached=reached, planned=reached, capture=Path("a b/$c"), strategy="fast")
     diagnosis = examine_run(replace(run, log=evaluations(reached, gain)))
@@ -309,7 +309,7 @@ def test_a_run_of_the_fast_recipe_is_judged_by_its_lengths(scene, reached, is_sh
 
 
 def test_the_longer_run_of_the_fast_recipe_keeps_the_mean_pace(scene):
-    """Its photos grow in proportion to its length, so the cheap iterations at the start become more, too."""
+    """A longer run also trains on small photos for longer, so the mean time of an iteration stays the same."""
     gaussians, views = scene
     log = [{"iteration": i, "ms": 100.0 if i <= 1_500 else 300.0} for i in range(10, 3_001, 10)]
     run = trained(gaussians, views, reached=3_000, planned=3_000, log=log, capture=Path("a"), strategy="fast")
@@ -318,7 +318,7 @@ def test_the_longer_run_of_the_fast_recipe_keeps_the_mean_pace(scene):
 
 
 def test_advice_to_train_for_longer_gives_the_time_at_this_runs_pace(scene):
-    """After 400 iterations of 0.8 s, the command for 30,000 used to come without any hint that it takes hours."""
+    """After 400 iterations of 0.8 s, the command for 30,000 iterations used to give no hint that it takes hours."""
     gaussians, views = scene
     log = [{"iteration": i, "ms": 50.0 if i <= 300 else 800.0} for i in range(10, 401, 10)]
     run = trained(gaussians, views, reached=400, planned=400, log=log, capture=Path("a"))
@@ -338,7 +338,7 @@ def test_without_test_views_the_loss_shows_whether_training_still_improves(scene
 
 
 def test_a_warning_about_the_photos_remains_after_training(scene):
-    """A scene fits photos of differing exposure, so its renders are as bright as the photos."""
+    """A trained scene fits photos of differing exposure, so comparing renders with photos does not reveal the fault."""
     gaussians, views = scene
     before = Finding("exposure", Severity.WARNING, "1 of 12 photos", "fix it", ("a.jpg",), ("+0.6",))
     diagnosis = examine_run(trained(gaussians, views, beforehand=[before]))
@@ -350,7 +350,7 @@ def test_a_warning_about_the_photos_remains_after_training(scene):
 
 
 def test_an_unexplained_photo_is_not_also_reported_as_fitted(scene):
-    """One report used to say of the same two photos that the scene could not explain them and that it fitted them."""
+    """A report used to say that the scene did not explain two photos, and that it fitted the same two."""
     gaussians, views = scene
     run = trained(gaussians, views)
     poor = replace(run.train[0], psnr=run.train[0].psnr - 20.0)
@@ -379,7 +379,7 @@ def test_photos_that_show_what_others_do_not_are_named_with_the_option(scene):
 
 
 def test_a_photo_below_the_others_is_suspicious_only_if_the_scene_fits_the_others(scene):
-    """`fern`: the scene was too small for all photos, and the worst of them was right."""
+    """In `fern`, the scene was too small to fit any photo well, and the worst photo had no fault."""
     gaussians, views = scene
     run = trained(gaussians, views)
 

@@ -1,4 +1,4 @@
-"""Faults of the pixels, each at three severities: a slight one passes, the others are reported, and nothing else is."""
+"""Faults of the pixels, each at three severities: the slightest passes, the others are reported and nothing else is."""
 
 import io
 
@@ -14,7 +14,7 @@ SPOILED = (4, 13)
 
 
 def motion_blurred(image, length, degrees):
-    """Blur as a camera that moves while the shutter is open: the mean along a line of `length` px."""
+    """Blur by motion while the shutter is open: the mean along a line of `length` px."""
     a, offsets = np.radians(degrees), np.linspace(-length / 2, length / 2, 4 * length + 1)
     v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
     moved = [
@@ -31,7 +31,7 @@ def motion_blurred(image, length, degrees):
 
 
 def changed(views, change):
-    """Return the views with the photos of two of them changed, and the names of the two."""
+    """Change the photos of the views SPOILED; return all views and the names of the changed ones."""
     spoiled = {i: with_photo(views[i], change(views[i].image.astype(np.float64))) for i in SPOILED}
     return replaced(views, spoiled), {views[i].name for i in SPOILED}
 
@@ -58,7 +58,7 @@ def test_a_photo_out_of_focus(named, sigma, is_named):
 @pytest.mark.sliced(1)
 @pytest.mark.parametrize("contrast", [0.5, 0.2])
 def test_a_dull_photo_is_not_blurred(named, contrast):
-    """Detail falls with the square of the contrast, but low contrast must not be taken for blur."""
+    """The measure of detail falls with the square of the contrast, but low contrast is not blur."""
     views, points = room("forward", 256)
     spoiled, _ = changed(views, lambda image: 128 + contrast * (image - 128))
     assert "blurred" not in named(spoiled, points)
@@ -76,7 +76,8 @@ def test_exposure(named, stops, sign, is_named, with_points):
     assert set(jumps) == (names if is_named else set())
     assert set(found) <= {"exposure"}
     for text in jumps.values():
-        # At most a fifth of a small jump is lost: clipped pixels are left out, and depth is not known everywhere.
+        # At most a fifth of a small jump is lost, because pixels that are clipped or have no known depth do not
+        # count.
         measured = float(text.partition("(")[2].rstrip(")"))
         assert measured == pytest.approx(sign * stops, rel=0.2 if stops < 1 else 0.4)
 
@@ -87,7 +88,7 @@ def test_exposure(named, stops, sign, is_named, with_points):
 )
 @pytest.mark.parametrize(("stops", "is_named"), [(0.1, False), (0.9, True), (1.5, True)])
 def test_photos_that_are_dark_in_a_row(named, which, stops, is_named):
-    """The dark photos agree with one another. That so many neighbours differ gives them away."""
+    """The dark photos agree with one another, but many neighbours differ from them."""
     views, points = room("orbit")
     dark = {i: with_photo(views[i], views[i].image * 2.0 ** (-stops / 2.2)) for i in which}
     assert ("exposure" in named(replaced(views, dark), points)) == is_named
@@ -121,7 +122,7 @@ DUPLICATES = {
 @pytest.mark.sliced(2)
 @pytest.mark.parametrize("how", DUPLICATES)
 def test_duplicated_photos(named, how):
-    """Photo 9 is replaced by photo 8, first with its own pose and then with photo 8's."""
+    """Photo 9 is replaced by photo 8, once with photo 9's pose and once with photo 8's."""
     views, points = room("orbit", 160)
     change, is_named = DUPLICATES[how]
     copy = with_photo(views[9], change(views[8].image))

@@ -68,7 +68,7 @@ def test_one_camera_with_another_focal_length(named, orbit, factor, is_named):
 
 
 @pytest.mark.parametrize(("share", "is_fatal"), [(0.2, False), (1e-3, True), (0.0, True)])
-def test_turning_on_the_spot_is_hopeless(diagnosed, share, is_fatal):
+def test_cameras_with_one_centre_are_hopeless(diagnosed, share, is_fatal):
     views, points = room("outward", 96)
     spoiled = [with_camera(view, eye=share * view.camera.eye) for view in views]
     diagnosis = diagnosed(spoiled, points)
@@ -78,8 +78,8 @@ def test_turning_on_the_spot_is_hopeless(diagnosed, share, is_fatal):
         assert "walk while you take the photos" in diagnosis.advice[0]
 
 
-def test_without_points_only_one_place_is_hopeless(diagnosed):
-    """Without points, the distance to the subject is unknown."""
+def test_without_points_only_cameras_with_one_centre_are_hopeless(diagnosed):
+    """The distance to the subject is unknown, so a short baseline cannot be judged."""
     views, _ = room("outward", 96)
     assert not diagnosed([with_camera(view, eye=1e-3 * view.camera.eye) for view in views]).hopeless
     assert diagnosed([with_camera(view, eye=(7.0, 8.0, 9.0)) for view in views]).hopeless
@@ -91,7 +91,9 @@ def test_without_points_only_one_place_is_hopeless(diagnosed):
 @pytest.mark.parametrize(("degrees", "is_named"), [(8, False), (95, True), (175, True)])
 def test_cameras_that_look_away(named, layout, degrees, is_named, with_points):
     views, points = room(layout, 96)
-    points = points[np.abs(points).max(axis=1) < 4.5] if layout == "orbit" else points  # the ball alone
+    points = (
+        points[np.abs(points).max(axis=1) < 4.5] if layout == "orbit" else points
+    )  # the points of the ball
     spoiled = replaced(views, {5: turned(views[5], degrees), 16: turned(views[16], -degrees)})
     found = named(spoiled, points if with_points else None).get("facing away", ())
     ends = tuple(name.rpartition("/")[2] for name in found)
@@ -110,11 +112,11 @@ def test_a_hole_in_an_orbit(diagnosed, orbit, missing, name):
         assert f"a gap of {15 * (missing + 1)} degrees" in found[0].sentence
         assert views[4].name in found[0].advice and views[5 + missing].name in found[0].advice
     elif name:
-        assert found[0].severity is Severity.NOTE, "a subject on a wall has no back"
+        assert found[0].severity is Severity.NOTE, "a subject on a wall is never seen from behind"
 
 
 def test_one_height_is_a_note(diagnosed, orbit):
-    """The orbit's cameras go up and down. Moved to one height, they do not see the top."""
+    """The cameras of the orbit have different heights. Moved to one height, they do not see the top."""
     views, points = orbit
     ring = [with_camera(view, eye=view.camera.eye * (1, 0, 1)) for view in views]
     (found,) = [f for f in diagnosed(ring, points).findings if f.name == "one height"]
@@ -184,7 +186,7 @@ def with_tracks(folder, counts):
     measured = bytearray(cloud.read_bytes())
     struct.pack_into(
         "<d", measured, 8 + struct.calcsize("<Q3d3B"), 0.7
-    )  # the first point's error, as a mapper has it
+    )  # a mapper writes the reprojection error; here the first point has one
     cloud.write_bytes(measured)
 
 
@@ -207,7 +209,7 @@ def test_few_points_in_all_photos_make_no_single_pose_doubtful(named, orbit):
 
 @pytest.mark.parametrize(("times", "is_named"), [(2, False), (20, True)])
 def test_a_camera_that_stands_far_away_is_named(named, orbit, times, is_named):
-    """With point counts, only if its count is low; without counts, by its distance alone."""
+    """If the model has point counts, the camera is named only if its count is low, otherwise by its distance alone."""
     views, points = orbit
     spoiled = replaced(views, {7: with_camera(views[7], eye=times * views[7].camera.eye)})
     low = [*COUNTS[:7], 60, *COUNTS[8:]]
@@ -217,7 +219,7 @@ def test_a_camera_that_stands_far_away_is_named(named, orbit, times, is_named):
         assert ("times as far as the others" in label) == is_named
         assert label.startswith(views[7].name) == is_named
     assert "doubtful poses" not in named(spoiled, points, lambda folder: with_tracks(folder, COUNTS)), (
-        "many points support this pose, so the camera may stand there"
+        "many points support this pose, so it is right"
     )
 
 
@@ -233,7 +235,8 @@ def test_a_camera_with_few_points_that_looks_past_the_subject_is_named(named, or
 
 @pytest.mark.parametrize(("times", "is_named"), [(2.5, False), (4, True), (20, True)])
 def test_without_counts_a_camera_that_stands_apart_is_named(named, orbit, times, is_named):
-    """The unit is the distance that three quarters keep: 4 units from the centre are 3 from the nearest camera."""
+    """Distances are relative to the distance that three quarters of the cameras keep. At 4 units from the centre, the
+    nearest camera is 3 units away."""
     views, _ = orbit
     spoiled = replaced(views, {7: with_camera(views[7], eye=times * views[7].camera.eye)})
     (label,) = named(spoiled).get("doubtful poses", ("",))
@@ -253,7 +256,7 @@ def test_without_counts_a_camera_whose_picture_misses_the_subject_is_named(named
 
 @pytest.mark.parametrize("capture", ["fox", "snowmiku97", "truck11"])
 def test_no_pose_of_a_clean_capture_is_doubted(capture):
-    """The check runs without observation counts, and no photo is decoded."""
+    """The check runs without counts of observed points, and the photos are not decoded."""
     folder = DATA / capture
     if not folder.is_dir():
         pytest.skip(f"{capture} is not on this machine; see GSPLAT_EDU_DATA")
@@ -272,7 +275,7 @@ def test_tracks_computed_from_poses_are_no_evidence_for_them(tmp_path, orbit, ki
     write_colmap(tmp_path, views[:4], points, np.full(points.shape, 0.5), binary=kind == "bin")
     assert observed_points(tmp_path) == {}
     (tmp_path / "sparse" / "0" / f"points3D.{kind}").unlink()
-    assert min(observed_points(tmp_path).values()) > 0, "they are there"
+    assert min(observed_points(tmp_path).values()) > 0, "without points3D, the tracks count"
 
 
 def test_observed_points_are_read_from_text_too(tmp_path):
@@ -281,5 +284,7 @@ def test_observed_points_are_read_from_text_too(tmp_path):
     (model / "cameras.txt").write_text("1 PINHOLE 10 10 9 9 5 5\n")
     rows = b"1 1 0 0 0 0 0 0 1 a b.png\n1 2 7 3 4 -1 5 6 8\n\n2 1 0 0 0 0 0 0 1 d\\raw\xff.png\n\n"
     (model / "images.txt").write_bytes(b"# Image list\n" + rows)
-    assert observed_points(tmp_path) == {"a b.png": 2, r"d/raw\xff.png": 0}, "with the same names as frames"
+    assert observed_points(tmp_path) == {"a b.png": 2, r"d/raw\xff.png": 0}, (
+        "names are decoded like those of frames"
+    )
     assert observed_points(tmp_path / "nowhere") == {}

@@ -1,4 +1,4 @@
-"""`--outside-masks auto`: masks that cut out an object, and masks that hide something in front of a scene."""
+"""`--outside-masks auto` tells masks that cut out an object from masks that hide something in front of a scene."""
 
 import json
 
@@ -16,12 +16,12 @@ V, U = np.mgrid[:H, :W]
 
 
 def objects(i):
-    """A blob that wanders and changes its size."""
+    """Cut out a blob that moves and grows."""
     return np.hypot(U - 40 - i, 1.3 * (V - 36)) < 18 + i
 
 
 def person(i):
-    """Stands on the lower edge, away from the others."""
+    """Cut out a person who stands on the lower edge of the photo."""
     return (abs(U - 40 - i) < 12) & (V > 15)
 
 
@@ -38,7 +38,7 @@ def sky(i):
 
 
 def lens(i):
-    """The dark rim of a fisheye, alike in every photo."""
+    """Hide the dark rim of a fisheye, equal in every photo."""
     return np.hypot(U - 48, V - 36) < 35
 
 

@@ -1,4 +1,4 @@
-"""Planted faults of files are reported."""
+"""Faults planted in files are reported."""
 
 import json
 
@@ -69,7 +69,7 @@ def test_a_truncated_jpeg_is_named_too(tmp_path, orbit):
     (refused,) = survey.refused
     assert refused.name == "images/view_004.jpg" and refused.reason.startswith("image file is truncated")
     assert {max(shot.stats.thumbnail.shape) for shot in survey.shots} == {128}
-    assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the full size, not the decoded one"
+    assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the size of the file, not the decoded one"
 
 
 def test_all_photos_damaged_is_hopeless(diagnosed, orbit):
@@ -132,7 +132,7 @@ def test_a_photo_of_another_shape_than_its_camera_is_named(diagnosed, orbit):
 
 
 def test_names_that_read_like_messages_do_not_change_the_findings(tmp_path, orbit):
-    """Reasons and numbers come from fields. If sentences were parsed, such a name would be taken for part of one."""
+    """Findings are read from fields. If sentences were parsed, such a name would be taken for a part of one."""
     views, _ = orbit
     odd = "cannot be decoded (x); 1 of 2 photos have no file: skipped, first"
     write_transforms(tmp_path, views)

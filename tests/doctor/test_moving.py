@@ -1,4 +1,4 @@
-"""What a finished training says about things that moved."""
+"""The line about things that moved, at the end of a training."""
 
 from dataclasses import replace
 
@@ -12,11 +12,11 @@ from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
 
 
-def test_photos_outside_memory_are_not_read_again(tmp_path):
+def test_photos_outside_memory_are_not_compared_but_the_command_is_named(tmp_path):
     views, points, colors = procedural_capture(24, 6)
     write_colmap(tmp_path, views, points, colors)
     dataset = load_dataset(tmp_path, DataSettings(image_memory=0))
-    absent = replace(dataset, train=())  # nothing to compare: only the command is left to say
+    absent = replace(dataset, train=())  # no photos to compare
     start = from_points(points, colors, recipe(5))
     line = moved_line(tmp_path / "run", start, absent, render, RenderSettings())
     assert line == f"to find photos that do not fit the scene: gsplat-edu doctor {tmp_path / 'run'}"

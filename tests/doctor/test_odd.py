@@ -1,4 +1,4 @@
-"""Captures that are odd in unlikely ways: the doctor gives advice and prints no NaN or infinity."""
+"""On unusual captures, the doctor gives advice and prints no NaN or infinity."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What `--appearance auto` and `--sky auto` choose, and why."""
+"""The choices of `--appearance auto` and `--sky auto`, and their reasons."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def brighter(view, stops):
     return with_photo(view, view.image * 2.0 ** (stops / 2.2))
 
 
-def test_steady_photos_need_nothing(tmp_path):
+def test_photos_of_equal_exposure_are_not_corrected(tmp_path):
     remedy = appearance_for(written(tmp_path, *room("orbit", 160)))
     assert (remedy.value, remedy.reason) == ("none", "")
 
@@ -41,7 +41,7 @@ def test_wandering_exposures_are_corrected(tmp_path):
     assert "photos differ in brightness or tint from neighbours that see the same" in remedy.reason
 
 
-def test_a_single_dark_photo_is_no_reason(tmp_path):
+def test_a_single_dark_photo_is_not_corrected(tmp_path):
     views, points = room("orbit", 160)
     remedy = appearance_for(written(tmp_path, replaced(views, {4: brighter(views[4], -0.7)}), points))
     assert remedy.value == "none"
@@ -66,7 +66,7 @@ def test_one_photo_alone_cannot_be_compared(tmp_path):
 
 
 @pytest.mark.parametrize(("count", "value"), [(5, "none"), (11, "none"), (12, "mask"), (300, "mask")])
-def test_things_that_move_are_looked_for_where_there_are_enough_photos(count, value):
+def test_transients_are_masked_if_there_are_enough_photos(count, value):
     remedy = transients_for(count)
     assert remedy.value == value and f"{count} training photos" in remedy.reason
 
@@ -82,7 +82,7 @@ def test_a_sky_gets_a_shell_and_its_colours_on_a_dome_do_not(tmp_path):
         assert ("lie at infinity" in remedies["sky"].reason) == (name == "sky")
 
 
-def test_a_plain_white_sky_says_so(tmp_path):
+def test_the_reason_says_that_a_sky_is_plain_white(tmp_path):
     made = outdoor_capture(96, 72, 16, points=800, clouds=0.0)
     remedy = remedies_for(CaptureReader(written(tmp_path, made.views, made.points)), ["sky"])["sky"]
     assert remedy.value == "shell" and remedy.reason.endswith("are one white above the horizon")

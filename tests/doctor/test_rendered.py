@@ -1,4 +1,4 @@
-"""A rendered RGBA benchmark: its background is named, and its split is not questioned."""
+"""For a rendered RGBA benchmark, the doctor names the background and accepts equal photos."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 @pytest.fixture
 def cut_out():
-    """Views whose black is transparent; the last one is the first one's photo."""
+    """Views whose black pixels are transparent; the last view has the photo of the first."""
     views, points, colors = procedural_capture(24, 6, splats=60)
     images = [view.image for view in views[:-1]] + [views[0].image]
     clear = [
@@ -32,7 +32,7 @@ def cut_out():
     return clear, points, colors
 
 
-def test_the_background_is_named_and_the_usual_one(tmp_path, cut_out):
+def test_the_chosen_and_the_usual_background_are_named(tmp_path, cut_out):
     views, points, colors = cut_out
     write_blender(tmp_path / "blender", views[:4], views[4:])
     write_colmap(tmp_path / "colmap", views, points, colors)
@@ -50,7 +50,7 @@ def test_the_background_is_named_and_the_usual_one(tmp_path, cut_out):
     assert black in facts
 
 
-def test_photos_alike_are_a_note_for_rendered_captures(tmp_path, cut_out):
+def test_equal_photos_are_only_a_note_for_rendered_captures(tmp_path, cut_out):
     views, points, colors = cut_out
     write_blender(tmp_path / "blender", views[:4], views[4:])
     write_colmap(tmp_path / "colmap", views, points, colors)

@@ -9,10 +9,9 @@ from gsplat_edu.fit2d.splats import Splats2D, render_2d
 
 @pytest.fixture
 def smooth():
-    """Splats, an image size and a background without discontinuities.
-
-    Every splat is wider than the image, so no alpha is near the floor. No opacity is near the clamp, and the order is
-    that of the indices. So every pixel depends smoothly on every parameter.
+    """Splats, an image size and a background for which every pixel depends smoothly on every parameter. Every splat
+    is wider than the image, so no alpha is near the floor. No opacity is near the clamp, and splats are ordered by
+    index.
     """
     rng = np.random.default_rng(21)
     splats = Splats2D(
@@ -29,7 +28,7 @@ def smooth():
 
 @pytest.fixture
 def rough():
-    """Splats with discontinuities: needles, specks, some outside, some at the clamp, some below the floor."""
+    """Splats whose render is discontinuous: needles, specks, some outside, some at the clamp, some below the floor."""
     rng = np.random.default_rng(22)
     count = 60
     logits = rng.normal(0, 3, count)

@@ -51,7 +51,7 @@ def test_psnr_equals_that_of_the_metrics():
 
 
 def test_adam_follows_its_equations():
-    """Three steps written out, with a different rate for each parameter."""
+    """The test writes out three steps, with a different rate for each parameter."""
     rng = np.random.default_rng(8)
     splats = random_splats_2d(4, 9, 9, rng)
     settings = AdamSettings(betas=(0.8, 0.95), eps=1e-3)
@@ -108,8 +108,8 @@ def test_photos_are_shrunk_by_area_averaging():
     small = shrunk_photo(pixels, 30)
     assert small.shape == (20, 30, 3)
     means = pixels.reshape(20, 2, 30, 2, 3).mean(axis=(1, 3)) / 255
-    assert np.abs(small - means).max() < 0.51 / 255, "means, rounded to bytes"
-    assert np.array_equal(shrunk_photo(pixels, 100), pixels / 255), "nothing is enlarged"
+    assert np.abs(small - means).max() < 0.51 / 255, "area means, rounded to bytes"
+    assert np.array_equal(shrunk_photo(pixels, 100), pixels / 255), "photos are never enlarged"
     assert shrunk_photo(pixels[:1], 7).shape == (1, 7, 3)
 
 

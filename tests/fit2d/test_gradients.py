@@ -1,4 +1,4 @@
-"""Gradients against finite differences where the image is smooth, and against autograd where it is not."""
+"""Gradients equal finite differences where the image is smooth, and autograd where it is not."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Images of 2D splats against the reference renderer."""
+"""Images of 2D splats equal those of the reference renderer."""
 
 import numpy as np
 import pytest

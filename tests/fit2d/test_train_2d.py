@@ -20,7 +20,7 @@ QUICK = ("--splats", "30", "--iters", "60", "--size", "32")
 def main():
     spec = importlib.util.spec_from_file_location("train_2d", SCRIPT)
     module = importlib.util.module_from_spec(spec)
-    sys.modules["train_2d"] = module  # dataclasses look up their annotations here
+    sys.modules["train_2d"] = module  # dataclasses look up annotations in sys.modules
     spec.loader.exec_module(module)
     yield module.main
     del sys.modules["train_2d"]
@@ -74,7 +74,7 @@ print(hashlib.sha256(b"".join(array.tobytes() for array in fit.splats.arrays().v
 
 @pytest.mark.own_process
 def test_a_fit_does_not_depend_on_threads():
-    """The loop never calls BLAS, which splits sums among threads, and needs no torch."""
+    """The loop never calls BLAS, whose sums depend on the threads, and needs no torch."""
     digests = set()
     for threads in ("1", "4"):
         many = {f"{name}_NUM_THREADS": threads for name in ("OMP", "OPENBLAS", "MKL")}
