@@ -15,7 +15,7 @@ EVERYTHING = DataSettings(test_every=0)
 
 
 def assert_same_camera(actual, expected, atol=1e-9):
-    """repr() of a double is exact, so text loses nothing; 1e-9 allows for R -> quaternion -> R and R'(R e)."""
+    """Text keeps doubles exactly; 1e-9 allows for the roundings of R -> quaternion -> R and of R'(R e)."""
     for name in ("R", "eye", "fx", "fy", "cx", "cy"):
         np.testing.assert_allclose(
             getattr(actual, name), getattr(expected, name), rtol=0, atol=atol, err_msg=name
@@ -46,7 +46,7 @@ def test_what_is_written_is_read(written, small, layout):
 
 
 def test_the_layouts_agree(written):
-    """The formats' axes and pixel centres differ; the cameras read from them must not."""
+    """The formats have different axes and pixel centres, but the cameras read from them are equal."""
     colmap, others = load_dataset(written("colmap"), EVERYTHING), ("text", "transforms", "blender")
     for layout in others:
         other = by_stem(load_dataset(written(layout), EVERYTHING).train)
@@ -60,7 +60,7 @@ def test_the_layouts_agree(written):
 
 
 def test_intrinsics_that_differ_and_are_off_centre(tmp_path):
-    """Cameras of two sizes, with fx != fy and off-centre: COLMAP and transforms.json can store all of it."""
+    """COLMAP and transforms.json can store two image sizes, fx != fy and principal points off the centre."""
     rng = np.random.default_rng(3)
     views = []
     for i, (W, H) in enumerate([(20, 12), (15, 30), (20, 12)]):
@@ -101,7 +101,7 @@ def test_alpha_and_masks_make_the_round_trip(tmp_path):
 
 
 def test_the_procedural_scene_has_no_symmetry(truth):
-    """A view is not its neighbour's mirror image, so that swapped axes cannot pass the tests above."""
+    """No view is its neighbour's mirror image, so swapped axes cannot pass the other tests."""
     views = truth[0]
     assert len(views) == 24 and views[0].image.shape == (48, 64, 3)
     for view in views:

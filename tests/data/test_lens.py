@@ -1,4 +1,4 @@
-"""Undistortion against the lens formulas, restated here from OpenCV's documentation."""
+"""Undistortion agrees with the lens formulas of OpenCV's documentation, which this file implements again."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,14 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.lens import BAND, Lens, bands, lens_of, undistortion
 from gsplat_edu.data.lens_formulas import PERSPECTIVE
 
-W, H, FX, FY, CX, CY = 160, 120, 140.0, 133.0, 83.0, 57.0  # corner convention, as in files
+W, H, FX, FY, CX, CY = (
+    160,
+    120,
+    140.0,
+    133.0,
+    83.0,
+    57.0,
+)  # the first pixel's centre is (0.5, 0.5), as in files
 
 
 def perspective(x, y, **given):
@@ -29,13 +36,13 @@ def fisheye(x, y, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
 
 
 def whole(lens):
-    """Return the maps of all rows, computed in bands as for photos."""
+    """Return the maps of all rows, computed in bands as they are for photos."""
     parts = [undistortion(lens, band) for band in bands(lens.H)]
     return [np.concatenate(planes) for planes in zip(*parts, strict=True)]
 
 
 def dots(distort, coefficients):
-    """Draw a soft dot where the lens shows each of three rays, one ray per channel; return photo and rays."""
+    """Draw a soft dot per colour channel at the pixel of a ray; return the photo and the three rays."""
     rays = np.array([[-0.31, -0.22], [0.27, 0.19], [0.05, -0.24]])
     y, x = np.mgrid[:H, :W]
     photo = np.zeros((H, W, 3))
@@ -79,7 +86,7 @@ def test_rays_lie_where_the_pinhole_puts_them(one_photo, model, coefficients, re
     np.testing.assert_allclose(centres(view.image), expected, rtol=0, atol=0.15)
     assert ((W, H) if resolution is None else (W // 2, H // 2)) == (camera.W, camera.H)
     moved = np.hypot(*(centres(photo) - (expected if resolution is None else 2 * expected + 0.5)).T)
-    assert moved.max() > 1.0  # the test would notice if nothing were undistorted
+    assert moved.max() > 1.0  # without undistortion, the test would fail
 
 
 @pytest.mark.parametrize(
@@ -91,7 +98,8 @@ def test_rays_lie_where_the_pinhole_puts_them(one_photo, model, coefficients, re
     ],
 )
 def test_only_pixels_that_lie_inside_the_photo_are_valid(values, is_fisheye, some_outside):
-    """A pixel is valid exactly where the formula lands inside the edges. The float32 maps are accurate to 1e-4 px."""
+    """A pixel is valid if and only if its formula gives a place inside the photo. The float32 maps are accurate to
+    1e-4 px."""
     lens = lens_of(
         {"fx": FX, "fy": FY, "cx": CX, "cy": CY, **values}, W, H, "fisheye" if is_fisheye else "perspective"
     )
@@ -109,9 +117,8 @@ def test_only_pixels_that_lie_inside_the_photo_are_valid(values, is_fisheye, som
 
 
 def test_pixels_beyond_a_fold_of_the_image_are_invalid():
-    """With k1 = -0.6 the formula r (1 + k1 r²) peaks at r² = 1 / 1.8. Beyond it the image repeats, mirrored.
-
-    Slopes are differences between neighbours, so either answer is accepted within 5 % of that radius.
+    """With k1 = -0.6, r (1 + k1 r²) has its maximum at r² = 1 / 1.8, beyond which the image repeats in reverse.
+    Slopes are differences between neighbours, so both answers are accepted within 5 % of that radius.
     """
     lens = Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.6,))
     pinhole, (_, _, valid) = lens.undistorted(), whole(lens)
@@ -135,7 +142,10 @@ def test_pinholes_have_no_maps(one_photo):
         (Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 1e300)), "focal length would change"),
         (Lens(640, 480, 100.0, 100.0, 319.5, 239.5, (1e-9,)), "73 degrees to the side"),
         (Lens(640, 480, 560.0, 560.0, 319.5, 239.5, (9.0,)), "focal length would change"),
-        (Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,)), "no rectangle"),  # no slope, so no fold detection
+        (
+            Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,)),
+            "no rectangle",
+        ),  # one pixel has no slope and no fold
         (Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,), "fisheye"), "no rectangle"),
         (Lens(64, 48, 20.0, 20.0, 31.5, 23.5, (1e300,), "fisheye"), "no rectangle"),
         (Lens(32767, 48, 20000.0, 20000.0, 16383.0, 23.5, (0.1,)), "32767x48 px cannot be undistorted"),
@@ -152,14 +162,14 @@ def test_a_lens_that_no_pinhole_can_represent_is_refused(lens, check):
     "coefficients", [(-0.25,), (0.3,), (-0.1, 0.02, 0.01, -0.008), (-0.02, 0.0, 0.0, 0.01)]
 )
 def test_pixels_keep_their_shape_and_stay_inside(coefficients):
-    """OpenCV's own matrix scales each axis separately to fill the image, which would squeeze pixels by up to 20 %."""
+    """OpenCV's new camera matrix scales the axes separately to fill the image, so pixels would differ by up to 20 %."""
     lens = Lens(640, 480, 560.0, 550.0, 325.0, 230.0, coefficients)
     pinhole = lens.undistorted()
     assert pinhole.fx / pinhole.fy == pytest.approx(lens.fx / lens.fy, rel=1e-12)
     columns, rows, valid = whole(lens)
     assert valid.all()
-    # The view is as wide as possible: it touches an edge of the photo. OpenCV samples the rim, so it may miss by a
-    # pixel or two.
+    # The view is as wide as possible, so it touches an edge of the photo. OpenCV samples the rim at few points, so it
+    # may miss by a pixel or two.
     room = (columns.min(), 639 - columns.max(), rows.min(), 479 - rows.max())
     assert -0.5 <= min(room) < 2.0
 
@@ -176,7 +186,7 @@ def test_bands_give_the_same_maps_as_the_whole():
 
 
 def test_the_statues_strong_distortion_gives_a_sane_camera():
-    """k = -0.684 comes from real internet photos; checked at the calibrated size and at a quarter of it."""
+    """k = -0.684 comes from real photos. The camera is checked at the calibrated size and at a quarter of it."""
     lens = lens_of({"fx": 2395.65, "fy": 2395.65, "cx": 400, "cy": 600, "k1": -0.684122}, 800, 1200)
     for one in (lens, lens.scaled(200, 300)):
         pinhole = one.undistorted()

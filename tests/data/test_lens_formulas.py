@@ -1,4 +1,4 @@
-"""The formulas of all lens models, against COLMAP's own code, and photos taken through them."""
+"""The formulas of all lens models agree with COLMAP's code, and photos taken through them are undistorted."""
 
 import struct
 from pathlib import Path
@@ -49,7 +49,7 @@ COEFFICIENTS = {
     "FISHEYE": [],
     "EUCM": [0.6, 1.1],
 }
-"""Plausible coefficients of every model that photos can be read with, all different."""
+"""Plausible coefficients of every supported model, all of them different."""
 
 NEW = ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "EUCM")
 """Models that OpenCV does not have."""
@@ -100,7 +100,7 @@ def test_the_installed_colmap_has_no_model_that_is_unknown_here():
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 @pytest.mark.parametrize("model", COEFFICIENTS)
 def test_rays_meet_the_image_where_colmap_says(tmp_path, model, suffix):
-    """COLMAP puts the first pixel's centre at (0.5, 0.5). Rays up to 60 degrees, among them the optical axis."""
+    """COLMAP puts the first pixel's centre at (0.5, 0.5). The rays are up to 60 degrees off the optical axis."""
     pycolmap = pytest.importorskip("pycolmap")
     camera = pycolmap.Camera(model=model, width=W, height=H, params=parameters(model))
     x, y = np.random.default_rng(0).uniform(-1.2, 1.2, (2, 500))
@@ -121,7 +121,7 @@ def test_the_field_of_view_model_near_its_limits(omega):
 
 
 def test_rays_beyond_a_models_radius_have_no_image():
-    """A division with k = 0.2 ends at r = 1 / sqrt(0.8) = 1.118; an EUCM with beta < 0 where beta r² = -1."""
+    """The division model with k = 0.2 ends at r = 1 / sqrt(0.8) = 1.118, and EUCM with beta < 0 at beta r² = -1."""
     x, y = np.array([1.11, 1.12]), np.zeros(2)
     a, b = FORMULAS["division"].image(x, y, np.array([0.2]))
     assert np.isfinite([a[0], b[0]]).all() and np.isnan(a[1])
@@ -134,8 +134,8 @@ def test_rays_beyond_a_models_radius_have_no_image():
 
 
 @pytest.mark.parametrize("model", NEW)
-def test_the_pinhole_shows_only_the_photo_and_all_it_can(tmp_path, model):
-    """Every pixel is valid, and the wider of the two axes touches the rectangle of directions."""
+def test_the_pinhole_is_as_wide_as_the_photo_allows(tmp_path, model):
+    """Every pixel is valid, and one of the two axes touches the rectangle of directions."""
     lens = lens_of_model(model, tmp_path)
     pinhole, (columns, rows, valid) = lens.undistorted(), whole(lens)
     assert valid.mean() > 0.995
@@ -155,7 +155,7 @@ def test_the_formulas_of_opencvs_models_give_opencvs_maps(model):
 
 
 def test_our_rectangle_of_directions_is_opencvs():
-    """For a perspective lens; OpenCV examines nine points of each edge."""
+    """OpenCV examines nine points of each edge of a perspective lens."""
     lens = Lens(W, H, 90.0, 94.0, 82.5, 56.5, (-0.2, 0.05, 0.01, -0.02))
     ours, theirs = _rectangle(lens, MAX_ANGLE), _opencv_rectangle(lens)
     np.testing.assert_allclose(ours, theirs, rtol=0.01)
@@ -179,17 +179,18 @@ def test_rays_of_pixels_are_the_formulas_inverse(tmp_path, model):
     ],
 )
 def test_photos_wider_than_a_pinhole_are_cropped(lens):
-    """They look 60 degrees to the side, every pixel is one of the photo, and none comes from behind the camera."""
+    """The pinhole sees 60 degrees to each side. Every pixel shows a part of the photo, and none is from behind the
+    camera."""
     pinhole, (columns, rows, valid) = lens.undistorted(), whole(lens)
     assert _angle(pinhole) == pytest.approx(CROPPED_ANGLE, abs=0.02)
     assert valid.all() and lens.cropped
     assert (np.diff(columns, axis=1) > 0).all() and (
         np.diff(rows, axis=0) > 0
-    ).all()  # nothing wraps or mirrors
+    ).all()  # no wrapping and no mirroring
 
 
 def test_a_photo_is_cropped_to_the_radius_of_its_model():
-    """The photo shows a circle of rays, of radius 1 / sqrt(3.6) = 0.527: no pixel of the pinhole lies outside it."""
+    """The photo shows a circle of rays of radius 1 / sqrt(3.6) = 0.527, and all pixels of the pinhole are inside it."""
     lens = Lens(640, 480, 300.0, 300.0, 319.5, 239.5, (0.9,), "division")
     pinhole, (_, _, valid) = lens.undistorted(), whole(lens)
     y, x = np.mgrid[:480, :640]
@@ -212,9 +213,8 @@ def test_cropping_is_reported(one_photo):
 @pytest.mark.parametrize("model", NEW)
 def test_dots_alpha_and_masks_lie_where_the_pinhole_puts_them(tmp_path, model, resolution):
     """A dot per colour channel, one in alpha and one in the mask are found at u = fx x + cx of the view's camera.
-
-    A half pixel of another convention would be 0.5 px off, 0.25 px at half the size. A mask takes the nearest pixel,
-    which is at most 0.71 px away.
+    Another convention of pixel centres would be off by 0.5 px, at half the size by 0.25 px. A mask takes the nearest
+    pixel, which is at most 0.71 px away.
     """
     lens = lens_of_model(model, tmp_path)
     rays = np.array([[-0.31, -0.22], [0.27, 0.19], [0.05, -0.24], [-0.1, 0.2], [0.3, -0.1]])

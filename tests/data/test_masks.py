@@ -1,4 +1,4 @@
-"""Masks are found by their names, alike in every layout, or the capture is refused."""
+"""Masks are found by the same names in every layout; if none fits, the capture is refused."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def mask_image(path: Path, pixels=COUNTS) -> Path:
 
 
 def masked(capture):
-    """Return the names of the views with a mask, which has to be `COUNTS`."""
+    """Return the names of the views with a mask, and check that the mask is `COUNTS`."""
     found = []
     for view in load_dataset(capture, EVERYTHING).train:
         if (mask := view.read().mask) is not None:
@@ -56,7 +56,7 @@ def test_a_mask_may_have_the_name_of_its_photo_and_any_suffix(written, layout, e
 
 
 @pytest.mark.parametrize("layout", ["colmap", "transforms", "blender"])
-def test_masks_of_which_none_fits_end_the_command(written, layout):
+def test_a_capture_is_refused_if_no_mask_fits_a_photo(written, layout):
     capture = written(layout)
     mask_image(capture / "masks" / "IMG_0001_mask.png")
     with pytest.raises(DatasetError, match=r"masks: none of its 1 images is named like a photo.*IMG_0001"):
@@ -76,7 +76,7 @@ def test_two_masks_for_one_photo_are_refused(written):
 
 
 def test_a_photo_with_a_capital_suffix_in_a_folder(tmp_path):
-    """images/left/A.JPG and masks/left/A.JPG, for a capture and for photos without poses."""
+    """images/left/A.JPG has the mask masks/left/A.JPG, in a capture and in a folder of photos without poses."""
     photo = mask_image(tmp_path / "images" / "left" / "A.JPG")
     mask = mask_image(tmp_path / "masks" / "left" / "A.JPG")
     assert MaskFolder(tmp_path / "masks", ["left/A.JPG"]).find("left/A.JPG") == mask
@@ -93,7 +93,7 @@ def test_photos_that_differ_in_their_suffix_need_masks_of_their_own_names(tmp_pa
     assert find_masks(photos) == {photos[0]: other, photos[1]: one}
 
 
-def test_photos_beside_masks_of_which_none_fits_are_refused(tmp_path):
+def test_photos_without_poses_are_refused_if_no_mask_fits(tmp_path):
     photos = [mask_image(tmp_path / "photos" / "a.jpg")]
     check_some_used(photos)
     mask_image(tmp_path / "masks" / "b.jpg")
@@ -104,7 +104,7 @@ def test_photos_beside_masks_of_which_none_fits_are_refused(tmp_path):
 
 
 def test_the_noise_of_a_jpeg_mask_does_not_count(written):
-    """JPEG of quality 60 leaves up to tens of 255 where the mask is 0; the disc's edge moves by at most a pixel."""
+    """At quality 60, zero pixels become up to some tens of 255; the disc's edge moves by at most a pixel."""
     v, u = np.mgrid[:120, :160]
     radius = np.hypot(u - 80.0, v - 60.0)
     capture = written("colmap")
@@ -112,7 +112,7 @@ def test_the_noise_of_a_jpeg_mask_does_not_count(written):
     path.parent.mkdir()
     Image.fromarray(np.where(radius < 40, 255, 0).astype(np.uint8)).save(path, quality=60)
     with Image.open(path) as stored:
-        assert np.count_nonzero(np.asarray(stored)[radius > 42]) > 100, "the file has noise"
+        assert np.count_nonzero(np.asarray(stored)[radius > 42]) > 100, "the file has the noise of JPEG"
     found = decode_mask(path)
     assert not found[radius > 41].any() and found[radius < 39].all()
     Image.fromarray(COUNTS).save(path, quality=60)

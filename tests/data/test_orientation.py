@@ -1,4 +1,4 @@
-"""EXIF orientation: the sizes of a capture's cameras decide whether its photos are turned."""
+"""EXIF orientation: the sizes of a capture's cameras decide whether its photos are rotated."""
 
 import json
 
@@ -38,7 +38,7 @@ def images(folder, **settings):
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize("name", ["a.png", "a.tif"])
 def test_pixels_are_read_as_stored_and_turned_on_request(tmp_path, name, orientation):
-    """Also from a TIFF, which Pillow turns by itself."""
+    """This includes TIFF, which Pillow rotates by itself."""
     path = save(tmp_path / name, quarters(), orientation)
     stored = as_stored(quarters(), orientation)
     assert image_orientation(path) == orientation
@@ -54,7 +54,7 @@ def test_pixels_are_read_as_stored_and_turned_on_request(tmp_path, name, orienta
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 def test_poses_of_stored_pixels_are_not_broken(tmp_path, orientation):
-    """As COLMAP makes them: the camera has the size of the stored pixels."""
+    """A camera of COLMAP has the size of the stored pixels."""
     stored = as_stored(quarters(), orientation)
     folder = capture(tmp_path, [("a.png", orientation)])
     contents = json.loads((folder / "transforms.json").read_text())
@@ -66,7 +66,7 @@ def test_poses_of_stored_pixels_are_not_broken(tmp_path, orientation):
 
 @pytest.mark.parametrize("orientation", QUARTER_TURNS)
 def test_poses_of_upright_pixels_turn_the_photo(tmp_path, orientation):
-    """Other programs turn photos before they find poses; then only the upright size fits the camera."""
+    """Other programs rotate photos before they estimate poses; then only the upright size fits the camera."""
     folder = capture(tmp_path, [("a.png", orientation), ("b.png", 1)])
     found = images(folder)
     for image in found.values():
@@ -79,8 +79,8 @@ def test_poses_of_upright_pixels_turn_the_photo(tmp_path, orientation):
     np.testing.assert_array_equal(prepare(CaptureReader(folder)).shots[0].stats.thumbnail, quarters())
 
 
-def test_what_the_size_leaves_open_follows_the_others(tmp_path):
-    """If a portrait was turned before its pose was found, so was the photo taken upside down."""
+def test_photos_whose_size_decides_nothing_are_treated_like_the_others(tmp_path):
+    """If the program rotated a portrait before estimating its pose, it also rotated a photo taken upside down."""
     upright = quarters()
     folder = capture(tmp_path / "turned", [("a.png", 6), ("b.png", 3), ("c.png", 2), ("d.png", 1)])
     for image in images(folder).values():
@@ -89,7 +89,7 @@ def test_what_the_size_leaves_open_follows_the_others(tmp_path):
     np.testing.assert_array_equal(images(folder)["images/b.png"], as_stored(upright, 3))
     folder = capture(tmp_path / "both", [("a.png", 6), ("b.png", 3), ("e.png", 8)])
     contents = json.loads((folder / "transforms.json").read_text())
-    contents["frames"][2] |= {"w": 48, "h": 64}  # this one's pose is that of the stored photo
+    contents["frames"][2] |= {"w": 48, "h": 64}  # the pose of this one is that of the stored photo
     (folder / "transforms.json").write_text(json.dumps(contents))
     found = images(folder)
     np.testing.assert_array_equal(found["images/a.png"], upright)
@@ -109,7 +109,7 @@ def test_a_photo_that_fits_neither_way_is_refused(tmp_path):
 
 def test_masks_and_smaller_copies_of_turned_photos(tmp_path):
     folder = capture(tmp_path, [("a.png", 6)])
-    for kept in (True, False):  # a program that makes copies may keep EXIF, or turn the photo
+    for kept in (True, False):  # a program that makes copies may keep EXIF or rotate the photo
         copy = folder / "images_2" / "a.png"
         if kept:
             save(copy, quarters(32, 24), 6)

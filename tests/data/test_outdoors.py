@@ -1,4 +1,4 @@
-"""The traced capture is what it says: cameras, sky, points and colours agree."""
+"""Cameras, sky, points and colours of the ray-traced capture agree."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_points_lie_where_the_photos_show_them(made):
     assert np.median(np.concatenate(errors)) < 0.05
 
 
-def test_a_photo_of_its_own_and_a_dome(made):
+def test_the_capture_can_have_another_photo_and_a_dome(made):
     image, sky = photograph(made.views[2].camera)
     np.testing.assert_array_equal(image, made.views[2].image)
     np.testing.assert_array_equal(sky, made.sky[2])

@@ -1,4 +1,4 @@
-"""Faces of panoramas: geometry against COLMAP's model, the seam, antialiasing, alpha and masks."""
+"""Faces of panoramas: the geometry of COLMAP's model, the seam, antialiasing, alpha and masks."""
 
 import math
 
@@ -45,7 +45,7 @@ def face_rays(R, side):
 
 
 def painted(rays):
-    """Paint directions with smooth colours, different everywhere."""
+    """Return a smooth colour for each direction; no two are equal."""
     x, y, z = np.moveaxis(rays, -1, 0)
     waves = [np.sin(25 * x + 10 * y), np.cos(20 * y - 15 * z), np.sin(30 * z + x * y)]
     return np.round(127.5 + 120 * np.stack(waves, axis=-1)).astype(np.uint8)
@@ -66,8 +66,8 @@ def test_faces_are_rotations_that_cover_the_sphere():
     seen = np.zeros(len(rays), int)
     for R in rotations:
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(R) == pytest.approx(1) and R[0, 1] == pytest.approx(0)  # not rolled
-        assert R[1, 1] > 0.8  # its bottom is the panorama's
+        assert np.linalg.det(R) == pytest.approx(1) and R[0, 1] == pytest.approx(0)  # no roll
+        assert R[1, 1] > 0.8  # its down is near the panorama's down
         x, y, z = (rays @ R.T).T
         seen += (z > 0) & (np.abs(x) <= z) & (np.abs(y) <= z)
     latitude = np.degrees(np.arcsin(-rays[:, 1]))
@@ -77,7 +77,8 @@ def test_faces_are_rotations_that_cover_the_sphere():
 
 @pytest.mark.parametrize("number", range(8))
 def test_faces_show_what_their_rays_show(number):
-    """A face cut from a painted sphere is the face painted directly: to a few grey levels, also across the seam."""
+    """A face cut from a painted sphere equals the face painted directly up to a few grey levels, also across the
+    seam."""
     W, H, R = 1024, 512, face_rotations()[number]
     side = face_side(W)
     face, alpha, mask = cut_face(painted(directions(W, H)), None, None, R, side)
@@ -87,16 +88,16 @@ def test_faces_show_what_their_rays_show(number):
 
 
 def test_a_quarter_of_a_pixel_would_be_noticed():
-    """The bound above is sharp: a panorama shifted by a quarter of a pixel misses it."""
+    """A panorama that is shifted by a quarter of a pixel exceeds the bound of the previous test."""
     W, H, R = 1024, 512, face_rotations()[0]
-    shifted = painted(directions(2 * W, 2 * H)[::2, 1::2])  # the middles lie a quarter pixel aside
+    shifted = painted(directions(2 * W, 2 * H)[::2, 1::2])  # pixel centres shifted by a quarter of a pixel
     side = face_side(W)
     wrong = np.abs(cut_face(shifted, None, None, R, side)[0].astype(int) - painted(face_rays(R, side)))
     assert wrong.max() > 4 and wrong.mean() > 0.6
 
 
 def test_the_seam_leaves_no_line():
-    """Noise everywhere: turning the panorama by whole pixels and the face with it gives the same face."""
+    """The panorama is noise. Rotating it by whole pixels, and the face with it, gives the same face."""
     rng = np.random.default_rng(0)
     W, H, side = 256, 128, 80
     noise = rng.integers(0, 256, (H, W, 3), dtype=np.uint8)
@@ -113,7 +114,7 @@ def test_the_seam_leaves_no_line():
 
 
 def test_downscaled_faces_are_averages():
-    """A chequerboard of single pixels becomes grey at a quarter of its size; sampled at points it would not."""
+    """A chequerboard of single pixels becomes grey at a quarter of its size, which point sampling would not give."""
     W, H = 1600, 800
     y, x = np.mgrid[:H, :W]
     board = np.repeat((255 * ((x + y) % 2)).astype(np.uint8)[..., None], 3, axis=2)
@@ -123,7 +124,7 @@ def test_downscaled_faces_are_averages():
 
 
 def test_alpha_and_masks_are_cut_with_the_colours():
-    """Transparent pixels do not bleed into colours, and a pixel counts only if all its samples do."""
+    """Transparent pixels do not affect colours, and a pixel counts only if all of its samples count."""
     W, H, R, side = 512, 256, face_rotations()[4], 100
     rays = directions(W, H)
     clear = rays @ R[2] > 0.9  # a disc in the middle of the face
@@ -147,7 +148,7 @@ def test_only_whole_panoramas_are_cut(as_shipped):
 
 @pytest.mark.parametrize(("resolution", "side"), [(None, 163), (2.0, 82), (100, 100)])
 def test_a_capture_of_colmaps_panoramas_is_read_as_faces(tmp_path, resolution, side):
-    """COLMAP's model EQUIRECTANGULAR: one image becomes eight views from one centre, with mask, of any resolution."""
+    """An image of COLMAP's model EQUIRECTANGULAR becomes eight views from one centre, with masks, at any resolution."""
     W, H = 512, 256
     R = Rotation.from_euler("xyz", [0.2, 0.5, -0.1])
     eyes = np.array([[1.0, 2.0, 3.0], [4.0, 2.0, 0.0]])
@@ -155,7 +156,7 @@ def test_a_capture_of_colmaps_panoramas_is_read_as_faces(tmp_path, resolution, s
         (tmp_path / folder).mkdir(parents=True)
     lines, x, y, z, w = [], *R.as_quat()
     for number, eye in enumerate(eyes, 1):
-        rays = directions(W, H) @ R.as_matrix()  # in the world
+        rays = directions(W, H) @ R.as_matrix()  # in world axes
         Image.fromarray(painted(rays)).save(tmp_path / "images" / f"p{number}.png")
         Image.fromarray(np.where(rays[..., 1] < 0.3, 255, 0).astype(np.uint8)).save(
             tmp_path / f"masks/p{number}.png"
@@ -192,7 +193,7 @@ def test_colmaps_panoramas_of_another_shape_are_refused(tmp_path):
 
 
 def test_the_doctor_reads_panoramas(tmp_path):
-    """Its thumbnails are those of the faces."""
+    """The doctor's thumbnails are those of the faces."""
     Image.fromarray(painted(directions(512, 256))).save(tmp_path / "a.png")
     lens = FaceLens.of(512, 256, 5)
     stats = measure_photo(PhotoFile(tmp_path / "a.png", None, lens, 163, 163, None))

@@ -1,4 +1,4 @@
-"""Photos as phones and cameras write them: HEIC, 16 bits, colour profiles; all become 8-bit sRGB."""
+"""HEIC, 16-bit colour and colour profiles, as phones and cameras write them, become 8-bit sRGB."""
 
 import builtins
 import io
@@ -24,11 +24,11 @@ pytest.importorskip("pillow_heif")
 
 RNG = np.random.default_rng(5)
 NOISE = RNG.integers(0, 256, (12, 16, 3), dtype=np.uint8)
-DEEP = RNG.integers(0, 65536, (70, 16, 4)).astype(np.uint16)  # more rows than are rounded at once
+DEEP = RNG.integers(0, 65536, (70, 16, 4)).astype(np.uint16)  # more rows than one block of rounding
 ROUNDED = np.rint(DEEP / 257.0).astype(np.uint8)
 
 CODEC = 1
-"""Largest error of the HEIC codec on flat quarters at quality 100 without subsampling: its YCbCr has 8 bits."""
+"""Largest error of the HEIC codec in flat areas at quality 100 without subsampling, because YCbCr has 8 bits."""
 
 
 def srgb_profile():
@@ -40,14 +40,18 @@ def srgb_profile():
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 def test_a_turned_heic_in_p3_becomes_upright_srgb(tmp_path, orientation):
-    """The container turns it. EXIF says the same, and must not turn it again."""
+    """The container rotates the photo. EXIF has the same rotation, which must not be applied again."""
     path = save(tmp_path / "a.heic", quarters(), orientation, icc_profile=make_profile(P3))
     assert image_size(path) == (64, 48) and image_orientation(path) == 1
     rgb, alpha = decode(path)
     low, high = p3_range(quarters(), CODEC)
     assert alpha is None and rgb.shape == (48, 64, 3)
-    assert np.all(rgb >= np.floor(low) - 1) and np.all(rgb <= np.ceil(high) + 1), "a step for LittleCMS"
-    assert np.abs(rgb.astype(int) - quarters()).max() > 10, "without a conversion the colours would be duller"
+    assert np.all(rgb >= np.floor(low) - 1) and np.all(rgb <= np.ceil(high) + 1), (
+        "LittleCMS rounds by one step more"
+    )
+    assert np.abs(rgb.astype(int) - quarters()).max() > 10, (
+        "without conversion, the colours would be less saturated"
+    )
 
 
 def test_exif_alone_does_not_turn_a_heic(tmp_path):
@@ -88,7 +92,7 @@ def test_a_heic_with_alpha_keeps_it(tmp_path):
     assert rgb.shape == (48, 64, 3)
 
 
-def test_contents_count_not_names(tmp_path):
+def test_the_format_is_recognised_by_content_not_by_name(tmp_path):
     heic = save(tmp_path / "a.heic", quarters()).rename(tmp_path / "a.jpg")
     jpeg = save(tmp_path / "b.jpg", quarters(), quality=95).rename(tmp_path / "b.heic")
     for path in (heic, jpeg):
@@ -134,7 +138,7 @@ def test_without_pillow_heif_the_command_that_installs_it_is_named(tmp_path, mon
     for read in (decode, decode_mask, image_size, image_header, image_orientation):
         with pytest.raises(DatasetError, match=said):
             read(path)
-    assert is_image(path), "it is one all the same"
+    assert is_image(path), "a file of HEIC content is recognised without pillow-heif"
     assert decode(save(tmp_path / "a.png", quarters()))[0].shape == (48, 64, 3)
 
 
@@ -174,7 +178,7 @@ def tiff16(path, values, order, extra=()):
     tags += [(279, 4, [len(data)])] + ([(338, 3, list(extra))] if extra else [])
     depths = (
         8 + 2 + 12 * len(tags) + 4
-    )  # the only numbers that do not fit into their entry, and the pixels after them
+    )  # BitsPerSample does not fit into its entry, so it stands before the pixels
     tags[5] = (273, 4, [depths + 2 * channels])
     table = packed([len(tags)], 2)
     for tag, kind, numbers in tags:
@@ -190,7 +194,7 @@ def test_a_png_with_16_bits_is_rounded(tmp_path):
     rgb, alpha = decode(png16(tmp_path / "a.png", DEEP[..., :3], 2))
     np.testing.assert_array_equal(rgb, ROUNDED[..., :3])
     assert alpha is None
-    assert np.any(DEEP[..., :3] >> 8 != ROUNDED[..., :3]), "cutting off the lower byte gives others"
+    assert np.any(DEEP[..., :3] >> 8 != ROUNDED[..., :3]), "discarding the lower byte gives other values"
     rgb, alpha = decode(png16(tmp_path / "a.png", DEEP, 6))
     np.testing.assert_array_equal(rgb, ROUNDED[..., :3])
     np.testing.assert_array_equal(alpha, ROUNDED[..., 3])
@@ -211,7 +215,7 @@ def test_every_value_of_16_bits_is_rounded_to_the_nearest(tmp_path):
 
 def test_a_transparent_colour_of_16_bits_is_compared_with_all_of_them(tmp_path):
     values = np.full((4, 5, 3), 0x1234, np.uint16)
-    values[0, 0] = 0x1235  # the same upper byte
+    values[0, 0] = 0x1235  # another colour of the same upper byte
     _, alpha = decode(png16(tmp_path / "a.png", values, 2, transparent=(0x1234,) * 3))
     assert alpha[0, 0] == 255 and np.count_nonzero(alpha) == 1
     _, alpha = decode(png16(tmp_path / "a.png", values[..., 0], 0, transparent=(0x1234,)))
@@ -228,7 +232,7 @@ def test_a_tiff_with_16_bits_is_rounded(tmp_path, order):
     np.testing.assert_array_equal(alpha, ROUNDED[..., 3])
     rgb, alpha = decode(tiff16(tmp_path / "a.tif", DEEP, order, extra=(0,)))
     np.testing.assert_array_equal(rgb, ROUNDED[..., :3])
-    assert alpha is None, "the fourth value means nothing"
+    assert alpha is None, "the fourth value is unspecified"
     rgb, _ = decode(tiff16(tmp_path / "a.tif", DEEP[..., 0], order))
     np.testing.assert_array_equal(rgb, np.repeat(ROUNDED[..., :1], 3, axis=2))
 
@@ -239,7 +243,7 @@ def test_colours_that_were_multiplied_with_alpha_are_divided_by_it(tmp_path):
     stored = np.dstack([np.rint(colors * alpha[..., None]), alpha]).astype(np.uint16)
     rgb, found = decode(tiff16(tmp_path / "a.tif", stored, "<", extra=(1,)))
     np.testing.assert_array_equal(found, np.rint(alpha / 257.0))
-    # half a step of 16 bits, divided by an alpha of at least 3000, is 255 / 6000 of a step of 8 bits
+    # Half a step of 16 bits divided by an alpha of at least 3000 is 255 / 6000 of a step of 8 bits.
     np.testing.assert_allclose(rgb, 255.0 * colors, atol=0.5 + 255 / 6000)
 
 
@@ -269,7 +273,8 @@ def test_a_deep_file_cut_short_is_named(tmp_path, share):
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp"])
 def test_without_a_profile_or_with_srgb_no_bit_changes(tmp_path, name):
-    """Trainings on existing captures keep their bits, also with one of the versions of sRGB that differ by rounding."""
+    """Trainings on existing captures keep their bits, also if the profile is a version of sRGB that differs by
+    rounding."""
     pixels = RNG.integers(0, 256, (48, 64, 3), dtype=np.uint8)
     rough = make_profile(((0.6405, 0.33), (0.30, 0.60), (0.15, 0.06)))
     for profile in (None, srgb_profile(), make_profile(((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))), rough):
@@ -284,7 +289,7 @@ def test_without_a_profile_or_with_srgb_no_bit_changes(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.jpg"])
 def test_display_p3_becomes_srgb(tmp_path, name):
-    """Within the rounding of LittleCMS, a step; out of sRGB's gamut, values are clipped."""
+    """Colours agree within LittleCMS's rounding, one step; outside sRGB's gamut, values are clipped."""
     steps = np.arange(0, 256, 15, dtype=np.uint8)
     colors = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 18, 3)
     path = tmp_path / name
@@ -301,7 +306,7 @@ def test_display_p3_becomes_srgb(tmp_path, name):
 
 
 def test_any_rgb_profile_is_converted_and_alpha_is_not(tmp_path):
-    """sRGB's primaries with red and green exchanged: the conversion exchanges the values."""
+    """The profile has sRGB's primaries with red and green exchanged, so the conversion exchanges the values."""
     profile = make_profile(((0.30, 0.60), (0.64, 0.33), (0.15, 0.06)))
     alpha = RNG.integers(0, 255, (12, 16), dtype=np.uint8)
     path = tmp_path / "a.png"
@@ -321,7 +326,7 @@ def broken_profiles():
         (b"not a profile", damaged),
         (good[:200], damaged),
         (good[:128] + bytes(len(good) - 128), damaged),
-        (good[:16] + b"R\x1bB " + good[20:], damaged),  # a name for the terminal to act on
+        (good[:16] + b"R\x1bB " + good[20:], damaged),  # a name with an escape code for the terminal
         (lab, "its colour profile is for Lab, not for RGB"),
     ]
 
@@ -352,7 +357,7 @@ def test_a_capture_with_heic_photos_loads(one_photo):
 
 
 def test_the_forecast_knows_that_these_photos_take_more_memory_to_decode(one_photo):
-    """Measured: 14.3 bytes per pixel for HEIC, up to 21 for 16 bits; 10 are planned for other photos."""
+    """Decoding takes 14.3 bytes per pixel for HEIC and up to 21 for 16 bits, as measured; 10 are planned for others."""
     folder = one_photo(quarters())
     path = folder / "images" / "a.png"
     plain = Facts.of(load_dataset(folder)).decoding
@@ -364,16 +369,16 @@ def test_the_forecast_knows_that_these_photos_take_more_memory_to_decode(one_pho
 
 
 def test_profiles_are_read_from_bytes_as_pillow_gives_them():
-    """The file that is written is one that LittleCMS accepts in full: its white, its primaries and its curve."""
+    """LittleCMS reads white, primaries and curve of the written profile as they were meant."""
     profile = ImageCms.ImageCmsProfile(io.BytesIO(make_profile(P3))).profile
     assert profile.xcolor_space.strip() == "RGB" and profile.connection_space.strip() == "XYZ"
     np.testing.assert_allclose(profile.media_white_point[0], (0.9642, 1.0, 0.8249), atol=1e-4)
-    # Display P3's own profile, adapted to D50 (its columns as Apple publishes them)
+    # the columns that Apple publishes for Display P3, adapted to D50
     np.testing.assert_allclose(profile.red_colorant[0], (0.51512, 0.24120, -0.00105), atol=2e-4)
     np.testing.assert_allclose(profile.green_colorant[0], (0.29198, 0.69225, 0.04189), atol=2e-4)
     np.testing.assert_allclose(profile.blue_colorant[0], (0.15710, 0.06657, 0.78407), atol=2e-4)
 
 
-def test_the_helper_turns_back_what_pillow_turns():
+def test_upright_photos_are_rotated_back_as_pillow_rotates_them():
     assert as_stored(quarters(), 6).shape == (64, 48, 3)
     np.testing.assert_array_equal(as_stored(as_stored(quarters(), 6), 8), quarters())

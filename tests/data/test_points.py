@@ -1,4 +1,4 @@
-"""Start clouds from PLY files: our own, from other programs, ASCII, binary, and invalid ones."""
+"""Start points from PLY files: our own and other programs', ASCII and binary, and invalid files."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_round_trip(tmp_path):
 
 @pytest.mark.parametrize(("kind", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
 def test_binary(tmp_path, kind, order):
-    """The columns are in an odd order, one is not needed, and faces follow."""
+    """The columns have an unusual order, one of them is not needed, and faces follow."""
     dtype = np.dtype(
         [("z", order + "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("s", order + "i2")]
     )
@@ -56,7 +56,7 @@ def test_ascii(tmp_path):
 
 
 def test_colours(tmp_path):
-    """Floats are 0 to 1 already, f_dc are spherical harmonics, and without either a point is gray."""
+    """Float colours are 0 to 1, f_dc are spherical harmonics, and without any colour a point is gray."""
     body = np.array([[0, 0, 0, 0.25, 0.5, 2.0]] * 2, "<f4").tobytes()
     floats = RGB.replace("uchar", "float")
     cloud = read_points_ply(write(tmp_path, "binary_little_endian", XYZ + floats, body))

@@ -1,4 +1,4 @@
-"""What a reader has read stays as it was read, for every dataset that is derived from it."""
+"""All datasets derived from one reader see what the reader has read first."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Real captures, if this machine has them: numbers of views, notes, and poses that fit the points and photos."""
+"""Real captures, if this machine has them: numbers of views, notes, and poses that agree with points and photos."""
 
 import json
 
@@ -55,8 +55,8 @@ def test_snowmikus_points_have_the_colour_of_the_photos(real):
     """Check poses, axes and the pixel convention against the photos themselves.
 
     COLMAP coloured each point from the photos that show it. Many points are hidden from a view, so most colours differ.
-    But the share that agrees is largest without a shift. It is smaller half a pixel off in either direction, which is
-    the shift that a wrong convention would cause.
+    But the share that agrees is largest without a shift, and smaller if points are shifted by half a pixel, as by a
+    wrong convention.
     """
     dataset = load_dataset(real("snowmiku97"))
     views = dataset.train[::6]
@@ -82,7 +82,7 @@ def test_fox(real):
 
 
 def test_the_foxs_colmap_model(real):
-    """The model's own folder is given, and the photos lie beside it: nine views of an OPENCV camera."""
+    """The model's folder is given, the photos lie beside it, and nine views share an OPENCV camera."""
     dataset = load_dataset(real("fox/colmap9_opencv"), DataSettings(test_every=0))
     assert len(dataset.train) == 9 and len(dataset.points) == 1457
     assert points_in_sight(dataset).any(axis=0).mean() > 0.99
@@ -107,14 +107,14 @@ def test_truck11(real):
 
 
 def test_every_track_of_a_large_points_file_is_skipped(real):
-    """25,784 points have tracks of many lengths. Skipping one wrongly would garble all that follow."""
+    """25,784 points have tracks of many lengths. Skipping one track wrongly would garble all points after it."""
     cloud = read_points(real("snowmiku97") / "sparse" / "0")
     assert cloud.points.shape == (25784, 3) and np.isfinite(cloud.points).all()
     assert cloud.colors.min() >= 0 and cloud.colors.max() <= 1
 
 
 @pytest.mark.parametrize("resolution", [4.0, 300.0])
-def test_smaller(real, resolution):
+def test_smaller_photos_of_a_real_capture(real, resolution):
     dataset = load_dataset(real("snowmiku97"), DataSettings(resolution=resolution))
     camera = dataset.train[0].camera
     assert ((248, 186) if resolution == 4 else (300, 225)) == (camera.W, camera.H)

@@ -1,4 +1,4 @@
-"""Tracks of the models that we write, as COLMAP's own reader sees them."""
+"""COLMAP's own reader reads the tracks of the models that we write."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed (ex
 
 @pytest.mark.parametrize("binary", [False, True])
 def test_colmap_reads_the_tracks(tmp_path, binary):
-    """Each observation is there from both sides, and lies where COLMAP's camera projects its point, to rounding."""
+    """Points list images and images list points. Each observation lies where COLMAP's camera projects its point."""
     views, points, colors = procedural_capture(24, 6)
     write_colmap(tmp_path, views, points, colors, binary=binary)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
@@ -31,11 +31,11 @@ def test_colmap_reads_the_tracks(tmp_path, binary):
     assert found == sum(image.num_points3D for image in model.images.values())
     depths = [image.cam_from_world() * model.point3D(m.point3D_id).xyz
               for image in model.images.values() for m in image.points2D]  # fmt: skip
-    assert min(depth[2] for depth in depths) > 0  # what gsplat's trainer supervises depth with
+    assert min(depth[2] for depth in depths) > 0  # gsplat's trainer supervises depth with these
 
 
 def test_hidden_points_are_not_seen():
-    """Two walls, one behind the other: the camera sees the front one, and the rear one beside it."""
+    """Of two walls one behind the other, the camera sees the front one and the part of the rear one beside it."""
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 31), np.linspace(-1, 1, 31)))
     front, rear = np.stack([x, y, x * 0 + 2], 1), np.stack([4 * x, 4 * y, x * 0 + 4], 1)
     camera = Camera(np.eye(3), np.zeros(3), 50.0, 50.0, 49.5, 49.5, 100, 100)
@@ -45,7 +45,7 @@ def test_hidden_points_are_not_seen():
     assert len(behind) > 0 and np.all(np.abs(rear[behind, :2]).max(axis=1) > 1.9)
 
 
-def test_a_photo_sees_a_bounded_number(tmp_path):
+def test_the_number_of_observations_of_a_photo_is_limited(tmp_path):
     points = np.random.default_rng(0).uniform(-1, 1, (9_000, 3)) * (1, 1, 0.01) + (0, 0, 3)
     camera = Camera(np.eye(3), np.zeros(3), 50.0, 50.0, 49.5, 49.5, 100, 100)
     seen = visible_points(camera, points)

@@ -1,4 +1,4 @@
-"""transforms.json and Blender's files: dialects, missing values, and where the points come from."""
+"""transforms.json and Blender's files: dialects, missing values, and the source of the points."""
 
 import json
 import shutil
@@ -36,7 +36,7 @@ def camera_of(folder):
 
 
 def test_intrinsics_of_the_whole_file_and_their_defaults(one_photo):
-    """cx, cy default to the middle of the image; the file's corner convention is half a pixel from ours."""
+    """cx and cy default to the centre of the image. Files put the first pixel's centre at (0.5, 0.5), we at (0, 0)."""
     camera = camera_of(one_photo(PIXELS, fl_x=25.0))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (25.0, 25.0, 14.5, 9.5)
     camera = camera_of(one_photo(PIXELS, fl_x=25.0, fl_y=26.0, cx=13.0, cy=11.5))
@@ -44,7 +44,7 @@ def test_intrinsics_of_the_whole_file_and_their_defaults(one_photo):
 
 
 def test_fields_of_view(one_photo):
-    """At 90 degrees the focal length is half the size."""
+    """A field of view of 90 degrees has a focal length of half the size."""
     right, path = np.pi / 2, one_photo(PIXELS, camera_angle_x=np.pi / 2) / "transforms.json"
     contents = json.loads(path.read_text())
     del contents["fl_x"], contents["w"], contents["h"]  # the size then comes from the image
@@ -74,11 +74,11 @@ def test_a_frame_overrides_the_file(edited):
 
 
 def test_axes(one_photo):
-    """OpenGL's camera looks along -z with +y up: the identity, in a world of +y up, looks along the world's -z."""
+    """OpenGL's camera looks along -z with +y up, so the identity looks along -z of a world with +y up."""
     camera = camera_of(one_photo(PIXELS))
     np.testing.assert_array_equal(camera.R, np.diag([1.0, -1.0, -1.0]))
     u, v, z = camera.project(camera.world_to_cam([(0.2, 0.1, -2.0)]))
-    assert z[0] == 2.0 and u[0] > camera.cx and v[0] < camera.cy  # right stays right, up stays up
+    assert z[0] == 2.0 and u[0] > camera.cx and v[0] < camera.cy  # right and up are unchanged
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".Jpeg", ".webp", ".TIF"])
@@ -165,7 +165,7 @@ def test_the_file_may_be_given_instead_of_its_folder(edited):
 
 
 def test_a_ply_is_in_the_frame_of_the_poses(edited, small):
-    """The poses and the PLY both already include applied_transform, so the PLY is not moved again."""
+    """The poses and the PLY already include applied_transform, so the PLY is not moved again."""
     transform = [[0, 1, 0, 3.0], [1, 0, 0, -2.0], [0, 0, -1, 0.5]]
     dataset = load_dataset(edited(lambda contents: contents.update(applied_transform=transform)))
     np.testing.assert_array_equal(dataset.points, small[1])
@@ -178,8 +178,10 @@ def test_colmaps_points_are_moved_by_applied_transform(tmp_path, small):
     views, points, colors = small
     write_colmap(tmp_path, views, points, colors)
     write_transforms(tmp_path, views)
-    assert len(load_dataset(tmp_path).points) == 100_000  # how the two frames relate is not stated
-    transform = np.array([[0, 1, 0, 3.0], [0, 0, 1, -2.0], [1, 0, 0, 0.5]])  # not its own transpose
+    assert (
+        len(load_dataset(tmp_path).points) == 100_000
+    )  # the file does not say how the two frames are related
+    transform = np.array([[0, 1, 0, 3.0], [0, 0, 1, -2.0], [1, 0, 0, 0.5]])  # not symmetric
     write_transforms(tmp_path, views, extra={"applied_transform": transform.tolist()})
     dataset = load_dataset(tmp_path)
     expected = np.stack([points[:, 1] + 3, points[:, 2] - 2, points[:, 0] + 0.5], axis=1)
@@ -190,7 +192,7 @@ def test_colmaps_points_are_moved_by_applied_transform(tmp_path, small):
 
 
 def test_distortion_keys(one_photo):
-    """is_fisheye and camera_model mean the same; PINHOLE without coefficients distorts nothing."""
+    """is_fisheye and camera_model are equivalent, and PINHOLE without coefficients has no distortion."""
     assert camera_of(one_photo(PIXELS, camera_model="PINHOLE")).fx == 30
     fisheye = camera_of(one_photo(PIXELS, camera_model="OPENCV_FISHEYE", k1=0.05))
     assert fisheye.fx == camera_of(one_photo(PIXELS, is_fisheye=True, k1=0.05)).fx != 30
@@ -198,7 +200,8 @@ def test_distortion_keys(one_photo):
 
 
 def test_blenders_splits(tmp_path, small):
-    """The files define train and test. Without a test file, val is used instead; an explicit split overrides both."""
+    """The files define the training and test views. Without a test file, val is used; an explicit split overrides
+    both."""
     views = small[0]
     write_blender(tmp_path, views[3:], views[:3])
     dataset = load_dataset(tmp_path)
@@ -297,7 +300,7 @@ def test_blenders_val_is_left_out_and_reported(tmp_path, small):
         ({"applied_transform": np.eye(4).tolist(), "applied_scale": 0.5}, "has poses scaled by 0.5"),
     ],
 )
-def test_why_colmaps_points_are_not_used(tmp_path, small, extra, why):
+def test_a_note_says_why_colmaps_points_are_not_used(tmp_path, small, extra, why):
     views, points, colors = small
     write_colmap(tmp_path, views, points, colors)
     write_transforms(tmp_path, views, extra=extra)

@@ -1,4 +1,4 @@
-"""Random start points lie where at least two training photos look, and are the same in every run."""
+"""Random start points lie where at least two training photos see them, and are the same in every run."""
 
 import math
 
@@ -15,7 +15,7 @@ from gsplat_edu.scene.views import View
 
 
 def room(count=24):
-    """Cameras in the middle of a room that look outwards."""
+    """Cameras near the middle of a room that look outwards."""
     found = []
     for i in range(count):
         turn = 2 * math.pi * i / count
@@ -29,7 +29,7 @@ def orbit(count=12):
 
 
 @pytest.mark.parametrize("cameras", [room(), orbit()], ids=["room", "orbit"])
-def test_every_point_is_seen_twice_and_none_is_right_before_its_camera(cameras):
+def test_two_cameras_see_every_point_and_none_is_close_to_a_camera(cameras):
     cloud = cloud_in_view(cameras)
     assert len(cloud.points) == RANDOM_POINTS and np.isfinite(cloud.points).all()
     assert seen_by(cloud.points, cameras, 2).all() and cloud.colors.min() >= 0 and cloud.colors.max() <= 1
@@ -43,7 +43,7 @@ def test_every_point_is_seen_twice_and_none_is_right_before_its_camera(cameras):
 
 def test_a_room_gets_points_beyond_its_cameras():
     cloud = cloud_in_view(room())
-    assert np.median(np.linalg.norm(cloud.points, axis=1)) > 2, "the cameras are at 1"
+    assert np.median(np.linalg.norm(cloud.points, axis=1)) > 2, "the cameras are 1 from the centre"
 
 
 def test_one_photo_and_photos_that_share_nothing():
@@ -92,7 +92,7 @@ def test_photos_that_share_nothing_start_around_the_cameras(tmp_path):
 
 
 def test_cameras_close_together_start_where_they_look():
-    """Their spread is a twentieth of the distance to what they look at."""
+    """The distance between the cameras is a twentieth of the distance to the subject."""
     eyes = [np.array([0.2 * i, 0.1 * (i % 2), -8.0]) for i in range(-2, 3)]
     cameras = [Camera(look_at(eye, np.zeros(3)), eye, 60.0, 60.0, 31.5, 31.5, 64, 64) for eye in eyes]
     points = cloud_in_view(cameras).points

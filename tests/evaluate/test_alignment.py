@@ -1,4 +1,4 @@
-"""Held-out poses that are aligned: with a photo of another exposure, colours are fitted on the same half."""
+"""Poses of held-out photos are aligned, and colours are fitted on the same half of a photo of another exposure."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def scene():
 
 
 def photo_of(scene, scales):
-    """The scene's own render as a photo with alpha, of another exposure, with a camera off by half a degree."""
+    """Return the scene's render as a photo with alpha, of another exposure, with a camera off by half a degree."""
     gaussians, camera = scene
     with torch.no_grad():
         seen = shown(gaussians, camera)
@@ -47,11 +47,11 @@ def photo_of(scene, scales):
 
 @pytest.mark.parametrize("transparent", [True, False])
 def test_a_photo_of_another_exposure_is_scored_at_its_own(scene, transparent):
-    """The scene is the truth, so what the pose and the gains leave is rounding to bytes: more than 40 dB."""
+    """The photo shows the scene, so with pose and gains corrected only rounding to bytes is left, above 40 dB."""
     scores = {}
     for name, scales in (("even", EVEN), ("uneven", UNEVEN)):
         view = photo_of(scene, scales)
-        if not transparent:  # the background counts as part of the object, and darkens with it
+        if not transparent:  # the background counts as part of the object, and is darkened with it
             even = photo_of(scene, EVEN).read().over(GREY) / 255.0
             view = View(view.camera, photographed(even, scales), name="a")
         for colors in (False, True):
@@ -71,7 +71,8 @@ def test_no_pixel_in_a_half_gives_no_score(scene):
 
 
 def test_the_scored_half_does_not_move_the_pose(scene):
-    """Grey dark squares: the score is lost, but they change nothing about the pose, so they could not help it."""
+    """The scored squares of the photo are grey. The score is bad, but the pose, fitted on the other half, is the
+    same."""
     view = photo_of(scene, EVEN)
     photo, light = np.ascontiguousarray(view.read().over(GREY)), light_squares(*view.image.shape[:2])
     images = []

@@ -1,4 +1,4 @@
-"""A photo beside its render: photo first, both named, and pictures of earlier versions are still understood."""
+"""A photo beside its render, photo first, both with their names; pictures of earlier versions are recognised."""
 
 import numpy as np
 import pytest

@@ -35,7 +35,8 @@ def test_curves_are_labelled_and_hold_the_numbers():
 
 
 def test_the_curves_of_a_run_share_their_iterations_and_cut_off_outliers():
-    """One evaluation at iteration 5,000 used to get an axis from 4,800 to 5,200; one pause flattened all speeds."""
+    """A single evaluation at iteration 5,000 used to get an axis from 4,800 to 5,200, and one pause flattened all
+    speeds."""
     log = [{"iteration": 50 * i, "loss": 1.0 / i, "ms": 20.0 + i % 3} for i in range(1, 101)]
     log[40]["ms"] = 6000.0
     log.append({"iteration": 5000, "psnr": 30.0})
@@ -56,7 +57,7 @@ def test_a_count_that_hardly_changes_is_not_drawn_on_the_edge():
 
 @pytest.mark.parametrize(("low", "high"), [(0.1, 0.29), (0.002, 0.4), (0.05, 0.06)])
 def test_the_loss_has_plain_numbers_on_its_axis(low, high):
-    """A short run's loss used to be labelled 2.75 x 10^-1, 2.5 x 10^-1 and so on."""
+    """The loss of a short run used to be labelled 2.75 x 10^-1, 2.5 x 10^-1 and so on."""
     log = [{"iteration": i, "loss": low * (high / low) ** (i / 10)} for i in range(11)]
     (figure,) = run_curve_figures(log)
     FigureCanvasAgg(figure).draw()
@@ -66,7 +67,7 @@ def test_the_loss_has_plain_numbers_on_its_axis(low, high):
         for place, label in zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=True)
         if view[0] <= place <= view[1]
     ]
-    assert 1 <= len(texts) <= 8 and all(float(text) > 0 for text in texts), "numbers, not formulas"
+    assert 1 <= len(texts) <= 8 and all(float(text) > 0 for text in texts), "plain numbers, not powers of ten"
     assert not any(label.get_text() for label in axis.get_ticklabels(minor=True))
 
 

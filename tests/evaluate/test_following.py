@@ -1,4 +1,4 @@
-"""Paths stay near the cameras: every frame is near a real view, and paths are smooth and closed."""
+"""Paths are smooth and closed, and every frame is near a real view."""
 
 import math
 
@@ -20,7 +20,8 @@ def placed(eye, target, up=UP):
 
 
 def around(azimuths, elevations, radius=2.5, frame=FRAMES[0], jitter=0.0):
-    """Cameras at azimuths and elevations (degrees) around the subject, whose aim is off by about `jitter` degrees."""
+    """Return cameras at azimuths and elevations (degrees) around the subject; they miss its centre by about `jitter`
+    degrees."""
     rng = np.random.default_rng(0)
     cameras = []
     for azimuth, elevation in zip(np.radians(azimuths), np.radians(elevations), strict=True):
@@ -32,7 +33,7 @@ def around(azimuths, elevations, radius=2.5, frame=FRAMES[0], jitter=0.0):
 
 
 def seen_from(path, frame=FRAMES[0]):
-    """Azimuth and elevation (degrees) and distance of a path's cameras, as seen from the subject."""
+    """Return azimuth and elevation (degrees) and distance of a path's cameras, as seen from the subject."""
     offsets = np.stack([camera.eye - SUBJECT for camera in path.cameras]) @ frame
     distances = np.linalg.norm(offsets, axis=1)
     return (
@@ -43,20 +44,20 @@ def seen_from(path, frame=FRAMES[0]):
 
 
 def off(path, cameras):
-    """Largest angle in degrees between a frame's viewing direction and the nearest real one."""
+    """Return the largest angle between a frame's viewing direction and the nearest real one, degrees."""
     axes = np.stack([camera.R[2] for camera in cameras])
     cosines = np.stack([camera.R[2] for camera in path.cameras]) @ axes.T
     return np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0))).max()
 
 
 def steps(path):
-    """Change of position and of rotation from each frame to the next, and from the last to the first."""
+    """Return the change of position and of rotation from each frame to the next, and from the last to the first."""
     pairs = list(zip(path.cameras, path.cameras[1:] + path.cameras[:1], strict=True))
     return np.array([(np.linalg.norm(b.eye - a.eye), np.linalg.norm(b.R - a.R)) for a, b in pairs])
 
 
 def check_smooth(cameras, depth=1.0):
-    """On a smooth closed path, four times as many frames give a quarter of the step. A jump would remain."""
+    """Check that four times as many frames give a quarter of the step, which a jump would not."""
     few, many = (steps(path_along(cameras, frames, depth)).max(axis=0) for frames in (40, 160))
     assert (many <= 0.35 * few + 1e-9).all()
 
@@ -76,14 +77,14 @@ def test_cameras_all_round_get_a_full_circle(frame, count):
     np.testing.assert_allclose(elevations, 20, atol=1e-5)
     np.testing.assert_allclose(distances, 2.5, rtol=1e-6)
     np.testing.assert_allclose(path.cameras[0].eye, cameras[0].eye, atol=1e-5)
-    assert off(path, cameras) <= 180 / count + 1e-3, "half of the angle between neighbours"
+    assert off(path, cameras) <= 180 / count + 1e-3, "at most half of the angle between neighbours"
     check_smooth(cameras)
 
 
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize(("extent", "count"), [(20, 4), (90, 12), (200, 40), (270, 30)])
-def test_an_arc_is_never_left(frame, extent, count):
-    """Two rows, 20 degrees apart; neighbours in a row are at most 2 extent / (count - 1) apart."""
+def test_the_path_stays_within_an_arc_of_cameras(frame, extent, count):
+    """The cameras are in two rows, 20 degrees apart; neighbours in a row are at most 2 extent / (count - 1) apart."""
     azimuths = np.linspace(-extent / 2, extent / 2, count)
     cameras = around(azimuths, [10, 30] * (count // 2), frame=frame, jitter=1)
     path = path_along(cameras, 60)
@@ -95,9 +96,9 @@ def test_an_arc_is_never_left(frame, extent, count):
             or (f"cover {extent + 1} degrees" in path.description)
         )
     seen, elevations, distances = seen_from(path, frame)
-    # The centre comes from axes with 1 degree of jitter each; the mean has less.
+    # The centre follows from axes with 1 degree of jitter each, so its error is smaller.
     assert np.abs(seen).max() <= extent / 2 + 1 and np.ptp(seen) > 0.85 * extent
-    # For two values, mean + 0.85 sigma exceeds them by at most 16 % of their difference, 3 degrees.
+    # For two values, mean + 0.85 sigma exceeds the larger by at most 16 % of their difference, 3 degrees.
     assert elevations.min() > 10 - 4 and elevations.max() < 30 + 4
     np.testing.assert_allclose(distances, 2.5, rtol=0.03)
     between = 2 * extent / (count - 1)
@@ -106,19 +107,20 @@ def test_an_arc_is_never_left(frame, extent, count):
 
 
 def test_a_hole_in_the_circle_is_not_crossed():
-    """Two sides of a subject were photographed, 100 degrees apart. The path stays on the side with more photos."""
+    """Photos show two sides of a subject, 100 degrees apart. The path stays on the side with more photos."""
     cameras = around([*np.linspace(-50, 50, 15), *np.linspace(150, 210, 5)], [15] * 20)
     azimuths, *_ = seen_from(path_along(cameras, 50))
     assert np.abs(azimuths).max() <= 50
 
 
 def test_the_path_follows_distance_and_height():
-    """Near and low on one side, far and high on the other, as one walks around a statue on a slope."""
+    """Cameras are near and low on one side, far and high on the other, as around a statue on a slope."""
     azimuths = np.arange(36) * 10.0
     swing = np.cos(np.radians(azimuths))
     cameras = [around([a], [15 + 10 * s], radius=3 + s)[0] for a, s in zip(azimuths, swing, strict=True)]
     found, elevations, distances = seen_from(path_along(cameras, 72))
-    # A Gaussian of 15 degrees reduces a swing of one period by 1 - exp(-0.26²/2) = 3.4 %; ln r is not quite a cosine.
+    # Smoothing by a Gaussian of 15 degrees reduces the variation of ln r, nearly a cosine, by 1 - exp(-0.26²/2) = 3.4
+    # %.
     np.testing.assert_allclose(elevations, 15 + 10 * np.cos(np.radians(found)), atol=0.5)
     np.testing.assert_allclose(distances, 3 + np.cos(np.radians(found)), atol=0.12)
 
@@ -137,7 +139,7 @@ def test_outliers_do_not_move_the_path():
 
 
 def grid(frame, turns=(0.0,), jitter=0.0, pitch=0.0):
-    """Parallel cameras on a grid of 6 by 4 world units, 1 apart; `turns` roll the rows about the viewing axis."""
+    """Return parallel cameras on a grid of 6 by 4 world units, 1 apart; `turns` roll the rows about the viewing axis."""
     rng = np.random.default_rng(0)
     cameras = []
     for row in range(5):
@@ -154,7 +156,8 @@ def grid(frame, turns=(0.0,), jitter=0.0, pitch=0.0):
 @pytest.mark.parametrize("turns", [(0.0,), (0.0, math.pi)])
 @pytest.mark.parametrize("jitter", [0.0, 0.03])
 def test_cameras_facing_one_way_get_a_loop_between_them(frame, turns, jitter):
-    """A wall, or fields from the air in strips flown back and forth. Views turn by 12 degrees; the jitter is 2 to 3."""
+    """Photos of a wall, or of fields from the air, in strips back and forth. The loop turns by 12 degrees, jitter is
+    2 to 3."""
     cameras = grid(frame, turns, jitter)
     for depth in (1.0, 4.0, 100.0):
         path = path_along(cameras, 40, depth)
@@ -167,7 +170,7 @@ def test_cameras_facing_one_way_get_a_loop_between_them(frame, turns, jitter):
 
 
 def test_aerial_photos_that_look_down_on_one_place():
-    """From 80 to 90 degrees of elevation, azimuth is meaningless: the path is a loop above the place."""
+    """Above 80 degrees of elevation, azimuth has no meaning, so the path is a loop above the place."""
     cameras = around(np.arange(20) * 130.0, np.linspace(80, 89, 20))
     path = path_along(cameras, 30)
     _, elevations, _ = seen_from(path)
@@ -185,14 +188,14 @@ def test_a_panorama_turns_on_the_spot(radius, extent, closed):
     path = path_along(cameras, 36, 3.0)
     assert ("closed loop" in path.description) is closed
     assert max(np.linalg.norm(camera.eye - SUBJECT) for camera in path.cameras) <= radius + 1e-9
-    assert off(path, cameras) <= 5 + 1e-6, "half of the angle between neighbours"
+    assert off(path, cameras) <= 5 + 1e-6, "at most half of the angle between neighbours"
     turned = np.degrees(np.arccos(np.clip([c.R[2] @ ahead[0] for c in path.cameras], -1, 1)))
     assert turned.max() > (170 if closed else 90)
     check_smooth(cameras, 3.0)
 
 
-def test_a_walk_is_followed():
-    """Along a corridor and round a corner: photos face ahead, at most half a unit and 10 degrees apart."""
+def test_the_path_follows_a_walk():
+    """Photos along a corridor and round a corner look ahead, at most half a unit and 10 degrees apart."""
     places = [(0.0, 0.0, 0.5 * i) for i in range(20)]
     places += [(0.5 * i, 0.0, 10.0) for i in range(20)]
     ways = [0.0] * 15 + list(np.radians(np.linspace(0, 90, 10))) + [math.pi / 2] * 15
@@ -204,13 +207,13 @@ def test_a_walk_is_followed():
     eyes, real = (np.stack([camera.eye for camera in group]) for group in (path.cameras, cameras))
     distances = np.linalg.norm(eyes[:, None] - real, axis=2).min(axis=1)
     assert distances.max() < 0.5 and off(path, cameras) < 10
-    assert np.linalg.norm(np.ptp(eyes, axis=0)) > 12, "nearly the whole walk, which is 10 by 10"
+    assert np.linalg.norm(np.ptp(eyes, axis=0)) > 12, "nearly the whole walk, whose extent is 10 by 10"
     check_smooth(cameras, 2.0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_cameras_get_a_small_loop(count):
-    """Parallel cameras 0.2 apart, 4 units from the scene: half axes are at least 0.03 * 4, at most 0.1 times 1.2."""
+    """Parallel cameras 0.2 apart, 4 units from the scene, give half axes from 0.03 * 4 to 0.1 * 1.2."""
     R = FRAMES[1]
     cameras = [Camera(R, R[0] * 0.2 * i, 50, 50, 10, 10, 21, 21) for i in range(count)]
     path = path_along(cameras, 12, 4.0)
@@ -231,13 +234,13 @@ def test_two_cameras_that_look_at_one_subject():
 
 @pytest.mark.parametrize("azimuths", [[0, 90], [0, 120, 240], [0, 90, 180, 270]])
 def test_cameras_too_far_apart_for_a_path_get_a_loop_at_one_of_them(azimuths):
-    """All frames used to be the same, or taken between two photos, far from either."""
+    """All frames used to be equal, or half way between two photos, far from either."""
     cameras = around(azimuths, [10] * len(azimuths))
     path = path_along(cameras, 12, 2.0)
     eyes, real = (np.stack([camera.eye for camera in each]) for each in (path.cameras, cameras))
     nearest = np.linalg.norm(eyes[:, None] - real, axis=2).min(axis=0)
     assert np.sort(nearest)[0] < 0.1 and "too far apart" in path.description
-    # Half axes are 0.03 of the distance 2.5, and the view turns with the position by 0.075 / 2.5 rad, 1.7 degrees.
+    # Half axes are 0.03 of the distance 2.5, and the view turns by 0.075 / 2.5 rad, 1.7 degrees.
     assert 0.07 < np.ptp(eyes, axis=0).max() < 0.16 and off(path, cameras) < 1.8
     check_smooth(cameras, 2.0)
 

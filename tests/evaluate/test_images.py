@@ -75,7 +75,7 @@ def test_a_file_and_a_folder_are_not_confused(tmp_path):
 
 @pytest.mark.parametrize("suffix", [*sorted(NOT_WRITTEN), ".GIF"])
 def test_other_formats_are_refused_by_name(tmp_path, suffix):
-    """`--out x.gif` used to be taken for a folder."""
+    """`--out x.gif` used to create a folder."""
     with pytest.raises(
         ArgumentError, match=rf"x\{suffix}: {suffix[1:].upper()} is not supported; give a video"
     ):
@@ -106,7 +106,7 @@ def test_leftovers_of_killed_writers_are_removed_and_other_files_kept(tmp_path):
     ]
     kept = [
         f".v.{machine}-{os.getppid()}-abcd1234.mp4",
-        f".v.{other}-{gone.pid}-abcd1234.mp4",  # no such process here, but perhaps on the other machine
+        f".v.{other}-{gone.pid}-abcd1234.mp4",  # no such process on this machine, but perhaps on the other
         f"v.{machine}-{gone.pid}-abcd1234.mp4",
         ".v.original.mp4",
         ".v.12-ab.mp4",

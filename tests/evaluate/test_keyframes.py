@@ -1,4 +1,4 @@
-"""The file of a camera path: written, read back, and every mistake in one line."""
+"""The file of a camera path is written and read back, and every mistake in it is one line."""
 
 import json
 
@@ -76,19 +76,19 @@ def test_cameras_are_chosen_from_the_first_to_the_last():
 
 
 def changed(change):
-    """The text of a good file after a change to its document."""
+    """Return the text of a valid file after a change of its document."""
     document = path_of().document()
     change(document)
     return json.dumps(document)
 
 
 def frame(**values):
-    """A change of the second keyframe."""
+    """Return a change that sets fields of the second keyframe."""
     return changed(lambda document: document["keyframes"][1].update(values))
 
 
 def timed(*times, loop=False, duration=None):
-    """The text of a file whose keyframes have these times; None leaves one out."""
+    """Return the text of a file whose keyframes have these times; None omits a time."""
 
     def change(document):
         document["loop"] = loop

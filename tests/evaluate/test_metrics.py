@@ -29,7 +29,7 @@ def noise(*shape, seed=0):
 
 
 def ssim_by_definition(x, y):
-    """SSIM from its formula, with scipy's filter: 11 taps, sigma 1.5, zero outside."""
+    """Compute SSIM by its formula, with scipy's filter of 11 taps, sigma 1.5 and zeros outside."""
     taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     taps /= taps.sum()
 
@@ -64,7 +64,7 @@ def test_renders_are_clamped_and_photos_are_bytes():
 
 def test_8_bits_round_to_the_nearest_byte():
     truth = np.full((4, 4, 3), 100, dtype=np.uint8)
-    image = np.full((4, 4, 3), 100.4 / 255)  # rounds to 100: equal
+    image = np.full((4, 4, 3), 100.4 / 255)  # rounds to 100, as the other
     assert psnr_8bit(image, truth) == pytest.approx(100.0)
     assert psnr(image, truth) == pytest.approx(20 * math.log10(255 / 0.4), abs=1e-9)
     np.testing.assert_array_equal(to_bytes(np.full((1, 1, 3), 100.5 / 255)), 101)
@@ -79,9 +79,9 @@ def test_tensors_are_images_too():
 
 @pytest.mark.parametrize("shape", [(40, 31, 3), (5, 64, 3), (1, 1, 3)])
 def test_ssim_against_its_definition(shape):
-    """Both use float64. A window's sums have about 30 roundings (121 products, summed by rows and columns) of values
-    up to 1: 3e-15. The ratio divides by at least C2 = 9e-4 (and C1 = 1e-4 if both are dark), so the error is at most
-    1e-11. The mean does not add to it.
+    """Both compute in float64. The sums over a window (121 products, by rows and columns) round values up to 1 about
+    30 times, an error of 3e-15. The ratio divides by at least C2 = 9e-4 (and C1 = 1e-4 if both are dark), so its
+    error is at most 1e-11, and so is that of the mean.
     """
     x = noise(*shape)
     y = np.clip(x + 0.2 * (noise(*shape, seed=1) - 0.5), 0, 1)
@@ -157,7 +157,7 @@ def test_views_are_scored_over_the_background_in_their_order():
     black = np.zeros((4, 5, 3), dtype=np.uint8)
     views = [
         View(camera, black, name="black"),
-        View(camera, black, alpha=clear, name="clear"),  # only background
+        View(camera, black, alpha=clear, name="clear"),  # an empty scene renders the background
         View(camera, black, mask=none, name="nothing counts"),
         View(camera, np.full((4, 5, 3), 0.5), name="grey"),
     ]
@@ -190,11 +190,11 @@ def test_no_images_means_no_averages():
 
 
 def test_the_fitted_psnr_does_not_depend_on_the_exposure_of_the_photo():
-    """A photo of a third less light: the fit on the left half makes up for it on the right half."""
+    """The photo has a third less light, which the gains fitted on the left half compensate on the right half."""
     truth = np.random.default_rng(4).uniform(0.2, 0.8, (40, 60, 3))
     render = np.clip(truth + np.random.default_rng(5).normal(0.0, 0.01, truth.shape), 0.0, 1.0)
     darker = (truth + 0.055) * (2 / 3) ** (1 / 2.4) - 0.055
-    # Noise of 0.01 is 40 dB; the dark photo shrinks it by a sixth.
+    # Noise of 0.01 is 40 dB, and the dark photo reduces it by a sixth.
     assert psnr_fitted(render, truth) == pytest.approx(40.0, abs=0.4)
     assert psnr_fitted(render, darker) == pytest.approx(41.4, abs=0.6)
     assert psnr(render, darker) < 21.0

@@ -1,4 +1,4 @@
-"""The motion between keyframes: through all of them, smooth, and at constant speed or on time."""
+"""The motion passes through all keyframes, smoothly, at constant speed or at the given times."""
 
 import math
 
@@ -11,13 +11,13 @@ from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.evaluate.path_curve import PathCurve, Travel, _monotone
 from gsplat_edu.scene.camera import look_at
 
-# Unevenly spaced; the camera also turns and zooms.
+# Keyframes are unevenly spaced, and the camera also rotates and zooms.
 EYES = [(0, 0, -4), (0.3, -0.2, -3.8), (2.5, -0.5, -2), (3, 0, 1), (0.5, 0.4, 3.5)]
 FOVS = [50, 55, 40, 60, 45]
 
 
 def keyframes(times=(None, None, None, None, None)):
-    """Keyframes that look near zero from all around."""
+    """Return keyframes around the origin, which look near it."""
     return tuple(
         Keyframe(np.array(eye, float), look_at(eye, (0.1 * i, 0.1, 0)), float(fov), time)
         for i, (eye, fov, time) in enumerate(zip(EYES, FOVS, times, strict=True))
@@ -25,18 +25,18 @@ def keyframes(times=(None, None, None, None, None)):
 
 
 def turned(axis, degrees, eye=(0.0, 0.0, 0.0), fov=50.0, time=None):
-    """A keyframe turned about an axis."""
+    """Return a keyframe rotated about an axis."""
     R = Rotation.from_rotvec(np.radians(degrees) * np.array(axis, float)).as_matrix().T
     return Keyframe(np.array(eye, float), R, fov, time)
 
 
 def angles(a, b):
-    """Angles between rotations, radians."""
+    """Return the angles between rotations, radians."""
     return Rotation.from_matrix(a @ np.swapaxes(b, -1, -2)).magnitude()
 
 
 def speeds(curve, times, dt):
-    """Central differences: velocity, angular velocity in the camera's frame, rate of ln tan(fov / 2)."""
+    """Return central differences: velocity, angular velocity in the camera's frame, rate of ln tan(fov / 2)."""
     (e0, r0, f0), (e1, r1, f1) = (curve.poses(times + side * dt / 2) for side in (-1, 1))
     turn = Rotation.from_matrix(r1 @ np.swapaxes(r0, 1, 2)).as_rotvec() / dt
     zoom = np.diff(np.log(np.tan(np.radians([f0, f1]) / 2)), axis=0)[0] / dt
@@ -44,7 +44,7 @@ def speeds(curve, times, dt):
 
 
 def nearest(curve, keyframe, times):
-    """How near a curve comes to a keyframe, world units and radians, at one of given times."""
+    """Return the smallest distance of a curve from a keyframe at the given times, world units and radians."""
     eyes, rotations, fovs = curve.poses(times)
     moved = np.linalg.norm(eyes - keyframe.eye, axis=1)
     best = (moved + angles(rotations, keyframe.R) + np.radians(abs(fovs - keyframe.fov))).argmin()
@@ -58,7 +58,7 @@ def test_the_camera_passes_through_all_keyframes_at_constant_speed(loop):
     assert path.seconds == 2.0 * (5 if loop else 4), "two seconds per segment"
     times = np.linspace(0, path.seconds, 20001)
     for keyframe in path.keyframes:
-        # Between two samples the camera covers length / 20000, and the radius converts it to an angle.
+        # Between two samples the camera moves by length / 20000, which the radius converts to an angle.
         step = curve.length / 20000
         off = nearest(curve, keyframe, times)
         assert off[0] <= step and off[1] <= step / curve.travel.radius and off[2] < 0.1
@@ -77,7 +77,7 @@ def test_the_camera_passes_through_all_keyframes_at_constant_speed(loop):
 @pytest.mark.parametrize("loop", [False, True])
 @pytest.mark.parametrize("times", [None, (0.0, 0.5, 2.0, 2.4, 6.0)])
 def test_velocities_are_continuous_across_keyframes(loop, times):
-    """Just before and just after any instant, including a loop's seam, all velocities agree."""
+    """All velocities agree just before and just after any instant, including the seam of a loop."""
     path = KeyframePath(keyframes(times or (None,) * 5), loop, 9.0 if loop else None)
     curve = PathCurve(path)
     dt = 1e-5
@@ -87,12 +87,12 @@ def test_velocities_are_continuous_across_keyframes(loop, times):
     else:
         at = np.array(times)
     at = at if loop else at[1:-1]
-    # Around each keyframe, 200 steps: a jump of the velocity would appear between two of them.
+    # In 200 steps around each keyframe, a jump of the velocity would appear between two of them.
     around = at[:, None] + np.linspace(-2e-3, 2e-3, 201)
     moved, turn, zoom = (x.reshape(len(at), 201, -1) for x in speeds(curve, around.ravel(), dt))
     for rates in (moved, turn, zoom):
         scale = np.abs(rates).max()
-        assert scale > 0.01, "there is something to see"
+        assert scale > 0.01, "the velocity changes at all"
         # The velocity changes by its own size in a hundredth of a second at the fastest, so by 2e-3 of it in 2e-5 s;
         # differences of positions of size 4 over 1e-5 s have rounding errors of 1e-10.
         assert np.abs(np.diff(rates, axis=1)).max() < 5e-3 * scale
@@ -115,7 +115,7 @@ def test_keyframes_are_met_at_their_times(loop):
         np.testing.assert_allclose(rotations[i], keyframe.R, atol=1e-9)
         assert fovs[i] == pytest.approx(keyframe.fov)
     first, again = (np.concatenate([x.ravel() for x in curve.poses([t])]) for t in (0.25, 0.25 + 9.5))
-    assert np.allclose(first, again) == loop, "a loop repeats, an open path ends"
+    assert np.allclose(first, again) == loop, "a loop repeats its first camera, an open path does not"
 
 
 def test_the_times_change_the_speed_and_not_the_curve():
@@ -129,7 +129,7 @@ def test_the_times_change_the_speed_and_not_the_curve():
 
 
 def test_rotations_go_the_short_way_and_at_constant_speed():
-    """From 170 to -170 degrees it is 20 degrees across the back, not 340 across the front."""
+    """From 170 to -170 degrees, the camera rotates by 20 degrees, not by 340."""
     curve = PathCurve(KeyframePath((turned((0, 1, 0), 170), turned((0, 1, 0), -170)), False))
     _, rotations, _ = curve.poses(np.linspace(0, 2, 5))
     expected = Rotation.from_rotvec(np.radians([[0, a, 0] for a in (170, 175, 180, 185, 190)])).as_matrix()
@@ -138,7 +138,7 @@ def test_rotations_go_the_short_way_and_at_constant_speed():
 
 @pytest.mark.parametrize("count", [3, 4, 7])
 def test_a_full_turn_in_a_loop_closes_although_the_quaternion_changes_its_sign(count):
-    """Turning on the spot: constant angular speed, no translation to divide by."""
+    """The camera rotates without moving, so its angular speed is constant."""
     frames = tuple(turned((0, 1, 0), 360 * i / count) for i in range(count))
     curve = PathCurve(KeyframePath(frames, True, 10.0))
     _, rotations, _ = curve.poses(np.linspace(0, 10, 101))
@@ -148,7 +148,7 @@ def test_a_full_turn_in_a_loop_closes_although_the_quaternion_changes_its_sign(c
 
 
 def test_a_ring_of_keyframes_gives_nearly_a_circle():
-    """Between the keyframes of a ring, in which the camera turns as it moves, it stays at the same distance."""
+    """Between the keyframes of a ring, the camera keeps its distance from the centre."""
     ring = [2 * math.pi * i / 12 for i in range(12)]
     eyes = [(3 * math.sin(a), -1.0, -3 * math.cos(a)) for a in ring]
     path = KeyframePath(tuple(Keyframe(np.array(e), look_at(e, (0, -1, 0)), 50.0) for e in eyes), True)
@@ -158,12 +158,12 @@ def test_a_ring_of_keyframes_gives_nearly_a_circle():
     assert abs(np.hypot(eyes[:, 0], eyes[:, 2]) - 3).max() < 3 * 3 / 128 * (2 * math.pi / 12) ** 4
     inwards = -eyes * (1, 0, 1) / np.hypot(eyes[:, 0], eyes[:, 2])[:, None]
     assert np.sum(inwards * rotations[:, 2], axis=1).min() > np.cos(np.radians(0.5))
-    # One radian counts as much as the radius of the circle, up to the polygon's shorter way.
+    # One radian counts as much as the radius of the circle, except that the polygon is shorter than the circle.
     assert curve.travel.radius == pytest.approx(3 * math.sin(math.pi / 12) / (math.pi / 12))
 
 
 def test_three_keyframes_of_an_open_path_are_one_parabola():
-    """Its two ends have no fourth keyframe to mix another one from."""
+    """At the two ends, there is no fourth keyframe that would change the curve."""
     path = KeyframePath(tuple(turned((0, 1, 0), 0, (x, x * x, 5.0)) for x in (-1.0, 0.0, 1.0)), False)
     x, y, z = PathCurve(path).poses(np.linspace(0, 4, 41))[0].T
     np.testing.assert_allclose(y, x * x, atol=1e-12)
@@ -171,7 +171,7 @@ def test_three_keyframes_of_an_open_path_are_one_parabola():
     assert (x[0], x[20], x[40]) == pytest.approx((-1.0, 0.0, 1.0))
 
 
-def test_equal_keyframes_are_one_place_and_with_times_a_rest():
+def test_equal_keyframes_are_merged_or_a_rest_if_they_have_times():
     a, b, c = turned((0, 1, 0), 0), turned((0, 1, 0), 20, (1, 0, 0)), turned((1, 0, 0), 20, (1, 2, 0))
     twice, once = (PathCurve(KeyframePath(k, False, 4.0)) for k in ((a, b, b, c), (a, b, c)))
     for one, other in zip(twice.poses(np.linspace(0, 4, 50)), once.poses(np.linspace(0, 4, 50)), strict=True):
@@ -195,7 +195,7 @@ def test_a_path_whose_keyframes_are_all_equal_stands_still(loop, times):
     np.testing.assert_allclose(fovs, 50.0)
 
 
-def test_a_zoom_on_the_spot_is_even_in_the_logarithm():
+def test_a_zoom_without_motion_is_linear_in_the_logarithm():
     path = KeyframePath((turned((0, 1, 0), 0, fov=90.0), turned((0, 1, 0), 0, fov=10.0)), False)
     _, _, fovs = PathCurve(path).poses(np.linspace(0, 2, 5))
     scales = np.tan(np.radians(fovs) / 2)
@@ -205,12 +205,12 @@ def test_a_zoom_on_the_spot_is_even_in_the_logarithm():
 def test_a_slight_turn_on_a_straight_flight_does_not_disturb_its_speed():
     path = KeyframePath(tuple(turned((0, 1, 0), (i % 2) * 0.5, (0, 0, 3.0 * i)) for i in range(5)), False)
     z = PathCurve(path).poses(np.linspace(0, 8, 81))[0][:, 2]
-    # Turning by 0.009 in 3 units with a radius of 12 / 2 pi changes a step by (0.017 / 3)² / 2.
+    # Rotating by 0.009 over 3 units with a radius of 12 / 2 pi changes a step by (0.017 / 3)² / 2.
     np.testing.assert_allclose(np.diff(z), 12 / 80, rtol=1e-4)
 
 
 def test_the_monotone_cubic_agrees_with_scipys_inside():
-    """SciPy chooses other slopes at the two ends only."""
+    """SciPy chooses other slopes, but only at the two ends."""
     rng = np.random.default_rng(0)
     x, y = np.cumsum(rng.uniform(0.1, 3, 12)), np.cumsum(rng.choice([0.0, 0.3, 2.0, 7.0], 12))
     at = np.linspace(x[1], x[-2], 300)
@@ -233,7 +233,7 @@ def test_cameras_of_a_video():
 
 
 def test_the_measure_of_distance_follows_the_scale_of_the_scene():
-    """The same path ten times as large takes the same times."""
+    """A path ten times as large passes the keyframes at the same times."""
     small, large = (
         PathCurve(KeyframePath(keyframes(), False).placed(np.eye(3), s, (0, 0, 0))) for s in (1, 10)
     )

@@ -25,7 +25,7 @@ def scene(means, logit):
     )
 
 
-def test_a_bare_scene_fills_the_picture_despite_floaters():
+def test_a_scene_without_cameras_fills_the_picture_despite_floaters():
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(2000, 3))
     ball = 0.5 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + (4, 5, 6)
@@ -34,13 +34,13 @@ def test_a_bare_scene_fills_the_picture_despite_floaters():
     for camera in orbit_of_scene(gaussians, 7, 100):
         u, v, _ = camera.project(camera.world_to_cam(ball))
         assert (camera.W, camera.H) == (100, 100)
-        # The medians of 2000 points are off by about 0.5 / sqrt(2000), under 3 px here, and so are the edges.
+        # The medians of 2000 points have errors of about 0.5 / sqrt(2000), below 3 px, as do the edges.
         assert abs(u.mean() - 50) < 3 and abs(v.mean() - 50) < 3
         assert u.min() > -3 and u.max() < 103 and u.max() - u.min() > 80
         assert camera.eye[1] < 5, "the camera is above the scene"
 
 
-def test_one_gaussian_is_a_scene_and_none_is_not():
+def test_one_gaussian_has_an_orbit_and_an_empty_scene_has_none():
     (camera,) = orbit_of_scene(scene([[1.0, 2.0, 3.0]], 0.0), 1, 10)
     assert image_of(camera, (1, 2, 3))[:2] == pytest.approx((5, 5), abs=1e-6)
     with pytest.raises(ArgumentError, match="gaussians: is empty"):

@@ -18,7 +18,7 @@ VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
 class Page(HTMLParser):
-    """Checks that tags close in order, and collects what a page refers to."""
+    """Checks that tags are closed in order, and collects the addresses, scripts and pictures of a page."""
 
     def __init__(self, path):
         super().__init__()
@@ -80,7 +80,7 @@ def test_a_page_is_well_formed_and_self_contained(tmp_path):
     write_report(path, full_report())
     page = Page(path)
     assert path.read_text("utf-8").startswith("<!DOCTYPE html>")
-    # There is one script, our own, which a policy can allow by its hash, and no inline event handler.
+    # The only script is our own, which a policy can allow by its hash, and there are no inline event handlers.
     assert page.tags.count("script") == 1 and f"<script>{SCRIPT}</script>" in path.read_text("utf-8")
     assert "link" not in page.tags and not page.handlers
     assert page.references and all(r.startswith(("data:", "#")) for r in page.references)
@@ -111,7 +111,7 @@ def test_best_and_worst_are_named_and_shown(tmp_path):
 def test_pictures_are_render_photo_and_difference(tmp_path):
     (_, render), (_, photo), (_, difference) = picture("a", 50).panels
     means = [np.array(Image.open(io.BytesIO(data))).mean() for data in (render, photo, difference)]
-    np.testing.assert_allclose(means, (50, 200, 150), atol=1)  # a JPEG of one colour is exact to one step
+    np.testing.assert_allclose(means, (50, 200, 150), atol=1)  # a JPEG of one colour is exact up to one step
     big = np.zeros((900, 1600, 3), np.uint8)
     assert Image.open(io.BytesIO(Picture.of("b", big, big).panels[0][1])).size == (640, 360)
     write_report(tmp_path / "r.html", Report("t", {}, scores=[score("a", 20.0)], pictures=[picture("a", 50)]))
@@ -124,7 +124,7 @@ def test_pictures_are_render_photo_and_difference(tmp_path):
     ("step", "times"), [(0, 16), (3, 16), (15, 16), (16, 8), (60, 4), (127, 2), (128, 1), (200, 1)]
 )
 def test_differences_are_amplified_until_visible_and_say_by_how_much(step, times):
-    """The difference of a good render, a few steps of 255, used to look black."""
+    """The difference of a good render is a few steps of 255 and used to look black."""
     title, data = Picture.of(
         "a", np.full((30, 40, 3), step, np.uint8), np.zeros((30, 40, 3), np.uint8)
     ).panels[2]
@@ -231,7 +231,7 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
         tab.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
-        # A number takes one line, so its cell has the height of one line.
+        # A cell with a number has the height of one line.
         heights = tab.evaluate(
             "[...document.querySelectorAll('td.n')].map((e) => e.getClientRects()[0].height)"
         )
@@ -319,7 +319,9 @@ def test_a_drawing_has_unique_ids_and_is_repeatable():
     first, second = (svg_element(*run_curve_figures(log)) for _ in range(2))
     other = svg_element(*run_curve_figures(log), name="other")
     ids, others = (set(re.findall(r'id="(p[0-9a-f]{10})"', text)) for text in (first, other))
-    assert ids and others and not ids & others, "the clip path of one drawing would cut the other"
+    assert ids and others and not ids & others, (
+        "with equal ids, the clip path of one drawing would cut the other"
+    )
     assert first == second and first.startswith("<svg") and len(first) < 100_000
 
 

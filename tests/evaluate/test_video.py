@@ -1,4 +1,4 @@
-"""Videos contain the whole picture at any size, are repeatable, and play in a browser in the right colours."""
+"""Videos contain the whole picture at any size, have reproducible bytes, and play in a browser in the right colours."""
 
 import base64
 import os
@@ -52,7 +52,7 @@ PLAY = """async ([kind, data, expected]) => {
 
 
 def quarters(height, width, turn):
-    """Four colours, one in each quarter of the picture; each frame moves them on by one place."""
+    """Return frames with a colour in each quarter of the picture, which each frame moves on by one quarter."""
     image = np.zeros((height, width, 3), dtype=np.uint8)
     for i, colour in enumerate(np.roll(COLOURS, turn, axis=0)):
         rows = slice(None, height // 2) if i < 2 else slice(height // 2, None)
@@ -71,7 +71,7 @@ def boxes(data):
 
 @pytest.mark.parametrize(("height", "width"), [(33, 47), (48, 33), (33, 48), (32, 48), (1, 9)])
 def test_the_video_contains_the_whole_picture(tmp_path, height, width):
-    """Odd heights and widths used to be cut. The last row and column are white here and must survive."""
+    """Odd heights and widths used to lose a row or column. Here the last row and column are white."""
     frames = [np.zeros((height, width, 3), dtype=np.uint8) for _ in range(3)]
     for i, frame in enumerate(frames):
         frame[:] = 60 + 40 * i
@@ -91,7 +91,8 @@ def test_the_video_contains_the_whole_picture(tmp_path, height, width):
             )
             < 20
         )
-        # The codec is lossy, with half-resolution chroma and range 16..235: nearer to white than to the grey beside it.
+        # The codec is lossy, with chroma of half resolution and the range 16..235, so compare with white and grey
+        # only.
         assert shown[height - 1 :].min() > 200 and shown[:, width - 1 :].min() > 200
     assert not video.read()[0]
 
@@ -108,7 +109,7 @@ def test_equal_frames_give_equal_bytes_and_the_index_is_in_front(tmp_path):
     # profile 0 (8 bits, 4:2:0), limited range, BT.601 matrix
     entry = first[first.index(b"vpcC") + 4 :]
     assert entry[4] == 0 and entry[6] == 0x82 and tuple(entry[7:10]) == (1, 1, 6)
-    assert streamable(first) == first, "already streamable"
+    assert streamable(first) == first, "the index is in front already"
 
 
 def test_a_video_may_have_any_name(tmp_path):
@@ -157,7 +158,7 @@ def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
 
 @pytest.mark.parametrize("fps", [30.0, 23.976, 8.0])
 def test_a_video_takes_half_a_bit_per_pixel_at_its_frame_rate(tmp_path, fps):
-    """A texture that moves, with grain; without a limit it takes more than a bit per pixel."""
+    """The frames show a moving texture with grain, which would take more than a bit per pixel without a limit."""
     rng = np.random.default_rng(0)
     large = cv2.GaussianBlur(rng.uniform(0, 255, (500, 700)).astype(np.float32), (0, 0), 1.5)
     large = np.clip(128 + 4 * (large - 128), 0, 255).astype(np.uint8)
@@ -168,7 +169,7 @@ def test_a_video_takes_half_a_bit_per_pixel_at_its_frame_rate(tmp_path, fps):
         for one, noise in zip(moved, grain, strict=True)
     ]
     (path,) = write_frames(tmp_path / "a.mp4", frames, fps=fps)
-    assert path.stat().st_size < 1.5 * 0.5 / 8 * 12 * 480 * 640  # the first frame has none before it
+    assert path.stat().st_size < 1.5 * 0.5 / 8 * 12 * 480 * 640  # the first frame has no predecessor
     video = cv2.VideoCapture(str(path))
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=1e-3)
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 12

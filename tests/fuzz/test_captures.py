@@ -1,4 +1,4 @@
-"""Damaged captures: each is loaded with finite cameras and points and readable photos, or refused in one line."""
+"""Damaged captures are loaded with finite cameras and points and readable photos, or refused in one line."""
 
 import tracemalloc
 
@@ -20,8 +20,8 @@ CAPTURES = slices.count("GSPLAT_EDU_FUZZ_CAPTURES", 40, 3_000)
 SEEDS = range(slices.SEED, slices.SEED + CAPTURES)
 
 MOST_MEMORY = 32 << 20
-"""Bytes; the captures take less than 20 KiB. This holds for all files but photos: Pillow asks for as much as a chunk of
-a PNG declares, up to 4 GiB, although it never touches most of it."""
+"""Largest memory that reading may take, bytes; the captures have less than 20 KiB. Photos are excluded, because
+Pillow allocates as much as a chunk of a PNG declares, up to 4 GiB, although it never touches most of it."""
 
 LENS = {"k1": 0.01, "k2": 0.001, "p1": 0.001, "p2": -0.001, "camera_model": "OPENCV", "aabb_scale": 4}
 
@@ -95,4 +95,4 @@ def test_damaged_captures(tmp_path, layout, name):
         finally:
             tracemalloc.stop()
         assert peak < MOST_MEMORY or name.endswith(".png"), f"seed {seed}: {peak:,} bytes"
-    assert loaded < CAPTURES, "some are refused"
+    assert loaded < CAPTURES, "no damage was refused"

@@ -1,6 +1,5 @@
-"""Damaged checkpoints: any damage ends in a one-line error or in a training that continues.
-
-Also run on the build with sanitizers (tools/sanitize.sh), so one step follows every checkpoint that was loaded.
+"""Damaged checkpoints end in a one-line error or in a training that continues. They also run on the build with
+sanitizers (tools/sanitize.sh), so one step follows every loaded checkpoint.
 """
 
 import json
@@ -23,7 +22,7 @@ def snapshot(trainer):
     """Return the whole state of a trainer for comparison: tensors by identity, numbers by value."""
     tensors, numbers = trainer.state()
     kept = {key: tensor.data_ptr() for key, tensor in tensors.items() if key != "density.generator"}
-    drawn = tensors.get("density.generator")  # fast draws nothing
+    drawn = tensors.get("density.generator")  # fast has no random state
     state = None if drawn is None else drawn.tolist()
     return kept, state, json.dumps(numbers), id(trainer.gaussians)
 

@@ -1,4 +1,4 @@
-"""Damaged config.json: `train --resume` exits with 0, or with 2 and one line; other readers refuse it in one line."""
+"""On a damaged config.json, `train --resume` exits with 0, or with 2 and one line; other readers refuse in one line."""
 
 import contextlib
 import io
@@ -22,7 +22,7 @@ SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
 
 
 def resumed(words):
-    """Run the command; return its exit code and what it wrote to an error stream like Python's own."""
+    """Run the command; return its exit code and what it wrote to stderr, which is encoded as Python's own is."""
     stream = io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace", write_through=True)
     with contextlib.redirect_stderr(stream), contextlib.redirect_stdout(io.StringIO()):
         code = main(words)

@@ -1,4 +1,4 @@
-"""Damaged photos: each is decoded or refused in one line; so are headers, EXIF, masks and working copies."""
+"""Damaged photos, headers, EXIF, masks and working copies are decoded or refused in one line."""
 
 import io
 
@@ -21,7 +21,7 @@ PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 
 
 def exif():
-    """Return what a phone writes: orientation, camera, focal lengths, time and position."""
+    """Return EXIF as phones write it: orientation, camera, focal lengths, time and position."""
     tags = Image.Exif()
     tags[ExifTags.Base.Orientation], tags[ExifTags.Base.Make], tags[ExifTags.Base.Model] = 6, "Maker", "One"
     details = tags.get_ifd(ExifTags.IFD.Exif)
@@ -80,7 +80,7 @@ def read(path, seed):
 
 
 @pytest.mark.usefixtures("as_shipped")
-@pytest.mark.filterwarnings("ignore")  # Pillow's, about invalid EXIF
+@pytest.mark.filterwarnings("ignore")  # Pillow warns of invalid EXIF
 @pytest.mark.parametrize(
     "kind", ["jpg", "png", "deep.png", "palette.png", "tif", "webp", "bmp", "ppm", "heic"]
 )
@@ -94,10 +94,10 @@ def test_damaged_photos(tmp_path, kind):
             W, H = image_size(path)
         except SplatError:
             W, H = 0, 0
-        if W * H < 1_000_000:  # larger ones are bounded by the free memory
+        if W * H < 1_000_000:  # larger photos are limited by the free memory
             loaded += read(path, seed)
             copied(path, seed)
-    assert loaded < IMAGES, "some are refused"
+    assert loaded < IMAGES, "no damage was refused"
 
 
 def copied(path, seed):
@@ -132,7 +132,7 @@ ODD_VALUES += (TiffImagePlugin.IFDRational(0, 5), TiffImagePlugin.IFDRational(5,
 
 
 @pytest.mark.usefixtures("as_shipped")
-@pytest.mark.filterwarnings("ignore")  # Pillow's, about invalid EXIF
+@pytest.mark.filterwarnings("ignore")  # Pillow warns of invalid EXIF
 def test_values_of_exif_that_no_camera_writes(tmp_path):
     path, image = tmp_path / "odd.jpg", Image.new("RGB", (20, 14), (90, 80, 70))
     for seed in SEEDS:

@@ -1,7 +1,6 @@
-"""Damaged records of jobs, blocks, stages, runs and edits, and damaged uploads: each is read, or refused in one line.
-
-Whatever is read keeps what the readers promise: command lines of jobs name places in the library only and no address,
-and records of blocks and stages name files in their folder only.
+"""Damaged records of jobs, blocks, stages, runs and edits, and damaged uploads, are read or refused in one line.
+Records that are read are safe: command lines of jobs name only places in the library and no address, and records of
+blocks and stages name only files in their folder.
 """
 
 import functools
@@ -32,7 +31,7 @@ from gsplat_edu.studio.unpack import ZipLimits, unpack
 from gsplat_edu.train.config import recipe
 from studio.test_uploads import zipped
 
-pytestmark = pytest.mark.sliced  # a soak reads many more
+pytestmark = pytest.mark.sliced  # a soak reads many more records
 
 RECORDS = slices.count("GSPLAT_EDU_FUZZ_RECORDS", 60, 20_000)
 """Damaged records per reader."""
@@ -75,7 +74,7 @@ def test_damaged_jobs(tmp_path):
         for word in folder.read(render).argv:
             assert not word.startswith("/") or Path(word).is_relative_to(library.root), seed
             assert word not in ("--scheduler", "--workers", "--export", "--view"), seed
-    assert read < RECORDS, "some are refused"
+    assert read < RECORDS, "no damage was refused"
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -90,7 +89,7 @@ def test_damaged_events():
             assert "\n" not in str(error)
         else:
             read += 1
-    assert read < RECORDS, "some are refused"
+    assert read < RECORDS, "no damage was refused"
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -176,7 +175,7 @@ def test_damaged_edits():
 
 @pytest.mark.usefixtures("as_shipped")
 def test_damaged_uploads(tmp_path):
-    """Zip files; whatever is unpacked lies in its folder and is no larger than the limits allow."""
+    """Files unpacked from damaged zip files lie in their folder and are no larger than the limits allow."""
     whole = zipped({"a.jpg": random.Random(0).randbytes(300), "b/c.jpg": bytes(1000)})
     path = tmp_path / "a.zip"
     for seed in SEEDS:

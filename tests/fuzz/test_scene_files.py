@@ -1,4 +1,4 @@
-"""Damaged scene files: any damage ends in a finite scene or a one-line error, and memory stays small."""
+"""Damaged scene files end in a finite scene or a one-line error, and memory stays small."""
 
 import tracemalloc
 import zipfile
@@ -18,7 +18,8 @@ FILES = slices.count("GSPLAT_EDU_FUZZ", 100, 20_000)
 SEEDS = range(slices.SEED, slices.SEED + FILES)
 
 MOST_MEMORY = 24 << 20
-"""Bytes. Files here have at most 32 KiB; they are allowed 1 MiB of contents, plus float32 copies of those."""
+"""Largest memory that reading may take, bytes. The files have at most 32 KiB; 1 MiB of contents and float32 copies of
+them are allowed."""
 
 
 def check(path, seed):
@@ -48,7 +49,7 @@ def test_damaged_files(tmp_path, suffix):
 
 @pytest.mark.sliced
 def test_damage_inside_a_sog(tmp_path):
-    """A zip has checksums, so its parts are damaged before they are zipped."""
+    """A zip has checksums, so the damage is done before zipping."""
     parts = {}
     with zipfile.ZipFile(small_file(tmp_path, ".sog")) as bundle:
         for name in bundle.namelist():
@@ -66,7 +67,7 @@ def test_damage_inside_a_sog(tmp_path):
 
 @pytest.mark.sliced
 def test_damage_inside_levels_of_detail(tmp_path):
-    """Half of the damage goes to the index, the rest to one of the files that it names."""
+    """Half of the damage is in the index, the rest in one of the files that it names."""
     whole = small_levels(tmp_path)
     files = sorted(file for file in whole.parent.rglob("*") if file.is_file())
     for seed in SEEDS:
