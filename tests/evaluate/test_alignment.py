@@ -71,8 +71,7 @@ def test_no_pixel_in_a_half_gives_no_score(scene):
 
 
 def test_the_scored_half_does_not_move_the_pose(scene):
-    """The scored squares of the photo are grey. The score is bad, but the pose, fitted on the other half, is the
-    same."""
+    """Painting the scored squares of the photo grey does not change the pose, which is fitted on the others."""
     view = photo_of(scene, EVEN)
     photo, light = np.ascontiguousarray(view.read().over(GREY)), light_squares(*view.image.shape[:2])
     images = []

@@ -139,7 +139,7 @@ def test_outliers_do_not_move_the_path():
 
 
 def grid(frame, turns=(0.0,), jitter=0.0, pitch=0.0):
-    """Return parallel cameras on a grid of 6 by 4 world units, 1 apart; `turns` roll the rows about the viewing axis."""
+    """Return parallel cameras on a grid of 6 by 4 world units, 1 apart; `turns` are the rolls of the rows."""
     rng = np.random.default_rng(0)
     cameras = []
     for row in range(5):
