@@ -1,9 +1,8 @@
-"""The chapter's run with its seeds reproduces the printed numbers up to the first densification.
-
-Other machines add float32 numbers in another order. The tolerance of 2e-4 covers that and the four printed digits; it
-is a hundredth of the difference between the losses of two views. The count of the first densification is exact,
-because no gradient norm is near the threshold of 2e-4: the nearest is 4.9e-7 away, a quarter of a per cent. The
-faintest Gaussian has opacity 0.042, and only those below 0.005 are pruned.
+"""The chapter's run with its seeds reproduces the printed numbers up to the first densification. Other machines add
+float32 numbers in another order. The tolerance of 2e-4 covers these roundings and the four printed digits; it is a
+hundredth of the difference between the losses of two views. The count of the first densification is exact, because no
+gradient norm is near the threshold of 2e-4: the nearest is 4.9e-7 away, a quarter of a per cent. The faintest
+Gaussian has opacity 0.042, and only Gaussians below 0.005 are pruned.
 
 The native kernels also stop a tile below 1e-4. Their tolerance is 1e-3, and their first densification is the same.
 """
@@ -36,7 +35,7 @@ TOLERANCE = {"torch": 2e-4, "cpu": 1e-3}
     ids=["torch", "cpu", "torch, whole"],
 )
 def test_the_first_iterations_give_the_numbers_of_the_chapter(backend, iterations):
-    """The dense backend takes a second for each iteration, so only `make soak` takes it beyond the first."""
+    """The dense backend takes a second per iteration, so only `make soak` runs more than one."""
     capture = sphere_capture(128)
     config = course_config(iterations=iterations)
     generator = torch.Generator().manual_seed(9)
@@ -57,7 +56,7 @@ def test_the_first_iterations_give_the_numbers_of_the_chapter(backend, iteration
         0.2360, abs=TOLERANCE[backend]
     )
 
-    with one_thread():  # on a busy machine, torch's threads wait minutes for one another
+    with one_thread():  # torch's threads wait minutes for one another on a busy machine
         losses = trainer.run().losses
     expected = {i: loss for i, loss in CHAPTER.items() if i < iterations}
     assert {i: losses[i] for i in expected} == pytest.approx(expected, abs=TOLERANCE[backend])

@@ -1,4 +1,5 @@
-"""Compile kernels for a GPU that may be absent: compile_kernels.py CAPABILITY least|most gaussians|pixels|loss
+"""Compile kernels for a GPU, which this machine may lack: compile_kernels.py CAPABILITY least|most
+gaussians|pixels|loss
 
 Kernels that have variants are compiled without their options (least) or with all of them (most).
 

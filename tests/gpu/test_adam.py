@@ -4,7 +4,7 @@ import torch
 from gsplat_edu import ArgumentError
 from gsplat_edu.ops import kernels
 
-# Not `triton`: without its wheel, that name means this folder.
+# Not `triton`, which is the name of this folder if the wheel is missing.
 pytest.importorskip("triton.language", reason="triton is not installed")
 
 from gsplat_edu.ops.adam import AdamNumbers
@@ -22,7 +22,7 @@ def numbers(t):
 
 
 def gradients(shape, seed=0):
-    """Return gradients of very different sizes: some always 0, some so small that eps matters. No g² underflows."""
+    """Return gradients of very different sizes, some always 0, some comparable to eps. No g² underflows."""
     generator = torch.Generator().manual_seed(seed)
     sizes = 10.0 ** torch.randint(-9, 3, shape, generator=generator)
     sizes[torch.rand(shape, generator=generator) < 0.1] = 0.0
@@ -34,10 +34,11 @@ def gradients(shape, seed=0):
 def in_float64(start, all_gradients):
     """Return parameter and moments after the steps in float64, and the allowed error of float32 for each.
 
-    |m| is bounded by M, the same mean of |g|. A step rounds each term of m in its factor, its product and the sum (3 U)
-    and in 1 - b (U), so m is off by 4 U t M after t steps. v is positive and has one more rounding, in g²: it is off by
-    5 U t v. In the step, the error of m counts in full, that of v is halved by the root, and factors, products, root,
-    sum and quotient round 8 times. Updating the parameter p rounds once, by U |p|. 1/10 covers the higher orders.
+    |m| is bounded by M, the same mean of |g|. A step rounds each term of m in its factor, its product and the sum (3
+    U) and in 1 - b (U), so m is off by 4 U t M after t steps. v is positive and has one more rounding, in g²: it is
+    off by 5 U t v. A step has the error of m, half the error of v because of the root, and 8 roundings of factors,
+    products, root, sum and quotient. Updating the parameter p rounds once, by U |p|. The bound adds 1/10 for higher
+    orders.
     """
     p, m, v, M = start.double(), *torch.zeros(3, *start.shape, dtype=torch.float64)
     e_p = torch.zeros_like(p)
@@ -66,7 +67,7 @@ def natively(parameter, m, v, gradient, numbers):
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (1500, 3), (2, 1024)])
 def test_twenty_steps_match_float64(device, shape):
-    """Sizes below one block, above one block, and exactly two blocks."""
+    """The sizes are below one block, above one block, and exactly two blocks."""
     start = torch.randn(shape, generator=torch.Generator().manual_seed(1))
     drawn = gradients(shape)
     ours = walk(adam_triton, start.clone().to(device), [g.to(device) for g in drawn])
@@ -80,7 +81,7 @@ def test_twenty_steps_match_float64(device, shape):
 
 
 def test_steps_match_torch(device):
-    """torch's own optimiser in float64 is a second reference."""
+    """torch's optimiser in float64 is a second reference."""
     start, drawn = torch.randn(40, generator=torch.Generator().manual_seed(2)), gradients((40,), seed=3)
     theirs = start.double().requires_grad_()
     optimizer = torch.optim.Adam([theirs], lr=RATE, betas=(B1, B2), eps=EPS)
@@ -126,7 +127,7 @@ def test_autograd_notices_the_step_and_gradients_may_be_strided(device):
 
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (4, 0, 3)])
 def test_an_empty_parameter_is_left_alone(device, shape):
-    """For example (N, 0, 3), the shape of sh_rest at degree 0."""
+    """At degree 0, sh_rest has the shape (N, 0, 3)."""
     empty = torch.zeros(shape, device=device)
     adam_triton(empty, empty.clone(), empty.clone(), empty.clone(), numbers(1))
 
@@ -134,7 +135,7 @@ def test_an_empty_parameter_is_left_alone(device, shape):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU to wait for")
 def test_a_step_does_not_synchronise(device):
     tensors = torch.zeros(4, 3000, device=device)
-    adam_triton(*tensors, numbers(1))  # compiles
+    adam_triton(*tensors, numbers(1))  # the first call compiles
     torch.cuda.set_sync_debug_mode("error")
     try:
         adam_triton(*tensors, numbers(2))

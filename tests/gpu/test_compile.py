@@ -1,6 +1,5 @@
-"""Every kernel compiles for real GPUs, even on a machine without one: the compiler is stricter than the interpreter.
-
-The compiler and the assembler ship with triton; no kernel is run. sm_80 is an A100, sm_90 an H100.
+"""Every kernel compiles for real GPUs, because the compiler is stricter than the interpreter. The compiler and the
+assembler ship with triton, so this needs no GPU, and no kernel is run. sm_80 is an A100, sm_90 an H100.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""The backend cuda passes the conformance kit: every output, every gradient."""
+"""The backend cuda passes the conformance kit with all outputs and gradients."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from ours import Renderer
 CASES = {case.name: case for case in run.load_cases()}
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # from NumPy, in the interpreter
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter computes with NumPy, which warns
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.sliced(6)
 def test_the_kernels_pass(device, name):

@@ -25,7 +25,7 @@ def gradients(scene, backend, dtype):
 
 @pytest.mark.parametrize(("count", "size"), [(20_000, (331, 217)), (200_000, (990, 742))])
 def test_gradients_match_the_native_kernels_in_float64(count, size):
-    """As in test_render.py, but with 100 times the pairs and hundreds of Gaussians per tile: 1e-3 of the largest."""
+    """As in test_render.py, but the bound is 1e-3 for 100 times the pairs and hundreds of Gaussians per tile."""
     scene = random(count, size, seed=4)
     scene.log_scales[:] -= 2.0
     ours, truth = gradients(scene, "cuda", torch.float32), gradients(scene, "cpu", torch.float64)

@@ -7,7 +7,7 @@ from gsplat_edu import ArgumentError
 from gsplat_edu.ops import kernels
 from gsplat_edu.ops.losses import l1_ssim
 
-# Not `triton`: without its wheel, that name means this folder.
+# Not `triton`, which is the name of this folder if the wheel is missing.
 pytest.importorskip("triton.language", reason="triton is not installed")
 
 from gsplat_edu.render.triton import loss as module
@@ -18,7 +18,7 @@ U = 2.0**-24
 
 
 def blur(planes):
-    """Blur (H, W, 3) along both axes, as two products with dense matrices."""
+    """Blur (H, W, 3) along both axes by two products with dense matrices."""
 
     def matrix(n):
         apart = torch.arange(n, dtype=torch.float64)[:, None] - torch.arange(n)
@@ -85,19 +85,19 @@ def bounds(x, y, weight):
         e_d += (values - a).abs() * blur(e) + blur((means - a).abs() * e)
     n = x.numel()
     e_gradient = (1 - weight) / n * 3 * U + weight / n * e_d
-    # Sums are trees or pairwise: a number takes part in at most 32 additions within its block and as many among blocks.
+    # Sums are trees or pairwise, with at most 32 additions per number within its block and as many among blocks.
     lost = weight / n * (e_S + U + 70 * U * (1 - S).abs()) + (1 - weight) / n * 73 * U * (x + y)
     return 1.1 * lost.sum(), 1.1 * e_gradient
 
 
 def images(size, kind, seed=0):
-    """Return an image and a target that differ by more than float32 rounding at every number, so that L1 is smooth."""
+    """Return an image and a target whose numbers all differ by more than float32 rounding, so that L1 is smooth."""
     generator = torch.Generator().manual_seed(seed)
     image = torch.rand(*size, 3, generator=generator)
     target = torch.rand(*size, 3, generator=generator)
     if kind == "bytes":
         target = torch.randint(0, 256, (*size, 3), generator=generator, dtype=torch.uint8)
-    if kind == "flat":  # variances near 0, where rounding is largest against C2
+    if kind == "flat":  # variances near 0, where rounding is largest relative to C2
         image, target = 0.8 + 0.01 * (image - 0.5), torch.full((*size, 3), 203, dtype=torch.uint8)
     assert (image.double() - as_double(target)).abs().min() > 4 * U
     return image, target
@@ -119,7 +119,7 @@ def value_and_gradient(loss, image, target, weight):
 @pytest.mark.parametrize("kind", ["floats", "bytes", "flat"])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_value_and_gradient_match_float64(device, size, kind, weight):
-    """Sizes below the window and above one block; none is a multiple of a block."""
+    """The sizes are below the window or above one block, and not multiples of a block."""
     image, target = images(size, kind)
     value, gradient = value_and_gradient(l1_ssim_triton, image.to(device), target.to(device), weight)
     x, y = image.double(), as_double(target)
@@ -132,7 +132,7 @@ def test_value_and_gradient_match_float64(device, size, kind, weight):
 
 
 def test_a_slightly_wrong_window_exceeds_the_bound(monkeypatch):
-    """Taps that fall off 1% too fast exceed the bound, so it is tight enough to find errors."""
+    """A window that is 1 % too narrow exceeds the bound, which is therefore tight enough to find errors."""
     x, y = (t.double() for t in images((19, 23), "floats"))
     e_value, e_gradient = bounds(x, y, 0.2)
     exp = torch.exp
@@ -168,7 +168,7 @@ def test_without_ssim_weight_nothing_is_blurred(device, monkeypatch):
 
 
 def test_equal_image_and_target_give_zero_loss_and_gradient(device):
-    """S is 1 up to rounding, and |x - y| has slope 0 at its corner, so only rounding within the bound is left."""
+    """S is 1 up to rounding, and |x - y| has slope 0 at its corner, so the gradient is rounding within the bound."""
     image, _ = images((19, 23), "floats")
     value, gradient = value_and_gradient(l1_ssim_triton, image.to(device), image.to(device), 0.2)
     e_value, e_gradient = bounds(image.double(), image.double(), 0.2)
@@ -197,7 +197,7 @@ def test_the_loss_of_an_empty_image_is_nan(device, weight):
 def test_the_loss_does_not_synchronise(device):
     image, target = (t.to(device) for t in images((33, 48), "bytes"))
     image.requires_grad_()
-    l1_ssim_triton(image, target, 0.2).backward()  # compiles
+    l1_ssim_triton(image, target, 0.2).backward()  # the first call compiles
     torch.cuda.set_sync_debug_mode("error")
     try:
         l1_ssim_triton(image, target, 0.2).backward()

@@ -1,6 +1,5 @@
-"""The backend cuda against the NumPy reference and the native kernels in float64.
-
-On a machine without a GPU the kernels run in Triton's interpreter. Scenes and bounds are those of the native float32
+"""The backend cuda agrees with the NumPy reference and the native kernels in float64. On a machine without a GPU, the
+kernels run in Triton's interpreter. Scenes and bounds are those of the native float32
 kernels (tests/native). Forward: four times each pixel's change when the parameters move by 4 eps, plus the rounding of
 the sum. Backward: 3e-4 of the largest gradient, or 4e-3 for ill-conditioned conics. Batches hold 16 Gaussians, so most
 scenes have tiles with several. 41 x 35 and 17 x 33 px are not multiples of a tile.
@@ -90,7 +89,8 @@ def test_images_match_the_reference(device, name):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", SMALLER)
 def test_gradients_match_the_native_kernels_in_float64(device, name, antialiased):
-    """Includes scenes with ties: the order is the same, and so are the float32 ties, since a camera axis is along z."""
+    """Scenes with ties are included. A camera axis is along z, so depths that are equal in float64 are equal in
+    float32."""
     settings = dataclasses.replace(SETTINGS, antialiased=antialiased, jacobian_limit=1.3)
     values, gradients, out = images_and_gradients(SMALLER[name], "cuda", device, settings)
     truths, expected, oracle = images_and_gradients(SMALLER[name], "cpu", device, settings)
@@ -113,10 +113,11 @@ def test_lower_sh_degrees(device, degree):
         assert np.abs(gradients[key] - truth).max() <= 3e-4 * np.abs(truth).max(), key
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of divisions whose results are not used
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # divisions by zero whose results are not used
 @pytest.mark.parametrize("dilation", [0.0, 0.1, 1.0])
 def test_dilations(device, dilation):
-    """Gaussians of a few pixels, which float32 resolves, and a line, which is not drawn without dilation."""
+    """The scene has Gaussians of a few pixels, which float32 resolves, and a line, which is not drawn without
+    dilation."""
     scene = random(20, (17, 33), seed=3)
     scene.log_scales[7] = (-1.0, -60.0, -60.0)
     settings = dataclasses.replace(SETTINGS, dilation=dilation)
@@ -180,7 +181,7 @@ POISON = (
 
 
 @pytest.mark.sliced(1)
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # from NumPy, in the interpreter
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter computes with NumPy, which warns
 @pytest.mark.parametrize(("name", "value"), POISON)
 def test_one_bad_gaussian_does_not_affect_others(device, name, value):
     scene = random(20, (17, 33), seed=3)
@@ -199,7 +200,7 @@ def test_one_bad_gaussian_does_not_affect_others(device, name, value):
 
 
 def test_means_far_outside_their_tiles(device):
-    """A wide Gaussian with its mean 400 px outside the image: moments are shifted far without losing digits."""
+    """The mean of a wide Gaussian is 400 px outside the image, and shifting the moments that far loses no digits."""
     scene = random(4, (41, 35), seed=6)
     far = scene.gaussians(torch.float64)
     far.means[0, 0] += 25.0
@@ -248,7 +249,7 @@ def test_a_camera_is_uploaded_once(device):
 @pytest.mark.sliced(2)
 @pytest.mark.parametrize("channels", [1, 3, 7, 32])
 def test_features_and_median_depth_match_the_native_kernels(device, channels):
-    """The bounds are those of colours, of which features are more: 3e-4 of the largest gradient.
+    """As for colours, the bound is 3e-4 of the largest gradient.
 
     The median depth may differ where the transmittance is within float32 rounding of one half.
     """

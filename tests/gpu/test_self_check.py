@@ -1,4 +1,4 @@
-"""The check that the backend cuda must pass on a device before it is used there."""
+"""The check that the backend cuda has to pass on a device before its first use."""
 
 import pytest
 import torch
@@ -24,12 +24,12 @@ def empty_cache(monkeypatch, tmp_path):
 def test_correct_kernels_are_checked_once(device, empty_cache, monkeypatch):
     assert self_check.cuda_failure(torch.device(device)) is None
     assert "triton" in empty_cache.read_text()
-    self_check._failure.cache_clear()  # as in a new process
+    self_check._failure.cache_clear()  # a new process starts like this
     monkeypatch.setattr(self_check, "kernel_error", lambda device: "checked again")
     assert self_check.cuda_failure(torch.device(device)) is None
 
 
-def test_a_pass_does_not_cover_other_kernels(device, empty_cache, monkeypatch):
+def test_changed_kernels_are_checked_again(device, empty_cache, monkeypatch):
     empty_cache.parent.mkdir()
     for content in ("{", "[" * 100_000, '{"a": 1}', '["another device"]', "[1]"):
         empty_cache.write_text(content)
@@ -71,7 +71,7 @@ def test_a_gradient_that_is_one_percent_too_large_fails(device, monkeypatch, nam
 
 @pytest.mark.skipif(kernels.REASON is None and torch.cuda.is_available(), reason="this machine has a GPU")
 def test_auto_uses_the_cpu_if_the_kernels_do_not_run(monkeypatch, tmp_path, capsys):
-    """torch's CPU build stands in for a GPU whose driver fails: the first CUDA call raises."""
+    """torch's CPU build acts like a GPU whose driver fails, because the first CUDA call raises."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     with pytest.warns(

@@ -32,7 +32,7 @@ def tensors(run):
 
 @pytest.fixture(scope="module")
 def trained(views, device):
-    """A run on the backend cuda, and its losses."""
+    """Train on the backend cuda; return the run and its losses."""
     run = trainer(views, "cuda", device)
     return run, run.run().losses
 
@@ -62,7 +62,7 @@ def test_a_training_follows_the_native_backend(views, trained):
         difference = (tensors(ours)[name] - expected).abs()
         assert float(difference.median()) < 1e-3 * reach, name
         assert float((difference > 0.01 * reach).float().mean()) < 0.05, name
-        assert float((expected - start[name]).abs().max()) > 0.1 * reach, "the parameters moved"
+        assert float((expected - start[name]).abs().max()) > 0.1 * reach, "training moved the parameters"
 
 
 @pytest.mark.sliced(1, group="trainings by the GPU's kernels")

@@ -1,8 +1,6 @@
-"""Autograd of the dense renderer against finite differences, in float64.
-
-The scenes are smooth, and each test asserts why: the alpha floor is off (finite differences fail at a jump), no alpha
-reaches the clamp at 0.99, no colour reaches the floor at 0, and no two splats swap places in depth under the step of
-1e-6.
+"""Autograd of the dense renderer agrees with finite differences in float64. The scenes are smooth, and each test
+asserts why: there is no alpha floor (finite differences fail at a jump), no alpha reaches the clamp at 0.99, no
+colour reaches the floor at 0, and no two splats swap places in depth under the step of 1e-6.
 """
 
 import pytest
@@ -29,7 +27,7 @@ def scene(seed):
 
 def assert_smooth(means, color, logits):
     depths = torch.sort(means[:, 2]).values
-    assert depths.diff().min() > 1e-3, "depths keep their order"
+    assert depths.diff().min() > 1e-3, "no depths swap under the step"
     assert torch.sigmoid(logits).max() < 0.95, "no alpha is clamped"
     assert color.min() > 0.01, "no colour is floored"
 

@@ -1,4 +1,4 @@
-"""How every reader handles files whose contents do not match their names."""
+"""Every reader handles files whose contents do not match their names."""
 
 import tracemalloc
 
@@ -10,10 +10,10 @@ from gsplat_edu.io.formats import FORMATS, format_of, read_scene, write_scene
 from scene_files import random_scene, small_file
 
 SLACK = 8 << 20
-"""Bytes that a reader may use for even the smallest file: imports, buffers and the minimum allowance."""
+"""Bytes that a reader may use for any file, however small: imports, buffers and the minimum allowance."""
 
 TIMES = 100
-"""A reader may allocate this many times the file's size: 64 for compressed contents, and a copy in float32."""
+"""A reader may allocate this multiple of the file's size: 64 times for compressed contents, and a float32 copy."""
 
 every_format = pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 
@@ -30,7 +30,9 @@ def refused(path):
 def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
     path = small_file(tmp_path, suffix)
     data = path.read_bytes()
-    odd = 7 if suffix == ".splat" else 0  # no header: a cut between two splats leaves a valid scene
+    odd = (
+        7 if suffix == ".splat" else 0
+    )  # the format has no header, so a cut between two splats leaves a valid scene
     for end in range(0, len(data), 64):
         if end + odd < len(data) and end + odd > 0:
             path.write_bytes(data[: end + odd])
@@ -38,7 +40,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
 
 
 @every_format
-def test_a_git_lfs_pointer_is_called_one(tmp_path, suffix):
+def test_a_git_lfs_pointer_is_named_in_the_error(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 123\n")
     assert "git lfs pull" in refused(path)
@@ -79,7 +81,11 @@ def test_files_with_nan_or_infinity_are_refused(tmp_path, suffix):
     data = bytearray(path.read_bytes())
     before = {".splat": b"", ".glb": b"BIN\0"}.get(suffix, b"end_header\n")
     start = data.index(before) + len(before)
-    for bits in (b"\x00\x00\xc0\x7f", b"\x01\x00\x80\x7f", b"\x00\x00\x80\xff"):  # NaN, signalling, -inf
+    for bits in (
+        b"\x00\x00\xc0\x7f",
+        b"\x01\x00\x80\x7f",
+        b"\x00\x00\x80\xff",
+    ):  # NaN, a signalling NaN, and -inf
         data[start : start + 4] = bits
         path.write_bytes(data)
         refused(path)
@@ -123,4 +129,4 @@ def test_memory_stays_a_small_multiple_of_the_file(tmp_path, suffix):
                 tracemalloc.stop()
             assert peak < SLACK + TIMES * len(data)
             at = data.find(count, at + 1)
-    assert claims or suffix == ".splat", "the file must state its number of splats somewhere"
+    assert claims or suffix == ".splat", "the file has to declare its number of splats"

@@ -21,7 +21,7 @@ XYZ = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
 SCALES = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
 RGB = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-HALF = 0.5  # steps: the largest error of rounding to nearest
+HALF = 0.5  # The largest errors of rounding to the nearest step.
 
 
 def parse(path):
@@ -91,14 +91,14 @@ def test_a_handmade_file_is_read(tmp_path, colored, order):
     scene = read(path)
     g = scene.gaussians
     assert (scene.antialiased, scene.up, g.sh_degree) == (None, None, 0)
-    np.testing.assert_array_equal(g.means.numpy(), [[1, -2, 20], [-1, 2, 10]])  # the file's axes are kept
+    np.testing.assert_array_equal(g.means.numpy(), [[1, -2, 20], [-1, 2, 10]])  # axes are those of the file
     middle = -5 + 4 * 1024 / 2047
     np.testing.assert_allclose(g.log_scales.numpy(), [[-5, -2, 3], [middle, -6, -7]], rtol=1e-6)
     rgb = np.array([[1.0, 0.0, 0.2], [0.0, 1.0, 0.4]])
     if colored:
         rgb = np.array([[1.5, 0.0, 0.1], [-0.5, 1.0, 0.2]])
     np.testing.assert_allclose(g.sh0.numpy()[:, 0], (rgb - 0.5) / C0, rtol=1e-6, atol=1e-6)
-    # 51 of 255 is 0.2; 255 is a quarter of a step below 1
+    # 51 of 255 is 0.2; 255 is read as a quarter of a step below 1
     np.testing.assert_allclose(g.opacities.numpy(), [0.2, 1 - 0.25 / 255], rtol=1e-6)
     first, second = g.quats.double().numpy()
     code = np.sqrt(2.0) * (np.array([[512, 100, 900], [0, 1023, 100]]) / 1023 - 0.5)
@@ -106,7 +106,7 @@ def test_a_handmade_file_is_read(tmp_path, colored, order):
     assert first[0] == pytest.approx(np.sqrt(1 - (code[0] ** 2).sum()), abs=1e-7)
     np.testing.assert_allclose(
         second, [*code[1], 0.0], atol=1e-7
-    )  # z is left out, but the others leave no length for it
+    )  # z is omitted, but the other components have length 1 already
 
 
 @pytest.mark.parametrize("rest", [3, 8, 15])
@@ -128,7 +128,7 @@ def test_sh_bytes_are_stored_channel_by_channel(tmp_path, rest):
 
 
 def matched(scene, back):
-    """Return the given splats in the order of those read back, matched one to one by the nearest mean."""
+    """Return the given splats in the order in which they were read, matched one to one by the nearest mean."""
     _, nearest = cKDTree(scene.gaussians.means.numpy()).query(back.gaussians.means.numpy())
     if len(nearest):
         assert len(set(nearest.tolist())) == len(scene.gaussians)
@@ -142,7 +142,7 @@ def check_values(path, given):
     low, high = np.repeat(bounds[:, 0::2], 256, axis=0), np.repeat(bounds[:, 1::2], 256, axis=0)
     extents = (high - low)[: len(given)].transpose(1, 0, 2)  # position, scale, colour
     steps = np.array([2047, 1023, 2047])
-    rounding = 3e-7  # of a float32, relative
+    rounding = 3e-7  # relative rounding of float32
     for name, extent in (("means", extents[0] / steps), ("log_scales", extents[1] / steps)):
         before, after = (x.tensors()[name].double().numpy() for x in (given, back))
         assert (np.abs(after - before) <= (HALF + rounding) * extent + rounding * np.abs(before)).all(), name
@@ -162,8 +162,8 @@ def check_rotations(before, after):
     assert (after.norm(dim=1) - 1).abs().max() < 1e-6 if len(after) else True
     before = torch.nn.functional.normalize(before.double(), dim=1)
     after = after.double() * torch.sign((before * after).sum(dim=1, keepdim=True))
-    # Three components are rounded to steps of sqrt(2) / 1023. The fourth follows from the unit length; being the
-    # largest, it is off by no more than the three together.
+    # Three components are rounded to steps of sqrt(2) / 1023. The fourth follows from the unit length. Since it is
+    # the largest, its error is at most the sum of the three.
     assert ((after - before).abs() <= 3 * HALF * np.sqrt(2) / 1023 + 1e-6).all()
 
 
@@ -195,7 +195,7 @@ def test_a_second_round_trip_changes_nothing(tmp_path, count):
     np.testing.assert_array_equal(words[:, [0, 2, 3]], words2[:, [0, 2, 3]])
     np.testing.assert_array_equal(sh, sh2)
     np.testing.assert_allclose(bounds, bounds2, atol=1e-6)  # colours pass through f_dc in float32
-    # If the two largest components are nearly equal, the second write may leave out the other one.
+    # If the two largest components are nearly equal, the second write may omit the other one.
     assert np.count_nonzero(words[:, 1] != words2[:, 1]) <= count // 100
     check_rotations(read(first).gaussians.quats, read(second).gaussians.quats)
 
@@ -216,7 +216,7 @@ def order_of(scene, path):
 
 
 def test_splats_are_sorted_along_a_morton_curve(tmp_path):
-    """300 splats in each corner of a cube, shuffled. x varies fastest, then y, then z; a corner keeps its order."""
+    """Each corner of a cube has 300 splats, shuffled. x varies fastest, then y, then z, and a corner keeps its order."""
     corner = np.random.default_rng(0).permutation(np.repeat(np.arange(8), 300))
     means = np.stack([corner & 1, corner >> 1 & 1, corner >> 2], axis=1)
     order = order_of(with_means(means), tmp_path / "a.compressed.ply")
@@ -224,7 +224,7 @@ def test_splats_are_sorted_along_a_morton_curve(tmp_path):
 
 
 def test_chunks_are_tight(tmp_path):
-    """Also in a crowd next to an outlier: the crowd is a single cell of the first curve and is sorted again."""
+    """Next to an outlier, a cluster is a single cell of the curve, and is sorted again by itself."""
     rng = np.random.default_rng(0)
     means = np.concatenate([rng.uniform(0, 1, (8 * 8 * 8 * 256, 3)), [[1e6, 1e6, 1e6]]])
     path = tmp_path / "a.compressed.ply"
@@ -252,7 +252,7 @@ def test_a_sorted_scene_keeps_its_order(tmp_path):
 def test_all_means_in_one_point(tmp_path, count):
     scene, path = with_means(np.full((count, 3), 1234.5678)), tmp_path / "a.compressed.ply"
     write(path, scene)
-    check_values(path, scene.gaussians)  # the order is kept
+    check_values(path, scene.gaussians)  # equal codes keep their order
     np.testing.assert_array_equal(read(path).gaussians.means.numpy(), scene.gaussians.means.numpy())
 
 
@@ -429,7 +429,7 @@ def shared(name):
 
 
 def test_a_file_by_supersplat_matches_its_source_and_ours(tmp_path):
-    """SuperSplat compressed the PLY. Our compressed file of the same PLY has the same numbers."""
+    """SuperSplat compressed a PLY, and our compressed file of this PLY has the same numbers."""
     theirs = shared("plush_dog/point_cloud_29999_clean.compressed.ply")
     original = Scene(load_ply(shared("plush_dog/point_cloud_29999_clean.ply")))
     scene = read(theirs)
@@ -463,7 +463,7 @@ def test_real_files_that_are_not_compressed_are_refused(name):
 
 @pytest.mark.parametrize("near", [2_000, 2_048, 2_050])
 def test_a_far_sky_does_not_coarsen_the_scene(tmp_path, near):
-    """A chunk with splats of both would place the near ones to 600 / 2047 world units at best."""
+    """A chunk with splats of both would round the near ones to 600 / 2047 world units."""
     scene, rng = random_scene(near, rest=0), np.random.default_rng(0)
     away = rng.normal(size=(700, 3))
     away = 300.0 * away / np.linalg.norm(away, axis=1, keepdims=True)

@@ -33,13 +33,13 @@ def test_moving_scene_and_camera_together_keeps_the_image(degree, s):
     move = similarity(degree, s)
     before = image(scene.gaussians, made.camera, jacobian_limit=1.3)
     after = image(move.scene(scene).gaussians, move.camera(made.camera), jacobian_limit=1.3)
-    # float64 throughout: some hundred operations, each within 1e-16 of values of order 1
+    # rounding of some hundred float64 operations on values of order 1
     assert (before - after).abs().max() < 1e-12
     unmoved = image(move.scene(scene).gaussians, made.camera, jacobian_limit=1.3)
-    assert (before - unmoved).abs().max() > 1e-2, "the scene has moved"
+    assert (before - unmoved).abs().max() > 1e-2, "without the camera's motion, the image differs"
 
 
-def test_half_turned_equals_the_similarity():
+def test_a_half_turn_equals_the_similarity():
     made = native_scenes.random(40)
     gaussians = made.gaussians()
     turned = half_turned(gaussians)

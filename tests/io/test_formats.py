@@ -17,7 +17,7 @@ def threads():
 
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 def test_bytes_do_not_depend_on_threads(tmp_path, threads, suffix):
-    """40,000 splats, because torch splits work on more than 32,768 numbers among threads."""
+    """The scene has 40,000 splats, because torch splits work on more than 32,768 numbers among threads."""
     move = Similarity.of_matrix([[0, 0, 1, 0.1], [1, 0, 0, 0.2], [0, 1, 0, 0.3]])
     written = []
     for count in (1, 2):

@@ -1,4 +1,4 @@
-"""Binary glTF: a header of twelve bytes, a chunk of JSON, a chunk of numbers."""
+"""Binary glTF: a header of twelve bytes, a chunk of JSON and a chunk of numbers."""
 
 import json
 import struct
@@ -40,7 +40,7 @@ def parse(path):
     assert kind == b"JSON" and size % 4 == 0
     text = data[20 : 20 + size]
     document = json.loads(text)
-    assert text.rstrip(b" ").endswith(b"}"), "padded with spaces"
+    assert text.rstrip(b" ").endswith(b"}"), "the JSON is padded with spaces"
     if 20 + size == len(data):
         return document, {}
     start = 28 + size
@@ -75,7 +75,7 @@ def test_stored_values_decode_to_the_parameters(tmp_path, rest, count):
     arrays = parse(tmp_path / "new" / "a.glb")[1]
     x, y, z = g.means.numpy().T
     np.testing.assert_array_equal(arrays["POSITION"], np.stack([x, -y, -z], axis=1))
-    # One rounding to float32, 2^-24 of the number, and a margin for NumPy's and torch's own.
+    # One rounding to float32, 2^-24 of the number, and a margin for the roundings of NumPy and torch.
     scales, opacities = torch.exp(g.log_scales.double()), torch.sigmoid(g.logit_opacities.double())
     np.testing.assert_allclose(arrays[PREFIX + "SCALE"], scales.numpy(), rtol=2**-23)
     np.testing.assert_allclose(arrays[PREFIX + "OPACITY"][:, 0], opacities.numpy(), rtol=2**-23)
@@ -85,7 +85,7 @@ def test_stored_values_decode_to_the_parameters(tmp_path, rest, count):
     names = [f"{PREFIX}SH_DEGREE_{d}_COEF_{n}" for d in range(degrees + 1) for n in range(2 * d + 1)]
     assert set(arrays) == {"POSITION", *(PREFIX + name for name in ("ROTATION", "SCALE", "OPACITY")), *names}
 
-    # Ellipsoids and view-dependent colours are those of the scene, turned by half a turn about x.
+    # Ellipsoids and view-dependent colours are those of the scene, rotated by half a turn about x.
     H = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
     covariances = cov3d_t(g.log_scales.double(), g.quats.double())
     turned = cov3d_t(torch.log(torch.tensor(arrays[PREFIX + "SCALE"]).double()), stored[:, [3, 0, 1, 2]])
@@ -131,7 +131,7 @@ def test_the_document_follows_the_extension(tmp_path):
 def test_antialiasing_and_up_are_stored_in_extras(tmp_path, count, facts, extras):
     glb.write(tmp_path / "a.glb", Scene(random_gaussians(count, 0), **facts))
     read = parse(tmp_path / "a.glb")[0]["asset"]["extras"]
-    assert json.dumps(read) == json.dumps(extras), "also without -0.0"
+    assert json.dumps(read) == json.dumps(extras), "no entry is -0.0"
 
 
 def test_an_empty_scene_is_a_file_without_a_mesh(tmp_path):
@@ -248,7 +248,7 @@ def test_unsupported_documents_are_refused(tmp_path, change, message):
     path = tmp_path / "a.glb"
     glb.write(path, Scene(random_gaussians(5, 3)))
     edited(path, lambda document: None)
-    assert len(glb.read(path).gaussians) == 5, "editing alone does no harm"
+    assert len(glb.read(path).gaussians) == 5, "an edited file without a mistake is read"
     edited(path, change)
     with pytest.raises(SceneFormatError, match=message) as caught:
         glb.read(path)

@@ -31,7 +31,7 @@ def random_gaussians(count, rest):
 
 
 def parse(path):
-    """Read the file as a viewer would: by the names in its header."""
+    """Read the file as a viewer does, by the names in its header."""
     header, body = path.read_bytes().split(b"end_header\n", 1)
     lines = header.decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -88,7 +88,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path], "and no temporary file is left"
+    assert list(tmp_path.iterdir()) == [path], "no temporary file is left"
 
 
 def assert_equal(a, b):
@@ -168,7 +168,7 @@ def shuffled_table(gaussians, kind="f4", more=()):
 @pytest.mark.parametrize("kind", ["f4", "f8"])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_any_property_order_byte_order_and_unknown_properties_are_read(tmp_path, form, kind, newline):
-    """ASCII is lossless too: it holds the shortest decimal that reads back as the same number."""
+    """ASCII is lossless too, because it has the shortest decimal that is read back as the same number."""
     gaussians = random_gaussians(6, 8)
     written(tmp_path / "a.ply", shuffled_table(gaussians, kind, more=("segment",)), form, newline)
     assert_equal(gaussians, load_ply(tmp_path / "a.ply"))
@@ -222,7 +222,7 @@ def test_absurd_counts_allocate_nothing(tmp_path, form):
 @pytest.mark.parametrize(("value", "text"), [(np.nan, "nan"), (-np.inf, "-inf"), (1e300, "inf")])
 def test_values_that_are_not_finite_are_named(tmp_path, form, value, text):
     table = shuffled_table(random_gaussians(5, 3), "f8", more=("unused",))
-    table["unused"] = np.nan  # not read
+    table["unused"] = np.nan  # this property is not read
     table["scale_1"][3] = value
     written(tmp_path / "a.ply", table, form)
     assert f"vertex 3: scale_1 is {text} (1 such vertices in all)" in refused(tmp_path / "a.ply")
@@ -327,7 +327,7 @@ def test_antialiasing_and_up_are_kept_in_comments(tmp_path, antialiased, up):
         (["antialiased 0"], False),
         (["gsplat_edu antialiased 1"], True),  # older versions of this package
         (["  SPLATRENDERMODE:  MIP  "], True),
-        (["antialiased 1", "SplatRenderMode: default"], False),  # the last one wins
+        (["antialiased 1", "SplatRenderMode: default"], False),  # the last comment wins
         (["SplatRenderMode: default", "antialiased 1"], True),
         (["SplatRenderMode: 2dgs"], None),
         (["antialiased 2", "antialiased", "antialiased 1 2", "not antialiased 1"], None),
@@ -372,7 +372,7 @@ def test_a_malformed_up_comment_is_refused(tmp_path, up):
 
 
 def test_infinite_logits_become_opaque_or_transparent(tmp_path):
-    """Programs that store opacities in bytes write the logits of 0 and 1."""
+    """Programs that store opacities in bytes write infinite logits for 0 and 1."""
     path = tmp_path / "scene.ply"
     save_ply(path, random_gaussians(3, 0))
     data = bytearray(path.read_bytes())
@@ -389,7 +389,7 @@ def test_infinite_logits_become_opaque_or_transparent(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 3, 6, 7])
-def test_files_of_several_blocks_are_those_of_one(tmp_path, monkeypatch, count):
+def test_writing_in_several_blocks_gives_the_same_file(tmp_path, monkeypatch, count):
     gaussians, origin = random_gaussians(count, 8), (1e6, -2.0, 0.1)
     save_ply(tmp_path / "one.ply", gaussians, origin)
     one = load_ply(tmp_path / "one.ply", origin)
@@ -410,7 +410,8 @@ def test_values_that_are_not_finite_are_counted_over_all_blocks(tmp_path, monkey
 
 
 def test_opening_a_scene_takes_little_more_than_its_parameters(tmp_path):
-    """Blocks of rows, of their columns and of their float64 means come on top; three copies of all would be 140 MiB."""
+    """Besides the parameters, reading holds blocks of rows, of columns and of float64 means; three copies of all
+    would take 140 MiB."""
     save_ply(tmp_path / "large.ply", random_gaussians(200_000, 15))
     rows = tmp_path / "large.ply"
     with pytest.MonkeyPatch.context() as patch:

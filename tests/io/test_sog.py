@@ -37,7 +37,7 @@ def arrays(gaussians):
 
 
 def in_their_order(original, read):
-    """Return the original's splats in the order in which they were read, matched by the nearest mean."""
+    """Return the original splats in the order in which they were read, matched by the nearest mean."""
     nearest = torch.cdist(read.means.double(), original.means.double()).argmin(dim=1)
     assert sorted(nearest.tolist()) == list(range(len(original))), "each splat appears once"
     return original.map(lambda tensor: tensor[nearest])
@@ -51,7 +51,7 @@ def assert_nearest(values, read, entries):
 
 
 def assert_close(original, read, meta):
-    """Check up to 1024 splats: each attribute is off by at most half a step of its quantisation."""
+    """Check that each attribute is off by at most half a step of its quantisation, for up to 1024 splats."""
     a, b = arrays(original), arrays(read)
     # Half of 1/65535 of the range of log(1 + |x|), converted to x by d/dv (e^v - 1) = 1 + |x|, plus float32 rounding.
     width = np.subtract(meta["means"]["maxs"], meta["means"]["mins"])
@@ -69,7 +69,7 @@ def assert_close(original, read, meta):
     assert float(opacities.abs().max()) <= 0.5 / 255 + 1e-6
     assert_nearest(a["log_scales"], b["log_scales"], meta["scales"]["codebook"])
     assert_nearest(a["sh0"], b["sh0"], meta["sh0"]["codebook"])
-    if "shN" in meta:  # the palette holds all of up to 1024 vectors, so only its codebook rounds
+    if "shN" in meta:  # up to 1024 vectors are all in the palette, so only the codebook rounds
         assert_nearest(a["sh_rest"], b["sh_rest"], meta["shN"]["codebook"])
 
 
@@ -78,7 +78,7 @@ def assert_close(original, read, meta):
 def test_a_round_trip_stays_within_half_a_step(tmp_path, count, rest):
     scene = random_scene(count, rest)
     scene.gaussians.means[:, 1] *= 30
-    scene.gaussians.logit_opacities[:20] = -50.0  # transparent pixels keep their colours
+    scene.gaussians.logit_opacities[:20] = -50.0  # WebP keeps the colours of transparent pixels
     sog.write(tmp_path / "new" / "a.sog", scene)
     back = sog.read(tmp_path / "new" / "a.sog")
     meta = json.loads(unzipped(tmp_path / "new" / "a.sog")["meta.json"])
@@ -190,7 +190,7 @@ def test_rotations_are_stored_w_first():
 
 
 def test_splats_are_in_morton_order(tmp_path):
-    """As read, their means are rounded to the written steps, so writing them again changes no order."""
+    """The means that were read are rounded already, so writing them again keeps the order."""
     scene = random_scene(300, 0)
     scene.gaussians.means[:40] = scene.gaussians.means[40:80]
     write_scene(tmp_path / "a.sog", scene)
@@ -203,7 +203,7 @@ def test_splats_are_in_morton_order(tmp_path):
     ("values", "optimum"),
     [
         (np.random.default_rng(0).uniform(0, 1, 200_000), 1 / 256 / math.sqrt(12)),  # equal steps
-        # Panter and Dite, for many entries of a normal density: sqrt(3) pi / 2 / 256^2
+        # Panter and Dite's limit for many entries and a normal density: sqrt(3) pi / 2 / 256^2
         (np.random.default_rng(0).normal(size=200_000), math.sqrt(math.sqrt(3) * math.pi / 2) / 256),
     ],
 )
@@ -223,7 +223,7 @@ def test_codebooks_keep_few_values_exactly():
     heavy = np.concatenate([np.zeros(100_000), np.linspace(1, 2, 400), [1e30]]).astype(np.float32)
     entries = codebook(heavy)
     error = heavy - entries[nearest_in_codebook(heavy, entries)]
-    assert np.abs(error).max() < 1 / 100, "neither the zeros nor the outlier take entries from the rest"
+    assert np.abs(error).max() < 1 / 100, "the other values keep nearly all entries"
 
 
 def test_palettes_keep_few_vectors_exactly():
@@ -241,7 +241,7 @@ def test_palettes_keep_few_vectors_exactly():
 @pytest.mark.parametrize("size", [1e-38, 1.0, 1e36])
 @pytest.mark.parametrize("spread", [0.0, 1.0])
 def test_palettes_beat_a_subset_of_the_vectors(size, spread):
-    """5000 vectors near a 3-dimensional subspace, with unequal weights: 4096 entries cannot hold them all."""
+    """5000 vectors near a 3-dimensional subspace, with unequal weights, are more than the 4096 entries."""
     rng = np.random.default_rng(0)
     vectors = rng.normal(size=(5000, 3)) @ rng.normal(size=(3, 24)) + 0.05 * rng.normal(size=(5000, 24))
     weights = np.exp(spread * rng.normal(size=5000)).astype(np.float32)
@@ -253,7 +253,7 @@ def test_palettes_beat_a_subset_of_the_vectors(size, spread):
 
     kept = vectors[
         np.argsort(-weights, kind="stable")[:4096]
-    ]  # the baseline keeps the heaviest vectors and maps the others to the nearest of them
+    ]  # the baseline keeps the heaviest vectors and maps the others to the nearest of these
     nearest = np.argmin((kept**2).sum(axis=1) - 2 * vectors @ kept.T, axis=1)
     assert loss(entries[labels].astype(np.float64) / size) < 0.8 * loss(kept[nearest])
 
@@ -266,7 +266,7 @@ def test_the_number_of_picks_is_exact_for_any_chances():
         picked = _picked(chances, count)
         assert picked.sum() == count
         if count * chances.max() >= chances.sum() > 0:
-            assert picked[chances.argmax()], "its share is at least one pick"
+            assert picked[chances.argmax()], "a chance of at least one is always picked"
     even = _picked(np.ones(100), 20)
     assert np.diff(np.flatnonzero(even)).tolist() == [5] * 19
 
@@ -302,7 +302,7 @@ def test_scenes_that_a_sog_cannot_hold_are_refused(tmp_path):
     with pytest.raises(ArgumentError, match=r"means\[0, 0\]: is NaN or infinite"):
         sog.write(tmp_path / "a.sog", Scene(random_scene(5).gaussians.map(lambda t: t.double() * 1e300)))
     one = random_scene(1, 0).gaussians
-    many = one.map(lambda t: t.expand(2**26 + 1, *t.shape[1:]))  # takes no memory
+    many = one.map(lambda t: t.expand(2**26 + 1, *t.shape[1:]))  # an expanded tensor takes no memory
     with pytest.raises(ArgumentError, match="are 67,108,865, but a SOG has at most"):
         sog.write(tmp_path / "a.sog", Scene(many))
     assert list(tmp_path.iterdir()) == []
@@ -347,7 +347,7 @@ def shared(name):
 
 @pytest.mark.parametrize(("name", "count"), [("playbot_lod3_0", 31_000), ("playbot_lod6_0", 1_873)])
 def test_a_scene_from_another_program(tmp_path, name, count):
-    """A scene read from a SOG has few distinct values, so writing it again loses only the order."""
+    """A scene read from a SOG has few distinct values, so writing it again changes only the order."""
     scene = sog.read(shared(f"formats/{name}.sog"))
     read = arrays(scene.gaussians)
     assert (len(scene.gaussians), scene.gaussians.sh_degree) == (count, 2)
@@ -370,13 +370,13 @@ def test_axes_match_those_of_a_ply(tmp_path):
     original = load_ply(shared("plush_dog/point_cloud_29999_clean.ply"))
     sog.write(tmp_path / "a.sog", Scene(original))
     back = sog.read(tmp_path / "a.sog").gaussians
-    # 16 bits over a logarithmic range of about 1: an error well below 1e-3.
+    # 16 bits over a logarithmic range of about 1 have an error well below 1e-3.
     distance = torch.cdist(back.means[:500], original.means)
     assert float(distance.min(dim=1).values.max()) < 1e-4
     same = Gaussians.concatenated([original.map(lambda t: t[distance.argmin(dim=1)])])
     turns = quat_to_R_t(same.quats.double()).mT @ quat_to_R_t(back.quats[:500].double())
     assert float(torch.einsum("nii->n", turns).min()) > 2.99
-    # The palette holds half as many vectors as there are splats, and approximates unseen ones coarsely.
+    # The palette has half as many vectors as there are splats, and approximates invisible splats coarsely.
     assert (
         float(torch.corrcoef(torch.stack([same.sh_rest.flatten(), back.sh_rest[:500].flatten()]))[0, 1]) > 0.9
     )

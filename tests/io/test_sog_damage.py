@@ -18,7 +18,7 @@ COUNT = 40
 
 @pytest.fixture(scope="module")
 def contents(tmp_path_factory):
-    """The files of a small scene, by name."""
+    """Return the files of a small scene by name."""
     path = tmp_path_factory.mktemp("sog") / "meta.json"
     sog.write(path, random_scene(COUNT, 3))
     return {file.name: file.read_bytes() for file in sorted(path.parent.iterdir())}
@@ -127,7 +127,7 @@ def test_other_zip_methods_are_refused(tmp_path, contents, method):
 
 
 def test_zip_bombs_are_not_unpacked(tmp_path, contents):
-    """300 MB of zeros in 300 kB, first declared as such, then declared as 100 bytes in both headers of the zip."""
+    """300 kB unpack to 300 MB of zeros, of which both headers of the zip declare all, then only 100 bytes."""
     path = zipped(tmp_path / "a.sog", contents | {"quats.webp": bytes(300 << 20)}, zipfile.ZIP_DEFLATED)
     bomb = path.read_bytes()
 
@@ -151,7 +151,7 @@ def test_the_last_of_two_files_with_the_same_name_is_read(tmp_path, contents):
 
 
 def test_odd_fields_of_a_zip_directory_cause_no_warning(tmp_path, contents):
-    """An empty Unicode path, about which newer versions of Python warn."""
+    """The field is an empty Unicode path, of which newer versions of Python warn."""
     path = tmp_path / "a.sog"
     with zipfile.ZipFile(path, "w") as bundle:
         for name, data in contents.items():
@@ -339,7 +339,7 @@ def test_images_of_other_sizes_are_refused(tmp_path, contents):
 
 @pytest.mark.parametrize("kind", ["lossless", "extended", "lossy"])
 def test_absurd_sizes_are_refused_before_anything_is_decoded(tmp_path, contents, kind):
-    """Each of the three kinds of header declares its largest size."""
+    """Each of the three kinds of WebP header declares the largest size it can."""
     if kind == "lossless":
         data = bytearray(contents["scales.webp"])
         assert data[12:16] == b"VP8L"
@@ -374,7 +374,7 @@ def test_other_images_are_refused(tmp_path, contents):
 
 
 def test_lossy_images_are_read(tmp_path, contents):
-    """Opaque lossy images, and rotations with lossy colour but exact alpha: all three WebP headers are supported."""
+    """Images are lossy, rotations with lossy colour but exact alpha, so all three WebP headers are read."""
     lossy = {
         "means_u.webp": webp(pixels_of(contents["means_u.webp"])[:, :, :3], lossless=False),
         "quats.webp": webp(pixels_of(contents["quats.webp"]), lossless=False, alpha_quality=100),
@@ -387,7 +387,7 @@ def test_lossy_images_are_read(tmp_path, contents):
 
 
 def test_images_may_be_larger_than_the_scene(tmp_path, contents):
-    """Some writers use squares with a power of two as edge. Splats are still stored row by row."""
+    """Some writers use squares whose side is a power of two, in which splats are stored row by row."""
     wide = {}
     for name, data in contents.items():
         if name.endswith(".webp") and name != "shN_centroids.webp":

@@ -34,7 +34,7 @@ def test_a_handmade_file_is_read(tmp_path):
     g = scene.gaussians
     assert (scene.antialiased, scene.up, g.sh_degree, g.sh_rest.shape) == (None, None, 0, (2, 0, 3))
     assert {tensor.dtype for tensor in g.tensors().values()} == {torch.float32}
-    np.testing.assert_array_equal(g.means.numpy(), [[1, 2, 3], [-4, -5, -6]])  # the file's axes are kept
+    np.testing.assert_array_equal(g.means.numpy(), [[1, 2, 3], [-4, -5, -6]])  # axes are those of the file
     np.testing.assert_allclose(g.log_scales.numpy(), [np.log([0.5, 1, 2]), [0, 0, 0]], rtol=1e-6)
     colors = np.array([[1, 0, 0.2], [0, 0.4, 0]])
     np.testing.assert_allclose(g.sh0.numpy()[:, 0], (colors - 0.5) / C0, rtol=1e-5)
@@ -67,9 +67,7 @@ def test_a_round_trip_stays_within_half_a_step(tmp_path, rest, count):
     back = read(path).gaussians
     assert len(back) == count and back.sh_degree == 0
 
-    place = {
-        tuple(mean): i for i, mean in enumerate(scene.gaussians.means.tolist())
-    }  # means are kept to the bit
+    place = {tuple(mean): i for i, mean in enumerate(scene.gaussians.means.tolist())}  # means keep their bits
     order = torch.tensor([place[tuple(mean)] for mean in back.means.tolist()], dtype=torch.int64)
     given = scene.gaussians.map(lambda tensor: tensor[order])
     assert len(set(order.tolist())) == count
@@ -121,7 +119,7 @@ def test_a_second_round_trip_changes_almost_nothing(tmp_path, count):
     for name in ("position", "rgba"):
         np.testing.assert_array_equal(one[name], two[name])
     np.testing.assert_allclose(one["scales"], two["scales"], rtol=1e-6)  # log and exp in float32
-    # Normalised once more: the rounded components have a length within 4 * 1/256 of 1.
+    # The rounded components have a length within 4 * 1/256 of 1 and are normalised again.
     assert np.abs(one["quat"].astype(int) - two["quat"]).max(initial=0) <= 2
 
 

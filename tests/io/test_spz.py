@@ -1,4 +1,4 @@
-"""SPZ against an independent writer in this file, against files from other programs, and with damage."""
+"""SPZ files of an independent writer in this file and of other programs are read, and damaged files are refused."""
 
 import gzip
 import os
@@ -27,7 +27,7 @@ HALF_COLOR = 0.5 / (0.15 * 255)
 HALF_HARMONIC = 0.5 / 128
 HALF_SCALE = 0.5 / 16
 HALF_OPACITY = 0.5 / 255
-ROUNDING = 1e-6  # of float32, small against the steps above
+ROUNDING = 1e-6  # rounding of float32, small relative to the steps above
 
 # The three small components s of a quaternion have steps of 1 / (511 sqrt(2)). An error e of half a step each moves the
 # quaternion by |e| across and by at most (2 |s| |e| + |e|²) / 2c along its largest component c >= 1/2, where
@@ -107,7 +107,7 @@ def test_a_second_round_trip_changes_nothing(tmp_path):
     for name, tensor in once.gaussians.tensors().items():
         if name != "quats":
             assert torch.equal(tensor, twice.gaussians.tensors()[name]), name
-    # If the two largest components are nearly equal, the second write may leave out the other one.
+    # If the two largest components are nearly equal, the second write may omit the other one.
     assert float(angles(once.gaussians.quats, twice.gaussians.quats).max()) <= ANGLE
     before = path.read_bytes()
     spz.write(path, once)
@@ -190,14 +190,14 @@ def test_antialiasing_is_kept_and_up_is_fixed(tmp_path, given, stored):
 
 
 def test_a_half_turned_scene_renders_the_same():
-    """Turned Gaussians in front of the turned camera give the same image, including view-dependent colour."""
+    """Rotated Gaussians in front of the rotated camera give the same image, including view-dependent colour."""
     g = random_scene(40, 15).gaussians.map(torch.Tensor.double)
     camera = Camera.looking_at((1.0, -2.0, -9.0), (0.2, 0.1, 0.0), 30.0, 31.0, 24, 28)
     turn = np.diag((1.0, -1.0, -1.0))
     turned = Camera(camera.R @ turn, turn @ camera.eye, 30.0, 31.0, camera.cx, camera.cy, 24, 28)
     image = render(g, camera, backend="torch").image
     assert float(image.max()) > 0.2
-    # Only the order of float64 rounding differs. A single wrong sign of a degree would cost about 0.1.
+    # Only float64 rounding differs; a wrong sign of a single degree would change the image by about 0.1.
     torch.testing.assert_close(
         render(half_turned(g), turned, backend="torch").image, image, rtol=0, atol=1e-9
     )
@@ -257,7 +257,7 @@ def new_file(g, flags=0, zone=b"", degree_4=False):
     return b"".join([header, zone, *sizes, *packed])
 
 
-# Versions 1 and 2 store x, y, z as bytes: half a step is 1/255 each. w >= 1/2 moves by (2 |s| |e| + |e|²) / 2w.
+# Versions 1 and 2 store x, y, z as bytes, so half a step is 1/255. w >= 1/2 changes by (2 |s| |e| + |e|²) / 2w.
 E2 = np.sqrt(3) / 255
 ANGLE_2 = 2 * np.hypot(E2, np.sqrt(3) * E2 + E2**2)
 
@@ -272,16 +272,16 @@ def test_older_versions(tmp_path, version, rest):
     path.write_bytes(gzip.compress(old_body(version, half_turned(g), flags=1), mtime=0))
     read = spz.read(path)
     assert read.antialiased
-    # float16 has 11 significant bits: half a step of numbers up to 16 is 2^-8.
+    # float16 has 11 significant bits, so half a step of numbers up to 16 is 2^-8.
     assert_close(read.gaussians, g, 2.0**-7 if version == 1 else 2.0**-12, ANGLE if version == 3 else ANGLE_2)
-    path.write_bytes(old_body(version, half_turned(g), flags=1))  # without the gzip
+    path.write_bytes(old_body(version, half_turned(g), flags=1))  # not compressed by gzip
     again = spz.read(path).gaussians
     assert all(torch.equal(t, again.tensors()[name]) for name, t in read.gaussians.tensors().items())
 
 
 def test_nan_and_infinity_are_left_to_the_caller(tmp_path):
     body = bytearray(old_body(1, random_scene(2, 0).gaussians))
-    body[16:20] = b"\x01\x7c\x00\xfc"  # signalling NaN, minus infinity
+    body[16:20] = b"\x01\x7c\x00\xfc"  # a signalling NaN, and minus infinity
     (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(body)))
     assert spz.read(tmp_path / "a.spz").gaussians.finite_rows().tolist() == [False, True]
 
@@ -432,12 +432,12 @@ def test_damage_of_older_versions_is_named(tmp_path, files):
 def bombs():
     zeros = bytes(1 << 24)
     one = random_scene(1, 0).gaussians
-    yield gzip.compress(old_body(3, one) + zeros)  # more than it declares
-    yield gzip.compress(old_body(3, one, flags=2) + zeros)  # as extensions
+    yield gzip.compress(old_body(3, one) + zeros)  # it unpacks to more than it declares
+    yield gzip.compress(old_body(3, one, flags=2) + zeros)  # the bomb is in the extensions
     yield gzip.compress(
         old_body(3, one)[:8] + struct.pack("<IBBBB", 1 << 20, 0, 12, 0, 0) + zeros
-    )  # as much as it declares
-    for declared in (True, False):  # whether the frame declares its size
+    )  # it unpacks to as much as it declares
+    for declared in (True, False):  # the frame may or may not declare its size
         packed = zstandard.ZstdCompressor(write_content_size=declared).compress(zeros)
         data = new_file(one)
         sizes = list(struct.iter_unpack("<QQ", data[32:112]))
@@ -469,7 +469,7 @@ def test_the_same_scene_as_compressed_ply():
     read = spz.read(shared("biker.spz"))
     other = compressed_ply.read(shared("biker.compressed.ply"))
     assert (len(read.gaussians), read.gaussians.sh_degree, read.antialiased) == (152_746, 0, False)
-    there = other.gaussians.log_scales >= -10  # SPZ clamps the rest
+    there = other.gaussians.log_scales >= -10  # SPZ clamps values outside
     assert float(there.float().mean()) > 0.999
     scales = torch.where(there, other.gaussians.log_scales, read.gaussians.log_scales)
     assert_close(read.gaussians, replace(other.gaussians, log_scales=scales), 2.0**-12)
@@ -487,7 +487,7 @@ def test_three_splats_as_ply():
 
 @pytest.mark.parametrize(("name", "z"), [("raw", 1), ("v2", 1), ("v3", -1), ("v4", -1)])
 def test_minimal_files_from_other_programs(name, z):
-    """The four corners of a square, as their writers define them. The first two files have the opposite sign of z."""
+    """The scene is four corners of a square. The first two files' writers use the opposite sign of z."""
     read = spz.read(shared(f"splat_fixtures/minimal-{name}.spz")).gaussians
     assert read.sh_degree == 0
     assert read.means.tolist() == [[-1, 0, z], [0, 0, z], [-1, 0, 0], [0, 0, 0]]

@@ -1,4 +1,4 @@
-"""Events survive their file, whatever they hold, and readers survive damaged files."""
+"""Events of any content are read back from their file, and damaged files do not break readers."""
 
 import math
 import os
@@ -29,7 +29,7 @@ ALL = [
 
 
 @pytest.mark.parametrize("event", ALL, ids=lambda event: type(event).__name__)
-def test_an_event_survives_its_line(event):
+def test_an_event_is_read_back_from_its_line(event):
     line = events.line_of(event, 5.25)
     assert line.count("\n") == 1 and line.isascii()
     assert events.parse_line(line) == (5.25, event)
@@ -39,7 +39,7 @@ def test_every_kind_is_tested():
     assert {type(event) for event in ALL} == set(events.KINDS.values())
 
 
-def test_a_figure_that_json_lacks_is_null():
+def test_numbers_that_json_lacks_become_null():
     line = events.line_of(events.Metric("psnr", math.nan), 0.0)
     assert events.parse_line(line)[1] == events.Metric("psnr", None)
 
@@ -58,12 +58,12 @@ def test_a_figure_that_json_lacks_is_null():
         '{"event":"diagnosed","time":1,"facts":[["a"]],"fine":[],"advice":[]}',
     ],
 )
-def test_other_lines_are_refused(line):
+def test_lines_that_are_no_events_are_refused(line):
     with pytest.raises(ValueError):
         events.parse_line(line)
 
 
-def test_a_reader_sees_whole_lines_once(tmp_path):
+def test_a_reader_returns_each_complete_line_once(tmp_path):
     path = tmp_path / "events.jsonl"
     follower = Follower(path)
     assert follower.read() == []
@@ -92,7 +92,7 @@ def test_a_line_without_an_end_is_bounded(tmp_path, monkeypatch):
     assert events_after(path) == []
 
 
-def test_the_last_word_is_that_of_the_last_process(tmp_path):
+def test_the_result_is_that_of_the_last_process(tmp_path):
     path = tmp_path / "events.jsonl"
     assert last_word(path) is None and last_stage(path) == ""
     done, begun, stage = events.Finished(("x",)), events.Started(1, ""), events.Progress("photos", 1)
@@ -100,12 +100,12 @@ def test_the_last_word_is_that_of_the_last_process(tmp_path):
     assert last_word(path) == done
     path.write_text("".join(events.line_of(event, 0.0) for event in (begun, done, begun, stage)))
     assert last_word(path) is None and last_stage(path) == "photos"
-    long = events.Failed("x" * 10_000, 2)  # longer than the part that is read at first
+    long = events.Failed("x" * 10_000, 2)  # longer than the block that is read first
     path.write_text("".join(events.line_of(event, 0.0) for event in (begun, long)))
     assert last_word(path) == long
 
 
-def test_an_emitter_thins_progress_out_and_keeps_its_end(tmp_path):
+def test_an_emitter_drops_frequent_progress_but_not_the_last(tmp_path):
     path = tmp_path / "events.jsonl"
     made = Emitter(path)
     for done in range(1000):
@@ -116,7 +116,7 @@ def test_an_emitter_thins_progress_out_and_keeps_its_end(tmp_path):
     found = [event for _, _, event in events_after(path)]
     assert found[0] == events.Stage("training")
     assert found[-2:] == [events.Progress("training", 1000, 1000, 2.0), events.Finished((str(tmp_path),))]
-    assert len(found) < 20  # a thousand steps take a few ms; half a second lies between two events
+    assert len(found) < 20  # a thousand steps take a few ms, and events are at least half a second apart
 
 
 def test_a_full_disk_does_not_end_the_command(capsys):
@@ -128,13 +128,13 @@ def test_a_full_disk_does_not_end_the_command(capsys):
     )
 
 
-def test_nothing_is_written_outside_of_a_job(monkeypatch):
+def test_no_events_are_written_outside_a_job(monkeypatch):
     monkeypatch.delenv(events.EVENTS, raising=False)
     emitter.start_reporting()
     emitter.progress("a", 1, 2, lambda: pytest.fail("the forecast was computed for nobody"))
 
 
-def test_a_process_is_known_by_its_start(tmp_path):
+def test_a_process_is_identified_by_its_start_time(tmp_path):
     known = identity(os.getpid())
     assert known and is_running(os.getpid(), known)
     assert not is_running(os.getpid(), known + "1") and not is_running(os.getpid(), "")
@@ -142,5 +142,5 @@ def test_a_process_is_known_by_its_start(tmp_path):
     if child == 0:
         os._exit(0)
     os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
-    assert identity(child) is None  # it has ended, although its number is still taken
+    assert identity(child) is None  # the process has ended, although its number is still in use
     os.waitpid(child, 0)

@@ -1,4 +1,4 @@
-"""The queue runs real processes: small programs that write events as commands do."""
+"""The queue runs processes: small programs that write events as commands do."""
 
 import itertools
 import json
@@ -48,7 +48,7 @@ emit("finished", outputs=[sys.argv[2]])
 
 
 def asked(*words, reads=(), writes=()):
-    """Work that is a command line already."""
+    """Return work whose command line is given."""
     return Work(words[0], tuple(reads), tuple(writes), {"words": list(words[1:])})
 
 
@@ -61,7 +61,7 @@ def render(work, purpose):
 
 @pytest.fixture
 def opened(tmp_path):
-    """Open queues on one folder; they are closed at the end, and their processes ended."""
+    """Return a function that opens queues on one folder; at the end they are closed and their processes are killed."""
     made = []
 
     def open_queue(**options):
@@ -81,7 +81,7 @@ def opened(tmp_path):
 def until(condition, patience=20.0):
     end = time.monotonic() + patience
     while not condition():
-        assert time.monotonic() < end, "it did not happen"
+        assert time.monotonic() < end, "the awaited state did not occur"
         time.sleep(0.02)
 
 
@@ -91,7 +91,7 @@ def reached(queue, name, *states):
 
 
 def abandon(queue):
-    """End a queue as kill -9 would: nothing is written any more, and its processes run on."""
+    """Abandon a queue as kill -9 would: it writes nothing more, and its processes keep running."""
     queue._closed.set()
     queue._thread.join()
 
@@ -119,7 +119,7 @@ def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_pat
         queue.get(first.id)
 
 
-def test_two_run_at_once_if_told_so(opened, tmp_path):
+def test_two_jobs_run_at_once_if_the_queue_allows_it(opened, tmp_path):
     queue = opened(at_once=2)
     jobs = [queue.submit(asked("run", str(tmp_path / name), "waits")) for name in "abc"]
     for job in jobs[:2]:
@@ -147,7 +147,7 @@ def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
     assert not (tmp_path / "b.ran").exists()
 
 
-def test_a_job_that_does_not_listen_is_killed(opened, tmp_path):
+def test_a_job_that_ignores_its_interrupt_is_killed(opened, tmp_path):
     queue = opened(patience={"interrupt": 0.2, "terminate": 0.2})
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits", "stubborn"))
     until((tmp_path / "a.ran").exists)
@@ -155,7 +155,7 @@ def test_a_job_that_does_not_listen_is_killed(opened, tmp_path):
     assert reached(queue, job.id, State.CANCELLED).line == "it was ended"
 
 
-def test_a_paused_job_stands_still(opened, tmp_path):
+def test_a_paused_job_makes_no_progress(opened, tmp_path):
     queue = opened()
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     with pytest.raises(ArgumentError):
@@ -172,7 +172,7 @@ def test_a_paused_job_stands_still(opened, tmp_path):
     queue.resume(job.id)
     until(lambda: events.stat().st_size > size)
     queue.pause(job.id)
-    queue.cancel(job.id)  # a stopped process has to be continued to hear it
+    queue.cancel(job.id)  # a stopped process handles signals only once it is continued
     reached(queue, job.id, State.CANCELLED)
 
 
@@ -189,7 +189,7 @@ def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_pat
     found = opened()
     assert found.get(job.id).state is State.RUNNING and found.get(after.id).state is State.HELD
     (tmp_path / "a").touch()
-    os.waitpid(found.get(job.id).pid, 0)  # an orphan's process is waited for by init
+    os.waitpid(found.get(job.id).pid, 0)  # init waits for an orphaned process
     assert reached(found, job.id, State.DONE).attempts == 1
     assert found.get(after.id).state is State.HELD and not (tmp_path / "b.ran").exists()
     found.resume(after.id)
@@ -197,7 +197,7 @@ def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_pat
     assert (tmp_path / "a.ran").read_text().count("\n") == 1
 
 
-def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
+def test_a_job_that_ended_without_a_queue_is_not_run_again(opened, tmp_path):
     queue = opened()
     done, killed = (queue.submit(asked("run", str(tmp_path / name), "waits")) for name in "ab")
     until((tmp_path / "a.ran").exists)
@@ -206,7 +206,7 @@ def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
     os.waitpid(queue.get(done.id).pid, 0)
     folder = JobFolder(
         queue.folder / killed.id
-    )  # as if it had been running when the computer was switched off
+    )  # the record of a job that ran when the computer was switched off
     folder.write(
         Job(**{**vars(queue.get(killed.id)), "state": State.RUNNING, "pid": 2, "identity": "other boot"})
     )
@@ -233,7 +233,7 @@ def test_a_queue_killed_before_it_noted_the_process_finds_it_by_its_first_event(
     assert opened().get(job.id).pid == pid
 
 
-def test_closing_interrupts_what_runs_and_keeps_what_waits(opened, tmp_path):
+def test_closing_interrupts_running_jobs_and_keeps_waiting_ones(opened, tmp_path):
     queue = opened()
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     waiting = queue.submit(asked("run", str(tmp_path / "b"), "waits"))
@@ -262,7 +262,7 @@ def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path, monkey
     shutil.copytree(queue.folder / kept[1].id, queue.folder / "000077")
     found = opened()
     assert len(found.damaged) == 2 and all(line.count("\n") == 0 for line in found.damaged.values())
-    assert found.submit(asked("run", str(tmp_path / "e"))).id == "000078"  # no id is used twice
+    assert found.submit(asked("run", str(tmp_path / "e"))).id == "000078"  # ids are never reused
 
 
 def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch):
@@ -284,7 +284,7 @@ def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch)
     assert (tmp_path / "a.ran").read_text().count("\n") == 1
 
 
-def test_jobs_name_a_place_by_its_new_name(opened, tmp_path):
+def test_jobs_follow_a_renamed_place(opened, tmp_path):
     queue = opened()
     place, other = tmp_path / "runs" / "a", tmp_path / "runs" / "ab"
     place.mkdir(parents=True)
@@ -303,7 +303,7 @@ def test_jobs_name_a_place_by_its_new_name(opened, tmp_path):
     now = queue.get(job.id)
     assert now.work == Work("run", ("captures/a",), ("runs/b/x",), {"words": ["fails"]})
     assert now.argv == ("run", str(moved / "x"), "fails")
-    assert queue.get(near.id) == before  # a name that begins alike is another place
+    assert queue.get(near.id) == before  # a place whose name has the same beginning is another place
     assert JobFolder(queue.folder / job.id).read(in_place) == now
 
     def refused():
@@ -347,13 +347,13 @@ def test_a_writer_waits_for_readers_and_readers_for_a_writer(opened, tmp_path):
         return queue.submit(asked("run", str(tmp_path / name), "waits", **places)).id
 
     readers = [add(name, reads=["runs/a"], writes=[f"scenes/{name}"]) for name in ("r1", "r2")]
-    started(tmp_path, "r1", "r2")  # readers run together
+    started(tmp_path, "r1", "r2")  # readers run at the same time
     writer = add("w", reads=["captures/a"], writes=["runs/a"])
     late = add("r3", reads=["runs/a"])
     apart = add("o", reads=["runs/ab"], writes=["runs/a/exports/x"])
-    started(tmp_path, "o")  # a job of other places passes them
+    started(tmp_path, "o")  # a job of other places overtakes them
     assert queue.get(writer).waits_for == tuple((name, "runs/a") for name in readers)
-    assert queue.get(late).waits_for == ((writer, "runs/a"),)  # it may not pass the writer
+    assert queue.get(late).waits_for == ((writer, "runs/a"),)  # this reader may not overtake the writer
     (tmp_path / "r1").touch()
     until(lambda: queue.get(writer).waits_for == ((readers[1], "runs/a"),))
     assert queue.get(writer).state is queue.get(late).state is State.QUEUED
@@ -368,7 +368,7 @@ def test_a_writer_waits_for_readers_and_readers_for_a_writer(opened, tmp_path):
     assert queue.get(apart).state is State.RUNNING and queue.get(late).waits_for == ()
 
 
-def test_a_job_that_is_resumed_waits_behind_those_that_came_meanwhile(opened, tmp_path):
+def test_a_resumed_job_waits_for_jobs_added_before_it_was_resumed(opened, tmp_path):
     queue = opened(at_once=4)
     work = {name: asked("run", str(tmp_path / name), "waits", writes=["runs/a"]) for name in "abc"}
     jobs = {name: queue.submit(work[name]).id for name in "abc"}
@@ -382,7 +382,7 @@ def test_a_job_that_is_resumed_waits_behind_those_that_came_meanwhile(opened, tm
     started(tmp_path, "b")
 
 
-def test_a_job_found_running_still_keeps_others_from_its_place(opened, tmp_path):
+def test_a_job_of_a_killed_queue_keeps_its_place_locked(opened, tmp_path):
     queue = opened()
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits", writes=["runs/a"]))
     started(tmp_path, "a")
@@ -395,7 +395,7 @@ def test_a_job_found_running_still_keeps_others_from_its_place(opened, tmp_path)
     reached(found, late.id, State.DONE)
 
 
-def test_two_names_of_a_place_are_one(opened, tmp_path):
+def test_two_paths_of_one_place_exclude_each_other(opened, tmp_path):
     queue = opened(at_once=2, identify=str.lower)
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits", writes=["runs/A"]))
     late = queue.submit(asked("run", str(tmp_path / "b"), reads=["runs/a"]))
@@ -406,7 +406,7 @@ def test_two_names_of_a_place_are_one(opened, tmp_path):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_random_jobs_all_end_and_never_collide(opened, tmp_path, seed):
-    """Each program notes when it began and ended; no writer of a place overlaps another job of it."""
+    """Each program records when it starts and ends. No writer of a place overlaps with another job of that place."""
     random, queue = np.random.default_rng(seed), opened(at_once=3)
     begun, ended, works = {}, {}, {}
 
@@ -424,7 +424,7 @@ def test_random_jobs_all_end_and_never_collide(opened, tmp_path, seed):
     until(lambda: len(ended) == len(works), 60)
     for one, other in itertools.combinations(works, 2):
         if collision(works[one], works[other], str):
-            assert ended[one] < begun[other]  # and they keep their order
+            assert ended[one] < begun[other]  # jobs of one place keep their order
 
 
 def test_a_process_proves_by_its_environment_that_a_job_started_it():

@@ -1,4 +1,4 @@
-"""Put benchmarks/, where the ladder lives, on the import path, and skip without a C++ compiler."""
+"""Put benchmarks/, which contains the ladder, on the import path; skip without a C++ compiler."""
 
 import os
 import shutil

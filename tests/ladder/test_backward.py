@@ -1,4 +1,4 @@
-"""The backward rungs against autograd in float64, and slots on other threads and in other orders."""
+"""The backward rungs agree with autograd in float64, and slots give the same bits for any threads and order."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def dense(cloud, g):
 def bounds(cloud, g, parts):
     """Bound the float32 error by n eps of a pixel's light over 1 - alpha in each h, with a factor of 4.
 
-    A pixel's R starts at no more than sum_k |g_k| times the light that its n splats take, since colours are at most 1.
+    Colours are at most 1, so a pixel's R starts at no more than sum_k |g_k| times the light that its n splats take.
     Each of n subtractions loses at most half an eps of that, and dL/dalpha contains R / (1 - alpha). The factor of 4
     covers T and the sums over pixels.
     """
@@ -53,7 +53,7 @@ def bounds(cloud, g, parts):
         dim=1,
     )
     conics = torch.stack([moment(dx * dx) / 2, moment(dx * dy), moment(dy * dy) / 2], dim=1)
-    # Of w g: each weight is a product of at most `layers` factors, and the pixels of its tiles are summed.
+    # In w g, each weight is a product of at most `layers` factors, and the pixels of its tiles are summed.
     colors = 4 * layers * EPS * (T[:-1] * alphas / (1 - alphas) * strength).sum((1, 2))
     return (
         means,
@@ -64,7 +64,7 @@ def bounds(cloud, g, parts):
 
 
 def assert_clear_of_edges(parts):
-    """Check that no alpha is so near the floor or the clamp that float32 falls on the other side."""
+    """Check that no alpha is so near the floor or the clamp that float32 and float64 are on different sides."""
     raw = parts[0]
     assert all(((raw / edge - 1).abs() > 20 * EPS).all() for edge in (ALPHA_MIN, ALPHA_MAX))
 
@@ -83,7 +83,7 @@ def assert_no_tile_stops(cloud, T):
 @pytest.mark.sliced(3)
 def test_a_rung_agrees_with_autograd(rung, opaque, threads):
     cloud = splats.scene(220, 52, seed=3, stretch=3.0)._replace(W=45)  # tiles are cut on the right and below
-    if opaque:  # clamped: light behind such a splat is a difference of nearly equal numbers
+    if opaque:  # clamped opacities, behind which light is a difference of nearly equal numbers
         cloud.opacities[::4] = 1.0
     g = weights(cloud)
     reference, parts = dense(cloud, g)
@@ -96,7 +96,7 @@ def test_a_rung_agrees_with_autograd(rung, opaque, threads):
     ):
         error = (torch.tensor(mine).double() - theirs).abs()
         assert (error <= bound).all(), f"{name}: {float((error / bound).max()):.2f} of the bound"
-        # The bound is tight enough to reveal a wrong formula.
+        # A wrong formula would exceed the bound.
         assert (theirs.abs() > 100 * bound).double().mean() > 0.2, name
 
 
@@ -112,7 +112,7 @@ def test_slots_give_the_same_bits_for_any_threads_and_order():
 
 
 def test_atomic_sums_depend_on_the_order_of_the_tiles():
-    """This is deterministic: one thread adds the same numbers in two orders."""
+    """One thread adds the same numbers in two orders, so the test is deterministic."""
     cloud = splats.scene(3000, 128, seed=5)
     g, image = weights(cloud), forward.tight(cloud).image
     tiles = np.arange(backward.num_tiles(cloud))
@@ -121,7 +121,7 @@ def test_atomic_sums_depend_on_the_order_of_the_tiles():
 
 
 def test_splats_behind_a_stopped_tile_get_no_gradient():
-    """The replay ends where the forward pass stopped."""
+    """The backward pass ends at the splat at which the forward pass stopped."""
     cloud = splats.scene(40, 16, seed=7)
     wide = np.array([[1e-6, 0.0, 1e-6]] * 40, np.float32)
     cloud = cloud._replace(conics=wide, opacities=np.full(40, 0.9, np.float32))

@@ -23,7 +23,7 @@ TILED = [rung for rung in ORACLES if rung != "naive"]
 
 
 def odd(count: int, seed: int, stretch: float) -> Splats:
-    """Return a scene whose sides are not multiples of a tile, with splats on and beyond its edges."""
+    """Return a scene of an image whose sides are not multiples of a tile, with splats on and beyond its edges."""
     return scene(count, 45, seed, stretch)._replace(H=37)
 
 
@@ -32,7 +32,7 @@ def check(rung: str, splats: Splats) -> None:
     image, T = oracle(splats, **ORACLES[rung])
     image_bound, T_bound = tolerance(splats, conics_again=rung == "package")
     assert image_bound.max() < 1e-2 and np.median(image_bound) < 1e-4, (
-        "the bound is tight enough to mean something"
+        "a wrong formula would exceed the bound"
     )
     assert (np.abs(rendered.image - image) <= image_bound).all()
     assert (np.abs(rendered.transmittance - T) <= T_bound).all()
@@ -67,7 +67,7 @@ def test_splats_off_the_screen_and_below_the_floor_draw_nothing(rung):
 
 @pytest.mark.parametrize("rung", TILED)
 def test_a_dark_tile_stops(rung):
-    """Eight opaque splats darken every pixel. The one behind them is in the tiles' lists but is not drawn."""
+    """Eight opaque splats darken every pixel. A splat behind them is in the tiles' lists but not drawn."""
     wide = np.tile(1e4 * np.eye(2), (9, 1, 1))
     colors = np.repeat([[1.0, 0, 0], [0, 1.0, 0]], [8, 1], axis=0)
     splats = from_cov2d(np.full((9, 2), 20.0), wide, colors, np.full(9, 0.95), (37, 45))
@@ -85,7 +85,7 @@ def test_the_counts_of_the_naive_rung_are_exact():
     dx, dy = (p[..., None] - splats.means2d[:, k].astype(float) for k, p in enumerate((x, y)))
     A, B, C = splats.conics.astype(float).T
     alpha = splats.opacities * np.exp(-0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy)
-    assert np.abs(alpha / ALPHA_MIN - 1).min() > 1e-5, "rounding decides no alpha"
+    assert np.abs(alpha / ALPHA_MIN - 1).min() > 1e-5, "no alpha is so near the floor that rounding decides"
     counts = forward.naive(splats).counts
     assert counts.pairs == 0
     assert counts.evaluated == 200 * 37 * 45
@@ -111,7 +111,7 @@ def test_projected_splats_match_the_reference_renderer():
     means, cov3ds, colors, opacities = sphere_shell()
     splats = projected(camera, means, cov3ds, colors, opacities)
     expected, _ = render_gaussians(camera, means, cov3ds, colors, opacities, extent="exact", stop="none")
-    # Rounding a mean at 45 px to float32 moves it by 2e-6 px and an alpha by less, except by 1/255 at the floor.
+    # Rounding a mean at 45 px to float32 moves it by 2e-6 px, and alpha by less, or by 1/255 at the floor.
     difference = np.abs(oracle(splats)[0] - expected)
     assert np.median(difference) < 1e-5 and difference.max() < 2 * ALPHA_MIN
 

@@ -1,4 +1,4 @@
-"""The dense torch renderer against the NumPy one, in float64."""
+"""The dense torch renderer and the NumPy renderer agree in float64."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_spherical_harmonics(degree):
 
 
 def test_camera_8_of_the_chapter():
-    """The differences are inherent in the two renderers: the box cuts off tails that the dense renderer keeps."""
+    """The NumPy renderer's box cuts off tails that the dense renderer keeps, so the images differ a little."""
     cam, shell = sphere_cameras(128)[8], sphere_shell()
     dense = render_t(*tensors(*shell), cam)
     boxed, _ = render_gaussians(cam, *shell)
@@ -113,4 +113,4 @@ def test_float32_stays_within_rounding(random_splats, random_camera):
     bound = (error * drawn).sum(axis=0) + near_floor.sum(axis=0) / 255
     difference = (single.double() - double).abs().numpy().max(axis=-1)
     assert (difference <= bound).all()
-    assert np.median(bound) < 2e-3, "the bound is far below the error of a wrong formula"
+    assert np.median(bound) < 2e-3, "a wrong formula would exceed the bound"

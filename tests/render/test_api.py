@@ -1,4 +1,4 @@
-"""render() with raw parameters against a manual chain of the NumPy functions."""
+"""render() with raw parameters equals a chain of the NumPy functions."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def scene(count=30, rest=15, dtype=torch.float64) -> Gaussians:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_image_matches_the_reference(random_camera, degree):
-    """Colours depend on the direction from the camera to the mean; the image matches the oracle up to rounding."""
+    """Colours follow from the direction from the camera to the mean. The image matches the reference up to rounding."""
     gaussians = scene()
     raw = {name: tensor.numpy() for name, tensor in gaussians.tensors().items()}
     toward = raw["means"] - random_camera.eye

@@ -1,4 +1,4 @@
-"""Alpha, depths and normals against the reference; tests/native/test_map_gradients.py checks their gradients."""
+"""Alpha, depths and normals equal the reference's; tests/native/test_map_gradients.py checks their gradients."""
 
 import dataclasses
 
@@ -48,7 +48,7 @@ def test_depths_and_alpha_are_those_of_the_reference(name, backend):
     np.testing.assert_allclose(found["alpha"], alpha, **bound)
     np.testing.assert_allclose(found["expected-depth"], expected, **bound)
     safe = np.where(alpha > 0, alpha, 1)
-    # Relative to alpha: where it is near 1/255, the quotient has as many digits fewer.
+    # The quotient by alpha loses digits where alpha is near 1/255, so the bound is relative to alpha.
     np.testing.assert_allclose(found["depth"], np.where(alpha > 0, expected / safe, 0), rtol=0, atol=1e-6)
     crossed = (left < 0.5).any(axis=0)
     median = np.where(crossed, depths[(left < 0.5).argmax(axis=0)], 0.0)
@@ -60,7 +60,7 @@ def test_depths_and_alpha_are_those_of_the_reference(name, backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_wall_has_its_depth_and_its_normal(backend):
-    """Flat Gaussians in the plane z = 0 before a camera on the z axis, from either side."""
+    """A camera on the z axis looks at flat Gaussians in the plane z = 0, from either side."""
     rng = np.random.default_rng(0)
     base = random(60, (33, 25))
     wall = dataclasses.replace(

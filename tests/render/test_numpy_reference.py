@@ -1,15 +1,15 @@
-"""The NumPy oracle against an independent implementation of its formulas, pixel by pixel."""
+"""The NumPy reference equals an independent implementation of its formulas, pixel by pixel."""
 
 import numpy as np
 import pytest
 
 from gsplat_edu import Camera, project_cov3d, render_gaussians, sphere_shell
 
-TIGHT = {"rtol": 0, "atol": 1e-13}  # a few hundred float64 operations on numbers of order 1
+TIGHT = {"rtol": 0, "atol": 1e-13}  # rounding of a few hundred float64 operations on numbers of order 1
 
 
 def by_the_book(cam, means, cov3ds, colors, opacities, bg=(0.0, 0.0, 0.0), tile=None):
-    """Composite pixel by pixel; with `tile`, leave a tile once all its pixels are below 1e-4."""
+    """Composite pixel by pixel. With `tile`, stop a tile once the transmittance of all its pixels is below 1e-4."""
     means_cam = cam.world_to_cam(means)
     order = [i for i in np.argsort(means_cam[:, 2], kind="stable") if means_cam[i, 2] > 0.05]
     u, v, _ = cam.project(means_cam)
@@ -50,13 +50,13 @@ def test_tile_stop_follows_the_loop_over_tiles(random_splats, random_camera):
     np.testing.assert_allclose(image, expected, **TIGHT)
     np.testing.assert_allclose(T, expected_T, rtol=1e-12, atol=0)
     _, unstopped = render_gaussians(random_camera, *splats, extent="exact", stop="none")
-    assert (unstopped < T).any(), "some tile did stop"
-    assert T[unstopped < T].max() < 1e-4, "the stop affects only invisible light"
+    assert (unstopped < T).any(), "a tile stops early"
+    assert T[unstopped < T].max() < 1e-4, "the stop changes pixels by less than their remaining transmittance"
 
 
 @pytest.fixture
 def wide_splat():
-    """One splat slightly off a pixel centre, so wide that its 3-sigma box cuts it off where alpha is still 0.01."""
+    """A splat near a pixel centre, so wide that alpha is still 0.01 at the edge of its 3-sigma box."""
     cam = Camera(np.eye(3), (0, 0, 0), fx=100, fy=100, cx=50.25, cy=44.5, H=90, W=100)
     return cam, ([[0, 0, 10]], [np.diag([0.987, 0.597, 0.01])], [[1, 1, 1]], [1.0])
 
@@ -104,14 +104,14 @@ def test_box_stop_skips_hidden_splats():
 
 
 def test_box_stop_draws_a_splat_that_shows_beside_the_walls():
-    """The walls hide columns 2 to 6 of a splat whose box spans columns 0 to 17: it is drawn, its hidden part too."""
+    """The walls hide columns 2 to 6 of a splat whose box spans columns 0 to 17, so all of the splat is drawn."""
     cam = Camera(np.eye(3), (0, 0, 0), fx=100, fy=100, cx=15.5, cy=15.5, H=32, W=32)
     means = [[z * (column - 15.5) / 100, 0, z] for column, z in ((4, 1), (4, 2), (4, 3), (8, 4))]
     cov3ds = [np.diag([(0.03 * z) ** 2, 1e4, 1e-6]) for z in (1, 2, 3)] + [np.diag([0.12**2, 0.12**2, 1e-6])]
     splats = means, cov3ds, [[0, 0, 0]] * 3 + [[1, 1, 1]], [1.0] * 4
     stopped, T = render_gaussians(cam, *splats, stop="box")
     drawn, _ = render_gaussians(cam, *splats, stop="none")
-    assert T[16, 4] < 1e-4 and T[16, 14] > 0.1, "hidden, and beside the walls"
+    assert T[16, 4] < 1e-4 and T[16, 14] > 0.1, "behind the walls, and beside them"
     assert 0 < drawn[16, 4].max() < 1e-4
     np.testing.assert_array_equal(stopped, drawn)
 
@@ -151,7 +151,7 @@ def test_the_image_is_not_clipped():
 
 
 def test_the_sphere_is_round_and_coloured_by_position():
-    """The camera looks along +z from z = -3: the right of the image is +x (red), the bottom is +y (green)."""
+    """The camera looks along +z from z = -3, so +x (red) is right in the image and +y (green) is down."""
     cam = Camera.looking_at((0, 0, -3), (0, 0, 0), 75, 75, 64, 64)
     image, T = render_gaussians(cam, *sphere_shell())
     rows, columns = np.nonzero(T < 0.5)

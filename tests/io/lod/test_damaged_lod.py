@@ -1,4 +1,4 @@
-"""Damaged streamed SOGs: one clear line each."""
+"""Each damaged streamed SOG is refused in one clear line."""
 
 import json
 import shutil
@@ -143,7 +143,7 @@ def test_missing_and_changed_files_are_named(copy):
 
 
 def test_coarser_levels_may_be_missing(copy):
-    """Only the finest level is read."""
+    """Reading needs the finest level only."""
     shutil.rmtree(copy.parent / "1_0")
     assert len(read_scene(copy).gaussians) == 120
 

@@ -1,4 +1,4 @@
-"""Pairs of Gaussians become one, and keep their moments."""
+"""Pairs of Gaussians are merged into one that keeps their moments."""
 
 import math
 
@@ -12,7 +12,7 @@ from scene_files import random_scene
 
 
 def moments(blobs):
-    """Total weight; weighted sums of means, second moments about zero, and coefficients."""
+    """Return the total weight, and weighted sums of means, second moments about zero, and coefficients."""
     m = blobs.weights
     seconds = blobs.covariances + blobs.means[:, :, None] * blobs.means[:, None, :]
     return (
@@ -24,7 +24,7 @@ def moments(blobs):
 
 
 def lattice(side, gap=1.0, opacity=0.1, rest=3):
-    """Return flat splats of size 0.1 to 0.2 on a lattice: apart enough that none overlap."""
+    """Return flat splats of size 0.1 to 0.2 on a lattice so wide that none overlap."""
     generator = torch.Generator().manual_seed(0)
     axis = torch.arange(side, dtype=torch.float32)
     means = gap * torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)
@@ -49,14 +49,14 @@ def test_areas_are_those_of_the_three_projections():
 
 
 def test_a_pair_keeps_its_moments():
-    """Written out for each pair: weights 2 and 1 to 3, in plain sums over the mixture of the two."""
+    """The test computes the moments of each mixture of two splats itself."""
     a, b = blobs_of(random_scene(40, 3, seed=1).gaussians), blobs_of(random_scene(40, 3, seed=2).gaussians)
     merged = merged_pairs(a, b)
     for i in range(40):
         m = a.weights[i], b.weights[i]
         mu = (m[0] * a.means[i] + m[1] * b.means[i]) / sum(m)
         np.testing.assert_allclose(merged.means[i], mu, rtol=1e-12)
-        # E[x x'] of the mixture is that of the merged one
+        # E[x x'] of the mixture equals that of the merged Gaussian
         second = sum(
             w * (one.covariances[i] + np.outer(one.means[i], one.means[i]))
             for w, one in zip(m, (a, b), strict=True)
@@ -67,7 +67,7 @@ def test_a_pair_keeps_its_moments():
         assert merged.opacities[i] == pytest.approx(min(sum(m) / merged.areas[i], o), rel=1e-12)
 
 
-def test_two_copies_become_one_that_covers_like_both_on_top_of_each_other():
+def test_merging_two_copies_gives_the_opacity_of_both_composited():
     one = random_scene(1).gaussians
     twice = Gaussians.concatenated([one, one])
     merged, owners = halved(twice)
@@ -80,17 +80,19 @@ def test_two_copies_become_one_that_covers_like_both_on_top_of_each_other():
 
 
 def test_a_scene_keeps_its_total_moments():
-    """Splats that do not overlap: the bound on opacity never holds, so weights add up in every merge."""
+    """The splats do not overlap, so no merge reaches the bound on opacity, and weights add up."""
     gaussians = lattice(6)
     merged, _ = halved(gaussians)
     before, after = moments(blobs_of(gaussians)), moments(blobs_of(merged))
     assert len(merged) == 108
     for a, b in zip(before, after, strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-5, atol=1e-6 * before[0])  # float32 of the parameters
+        np.testing.assert_allclose(
+            b, a, rtol=1e-5, atol=1e-6 * before[0]
+        )  # rounding of the parameters to float32
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 10, 501])
-def test_half_is_left_and_every_splat_has_an_owner(count):
+def test_half_of_the_splats_remain_and_each_splat_has_an_owner(count):
     gaussians = random_scene(count).gaussians
     merged, owners = halved(gaussians)
     assert len(merged) == (count + 1) // 2
@@ -107,8 +109,8 @@ def test_splats_without_a_partner_keep_their_bits():
         np.testing.assert_array_equal(tensor[alone].numpy(), merged.tensors()[name][owners[alone]].numpy())
 
 
-def test_near_and_alike_merge_first():
-    """Four copies of a red splat and a blue one among them: the blue one stays, however near."""
+def test_near_splats_of_similar_colour_merge_first():
+    """A blue splat lies among four copies of a red one and is not merged, although it is near."""
     gaussians = lattice(2, gap=0.02)
     red, blue = torch.tensor([1.5, -1.5, -1.5]), torch.tensor([-1.5, -1.5, 1.5])
     sh0 = red.expand(8, 1, 3).clone()
@@ -127,7 +129,7 @@ def test_many_equal_splats_merge():
 
 
 def test_extreme_splats_stay_finite():
-    """Needles, plates, invisible ones, huge ones, far ones, and a rotation without a length."""
+    """The scene has needles, plates, invisible, huge and far splats, and a quaternion of zeros."""
     gaussians = random_scene(400).gaussians
     gaussians.log_scales[:50, 0] = -80.0
     gaussians.log_scales[50:100] = 80.0

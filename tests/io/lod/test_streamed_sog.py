@@ -1,4 +1,4 @@
-"""A streamed SOG: tree, files, order, levels; written and read."""
+"""Streamed SOGs: tree, files, order and levels, written and read."""
 
 import json
 from pathlib import Path
@@ -66,11 +66,11 @@ def test_levels_halve_until_the_smallest(written):
     assert meta["counts"][0] == 3000 and meta["counts"][-1] <= 200 < meta["counts"][-2]
     assert meta["count"] == sum(meta["counts"])
     for fine, coarse in zip(meta["counts"], meta["counts"][1:], strict=False):
-        assert fine / 2 <= coarse <= fine / 2 + 8  # each of the 16 leaves rounds up by a half
+        assert fine / 2 <= coarse <= fine / 2 + 8  # each of the 16 leaves rounds up
 
 
 def test_the_tree_is_as_specified(written):
-    """Two children or lods; unions of boxes; every level in every leaf; ascending errors from 0."""
+    """A node has two children or levels; boxes are unions; a leaf has every level, with errors ascending from 0."""
     _, path = written
     for node in nodes(document(path)["tree"]):
         assert ("children" in node) != ("lods" in node)
@@ -106,17 +106,17 @@ def test_runs_fill_the_files_of_one_level_in_morton_order(written):
             assert offset == end
             end += count
             part = read.map(lambda t, offset=offset, end=end: t[offset:end])
-            # the ellipsoids lie in the box, up to the rounding of a SOG
+            # the ellipsoids lie in the box up to a SOG's rounding
             reach = torch.sqrt(torch.einsum("nii->ni", cov3d_t(part.log_scales, part.quats)))
             slack = 0.02 * (1 + float(reach.max()))
             assert bool((part.means - reach >= torch.tensor(leaf["bound"]["min"]) - slack).all())
             assert bool((part.means + reach <= torch.tensor(leaf["bound"]["max"]) + slack).all())
-            # rounding moves a few points to the next of 16 cells, so the curve through those mostly ascends
+            # rounding moves a few points to a neighbouring cell of 16, so nearly all steps along the curve ascend
             cells = part.means.numpy() - part.means.numpy().min(axis=0)
             cells = (cells / cells.max(axis=0) * 65535).astype(np.uint16) >> 12
             codes = morton_codes(cells).astype(np.int64)
             if count > 60:
-                assert (np.diff(codes) < 0).mean() < 0.15, "a random order has a half"
+                assert (np.diff(codes) < 0).mean() < 0.15, "in a random order, half of the steps ascend"
 
 
 def test_the_order_is_exactly_mortons():
@@ -139,7 +139,7 @@ def test_the_finest_level_is_the_scene_and_a_leaf_covers_the_same_region_at_all_
         np.testing.assert_array_equal(tensor.numpy(), scene.gaussians.tensors()[name][rows].numpy())
     for leaf in leaves_of(root):
         low, high = (f(leaf.levels[0].means, 0) for f in (torch.amin, torch.amax))
-        for level in leaf.levels[1:]:  # a mean of points of a box lies in the box
+        for level in leaf.levels[1:]:  # the mean of points in a box lies in the box
             assert bool(((level.means >= low - 1e-6) & (level.means <= high + 1e-6)).all())
 
 
@@ -148,7 +148,7 @@ def test_reading_gives_the_finest_level_and_round_trips(written, tmp_path):
     back = read_scene(path.parent)
     assert (len(back.gaussians), back.antialiased, back.up) == (3000, False, (0.0, -1.0, 0.0))
     rows = torch.cdist(back.gaussians.means, scene.gaussians.means).argmin(dim=1)
-    assert len(set(rows.tolist())) > 2990  # a few that nearly coincide may swap by rounding
+    assert len(set(rows.tolist())) > 2990  # a few that nearly coincide may swap places by rounding
     assert float((back.gaussians.means - scene.gaussians.means[rows]).abs().max()) < 5e-4
     assert float((back.gaussians.opacities - scene.gaussians.opacities[rows]).abs().mean()) < 3e-3
     codec.write(tmp_path / "b" / "lod-meta.json", back, SMALL)
@@ -180,8 +180,8 @@ def test_levels_end_with_one_splat_a_leaf(tmp_path):
     assert document(tmp_path / "lod-meta.json")["counts"] == [100, 50, 26, 14, 8, 4, 2]
 
 
-def test_other_levels_take_the_place_of_some():
-    """As refining does: boxes follow, the order is Morton's again, other levels stay."""
+def test_some_levels_can_be_replaced():
+    """Refining replaces levels. Boxes are updated, the order is Morton's again, and other levels stay."""
     root = build_levels(random_scene(400, 0).gaussians, LodOptions(smallest=120, leaf=100))
     old = leaves_of(root)
     moved = [leaf.levels[1].map(lambda t: t.flip(0)) for leaf in old]
@@ -202,7 +202,7 @@ def test_sizes_are_checked():
     assert LodOptions(chunk=100).leaf == 100
 
 
-def test_files_named_and_their_bytes(written):
+def test_the_files_and_their_bytes_are_listed(written):
     _, path = written
     assert format_of(path).name == "PlayCanvas streamed SOG"
     assert format_of(Path("my.lod-meta.json.ply")).suffix == ".ply"
@@ -212,7 +212,7 @@ def test_files_named_and_their_bytes(written):
 
 
 @needs_posix
-def test_an_environment_of_other_programs_is_drawn_too(written, tmp_path):
+def test_the_environment_that_other_programs_write_is_read(written, tmp_path):
     _, path = written
     (tmp_path / "lod-meta.json").write_text(
         json.dumps({**document(path), "environment": "env/meta.json"}), encoding="utf-8"

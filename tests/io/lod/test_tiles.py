@@ -1,4 +1,4 @@
-"""3D Tiles: the tree, its errors and boxes, and what the tiles hold."""
+"""3D Tiles: the tree, its errors and boxes, and the contents of the tiles."""
 
 import json
 import struct
@@ -34,7 +34,7 @@ def all_tiles(tile):
 
 
 def unpacked(path):
-    """The glTF and its splats, read without the package's GLB reader."""
+    """Return the glTF and its splats, read without the package's GLB reader."""
     data = path.read_bytes()
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data)) and length % 4 == 0
@@ -126,7 +126,7 @@ def test_a_tile_declares_splats_as_cesium_expects(written):
 
 
 def test_version_2_holds_what_version_4_holds(tmp_path):
-    """Only rotations are stored otherwise, with 8 bits a component."""
+    """Only rotations are stored differently, with 8 bits per component."""
     scene = random_scene(200, 8)
     scene = Scene(scene.gaussians, antialiased=True)
     (tmp_path / "2.spz").write_bytes(spz.packed_version_2(scene))
@@ -137,7 +137,7 @@ def test_version_2_holds_what_version_4_holds(tmp_path):
         if name != "quats":
             assert torch.equal(tensor, four.gaussians.tensors()[name]), name
     a, b = (torch.nn.functional.normalize(s.gaussians.quats) for s in (two, scene))
-    # x, y and z are off by half a step of 1/127.5; w, the rest, by up to the root of their sum where it is small
+    # x, y and z are off by half a step of 1/127.5; w follows from them and is off by more where it is small
     assert float((a * b).sum(dim=1).abs().min()) > 0.99
     assert float((a * b).sum(dim=1).abs().median()) > 0.9999
 
