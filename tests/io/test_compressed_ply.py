@@ -216,7 +216,7 @@ def order_of(scene, path):
 
 
 def test_splats_are_sorted_along_a_morton_curve(tmp_path):
-    """Each corner of a cube has 300 splats, shuffled. x varies fastest, then y, then z, and a corner keeps its order."""
+    """Each corner of a cube has 300 splats, shuffled. x varies fastest, then y, then z; a corner keeps its order."""
     corner = np.random.default_rng(0).permutation(np.repeat(np.arange(8), 300))
     means = np.stack([corner & 1, corner >> 1 & 1, corner >> 2], axis=1)
     order = order_of(with_means(means), tmp_path / "a.compressed.ply")

@@ -1,4 +1,4 @@
-"""Adam in the backward pass: the bits of stored gradients followed by Adam, over several steps."""
+"""Adam in the backward pass gives the bits of storing gradients and calling Adam, over several steps."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def scene_with(count, degree, dtype, seed=0):
 
 
 def train(raw, camera, *, fused, steps=4, settings=None, regularised=True):
-    """Take steps; return everything that they wrote."""
+    """Take steps; return all parameters and moments."""
     gaussians = raw.trainable()
     optimizer, found = Adam(gaussians.tensors(), GROUPS), {}
     for step in range(steps):
@@ -63,7 +63,7 @@ def check_same(found, expected):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_bits_are_those_of_two_steps(isa, dtype, degree):
-    """700 Gaussians are two full blocks and a part of one."""
+    """700 Gaussians are two full blocks and a part of a third."""
     raw, camera = scene_with(700, degree, dtype)
     expected = train(raw, camera, fused=False)
     check_same(train(raw, camera, fused=True), expected)
@@ -85,8 +85,8 @@ def test_antialiasing_and_depth():
     check_same(*(train(raw, camera, fused=fused, settings=settings) for fused in (True, False)))
 
 
-def test_no_gaussian_is_in_view():
-    """Moments decay as with stored zeros."""
+def test_moments_decay_if_no_gaussian_is_in_view():
+    """Moments decay as they do with stored gradients of zero."""
     raw, camera = scene_with(300, 3, torch.float32)
     gone = raw.map(torch.clone)
     gone.means[:] = raw.means + torch.tensor(camera.R[0], dtype=torch.float32) * 1e3

@@ -161,7 +161,7 @@ def test_a_missing_or_invalid_argument_is_named(call, name, monkeypatch):
 
 
 class Dropping:
-    """The native module, with one argument removed from every call."""
+    """The native module without one argument in every call."""
 
     def __init__(self, source, name):
         self.source, self.name = source, name
@@ -202,7 +202,7 @@ def strided(tensor):
 
 
 def unaligned(tensor):
-    # Unlike torch, NumPy can make an array at an unaligned address.
+    # NumPy, unlike torch, can make an array at an unaligned address.
     room = np.zeros(tensor.numel() * tensor.element_size() + 1, np.uint8)
     return room[1:].view(tensor.numpy().dtype).reshape(tensor.shape)
 
@@ -232,11 +232,11 @@ def test_an_unsuitable_array_is_refused(call, name, wrong):
         or (call is gradients and name in ("camera", "features"))
     )
     if call in (images, gradients, statistics) and name in ("features", "errors", "values"):
-        # Their sizes may be any, or set those of other arrays; a frame checks them.
+        # These arrays may have any size, or determine the sizes of others, which a frame checks.
         optional |= wrong in ("empty", "one more", "flat") and (call is not gradients or wrong == "flat")
     if optional or (wrong in ("strided", "unaligned") and not given.numel()):
         return  # these arrays are valid
-    # The first array sets the size. If only its size is wrong, the error names the next array.
+    # The first array determines the size, so if its size is wrong, the error names the next array.
     leads = name in ("means", "parameter", "image") and wrong in ("empty", "one more", "flat", "nine axes")
     with pytest.raises(ValueError, match=r": \w+: has to be" if leads else rf": {name}: has to be"):
         call(**{name: WRONG[wrong](given)})

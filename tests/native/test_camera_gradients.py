@@ -1,8 +1,8 @@
-"""Gradients of the camera: pose and intrinsics, on the kernels of every instruction set and on the dense renderer.
+"""Gradients of pose and intrinsics, on the kernels of every instruction set and on the dense renderer.
 
-float64 is tested against finite differences on smooth scenes: no rim of a Gaussian is inside the small image, no alpha
-is clamped, no colour is floored, no depths swap, and no x/z is near the bound of the Jacobian. Harder scenes are
-compared between the backends, which take the same branches.
+float64 is tested against finite differences on smooth scenes: no rim of a Gaussian is inside the small image, no
+alpha is clamped, no colour is floored, no depths swap, and no x/z is near the bound of the Jacobian. On harder
+scenes, the backends are compared with each other, because they take the same branches.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ POSE = ("R", "eye", "intrinsics")
 
 
 def wide_scene():
-    """Return a smooth scene with means on both sides of the bounds of x/z and y/z, none near a bound."""
+    """Return a smooth scene with means on both sides of the bounds of x/z and y/z, but none near a bound."""
     scene = smooth_scene(3, n=6)
     means = scene.means.copy()
     means[:, :2] = [(-1.9, 0.1), (0.2, -1.8), (1.9, 1.9), (0.1, 0.2), (-0.3, 1.8), (0.3, -0.2)]
@@ -88,7 +88,7 @@ def test_gradcheck_on_the_dense_renderer(antialiased):
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_gradcheck_where_the_jacobian_is_clamped(backend):
-    """The bounds move with fx and cx, and with them the ellipses of the Gaussians beside the image."""
+    """The bounds depend on fx and cx, so the ellipses of Gaussians beside the image do, too."""
     scene, settings = wide_scene(), RenderSettings(jacobian_limit=1.2, depth=False)
     outside = clamped(scene, 1.2)
     assert outside.any(axis=0).all() and not outside.all(axis=0).any()
@@ -98,7 +98,7 @@ def test_gradcheck_where_the_jacobian_is_clamped(backend):
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_gradcheck_of_a_twist(backend):
-    """At zero, and away from it, where the exponential of a rotation has a derivative of its own."""
+    """A twist away from zero tests the derivative of the exponential of a rotation as well."""
     scene = smooth_scene(2, n=3)
     base = CameraTensors.of(scene.camera)
 
@@ -111,7 +111,7 @@ def test_gradcheck_of_a_twist(backend):
 
 
 def pose_gradients(scene, backend, dtype=torch.float64, antialiased=False, limit=None):
-    """Return the gradients of a random weighting of all images, by name, and that of the means."""
+    """Return the gradients of a random weighting of all images by name, including that of the means."""
     settings = RenderSettings(antialiased=antialiased, jacobian_limit=limit)
     gaussians = scene.gaussians(dtype).trainable()
     camera = CameraTensors.of(scene.camera)
@@ -127,11 +127,11 @@ def pose_gradients(scene, backend, dtype=torch.float64, antialiased=False, limit
     return {name: getattr(camera, name).grad for name in POSE}, gaussians.means.grad
 
 
-# Behind a tile's stop, the dense renderer continues with weights below 1e-4; the kernels give no gradient there.
+# The dense renderer does not stop tiles: it gives gradients with weights below 1e-4, the kernels none.
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "opaque, tiles stop"])
 @pytest.mark.parametrize(("antialiased", "limit"), [(False, None), (True, 1.3)])
 def test_float64_agrees_with_autograd_through_the_dense_renderer(name, antialiased, limit):
-    """Agreement to 1e-9 of the largest entry, times the number of Gaussians whose parts are added."""
+    """The bound is 1e-9 of the largest entry, times the number of Gaussians that add to it."""
     (ours, _), (theirs, _) = (
         pose_gradients(SCENES[name], backend, antialiased=antialiased, limit=limit)
         for backend in ("cpu", "torch")
@@ -144,7 +144,7 @@ def test_float64_agrees_with_autograd_through_the_dense_renderer(name, antialias
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["random", "partly behind", "thousands of layers"])
 def test_moving_the_camera_is_moving_all_gaussians_back(isa, name, dtype):
-    """All formulas depend on mean - eye: dL/d eye is minus the sum of dL/d mean, up to the rounding of the means'."""
+    """All formulas depend on mean - eye, so dL/d eye is minus the sum of dL/d mean, up to their rounding."""
     pose, means = pose_gradients(SCENES[name], "cpu", dtype)
     allowed = len(means) * torch.finfo(dtype).eps * means.double().abs().sum(dim=0)
     assert bool(((pose["eye"] + means.double().sum(dim=0)).abs() <= allowed).all())
@@ -153,7 +153,7 @@ def test_moving_the_camera_is_moving_all_gaussians_back(isa, name, dtype):
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_the_gradient_does_not_depend_on_threads(set_threads, threads):
-    """3,000 Gaussians are several blocks, whose sums are added in a fixed order."""
+    """The sums of several blocks of 3,000 Gaussians are added in a fixed order."""
     set_threads(1)
     alone, _ = pose_gradients(SCENES["thousands of layers"], "cpu", torch.float32)
     set_threads(threads)
@@ -162,7 +162,7 @@ def test_the_gradient_does_not_depend_on_threads(set_threads, threads):
 
 
 def test_the_gradients_of_the_gaussians_do_not_change():
-    """A camera of tensors renders the same image and gives the Gaussians the same gradients, bit for bit."""
+    """A camera of tensors gives the same image and the same gradients of the Gaussians, bit for bit."""
     scene, found = SCENES["random"], []
     for camera in (
         scene.camera,
@@ -175,7 +175,7 @@ def test_the_gradients_of_the_gaussians_do_not_change():
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
-def test_nothing_in_view_has_a_zero_gradient():
+def test_the_gradient_of_an_empty_view_is_zero():
     scene = SCENES["random"]
     behind = dataclasses.replace(scene, means=scene.means - (0, 0, 50))
     pose, _ = pose_gradients(behind, "cpu")
@@ -183,7 +183,7 @@ def test_nothing_in_view_has_a_zero_gradient():
 
 
 def recovered(start, camera_of, gaussians, camera):
-    """Return where L-BFGS, which sees only losses and gradients, ends; the loss is the images' squared difference."""
+    """Minimise the squared difference of two images by L-BFGS, and return the result."""
     truth = render(gaussians, camera, backend="cpu").image
     parameter = start.clone().requires_grad_()
     optimizer = torch.optim.LBFGS(
@@ -208,8 +208,8 @@ def seen():
     return views[1].camera, start.map(lambda tensor: tensor.detach().double())
 
 
-def test_a_wrong_pose_comes_back(seen):
-    """2 degrees about an oblique axis, and 2 % of the distance to the scene."""
+def test_a_wrong_pose_is_recovered(seen):
+    """The pose is wrong by 2 degrees about an oblique axis and by 2 % of the distance to the scene."""
     camera, gaussians = seen
     axis = torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64)
     turn, shift = np.radians(2.0), 0.02 * RADIUS
@@ -218,8 +218,8 @@ def test_a_wrong_pose_comes_back(seen):
     assert float(left[:3].norm()) <= 1e-3 * turn and float(left[3:].norm()) <= 1e-3 * shift
 
 
-def test_a_wrong_focal_length_comes_back(seen):
-    """fx 3 % too long, with all other numbers right."""
+def test_a_wrong_focal_length_is_recovered(seen):
+    """Only fx is wrong, by 3 %."""
     camera, gaussians = seen
     base = CameraTensors.of(camera)
     others = torch.ones(3, dtype=torch.float64)

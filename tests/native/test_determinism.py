@@ -33,7 +33,7 @@ def test_300_training_iterations_do_not_depend_on_threads(set_threads):
 
 
 def test_a_render_of_many_blocks_does_not_depend_on_threads(set_threads):
-    """12,000 Gaussians at 400 x 260 px: dozens of blocks to project, a dozen chunks to sort into 425 tiles."""
+    """12,000 Gaussians at 400 x 260 px are dozens of blocks to project, and a dozen chunks to sort into 425 tiles."""
     scene = random(12_000, (400, 260), seed=1)
     results = []
     for threads in (1, 2, 5):
@@ -50,7 +50,7 @@ def test_a_render_of_many_blocks_does_not_depend_on_threads(set_threads):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_gaussian_does_not_depend_on_its_neighbours(isa, dtype):
-    """Alone, and at any place among Gaussians outside the image or not finite, one Gaussian has the same bits."""
+    """A Gaussian has the same bits alone and at any place among Gaussians that are not drawn."""
     scene = random(300, (48, 32), seed=2)
     one = scene.gaussians(dtype)
     outside = one.means + torch.tensor(scene.camera.R[0], dtype=dtype) * 1e4

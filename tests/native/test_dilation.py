@@ -1,8 +1,7 @@
-"""`RenderSettings.dilation` on every backend: images against the NumPy reference, gradients against finite differences.
-
-Tolerances are those of test_parity.py (forward, float64: 1e-12) and test_gradients.py. A scene that is sharper than
-1 px makes alphas steeper: an error of 1e-15 in a distance that is measured in standard deviations of at least 0.1 px
-stays below 1e-13 in alpha. Scenes here are that thick, unless a test is about the rule for thin ones.
+"""`RenderSettings.dilation` on every backend: images agree with the NumPy reference, gradients with finite
+differences. Tolerances are those of test_parity.py (1e-12 in float64) and test_gradients.py. Gaussians thinner than 1
+px have steeper alphas, but with standard deviations of at least 0.1 px, an error of 1e-15 in a distance changes alpha
+by less than 1e-13. The scenes are that thick, except in the tests of thin Gaussians.
 """
 
 import dataclasses
@@ -43,7 +42,7 @@ def test_images_match_the_reference(backend, dilation, antialiased):
     scene = SCENES["random"]
     found = images(scene, backend, settings_of(dilation, antialiased))
     wanted = scene.truth(antialiased=antialiased, dilation=dilation)
-    # The dense backend has no stop. What it adds behind one is below 1e-4 of a colour, and nothing stops in this scene.
+    # The dense backend does not stop tiles. No tile stops in this scene.
     for ours, truth in zip(found, wanted, strict=True):
         np.testing.assert_allclose(ours, truth, rtol=0, atol=1e-12)
 
@@ -58,7 +57,7 @@ def test_every_instruction_set_takes_the_dilation(isa):
 @pytest.mark.parametrize("dilation", [0.0, 0.1, 1.0])
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_gradcheck(backend, dilation, antialiased):
-    """The Gaussians are wider than the image, so that every alpha is smooth whatever the dilation."""
+    """The Gaussians are wider than the image, so every alpha is smooth with any dilation."""
     scene, settings = smooth_scene(0, n=3), settings_of(dilation, antialiased)
     gaussians = scene.gaussians()
 
@@ -74,7 +73,7 @@ def test_gradcheck(backend, dilation, antialiased):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("dilation", [0.0, 0.1, 1.0])
 def test_gradients_of_small_gaussians_agree_with_the_dense_backend(dilation, antialiased):
-    """Autograd through the dense renderer, 1e-9 of the largest gradient as in test_gradients.py."""
+    """Autograd through the dense renderer agrees to 1e-9 of the largest gradient, as in test_gradients.py."""
     found = []
     for backend in ("cpu", "torch"):
         gaussians = SCENES["random"].gaussians().trainable()
@@ -108,7 +107,7 @@ def test_gradcheck_of_render_covariances(dilation):
 
 
 def flat_gaussian(widths, dtype=torch.float64):
-    """One Gaussian of the given standard deviations in px at (5, 5) px, opacity 0.9, and its camera."""
+    """Return a Gaussian at (5, 5) px of these standard deviations, px, with opacity 0.9, and its camera."""
     one = lambda *values: torch.tensor([values], dtype=dtype)  # noqa: E731
     scales = torch.tensor([[*widths, 1.0]], dtype=dtype)
     scene = Gaussians(
@@ -124,8 +123,8 @@ def flat_gaussian(widths, dtype=torch.float64):
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 @pytest.mark.parametrize("dilation", DILATIONS)
-def test_alpha_is_the_formula(backend, dilation):
-    """The issue's Gaussian, on the optical axis: 1.0 x 0.2 px. The scale along z has no effect there."""
+def test_alpha_follows_the_formula(backend, dilation):
+    """A Gaussian of 1.0 x 0.2 px is on the optical axis, where its scale along z has no effect."""
     scene, view = flat_gaussian((1.0, 0.2))
     view = dataclasses.replace(
         view, eye=np.array([5.0, 5.0, 0.0]), cx=5.0, cy=5.0
@@ -148,7 +147,7 @@ THIN = {
 @pytest.mark.parametrize("name", THIN)
 @pytest.mark.parametrize("backend", ["numpy", "cpu", "torch", "covariances"])
 def test_thin_gaussians_are_not_drawn_without_dilation(name, backend):
-    """The rule: det <= 1e-6 px² trace. Thin ones have zero gradients, and their neighbours those they have alone."""
+    """Gaussians with det <= 1e-6 px² trace have zero gradients, and their neighbours have those they have alone."""
     thin, view = flat_gaussian(THIN[name])
     view = dataclasses.replace(view, eye=np.array([5.0, 5.0, 0.0]), cx=5.0, cy=5.0)
     drawn = name.startswith("thicker")
@@ -167,7 +166,7 @@ def test_thin_gaussians_are_not_drawn_without_dilation(name, backend):
         out = render_covariances(*inputs, colors, opacities, view, settings)
     else:
         both = Gaussians(**{k: torch.cat([t, wide.tensors()[k]]) for k, t in thin.tensors().items()})
-        floor = torch.finfo(torch.float64).min / 4  # exp of it is 0, and it is finite
+        floor = torch.finfo(torch.float64).min / 4  # a finite logarithm whose exponential is 0
         both = dataclasses.replace(both, log_scales=both.log_scales.clamp(min=floor)).trainable()
         out = render(both, view, settings=settings, backend=backend)
         inputs = list(both.tensors().values())
@@ -186,7 +185,7 @@ def test_the_default_dilation_leaves_no_gaussian_out():
             assert dilation * spread + dilation**2 > THINNEST * (spread + 2 * dilation)
 
 
-def test_compensation_takes_the_dilation():
+def test_the_compensation_uses_the_dilation():
     flat = np.array([[2.0, 0.3], [0.3, 0.7]])
     det = np.linalg.det(flat)
     for dilation in DILATIONS:

@@ -1,8 +1,8 @@
-"""Features beside the colours: composited and differentiated like them, on every backend.
+"""Features are composited and differentiated like colours, on every backend.
 
-Finite differences are taken on smooth scenes: no rim of a Gaussian is inside the small image, no alpha is clamped, and
-no depths swap (`assert_smooth`). Hard scenes compare a backend with the NumPy reference, which renders any three
-numbers as a colour, and the kernels with the dense renderer.
+Finite differences are taken on smooth scenes: no rim of a Gaussian is inside the small image, no alpha is clamped,
+and no depths swap (`assert_smooth`). On hard scenes, images are compared with the NumPy reference, which renders any
+three numbers as a colour, and gradients of the kernels with the dense renderer.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ def features_of(scene, channels, dtype=torch.float64):
 
 
 def reference(scene, features):
-    """Return the features that the NumPy reference composites, three at a time."""
+    """Composite features by the NumPy reference, three at a time."""
     covs = build_cov3d_batch(np.exp(scene.log_scales), quat_to_R_batch(scene.quats))
     opacities = 1 / (1 + np.exp(-scene.logits))
     padded = np.pad(features.numpy(), ((0, 0), (0, -features.shape[1] % 3)))
@@ -49,7 +49,7 @@ def reference(scene, features):
 
 @pytest.mark.parametrize("name", HARD)
 def test_features_match_the_reference(isa, name):
-    """Sums of at most 200 products in float64; a conic of ratio 100:1 loses 1e4 eps."""
+    """Sums have at most 200 products in float64, and a conic of ratio 100:1 loses 1e4 eps."""
     scene = SCENES[name]
     features = features_of(scene, 7)
     out = render(scene.gaussians(), scene.camera, features=features, backend="cpu")
@@ -59,7 +59,7 @@ def test_features_match_the_reference(isa, name):
 
 
 def test_colours_given_as_features_are_the_colours(isa):
-    """The same numbers in the same order: float32 to the bit, over black."""
+    """Over black, both are the same operations in the same order, so float32 has the same bits."""
     scene = SCENES["random"]
     flat = dataclasses.replace(scene, sh=scene.sh * (np.arange(16) == 0)[None, :, None])
     gaussians = flat.gaussians(torch.float32)
@@ -72,7 +72,7 @@ def test_colours_given_as_features_are_the_colours(isa):
 
 
 def random_loss(scene, backend, channels, dtype=torch.float64):
-    """Return the gradients of a random weighting of image, transmittance, depth and features."""
+    """Differentiate a random weighting of image, transmittance, depth and features."""
     gaussians = scene.gaussians(dtype).trainable()
     features = features_of(scene, channels, dtype).requires_grad_()
     out = render(gaussians, scene.camera, features=features, backend=backend)
@@ -89,9 +89,8 @@ def random_loss(scene, backend, channels, dtype=torch.float64):
 @pytest.mark.parametrize("channels", [3, 32])
 @pytest.mark.parametrize("name", [name for name in HARD if name != "opaque, tiles stop"])
 def test_gradients_match_the_dense_renderer(isa, name, channels):
-    """To 1e-9 of the largest entry, as for colours: both take the same branches.
-
-    Without the opaque scene, where the kernels stop a tile and the dense renderer goes on.
+    """They agree to 1e-9 of the largest entry, as for colours, because both take the same branches. The opaque scene
+    is left out, because only the kernels stop tiles.
     """
     ours, dense = (random_loss(SCENES[name], backend, channels) for backend in ("cpu", "torch"))
     for key, truth in dense.items():
@@ -118,7 +117,7 @@ def check(scene, channels, backend):
 
     inputs = (features_of(scene, channels), base.means, base.quats, base.logit_opacities)
     inputs = [tensor.clone().requires_grad_() for tensor in inputs]
-    # The gradient of many outputs by random directions: all 32 channels one by one would take minutes.
+    # random directions, because 32 channels one by one would take minutes
     assert torch.autograd.gradcheck(forward, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True)
 
 
@@ -151,7 +150,7 @@ def test_several_cameras_stack_features(backend):
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 @pytest.mark.parametrize("channels", [33, 64, 71])
 def test_more_channels_than_a_pass_holds(backend, channels):
-    """Images, gradients and statistics of 71 channels are those of the same channels in several renders."""
+    """Images, gradients and statistics of 71 channels equal those of the same channels in several renders."""
     scene, features = SCENES["random"], features_of(SCENES["random"], channels)
     found = []
     for groups in ([features], features.split(32, dim=1)):
@@ -169,7 +168,7 @@ def test_more_channels_than_a_pass_holds(backend, channels):
             assert float((collected()["weight_sum"] - weights_of(scene)).abs().max()) < 1e-12
             assert float(collected()["absgrad"].sum()) > 0
     (image, grad, parameters, norms), (wanted, wanted_grad, wanted_parameters, wanted_norms) = found
-    bound = 1e-12 * channels  # sums in another order
+    bound = 1e-12 * channels  # the order of the sums differs
     torch.testing.assert_close(image, wanted, rtol=0, atol=1e-12)
     torch.testing.assert_close(grad, wanted_grad, rtol=0, atol=bound * float(wanted_grad.abs().max()))
     for name, gradient in wanted_parameters.items():
@@ -180,7 +179,7 @@ def test_more_channels_than_a_pass_holds(backend, channels):
 
 
 def weights_of(scene):
-    """Sums of w of the visible Gaussians: the gradient of a feature of ones."""
+    """Return the sum of w of each visible Gaussian, which is the gradient of a feature of ones."""
     feature = torch.ones(len(scene.means), 1, dtype=torch.float64, requires_grad=True)
     out = render(scene.gaussians(), scene.camera, features=feature, backend="cpu")
     out.features.sum().backward()
@@ -217,7 +216,7 @@ def test_an_empty_scene_has_features_of_zero(backend):
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_the_clamp_of_alpha_can_be_chosen(isa, backend):
-    """One opaque Gaussian in front of the camera: alpha at its centre is the clamp, and the gradient there is zero."""
+    """At the centre of an opaque Gaussian, alpha is the clamp and the gradient is zero."""
     scene = smooth_scene(0, n=1)
     scene = dataclasses.replace(
         scene, logits=np.full(1, 20.0), means=np.array([[0.0, 0.0, 0.0]]), log_scales=np.full((1, 3), 1.5)

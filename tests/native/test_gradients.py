@@ -1,7 +1,7 @@
 """Gradients of the native kernels.
 
-float64 is tested against finite differences and against autograd through the dense renderer. The scenes are smooth:
-every alpha stays further above the floor 1/255 than the step can move it (no Gaussian's rim is inside the small
+Gradients in float64 agree with finite differences and with autograd through the dense renderer. The scenes are
+smooth: every alpha is farther above the floor 1/255 than the step can move it (no Gaussian's rim is inside the small
 image), no alpha is clamped, no colour is floored, and no depths swap.
 
 float32 is tested against float64. Replaying the forward pass loses digits behind nearly opaque layers: the error of
@@ -96,11 +96,12 @@ def gradients(scene, backend, dtype=torch.float64, antialiased=False):
     return found | {"background": background.grad, "means2d": norms}
 
 
-# Behind a tile's stop, the dense renderer continues with weights below 1e-4; the kernels give no gradient there.
+# The dense renderer does not stop tiles: it gives gradients with weights below 1e-4, the kernels none.
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "opaque, tiles stop"])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_float64_agrees_with_autograd_through_the_dense_renderer(name, antialiased):
-    """Agreement to 1e-9 of the largest gradient, even at floors, clamps and needles: both take the same branches."""
+    """They agree to 1e-9 of the largest gradient, even at floors, clamps and needles, because both take the same
+    branches."""
     ours = gradients(SCENES[name], "cpu", antialiased=antialiased)
     theirs = gradients(SCENES[name], "torch", antialiased=antialiased)
     for key, gradient in theirs.items():
@@ -112,7 +113,8 @@ def test_float64_agrees_with_autograd_through_the_dense_renderer(name, antialias
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "ties in depth"])
 def test_float32_agrees_with_float64(isa, name):
-    """The bound is 3e-4 of each parameter's largest gradient. Ties in depth are left out: rounding decides their order.
+    """The bound is 3e-4 of each parameter's largest gradient. Ties in depth are left out, because rounding decides
+    their order.
 
     R loses eps |R0| / (1 - alpha) at a layer: 1.2e-7 x 100 = 1.2e-5 of R0 behind one clamped at 0.99. A pixel passes
     two such layers before its tile stops, and about twenty fainter ones that lose a tenth of that each. Needles and

@@ -1,4 +1,4 @@
-"""Which instruction sets the module offers on this machine."""
+"""The module offers the instruction sets of this machine."""
 
 import platform
 import re
@@ -13,7 +13,7 @@ LEVELS = {
     "v3": "abm avx avx2 bmi1 bmi2 f16c fma movbe xsave",
     "v4": "avx512bw avx512cd avx512dq avx512f avx512vl",
 }
-"""Linux's names for what each level of the x86-64 psABI adds."""
+"""Linux's names for the features that each level of the x86-64 psABI adds."""
 
 
 @pytest.mark.skipif(

@@ -20,7 +20,7 @@ SETTINGS = RenderSettings(background=BACKGROUND, jacobian_limit=LIMIT)
 
 
 def outside_scene() -> Scene:
-    """Return five wide Gaussians, four of them beyond the bounds; each still covers the whole image."""
+    """Return five wide Gaussians that cover the whole image, four of them beyond the bounds."""
     rng = np.random.default_rng(5)
     means = np.array([[0.1, 0.1, 0], [2.2, 0, 0.3], [-2.3, 0.1, -0.3], [0.2, 2.0, 0.5], [0.1, -2.1, -0.5]])
     sh = rng.normal(size=(5, 16, 3)) * 0.05

@@ -1,7 +1,6 @@
-"""Gradients of the maps that have one, by finite differences, on every instruction set and the dense renderer.
-
-The scene is smooth: no rim of a Gaussian is inside the small image, no alpha is clamped, no depths swap, and no
-shortest axis is near another one or sideways to the camera.
+"""Gradients of the differentiable maps agree with finite differences, on every instruction set and the dense
+renderer. The scene is smooth: no rim of a Gaussian is inside the small image, no alpha is clamped, no depths swap,
+and no shortest axis is nearly as long as another or perpendicular to the view.
 """
 
 import dataclasses
@@ -31,7 +30,7 @@ def check(name, backend):
 
     inputs = (base.means, base.quats, base.log_scales, base.logit_opacities)
     inputs = [tensor.clone().requires_grad_() for tensor in inputs]
-    # By random directions: hundreds of outputs one by one would take seconds on the dense renderer.
+    # random directions, because hundreds of outputs one by one would take seconds on the dense renderer
     assert torch.autograd.gradcheck(forward, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True)
 
 

@@ -1,12 +1,10 @@
-"""The native forward pass against the NumPy reference, with exact extents and tile stops.
-
-float64: sums of at most a few thousand terms of order 1, in another order, agree to 1e-12.
-
-float32: every step is backward stable: up to a rounding, its result is exact for parameters that differ by a few eps,
-because projections, exponents and products have no cancellation beyond that of their inputs. So the error of a pixel
-is bounded by its change when the parameters move by 4 eps (times 4, because only eight random moves are tried), plus
-the rounding of the sum over its layers: eps times the largest colour times the number of layers (a hundred). A pixel
-with an alpha that close to the floor may gain or lose 1/255 of a colour: two such pixels per scene are allowed.
+"""The native forward pass agrees with the NumPy reference, with exact extents and tile stops. In float64, sums of at
+most a few thousand terms of order 1, in another order, agree to 1e-12. In float32, every step is backward stable: up
+to a rounding, its result is exact for parameters that differ by a few eps, because projections, exponents and
+products have no cancellation beyond that of their inputs. The error of a pixel is therefore bounded by its change
+when the parameters move by 4 eps (times 4, because only eight random moves are tried), plus the rounding of the sum
+over its layers, which is eps times the largest colour times the number of layers (a hundred). A pixel with an alpha
+that close to the floor may gain or lose 1/255 of a colour, which two pixels per scene are allowed.
 """
 
 import numpy as np
@@ -82,7 +80,7 @@ def sensitivity(scene) -> np.ndarray:
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "ties in depth"])
 def test_float32_stays_within_rounding(isa, name):
-    """Ties in depth are left out, because rounding decides which of two equal depths is nearer."""
+    """Scenes with ties in depth are left out, because rounding decides which of two equal depths is nearer."""
     scene = SCENES[name]
     image, T, _ = rendered(scene, torch.float32)
     truth, truth_T, _ = scene.truth()

@@ -1,4 +1,4 @@
-"""`RenderSettings(stop="pixel")`: images and gradients against the rule applied one Gaussian after the other."""
+"""`RenderSettings(stop="pixel")`: images and gradients equal the rule applied to one Gaussian after the other."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ SETTINGS = RenderSettings(stop="pixel", alpha_max=0.999)
 
 
 def opaque(random_splats, dtype):
-    """120 large, opaque Gaussians: most pixels end."""
+    """Return 120 large, opaque Gaussians, in which most pixels stop."""
     means, _, colors, _ = random_splats(120)
     rng = np.random.default_rng(1)
     cov3ds = build_cov3d_batch(rng.uniform(0.05, 0.4, (120, 3)), quat_to_R_batch(rng.normal(size=(120, 4))))
@@ -44,14 +44,15 @@ def losses(image, features, T):
 
 
 def symmetric(gradient, parameter):
-    """Zeros for no gradient; both halves of a covariance's together, because the witness reads one of them."""
+    """Return zeros for no gradient. Both halves of a covariance's gradient are added, because the witness reads only
+    one."""
     if gradient is None:
         return torch.zeros_like(parameter)
     return gradient + gradient.mT if gradient.ndim == 3 else gradient
 
 
 @pytest.mark.parametrize("with_features", [False, True])
-def test_pixels_end_by_themselves(isa, random_splats, random_camera, with_features):
+def test_pixels_stop_one_by_one(isa, random_splats, random_camera, with_features):
     inputs = opaque(random_splats, torch.float64)
     view = render_covariances(
         *inputs[:4], random_camera, SETTINGS, features=inputs[4] if with_features else None
@@ -76,8 +77,8 @@ def test_pixels_end_by_themselves(isa, random_splats, random_camera, with_featur
 
 
 def test_float_and_double_agree(isa, random_splats, random_camera):
-    """In 99 % of the pixels rounding moves no end. What is left there is the rounding of 120 products of values up to
-    1, 16 operations each."""
+    """In 99 % of the pixels, rounding does not change the stop. Their error is the rounding of 120 products of values
+    up to 1, with 16 operations each."""
     views = []
     for dtype in (torch.float32, torch.float64):
         means, cov3ds, colors, opacities, _ = (t.detach() for t in opaque(random_splats, dtype))

@@ -1,4 +1,4 @@
-"""No crashes, hangs or leaks, and no bad Gaussian that spoils the others."""
+"""The kernels do not crash, hang or leak, and a bad Gaussian does not affect the others."""
 
 import dataclasses
 import math
@@ -30,7 +30,7 @@ def run_python(code: str, *arguments: str, **environment: str) -> subprocess.Com
 
 
 def poisoned(gaussians: Gaussians, victims: torch.Tensor, rng: np.random.Generator) -> Gaussians:
-    """Replace one random number of every victim by a poison."""
+    """Replace a random number of every victim by a bad value."""
     changed = gaussians.map(torch.clone)
     names = list(changed.tensors())
     for victim in victims.tolist():
@@ -93,7 +93,7 @@ def test_a_mean_near_the_float_maximum_does_not_reach_the_depth():
 
 
 def test_transmittance_of_thin_distant_splats_stays_in_range(isa):
-    """Cancellation in the exponent may leave a positive value; alpha must still not exceed the opacity."""
+    """Cancellation may make the exponent positive, but alpha does not exceed the opacity."""
     rng = np.random.default_rng(0)
     for _ in range(30):
         direction = rng.normal(size=3)
@@ -192,7 +192,7 @@ def test_other_dtypes_are_refused():
 
 
 def test_float64_covariances_keep_the_digits_of_needles():
-    """A needle of 1,000 x 0.2 px at 45 degrees: in float32 the determinant would keep 1 digit at most."""
+    """A needle of 1,000 x 0.2 px lies at 45 degrees, so a determinant in float32 would keep at most one digit."""
     half = math.sqrt(0.5)
     axes = torch.tensor([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     axes = axes * torch.tensor([1000.0, 0.2, 0.0], dtype=torch.float64)
@@ -235,7 +235,8 @@ def test_several_cameras_give_stacked_views():
 def test_memory_does_not_grow():
     """Render scenes of changing size in a new process: after 100 warm-up renders, 300 more may not add 16 MiB.
 
-    The warm-up begins with the largest, which needs about 30 MiB. A leak per render would add up to gigabytes.
+    The warm-up begins with the largest scene, which needs about 30 MiB. Leaking a buffer per render would take
+    gigabytes.
     """
     code = """
 import resource, numpy as np, torch
@@ -288,10 +289,9 @@ def test_the_dense_backend_trains_without_the_native_module(tmp_path):
 
 
 def test_an_exception_from_the_memory_check_ends_the_render():
-    """9,000 splats in 64 x 64 tiles need 295 MB for pairs, and Python is asked before any block of 256 MiB.
-
-    Ctrl-C raises KeyboardInterrupt in whatever Python code is running, so it must end the render. A MemoryError or an
-    ImportError only means that the available memory is unknown, so rendering continues.
+    """9,000 splats in 64 x 64 tiles need 295 MB for pairs, and the kernels call Python before any block of 256 MiB.
+    Ctrl-C raises KeyboardInterrupt in the Python code that is running, so it has to end the render. After a
+    MemoryError or an ImportError, the available memory is unknown, and rendering continues.
     """
     count = 9_000
     screens = Gaussians(
@@ -326,7 +326,7 @@ def test_an_exception_from_the_memory_check_ends_the_render():
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_denormal_numbers_are_zero_in_the_kernels_and_nowhere_else(threads):
-    """The square of 1e-20 is denormal in float32; the count leaves work for both threads."""
+    """The square of 1e-20 is denormal in float32. The Gaussians are so many that both threads work."""
     count = 1 << 17
     parameter, first, second = torch.zeros(3, count)
     numbers = {
@@ -346,7 +346,7 @@ def test_denormal_numbers_are_zero_in_the_kernels_and_nowhere_else(threads):
 
 
 def test_the_processor_time_of_stages_contains_that_of_their_tasks(set_threads):
-    """With one thread and with two, whose calls of `parallel` are as many."""
+    """One thread and two threads make equally many calls of `parallel`."""
     scene, calls = random(3000), []
     for threads in (1, 2):
         set_threads(threads)

@@ -1,4 +1,4 @@
-"""Statistics that a backward pass collects per Gaussian, against sums over the pixels of the dense formulas."""
+"""The statistics of each Gaussian that a backward pass collects equal sums of the dense formulas over the pixels."""
 
 import functools
 
@@ -19,7 +19,8 @@ NAMES = ("absgrad", "weight_sum", "weight_max", "pixels", "error_sum")
 
 @functools.cache
 def weights_of(name):
-    """Return the weight of every Gaussian in every pixel (N, H, W): its image if it is white and the others black."""
+    """Return the weight of every Gaussian in every pixel (N, H, W), rendered with this Gaussian white and the others
+    black."""
     scene = SCENES[name]
     covs = build_cov3d_batch(np.exp(scene.log_scales), quat_to_R_batch(scene.quats))
     opacities = 1 / (1 + np.exp(-scene.logits))
@@ -29,7 +30,7 @@ def weights_of(name):
 
 
 def collected(scene, names, errors=None, dtype=torch.float64, fused=False):
-    """Return the statistics of a pass with a random loss, scattered to all Gaussians, and that loss's weights."""
+    """Return the statistics of a pass with a random loss, scattered to all Gaussians, and the weights of the loss."""
     gaussians = scene.gaussians(dtype).trainable()
     out = render(gaussians, scene.camera, settings=RenderSettings(depth=False), backend="cpu")
     statistics = out.collect(*names, errors=errors)
@@ -50,7 +51,7 @@ def collected(scene, names, errors=None, dtype=torch.float64, fused=False):
     "name", ["random", "needles 100:1", "opaque, tiles stop", "17 x 33", "partly behind"]
 )
 def test_weights_are_those_of_the_reference(isa, name):
-    """To 1e-10 of an opaque pixel, times the number of pixels for sums."""
+    """The bound is 1e-10 of an opaque pixel, for sums times the number of pixels."""
     scene = SCENES[name]
     size = (scene.camera.H, scene.camera.W)
     errors = torch.rand(size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -66,7 +67,8 @@ def test_weights_are_those_of_the_reference(isa, name):
 
 
 def pixel_gradients(scene, draw):
-    """Return sums over the pixels of |d loss / d mean in the image|, one backward pass of the dense renderer each."""
+    """Return the sum over the pixels of |d loss / d mean in the image|, by a backward pass of the dense renderer per
+    pixel."""
     gaussians = scene.gaussians()
     covs = cov3d_t(gaussians.log_scales, gaussians.quats)
     toward = gaussians.means - torch.tensor(scene.camera.eye)
@@ -83,7 +85,7 @@ def pixel_gradients(scene, draw):
 
 @pytest.mark.parametrize("scene", [smooth_scene(3), random(40, (13, 11), seed=4)], ids=["smooth", "hard"])
 def test_absolute_gradients_are_sums_of_each_pixels(isa, scene):
-    """To 1e-9 of the largest. A few visible Gaussians get none where no pixel is above 1/255."""
+    """The bound is 1e-9 of the largest. A few visible Gaussians get none, because no pixel of theirs is above 1/255."""
     found, draw = collected(scene, ["absgrad"])
     truth = pixel_gradients(scene, draw)
     assert (found["absgrad"] - truth).abs().max() <= 1e-9 * truth.max()

@@ -90,7 +90,7 @@ def test_wrong_poses_come_back_and_the_held_out_quality_with_them(capture):
 
 
 @pytest.mark.sliced(1, group="quality that comes back")
-def test_a_wrong_focal_length_comes_back(capture):
+def test_a_wrong_focal_length_is_recovered(capture):
     views = capture[0][:HELD_OUT]
     off = []
     for view in views:
