@@ -1,4 +1,4 @@
-"""The documents' examples run, and the documents name everything that exists."""
+"""The documents' examples run, and the documents name all commands, constants, targets and benchmarks."""
 
 import importlib.util
 import re
@@ -17,7 +17,7 @@ README = (ROOT / "README.md").read_text()
 
 
 def tool(name):
-    """Import a script of tools/, which is no package."""
+    """Import a script from tools/, which is not a package."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -110,7 +110,7 @@ def test_the_architecture_is_short():
 
 
 def longest_line(text):
-    """Return the length of the longest line that is no table row."""
+    """Return the length of the longest line that is not a row of a table."""
     return max(len(line) for line in text.splitlines() if not line.startswith("|"))
 
 
@@ -144,7 +144,7 @@ def test_the_changelog_is_short():
 
 
 def test_sections_that_documents_name_are_in_the_results():
-    """As in: "Glare" in RESULTS.md, or: section "Glare" of [RESULTS.md](...)."""
+    """The patterns are: "Glare" in RESULTS.md, and: section "Glare" of [RESULTS.md](...)."""
     headings = re.findall(r"^## ([^(\n]+?)(?: \(|$)", (ROOT / "benchmarks" / "RESULTS.md").read_text(), re.M)
     named = set()
     for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]:

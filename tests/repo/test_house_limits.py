@@ -29,7 +29,7 @@ def test_the_repository_is_within_its_limits(limits, capsys):
         ("class A:\n    def f(self, a, b, c, d, e, f, *, g, h, i):\n        pass\n", "9 parameters"),
     ],
 )
-def test_a_breach_is_named(limits, tmp_path, text, says):
+def test_a_violation_is_named(limits, tmp_path, text, says):
     path = tmp_path / "new.py"
     path.write_text(text)
     (line,) = limits.breaches(path, "new.py")

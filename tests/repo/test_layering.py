@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def lint(folder):
-    """Run the contracts on a copy of the package, where a test may plant an import."""
-    # Otherwise an editable installation would be found before the copy.
+    """Run the contracts on a copy of the package, into which a test may write an import."""
+    # otherwise Python finds an editable installation before the copy
     code = (
         "import sys; sys.path.insert(0, 'src'); "
         "sys.meta_path[:] = [f for f in sys.meta_path if 'ScikitBuild' not in type(f).__name__]; "

@@ -1,4 +1,4 @@
-"""Licences of what pip installs with the package."""
+"""The licences of the packages that pip installs with this one."""
 
 import importlib
 import sys
@@ -42,7 +42,7 @@ def test_every_exception_is_explained_and_used():
         ("unknown", False),
     ],
 )
-def test_expressions_are_judged(expression, allowed):
+def test_licence_expressions_are_evaluated(expression, allowed):
     assert list_licences.compatible(expression) is allowed
 
 

@@ -1,4 +1,4 @@
-"""Properties that the native source must have."""
+"""Rules for the native source files."""
 
 import importlib.util
 import re
@@ -14,7 +14,7 @@ ISA_FREE = {
         for end in ("cpp", "h")
     ),
 }
-"""Files compiled once, for the oldest machine. All others are compiled once per instruction set."""
+"""Files that are compiled once, for the oldest processor. All others are compiled once per instruction set."""
 
 
 def test_the_constants_header_is_generated_from_constants_py():
@@ -41,7 +41,7 @@ def test_kernel_files_include_only_c_standard_headers():
 
 
 def test_only_one_file_asks_the_operating_system():
-    """So a port to another system changes that file alone."""
+    """A port to another system then changes only that file."""
     asked = re.compile(
         r"#include <(pthread|unistd|time|sys/.*|windows|malloc)\.h>|\b(aligned_alloc|getpid|_WIN32|__APPLE__)\b"
     )

@@ -1,4 +1,4 @@
-"""The chapters redefine nothing that the package has, and the shipped notebooks were executed from their sources."""
+"""The chapters redefine no name of the package, and the shipped notebooks were executed from their sources."""
 
 import ast
 import functools
@@ -17,7 +17,7 @@ import pytest
 from nbclient.exceptions import CellExecutionError
 
 ROOT = Path(__file__).parents[2]
-LONGEST = 450  # lines of a chapter's source
+LONGEST = 450  # largest number of lines of a chapter's source
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 SOURCES = sorted((ROOT / "notebooks" / "source").glob("*.py"))
 CHAPTERS = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
@@ -44,7 +44,7 @@ def public_names() -> set[str]:
 
 
 def redefinitions(text: str) -> set[str]:
-    """Find names of the package that a chapter binds itself, in any scope and by any statement."""
+    """Find names of the package that a chapter binds, in any scope and by any statement."""
     bound = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -105,8 +105,8 @@ def test_a_redefinition_is_found(text):
     assert redefinitions(text)
 
 
-def draws_aside(node: ast.AST) -> bool:
-    """Return whether a statement could draw a figure past plt.show()."""
+def draws_without_show(node: ast.AST) -> bool:
+    """Return whether a statement may draw a figure without plt.show()."""
     if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "plt":
         return node.attr not in ("subplots", "subplot_mosaic", "figure", "show", "setp")
     if isinstance(node, ast.Call):
@@ -124,7 +124,7 @@ def violations(text: str) -> list[str]:
         f"it is longer than {LONGEST} lines": text.count("\n") > LONGEST,
         "it has no figure": not made,
         "a figure is not shown by plt.show()": names.count("show") < made,
-        "a figure is drawn past plt.subplots()": any(map(draws_aside, nodes)),
+        "a figure is drawn past plt.subplots()": any(map(draws_without_show, nodes)),
         "it hides output": "%%capture" in text,
         "it swallows errors": any(isinstance(node, ast.Try | ast.TryStar) for node in nodes)
         or any(
@@ -228,7 +228,7 @@ def test_images_need_titles_and_colour_bars_labels_but_inner_axes_nothing(faults
     twin = made.axes[0].twinx()
     twin.plot([1, 0])
     twin.set(ylabel="the other, px")
-    assert len(faults(made)) == 2, "two axes without a title do not excuse each other"
+    assert len(faults(made)) == 2, "each axis needs a title"
     twin.set_title("two lines")
     assert faults(made) == []
 
@@ -269,7 +269,7 @@ def test_chapters_that_modules_name_link_them():
 
 
 def prose_numbers(markdown: str) -> set[str]:
-    """Find numbers in prose that must be measured: those with a decimal point, a % or three digits."""
+    """Find the numbers in prose that have to be measured: those with a decimal point, a % or three digits."""
     for skipped in (
         r"\$\$.*?\$\$",
         r"\$.*?\$",
@@ -312,11 +312,13 @@ def test_shipped_notebooks_match_their_source_and_were_executed(source):
     cells = jupytext.read(source).cells
     assert [(c.cell_type, c.source) for c in shipped.cells] == [(c.cell_type, c.source) for c in cells]
     code = [cell for cell in shipped.cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "run from top to bottom"
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), (
+        "executed from top to bottom"
+    )
     outputs = [output for cell in code for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error"]
     assert any({"image/png", "image/jpeg"} & set(output.get("data", {})) for output in outputs)
-    assert not any("(reduced)" in output.get("text", "") for output in outputs), "ships with the full budget"
+    assert not any("(reduced)" in output.get("text", "") for output in outputs), "it has the full budget"
 
 
 @pytest.mark.sliced(1)
@@ -325,7 +327,7 @@ def test_shipped_notebooks_match_their_source_and_were_executed(source):
 def test_chapters_execute_on_a_reduced_budget(source, tmp_path):
     done = subprocess.run(
         [sys.executable, str(ROOT / "tools" / "build_notebooks.py"), source.stem, "--out", str(tmp_path)],
-        # Use one thread: torch's threads wait for each other, which takes minutes on a busy machine.
+        # one thread, because torch's threads wait minutes for one another on a busy machine
         env=os.environ | {"GSPLAT_EDU_BUDGET": "reduced", "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,

@@ -1,4 +1,4 @@
-"""What README and SECURITY.md promise is checked by tests, which CONTRIBUTING.md names."""
+"""CONTRIBUTING.md names the tests of each promise of README and SECURITY.md."""
 
 import ast
 import re
@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def promises(text, heading):
-    """Return the promises of a section: what its list has in bold, without a full stop."""
+    """Return the promises of a section: the bold texts of its list, without a full stop."""
     section = re.search(rf"^## {re.escape(heading)}\n(.*?)^(?:## |What )", text, re.MULTILINE | re.DOTALL)[1]
     return [
         re.sub(r"\s+", " ", title).rstrip(".")
@@ -69,17 +69,17 @@ FORBIDDEN = {
     "numpy.load",
     "os.system",
 }
-"""What would run what a file holds."""
+"""Names whose use could execute the contents of a file."""
 
 
 def test_nothing_is_unpickled_or_evaluated():
     used = {name for path in (ROOT / "src").rglob("*.py") for name in names_used(path)}
-    assert "json.loads" in used, "names are found"
+    assert "json.loads" in used, "`names_used` finds names"
     assert not used & FORBIDDEN
 
 
 def test_a_connection_to_another_computer_fails_any_test():
-    """The hook is on in all tests. 192.0.2.1 belongs to nobody (RFC 5737), and no packet is sent."""
+    """The hook is installed in all tests. 192.0.2.1 is reserved for documentation (RFC 5737), and no packet is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagrams:
         for attempt in (
             lambda: datagrams.connect(("192.0.2.1", 9)),

@@ -45,7 +45,7 @@ ELSEWHERE = {
     "sanitize.sh": "Makefile",
     "set_up.sh": "Makefile",
 }
-"""The file that runs each tool."""
+"""Tools by the test file that runs them, or the make target."""
 
 
 SCRIPT = """
@@ -59,14 +59,14 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 def run(*words, cwd=ROOT):
-    """Run a command without the settings of the make that may run these tests."""
+    """Run a command without the environment of a make that runs these tests."""
     own = ("SHARD", "PART", "SMOKE", "BASE", "MAKEFLAGS", "MFLAGS", "GSPLAT_EDU_SHARD", "GSPLAT_EDU_BASE")
     env = {name: value for name, value in os.environ.items() if name not in own}
     return subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, check=False)
 
 
 def script(path, *words, folder):
-    """Run a Python script in a separate process, without captures except those it makes itself."""
+    """Run a Python script in a separate process; it finds only captures that it makes itself."""
     return Program(SCRIPT, [path, *words], folder).ended(patience=600)
 
 
@@ -100,7 +100,7 @@ def test_a_training_runs(path, tmp_path):
 
 
 def test_the_constants_are_generated(tmp_path):
-    """The tool is copied, because it writes next to itself."""
+    """A copy of the tool runs, because it writes next to itself."""
     for name in ("tools", "native"):
         (tmp_path / name).mkdir()
     shutil.copy(ROOT / "tools" / "generate_constants.py", tmp_path / "tools")
@@ -132,7 +132,7 @@ def test_every_make_target_is_explained_and_run():
 
 @pytest.mark.parametrize(("setting", "flags"), [("", ()), ("SMOKE=1", ("--smoke",))])
 def test_make_bench_runs_its_benchmarks(setting, flags):
-    """`test_a_benchmark_runs` runs the same commands, without a new process that imports torch for each."""
+    """`test_a_benchmark_runs` runs the same commands, but without a new process for each that imports torch."""
     done = run("make", "-n", "bench", *filter(None, [setting]))
     assert done.returncode == 0, done.stderr
     commands = [line.split()[1:] for line in done.stdout.splitlines() if "benchmarks/" in line]

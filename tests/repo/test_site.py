@@ -1,7 +1,7 @@
 """The site builds without a warning, opens from disk, and has no broken link.
 
-Every page is built. An eighth of the modules, by commit count, and the public API are documented there; `make soak`
-documents all, which takes twice as long.
+Every page is built, but only the public API and an eighth of the modules, by commit count, are documented. `make
+soak` documents all, which takes twice as long.
 """
 
 import re
@@ -18,7 +18,7 @@ from slices import SHARD, SHARDS, SOAK
 
 ROOT = Path(__file__).parents[2]
 NOT_PROSE = ("pre", "code", "dt", "math", "script", "style", "title")
-"""Tags whose text is not prose: programs, signatures, equations."""
+"""Tags whose text is not prose, such as programs, signatures and equations."""
 
 MODULES = sorted((ROOT / "src" / "gsplat_edu").rglob("*.py"))
 
@@ -102,8 +102,8 @@ def test_every_chapter_document_and_module_has_a_page(site):
     assert {"README", "ARCHITECTURE", "docs/DECISIONS", "reference/gsplat_edu.scene.camera"} <= names
     assert len([name for name in names if name.startswith("reference/gsplat_edu")]) == len(MODULES)
     course = [page for path, page in pages.items() if path.parent.name == "notebooks"]
-    assert all("img" in page.tags for page in course), "figures"
-    assert sum("math" in page.tags for page in course) > 5, "equations"
+    assert all("img" in page.tags for page in course), "the page has figures"
+    assert sum("math" in page.tags for page in course) > 5, "the page has equations"
 
 
 @pytest.mark.slow
@@ -115,7 +115,7 @@ def test_the_landing_page_shows_pictures_and_three_ways_in(site):
     assert len([picture for picture in pages[out / "index.html"].loaded if "_static" in picture]) > 3
     captions = re.findall(r'class="caption-text">(.*?)<', text.split("sidebar-tree")[1])
     assert captions[:3] == ["Learn", "Use", "Build on"]
-    # Modules and records fold away behind their indices.
+    # modules and records are folded behind their indices
     shown = re.findall(r'class="toctree-l1[^"]*"><a class="reference internal" href="(.*?)"', text)
     assert not [link for link in shown if "gsplat_edu." in link or re.search(r"decisions/\d", link)]
     assert "docs/decisions/index.html" in shown and "reference/index.html" in shown
@@ -149,7 +149,7 @@ def test_set_up_cells_are_folded_and_others_are_not(site):
 @pytest.mark.parametrize("width", [1440, 390])
 @pytest.mark.sliced(1, group="built whole", together=True)
 def test_no_line_of_code_is_cut_off(site, width, browser):
-    """Code and printed output fit or wrap."""
+    """Code and printed output fit into their box or wrap."""
     _, out = site
     page = browser.new_page(viewport={"width": width, "height": 900})
     for name in ("notebooks/10_the_naive_kernel.html", "README.html", "docs/PYTHON.html", "docs/CLI.html"):
@@ -181,7 +181,7 @@ def test_no_equation_and_no_docstring_is_garbled(site):
     for path, page in pages.items():
         prose = "".join(page.prose)
         assert "$" not in prose and not re.search(r"\\[a-zA-Z]", prose), path
-        assert "Return type" not in prose, "signatures carry the types"
+        assert "Return type" not in prose, "signatures have types"
 
 
 def test_a_folder_that_is_not_a_site_is_not_overwritten(tmp_path):

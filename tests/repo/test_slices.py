@@ -1,4 +1,4 @@
-"""The cases of the long tests that one run takes: an eighth by commit count, all of them over eight counts."""
+"""A run takes an eighth of the cases of the long tests, by commit count; eight consecutive counts take all."""
 
 import os
 import subprocess
@@ -15,14 +15,14 @@ ROOT = Path(__file__).parents[2]
 
 
 class Case(SimpleNamespace):
-    """A stand-in for a collected test; compared by identity."""
+    """Stands for a collected test, and is compared by identity."""
 
     __hash__ = object.__hash__
     __eq__ = object.__eq__
 
 
 def cases(name, mark, values):
-    """Make stand-ins with what `split` reads of collected tests: a name, a marker and parameters."""
+    """Make cases with the attributes of collected tests that `split` reads: a name, a marker and parameters."""
     return [
         Case(
             nodeid=f"{name}[{i}]",
@@ -38,7 +38,7 @@ def names(items):
 
 
 def runs(items, counts=range(8), **options):
-    """Return the names that each of eight consecutive counts runs."""
+    """Return the names of the cases that run at each of eight consecutive counts."""
     shards = slices.numbered(items)
     return [names(slices.split(items, shards, count % slices.SHARDS, **options)[0]) for count in counts]
 
@@ -51,7 +51,7 @@ def test_eight_consecutive_counts_run_every_case(first, size, n):
     taken = runs(items, range(first, first + 8))
     assert set().union(*taken) == set(names(items))
     for kept in taken:
-        assert kept == [name for name in names(items) if name in kept], "the order is kept"
+        assert kept == [name for name in names(items) if name in kept], "cases keep their order"
         assert set(names(cases("short", None, range(4)))) <= set(kept)
         assert min(n, size) <= len(kept) - 4 <= max(n, -(-size // 8))
     if size <= 7:
@@ -92,7 +92,7 @@ def test_tests_that_share_a_fixture_run_together():
 
 @pytest.mark.parametrize(("mark", "count"), [(pytest.mark.sliced(0), 0), (pytest.mark.sliced, 4)])
 def test_a_test_may_run_only_in_a_soak_or_always(mark, count):
-    """sliced(0) runs only in a soak. A test sliced without a number selects its own files."""
+    """A test marked sliced(0) runs only in a soak. A test marked without a number selects its own files."""
     items = cases("long", mark, range(4))
     assert [len(kept) for kept in runs(items)] == [count] * 8
 
@@ -105,7 +105,7 @@ def test_the_shards_of_a_soak_are_disjoint_and_hold_every_case(n):
 
 
 def test_a_cases_shard_depends_on_no_other_test():
-    """Otherwise a case would wait longer than eight commits whenever another test comes or goes."""
+    """Otherwise, a case would wait longer than eight commits whenever another test is added or removed."""
     mark = pytest.mark.sliced(1, group="captures")
     items = cases("a.py::one", mark, range(5)) + cases("b.py::two", mark, range(3))
     alone = slices.numbered(items[5:])
@@ -133,7 +133,7 @@ def test_known_costs_are_spread_evenly():
     for name, start in slices.balanced(costs).items():
         for i in range(costs[name][1]):
             loads[(start + i) % slices.SHARDS] += costs[name][0]
-    # Of 210 s, a shard takes 26 s on average; the longest single case is 40 s, beside one of 5 s in each shard.
+    # A shard takes 26 of 210 s on average. The longest case takes 40 s, and each shard has a case of 5 s.
     assert max(loads) == 45 and min(loads) >= 15
 
 
@@ -156,7 +156,7 @@ def test_long(case):
 
 
 def pytest_run(folder, *words, **variables):
-    """Run pytest itself on FAILING, with the hooks of this suite's conftest."""
+    """Run pytest on FAILING, with the hooks of this suite's conftest."""
     (folder / "test_failing.py").write_text(FAILING)
     (folder / "conftest.py").write_text(HOOKS)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:jaxtyping", *words]
@@ -189,7 +189,7 @@ def test_a_failure_says_how_to_repeat_its_slice(tmp_path):
         ((), {"GSPLAT_EDU_SHARD": "8"}, "GSPLAT_EDU_SHARD is '8'; give a number from 0 to 7, or none"),
     ],
 )
-def test_what_is_named_touched_or_soaked_runs(words, variables, ends, tmp_path):
+def test_named_touched_and_soaked_tests_run(words, variables, ends, tmp_path):
     said = pytest_run(tmp_path, *words, **variables)
     assert ends in said, said
 

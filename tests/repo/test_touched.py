@@ -1,4 +1,4 @@
-"""What a change touches, in small repositories and in this one."""
+"""The tests that a change touches, in small repositories and in this one."""
 
 import shutil
 import subprocess
@@ -71,7 +71,7 @@ def test_a_base_can_be_named(repository, monkeypatch):
 
 @WITHOUT_GIT
 def test_without_history_the_shard_is_the_first_and_the_reason_is_given(repository, tmp_path):
-    """A shallow clone counts its own few commits only."""
+    """A shallow clone has too few commits to count."""
     git(tmp_path, "clone", "--quiet", "--depth", "1", repository.as_uri(), "shallow")
     inside = repository / "unpacked"
     inside.mkdir()
@@ -90,7 +90,7 @@ def tree(folder, **files):
 
 @pytest.fixture
 def project(tmp_path):
-    """A package on a wide module, `base`, and a narrow one, `ruler`; tests with helpers."""
+    """A package that imports a module of many users, `base`, and one of few, `ruler`; its tests have helpers."""
     packages = {f"src__gsplat_edu__p{i}__m": "import gsplat_edu.base\n" for i in range(touched.FEW + 1)}
     tree(tmp_path, **packages, src__gsplat_edu__base="", src__gsplat_edu__ruler="")
     tree(
@@ -158,7 +158,7 @@ def test_every_package_has_tests():
     assert {name for name in names if not touched.tests_of(ROOT, [name])} == set()
 
 
-def test_what_the_table_names_exists():
+def test_the_names_in_the_table_exist():
     for key, places in touched.ELSEWHERE.items():
         assert (ROOT / key).exists(), key
         for place in places:

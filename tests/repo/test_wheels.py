@@ -1,6 +1,5 @@
-"""Wheels: one of this machine's module is packed, installed where nothing else is, and used.
-
-The module is the one that the set-up compiled from this checkout. `make wheels` compiles others, which takes minutes.
+"""A wheel with this machine's module is packed, installed into an empty environment, and used. The module is the one
+that the set-up compiled from this checkout. `make wheels` compiles others, which takes minutes.
 """
 
 import base64
@@ -40,7 +39,7 @@ FAST_TESTS = (
     *("tests/test_camera.py", "tests/io/test_ply.py"),
     *("tests/native/test_parity.py", "tests/viewer/test_content_policy.py"),
 )
-"""Of the references, the kernels, the formats, and the files of the package that are not Python."""
+"""Tests of the references, the kernels, the formats, and the files of the package that are not Python."""
 
 ONLY_INSTALLED = """
 from pathlib import Path
@@ -52,7 +51,7 @@ for module in (gsplat_edu, native):
 
 @pytest.fixture(scope="module")
 def module():
-    """Name and bytes of the compiled module."""
+    """The name and bytes of the compiled module."""
     path = Path(gsplat_edu._native.__file__)
     return path.name, path.read_bytes()
 
@@ -71,7 +70,7 @@ def wheel(module, pure, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory):
-    """A virtual environment with the wheel; it sees the dependencies of this one, but not this one's gsplat_edu."""
+    """A virtual environment with the wheel and this environment's dependencies, but not its gsplat_edu."""
     folder = tmp_path_factory.mktemp("installed") / "venv"
     venv.create(folder, symlinks=True)
     python = folder / "bin" / "python"
@@ -81,13 +80,13 @@ def installed(wheel, tmp_path_factory):
     )
     assert done.returncode == 0, done.stderr
     (site,) = folder.glob("lib/python3.*/site-packages")
-    # A folder named by a .pth file comes after `site`, and its own .pth files, the editable installation, do nothing.
+    # Python ignores .pth files, such as that of an editable installation, in a folder that a .pth file adds.
     (site / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
     return folder
 
 
 def run_installed(installed, *words, cwd):
-    """Run a program of the environment; PATH holds that environment only, and so no compiler."""
+    """Run a program of the environment; PATH has only that environment, so no compiler."""
     env = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "GSPLAT"))}
     env |= {"PATH": str(installed / "bin"), "OMP_NUM_THREADS": "1"}
     return subprocess.run(
@@ -115,7 +114,7 @@ def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
 
 @pytest.mark.sliced(1, group="built whole", together=True)
 def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
-    # A plugin, which fails the run at its end if it tested anything else.
+    # this plugin fails the run if it tested another gsplat_edu
     lines = "".join(f"    {line}\n" for line in ONLY_INSTALLED.splitlines())
     (tmp_path / "only_installed.py").write_text(f"def pytest_sessionfinish():\n{lines}")
     words = [
@@ -138,7 +137,7 @@ NEWER = {version: path for version, path in build_wheels.pythons().items() if ve
 @pytest.mark.sliced(1, group="built whole", together=True)
 @pytest.mark.skipif(not NEWER, reason="no Python 3.12 or newer is here, whose headers the stable ABI needs")
 def test_one_abi3_wheel_is_imported_by_every_newer_python(pure, tmp_path):
-    """What depends on Python, nanobind and the bindings, is compiled again; the set-up's object files are the rest."""
+    """Only nanobind and the bindings depend on Python and are compiled again; other object files are the set-up's."""
     objects = list(ROOT.glob("build/cp3*/CMakeFiles/kernels_*.dir/native/*.o"))
     objects += ROOT.glob("build/cp3*/CMakeFiles/_native.dir/native/*.o")
     rest = [path for path in objects if path.name != "bindings.cpp.o"]
@@ -190,7 +189,7 @@ def test_no_wheel_has_what_only_tests_and_benchmarks_use(wheel):
 
 @pytest.mark.parametrize("room", ["data", "clean"])
 def test_users_need_every_module_of_a_room_that_once_held_fixtures(room):
-    """A module there is imported by the package, or shown by the course or the documents."""
+    """Each module of these packages is imported by the package, or used in the course or the documents."""
     package = ROOT / "src" / "gsplat_edu"
     sources = list(package.rglob("*.py"))
     shown = [*ROOT.glob("notebooks/source/*.py"), ROOT / "README.md", *ROOT.glob("docs/*.md")]
@@ -204,7 +203,7 @@ def test_users_need_every_module_of_a_room_that_once_held_fixtures(room):
 
 
 def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):
-    """The package is packed again by the build backend too, which must not add a time or a folder of its own."""
+    """The build backend packs the package again, without adding a time or a folder."""
     again = pack(
         build_wheels.pure_wheel(tmp_path),
         module,
@@ -217,7 +216,7 @@ def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):
 
 
 def compiled(folder):
-    """Compile some files of the module, of the kernels and of the rest, from a copy of the checkout."""
+    """Compile some files of the module, both kernels and others, from a copy of the checkout."""
     shutil.copytree(ROOT / "native", folder / "native")
     shutil.copyfile(ROOT / "CMakeLists.txt", folder / "CMakeLists.txt")
     tools = Path(sys.executable).parent
@@ -232,7 +231,7 @@ def compiled(folder):
 
 
 def test_the_compiler_gives_the_same_bytes_in_every_folder(tmp_path):
-    """Of the whole module, make wheels REPEAT=1 shows the same."""
+    """`make wheels REPEAT=1` compares the whole module."""
     first, second = compiled(tmp_path / "one"), compiled(tmp_path / "another" / "folder")
     assert [name for name in first if first[name] != second[name]] == []
 
@@ -258,7 +257,7 @@ def test_the_time_of_every_file_is_the_one_asked_for(module, pure, tmp_path, mon
 
 
 def test_the_record_lists_every_file_with_its_hash(wheel):
-    """By the format's definition, not by the tool's own check."""
+    """The test follows the format's definition instead of the tool's own check."""
     archive = zipfile.ZipFile(wheel)
     (record,) = (name for name in archive.namelist() if name.endswith("/RECORD"))
     rows = dict(line.rsplit(",", 2)[:2] for line in archive.read(record).decode().splitlines())
@@ -319,7 +318,7 @@ def test_every_document_states_the_same_version():
 
 
 def macho(symbols, library=binaries.MACOS_LIBRARY, kind=6, oldest=(13, 0), signed=True):
-    """A 64-bit Mach-O file; symbols are a name and the number of its library, or None for its own."""
+    """Return a 64-bit Mach-O file. A symbol is a name and the number of its library, or None if it defines it."""
     path = library.encode() + b"\0" * (8 - len(library) % 8)
     commands = [
         struct.pack("<6I", 0xC, 24 + len(path), 24, 0, 0, 0) + path,
@@ -351,7 +350,7 @@ GOOD = [("_PyInit__native", None), ("_malloc", 1), ("_PyList_New", 0xFE)]
             [*GOOD, ("_PyList_GetItemRef", 0xFE)],
             {},
             ["_PyList_GetItemRef is not in the stable ABI"],
-        ),  # from 3.13 on
+        ),  # since Python 3.13
         ([*GOOD, ("_PyDict_Clear", 0)], {}, []),
         (GOOD, {"library": "/opt/lib/libc++.1.dylib"}, ["loads /opt/lib/libc++.1.dylib"]),
         (GOOD, {"oldest": (14, 2)}, ["needs macOS 14.2"]),
@@ -359,15 +358,15 @@ GOOD = [("_PyInit__native", None), ("_malloc", 1), ("_PyList_New", 0xFE)]
         (GOOD, {"kind": 8}, ["is no dynamic library"]),
     ],
 )
-def test_what_a_module_asks_of_macos_is_found(monkeypatch, symbols, options, wrong):
+def test_the_symbols_that_a_module_needs_from_macos_are_found(monkeypatch, symbols, options, wrong):
     monkeypatch.setattr(
         binaries, "system_symbols", lambda: {"_malloc", "_free"}
-    )  # zig's list is not installed here
+    )  # zig, which has the list, is not installed
     assert binaries.macos_problems(macho(symbols, **options), 12, (13, 0), arm=True) == wrong
 
 
-def test_what_a_program_for_windows_lacks_as_a_module_is_found():
-    """A launcher of setuptools: for x86-64, and no module of Python."""
+def test_a_windows_program_is_not_accepted_as_a_module():
+    """A launcher of setuptools is a program for x86-64, but not a module of Python."""
     (launcher,) = (path for path in distribution("setuptools").files if path.name == "cli-64.exe")
     found = binaries.windows_problems(Path(launcher.locate()).read_bytes(), 12)
     assert found[-1] == "does not export PyInit__native"

@@ -50,12 +50,12 @@ def test_a_run_is_evaluated_and_everything_is_written(capture, folder):
     assert (metrics["seconds"], metrics["mine"], metrics["iterations"]) == (12.5, "kept", 70)
     assert (metrics["num_gaussians"], metrics["train"]["num_images"]) == (len(points), 3)
 
-    # The numbers equal rendering and comparing by hand.
+    # the scores equal those of renders that the test makes
     images = [RENDER(gaussians, view.camera).image for view in views[:2]]
     by_hand = [psnr(image, view.image) for image, view in zip(images, views, strict=False)]
     assert [entry["psnr"] for entry in metrics["test_views"]] == by_hand
     assert metrics["test"]["psnr"] == pytest.approx(np.mean(by_hand), abs=1e-12)
-    assert min(by_hand) > 10, "the start points already look a little like the scene"
+    assert min(by_hand) > 10, "the start points resemble the scene a little"
 
     picture = np.array(Image.open(folder.renders / "test" / "view_000.png"))
     assert picture.shape == (13 + 24, 32 + 4 + 32, 3)

@@ -1,4 +1,4 @@
-"""Photos at the exposure of the scene: a scaled photo comes back, masks count, and `clean` judges by them."""
+"""Photos are converted to the exposure of the scene: scaled photos are recovered, masks count, and `clean` uses them."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from test_exposure import photographed
 
 
 def shows(image):
-    """A renderer that shows this image, with everything opaque."""
+    """Return a renderer that shows this image, opaque everywhere."""
     seen = torch.from_numpy(image).float()
 
     def render(gaussians, camera):
@@ -34,7 +34,7 @@ def shows(image):
     return render
 
 
-def test_a_photo_comes_back_at_the_exposure_of_the_scene(tmp_path):
+def test_a_photo_is_converted_to_the_exposure_of_the_scene(tmp_path):
     views, points, colors = procedural_capture(24, 4, splats=60)
     camera = views[0].camera
     image = np.random.default_rng(0).uniform(0.15, 0.6, (camera.H, camera.W, 3))
@@ -44,12 +44,12 @@ def test_a_photo_comes_back_at_the_exposure_of_the_scene(tmp_path):
     gaussians = from_points(points, colors, recipe(1))
     found = at_exposure_of_scene(dataset, gaussians, shows(image), (0.0, 0.0, 0.0))
     assert len(found.train) == len(dataset.train) and len(found.test) == len(dataset.test)
-    # A byte is 1/255, which dividing by the gain enlarges by up to a quarter; the gains are good to 1 %.
+    # A byte is 1/255, which dividing by the gain enlarges by up to a quarter; the gains are accurate to 1 %.
     np.testing.assert_allclose(found.train[0].read().image, image, atol=0.012)
     assert found.train[0].camera is dataset.train[0].camera
 
 
-def test_a_photo_comes_back_without_its_vignetting(tmp_path):
+def test_the_vignetting_of_a_photo_is_removed(tmp_path):
     views, points, colors = procedural_capture(24, 4, splats=60)
     camera = views[0].camera
     image = np.random.default_rng(0).uniform(0.2, 0.6, (camera.H, camera.W, 3))

@@ -1,4 +1,4 @@
-"""Runs that are extended, start from another scene, or resume with photos that have changed."""
+"""Runs that are extended, that start from another scene, or that are resumed with changed photos."""
 
 import dataclasses
 import json
@@ -71,7 +71,7 @@ def ply(out, iterations):
 
 @pytest.fixture(scope="module")
 def finished(capture, tmp_path_factory):
-    """A run of 20 iterations with the recipe's milestones for 20."""
+    """A run of 20 iterations with the milestones of the recipe for 20."""
     out = tmp_path_factory.mktemp("runs") / "egg"
     assert train(capture, out, "--iterations", "20") == 0
     return out
@@ -85,7 +85,7 @@ def run(finished, tmp_path):
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory):
-    """A run of 30 iterations at once, with the milestones for 20."""
+    """An uninterrupted run of 30 iterations with the milestones for 20."""
     short, words = recipe(20), []
     for name in ("means_rate_iterations", "sh_every", "densify_stop", "reset_every"):
         words += option_with(name, short.flat()[name]).split()
@@ -110,7 +110,7 @@ def test_a_finished_run_is_extended_with_its_own_milestones(capture, finished, w
 
 
 def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, tmp_path):
-    """Both relocate (opacities start at 0.5) and grow until the shorter schedule ends, then only add noise."""
+    """Both runs relocate (opacities start at 0.5) and grow until the shorter schedule ends, then only add noise."""
 
     def mcmc(out, *words):
         numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--set", "min_opacity=0.58", *BASE, *words]
@@ -154,7 +154,7 @@ def test_a_run_is_resumed_with_its_own_strategy_unless_another_is_named(capture,
 
 
 def test_a_longer_quality_extends_a_run_and_a_shorter_one_is_refused(capture, tmp_path, capsys, monkeypatch):
-    """A quality is a number of iterations: the one given, not that of config.json, is the new length."""
+    """A quality stands for a number of iterations, which replaces that of config.json."""
     monkeypatch.setattr("gsplat_edu.train.length.UNIT", 4)
     monkeypatch.setattr("gsplat_edu.runs.thin.LENGTHS", (1,))
 
@@ -168,12 +168,12 @@ def test_a_longer_quality_extends_a_run_and_a_shorter_one_is_refused(capture, tm
     assert "with iterations = 12, not 4: a run can be extended, not shortened" in capsys.readouterr().err
     assert run("--quality", "high", "--resume") == 0
     train = RunFolder(tmp_path / "run").read_config()["train"]
-    assert (train["iterations"], train["fast_stop"]) == (40, stop), "milestones stay"
+    assert (train["iterations"], train["fast_stop"]) == (40, stop), "milestones are not scaled again"
     assert RunFolder(tmp_path / "run").read_metrics()["iterations"] == 40
 
 
 def test_a_run_is_complete_once_it_is_constructed(capture, tmp_path):
-    """A program may inspect a run, save it, train it in parts and finish it, in this order."""
+    """A program may inspect a run, save it, train it in parts and finish it."""
     chosen, events = options(capture, tmp_path / "run", "--iterations", "6"), []
     assert not is_finished(chosen)
     run = CaptureRun(chosen)
@@ -190,11 +190,11 @@ def test_a_run_is_complete_once_it_is_constructed(capture, tmp_path):
 
 
 def test_an_interrupted_extension_gives_the_same_bytes(capture, whole, run):
-    capture_run = CaptureRun(_taken_up(capture, run, "--iterations", "30", "--resume"))
+    capture_run = CaptureRun(_resumed_options(capture, run, "--iterations", "30", "--resume"))
     trainer = capture_run.trainer
     assert capture_run.train(lambda: trainer.iteration >= 23)
     assert RunFolder(run).read_metrics()["iterations"] == 20, "the extension is not finished yet"
-    assert train(capture, run, "--resume") == 0, "config.json holds the new length"
+    assert train(capture, run, "--resume") == 0, "config.json has the new length"
     assert ply(run, 30) == ply(whole, 30)
 
 
@@ -213,7 +213,7 @@ def test_an_unfinished_run_is_extended_and_no_run_is_shortened(capture, whole, t
     assert entry == {"iteration": 7, "iterations_before": 20, "iterations": 30}
 
 
-def _taken_up(capture, out, *words):
+def _resumed_options(capture, out, *words):
     from gsplat_edu.budget.planned import taken_up
 
     given = [
@@ -237,7 +237,7 @@ def test_a_run_starts_from_a_run(capture, finished, tmp_path, capsys):
     loaded = sorted_in_space(load_ply(RunFolder(finished).scene(20)))
     for name, tensor in loaded.tensors().items():
         assert torch.equal(trainer.gaussians.tensors()[name].detach(), tensor), name
-    # The scene must be a better start than the points.
+    # the scene is a better start than the points
     scores = [RunFolder(folder).read_metrics()["train"]["psnr"] for folder in (finished, out)]
     assert scores[1] > scores[0]
 
@@ -258,7 +258,9 @@ def test_a_run_from_a_scene_is_resumed_with_it_or_without_its_name(capture, fini
     error = capsys.readouterr().err
     assert "was not started from" in error and error.count("\n") == 1
     scene.unlink()
-    assert train(capture, other, "--resume") == 0, "the checkpoint holds everything that came from the scene"
+    assert train(capture, other, "--resume") == 0, (
+        "the checkpoint has everything that the run took from the scene"
+    )
     assert ply(other, 8) == ply(out, 8)
     capsys.readouterr()
     assert train(capture, finished, "--iterations", "20", "--resume", "--from", str(out)) == 2
@@ -266,7 +268,8 @@ def test_a_run_from_a_scene_is_resumed_with_it_or_without_its_name(capture, fini
 
 
 def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tmp_path, capsys):
-    """Degree 1 in a run of degree 2, a NaN, a zero quaternion, and a capture far from zero."""
+    """The scene has degree 1, the run degree 2; the scene has a NaN and a zero quaternion; the capture is far from
+    zero."""
     views, points, colors = procedural_capture(24, VIEWS, splats=60)
     shift = np.array([1e5, -2e5, 3e4])
     far = []
@@ -297,11 +300,11 @@ def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tm
     assert len(trainer.gaussians) == len(near) - 2 and "2 of" in say.text and "left out" in say.text
     assert "contains harmonics up to degree 1; the others start at zero" in say.text
     assert trainer.gaussians.sh_rest.shape[1] == 8
-    # A run sorts its Gaussians; their colours, all different, tell which is which.
+    # a run sorts its Gaussians, which are identified by their colours
     kept = in_order_of_colour(near.map(lambda t: t[[i for i in range(len(near)) if i not in (3, 5)]]))
     found = in_order_of_colour(trainer.gaussians.map(torch.Tensor.detach))
     assert torch.equal(found.sh0, kept.sh0) and len(torch.unique(found.sh0, dim=0)) == len(found)
-    # float32 near 2e5 resolves 2**-7 of a coordinate; writing loses half of that.
+    # float32 near 2e5 has steps of 2**-6, and writing rounds by half a step
     moved = torch.tensor(run.dataset.origin - shift).float()
     np.testing.assert_allclose(found.means + moved, kept.means, atol=2**-7)
     assert torch.equal(found.sh_rest[:, :3], kept.sh_rest[:, :3])
@@ -366,7 +369,7 @@ def copied(capture, tmp_path):
 
 @pytest.mark.parametrize("part", ["images", "masks"])
 def test_a_photo_that_changed_before_a_resume_is_named(capture, tmp_path, capsys, part):
-    """A photo in the middle, which the fingerprint of older runs does not cover. Touching it is not a change."""
+    """The fingerprint of older runs does not cover a photo in the middle. Touching a photo does not change it."""
     moved, out = copied(capture, tmp_path), tmp_path / "run"
     assert train(moved, out, "--iterations", "2", "--time-limit", "0.001s") == 0
     photo = moved / part / "view_003.png"
@@ -412,7 +415,7 @@ def test_a_photo_that_changes_during_a_run_ends_it_with_its_state_saved(capture,
             for photo in photos:
                 changed(photo)
         for photo in photos:
-            os.utime(photo)  # not a change of the content
+            os.utime(photo)  # only its time changes
         return False
 
     trainer = run.trainer
@@ -437,7 +440,7 @@ def test_a_folder_in_use_is_refused_by_train_and_eval(capture, run, tmp_path, ca
                 f"is in use by `gsplat-edu train`, process {os.getpid()} on " in error
                 and error.count("\n") == 1
             )
-        assert main(["eval", str(run), "--out", str(tmp_path / "apart")]) == 0, "writes elsewhere"
+        assert main(["eval", str(run), "--out", str(tmp_path / "apart")]) == 0, "it writes to another folder"
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 20
 

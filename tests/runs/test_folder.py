@@ -39,7 +39,7 @@ def test_the_layout_of_a_run_folder(folder):
     assert folder.scene(70) == root / "point_cloud" / "iteration_70" / "point_cloud.ply"
 
 
-def test_config_and_metrics_come_back(folder):
+def test_config_and_metrics_are_read_as_written(folder):
     config = {"version": "0.1", "origin": [0.1, 1e-300, -3.0], "data": {"path": "ä", "points": None}}
     folder.write_config(config)
     assert folder.read_config() == config
@@ -48,7 +48,7 @@ def test_config_and_metrics_come_back(folder):
     assert folder.read_metrics() == {"test": {"psnr": 0.1 + 0.2}}
 
 
-def test_json_is_strict(folder):
+def test_numbers_that_json_lacks_are_refused(folder):
     folder.write_metrics({"psnr": 1.0})
     before = folder.metrics.read_bytes()
     for bad in (float("nan"), float("inf"), {1, 2}):
@@ -80,7 +80,7 @@ def test_only_a_torn_last_line_is_left_out(folder):
     folder.write_config({})
     lines = [{"iteration": 1, "loss": 0.5}, {"iteration": 2, "loss": 0.25}]
     text = "".join(json.dumps(line) + "\n" for line in lines)
-    for torn in ("", '{"iteration": 3, "lo', '{"iteration": 3}'):  # the last one may have been cut too
+    for torn in ("", '{"iteration": 3, "lo', '{"iteration": 3}'):  # the last line may be cut as well
         folder.log_file.write_text(text + torn)
         assert folder.log() == lines
     folder.log_file.write_text('{"iterat\n' + text)
@@ -96,7 +96,7 @@ def test_the_latest_scene_has_the_most_iterations(folder):
         path = folder.scene(iteration)
         path.parent.mkdir(parents=True)
         path.write_bytes(b"")
-    folder.scene(99999).parent.mkdir()  # the run stopped while writing it
+    folder.scene(99999).parent.mkdir()  # the run was killed while writing it
     (folder.path / "point_cloud" / "iteration_best").mkdir()
     (folder.path / "point_cloud" / "iteration_best" / "point_cloud.ply").write_bytes(b"")
     assert folder.latest_scene() == (folder.scene(7000), 7000)
@@ -128,14 +128,14 @@ def test_cameras_are_written_as_viewers_read_them(folder):
     entry, camera = json.loads(folder.cameras.read_text())[1], views()[1].camera
     assert (entry["id"], entry["img_name"], entry["width"], entry["height"]) == (1, "left/1.jpg", 7, 5)
     np.testing.assert_array_equal(entry["position"], np.add(camera.eye, (100.0, 0.0, 0.0)))
-    # Camera to world: the third column is the camera's forward axis.
+    # The matrix is camera to world, so its third column is the camera's forward axis.
     np.testing.assert_array_equal(np.array(entry["rotation"])[:, 2], camera.R[2])
     back = folder.read_cameras((100.0, 0.0, 0.0))[1][2]
     np.testing.assert_allclose(back.eye, camera.eye, atol=1e-13)  # float64 near 100 is accurate to 2^-47
 
 
 def test_a_cameras_file_without_our_keys_is_read(folder):
-    """Inria's files have no principal point, so the image's centre is used, and no split."""
+    """Inria's files have no split and no principal point, for which the image's centre is used."""
     folder.write_cameras(views(1), [])
     (entry,) = json.loads(folder.cameras.read_text())
     folder.cameras.write_text(

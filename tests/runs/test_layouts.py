@@ -1,7 +1,6 @@
-"""One capture in three layouts gives one scene, so an error in axes, pixel centres or frames shows up.
-
-The capture's principal point is the centre of the image, ((W - 1)/2, (H - 1)/2), the only one that all three can
-store, and its scene has no symmetry. Every eighth view is held out; Blender's layout has its own split for this.
+"""One capture in three layouts gives one scene, which reveals errors in axes, pixel centres or frames. The principal
+point is the centre of the image, ((W - 1)/2, (H - 1)/2), the only one that all three can store, and the scene has no
+symmetry. Every eighth view is held out, in Blender's layout by its own split.
 """
 
 import functools
@@ -73,18 +72,17 @@ def trained_psnr(dataset):
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS[1:])
 def test_trained_scenes_agree(datasets, layout):
-    """Poses differ by rounding, so the trainings diverge, but their quality must agree.
-
-    Without density control the scores of five starts that differ by a float32 rounding lie within 0.0014 dB; with it,
-    within 0.7. A principal point that is off by half a pixel costs 0.17 dB.
+    """Poses differ by rounding, so the trainings diverge, but their quality is the same. Without density control, the
+    scores of five starts that differ by a float32 rounding are within 0.0014 dB; with density control, within 0.7. A
+    principal point that is off by half a pixel costs 0.17 dB.
     """
     ours, theirs = trained_psnr(datasets["COLMAP"]), trained_psnr(datasets[layout])
-    assert ours > 24, "something was learned"
+    assert ours > 24, "training improved the scene"
     assert theirs == pytest.approx(ours, abs=0.02)
 
 
 def test_a_mirrored_world_is_detected(datasets):
-    """The comparison can fail: with x flipped the first images differ clearly."""
+    """If x is flipped, the first images differ clearly, so the comparison detects it."""
     dataset = datasets["COLMAP"]
     config = recipe(500)
     mirrored = from_points(dataset.points * np.array([-1.0, 1, 1]), dataset.colors, config)

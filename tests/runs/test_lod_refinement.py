@@ -1,4 +1,4 @@
-"""Levels of detail are refined against photos, and scored at the size at which they are shown."""
+"""Levels of detail are refined by photos, and scored at the size at which they are displayed."""
 
 import re
 
@@ -98,7 +98,7 @@ def test_a_level_that_training_makes_worse_stays_as_merged(run, monkeypatch):
         (["--lod-refine", "5", "--crop=-1,-1,-1,1,1,1"], "after --crop"),
     ],
 )
-def test_what_cannot_be_refined_costs_one_line(tmp_path, capsys, more, says):
+def test_scenes_that_cannot_be_refined_are_refused_in_one_line(tmp_path, capsys, more, says):
     write_scene(tmp_path / "in.ply", random_scene(20, 0))
     assert main(["convert", str(tmp_path / "in.ply"), str(tmp_path / "lod-meta.json"), *more]) == 2
     assert says in capsys.readouterr().err

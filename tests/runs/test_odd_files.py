@@ -1,4 +1,4 @@
-"""Files of a run with values of wrong types: every command that reads them prints one line naming the field."""
+"""If a file of a run has a value of a wrong type, every command that reads it prints one line that names the field."""
 
 import json
 
@@ -12,7 +12,7 @@ from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.runs.folder import RunFolder
 
 ODD = ["text", -1.5, True, [], [1], {}, {"psnr": "x"}, 10**400, "\ud800\x1b"]
-"""Values whose type is wrong for most fields."""
+"""Values of types that are wrong for most fields."""
 
 FIELDS = [
     "config.json:version",
@@ -84,7 +84,7 @@ def test_a_field_of_the_wrong_type_prints_at_most_one_line(run, capsys, field):
             path.write_text(changed((before or b"").decode(), name, key, value))
             for command, *options in readers:
                 if command == "eval" and value not in ("text", True):
-                    continue  # reads the same as info, but slower
+                    continue  # reads the same files as info, but takes longer
                 assert main([command, str(run / "run"), *options]) in (0, 2)
                 said = capsys.readouterr().err
                 assert said.count("\n") <= 1 and "\x1b" not in said, (value, said)

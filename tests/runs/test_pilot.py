@@ -1,4 +1,4 @@
-"""What `--refine auto` chooses."""
+"""The choice of `--refine auto`."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def options(folder, tmp_path, **data):
 
 
 def shaken(view, rng):
-    """Return a view whose pose is wrong by about 2 degrees and 2 % of the distance."""
+    """Return the view with a pose that is wrong by about 2 degrees and 2 % of the distance."""
     twist = torch.from_numpy(rng.normal(size=6) * ([0.02] * 3 + [0.05] * 3))
     return View(CameraTensors.of(view.camera).moved(twist).value(), view.image, name=view.name)
 
@@ -45,7 +45,7 @@ def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
     assert not (tmp_path / "run").exists()
 
 
-def test_the_least_that_none_beats_clearly_is_chosen():
+def test_the_smallest_refinement_without_a_clearly_better_one_is_chosen():
     def chosen(none, poses, both):
         return pilot._choice({"none": none, "poses": poses, "both": both})[0]
 
@@ -65,7 +65,7 @@ def test_without_held_out_photos_nothing_is_refined(tmp_path):
     )
 
 
-def test_the_pilots_take_over_what_the_run_looks_like():
+def test_pilots_have_the_settings_of_the_run():
     config = replace(recipe(100), background=(1.0, 1.0, 1.0), antialiased=True, max_gaussians=500, seed=3)
     made = pilot._config(config, "poses")
     assert (made.background, made.antialiased, made.max_gaussians, made.seed) == (

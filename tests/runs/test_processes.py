@@ -38,7 +38,7 @@ def options(capture, out, **changes):
 
 
 def train(settings, team=ALONE, until=None):
-    """Train as the command does: every rank trains, the first one also finishes."""
+    """Train as the command does: every rank trains, and the first rank also finishes the run."""
     own = settings if team.rank == 0 else replace(settings, out=Path("/nowhere"), resume=False)
     run = CaptureRun(own, team=team)
     stopped = run.train((lambda: run.trainer.iteration >= until) if until else lambda: False)
@@ -63,7 +63,7 @@ def alone(capture, tmp_path_factory):
     return out
 
 
-def test_messages_arrive_as_they_were_sent():
+def test_messages_are_received_unchanged():
     sent = [
         torch.arange(5, dtype=torch.int64),
         torch.tensor([[True, False]]),
@@ -79,7 +79,7 @@ def test_messages_arrive_as_they_were_sent():
             assert ours.numpy().tobytes() == theirs.numpy().tobytes()
 
 
-def test_every_rank_gets_what_each_other_sends_it():
+def test_every_rank_receives_the_messages_of_all_others():
     def work(team):
         found = team.exchange([[torch.tensor([10 * team.rank + rank])] for rank in range(team.size)])
         return (
@@ -95,7 +95,7 @@ def test_every_rank_gets_what_each_other_sends_it():
     assert all(sent > 0 for *_, sent in results)
 
 
-def test_a_rank_that_sends_nothing_is_noticed_by_the_others():
+def test_the_other_ranks_report_a_rank_that_sends_nothing():
     def work(team):
         if team.rank == 0:
             team.exchange([[torch.zeros(3)]] * 2)
@@ -107,7 +107,7 @@ def test_a_rank_that_sends_nothing_is_noticed_by_the_others():
 
 
 @pytest.mark.parametrize("name", [*facts()])
-def test_processes_that_compute_differently_are_refused(name):
+def test_processes_with_different_arithmetic_are_refused(name):
     def work(team):
         found = facts()
         check_alike(team, "compute alike", found)
@@ -127,8 +127,8 @@ def test_a_run_of_several_processes_has_the_bytes_of_one(capture, alone, tmp_pat
     assert contents(tmp_path / "run", 48) == contents(alone, 48)
 
 
-def test_a_run_goes_on_with_another_number_of_processes(capture, alone, tmp_path):
-    """One process, then four, then two; interrupted at 20 and 32 images, by one of the ranks."""
+def test_a_run_is_resumed_by_another_number_of_processes(capture, alone, tmp_path):
+    """The run has one process, then four, then two; a rank interrupts it after 20 and 32 images."""
     out = tmp_path / "run"
     assert train(options(capture, out), until=20)
     assert (out / "checkpoints/iteration_20.safetensors").exists()
@@ -140,7 +140,7 @@ def test_a_run_goes_on_with_another_number_of_processes(capture, alone, tmp_path
 
 
 def test_the_log_and_the_milestones_count_images(alone):
-    """Steps have four images: lines follow every tenth image, an evaluation the 24th, checkpoints the 16th."""
+    """Steps have four images. Lines follow every tenth image, an evaluation the 24th, a checkpoint each 16th."""
     lines = [json.loads(line) for line in (alone / "log.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines if "loss" in line] == [12, 20, 32, 40]
     assert [line["iteration"] for line in lines if "psnr" in line] == [24]
@@ -150,7 +150,7 @@ def test_the_log_and_the_milestones_count_images(alone):
     ]
 
 
-def test_another_batch_is_another_run(capture, alone):
+def test_resuming_with_another_batch_is_refused(capture, alone):
     config = recipe(48, batch=2, densify_start=3, densify_every=10, densify_stop=40, grad_threshold=1e-5)
     with pytest.raises(CheckpointError, match="was started with batch = 4, not 2"):
         CaptureRun(options(capture, alone, config=config, resume=True))
@@ -211,7 +211,7 @@ def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tm
 
 
 def rank_of(launcher, rank):
-    """Return the process with a rank among the children of torchrun."""
+    """Return the child process of torchrun that has a rank."""
     for pid in Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split():
         if f"RANK={rank}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
             return int(pid)
@@ -262,7 +262,7 @@ def test_a_mistake_is_reported_once(capture, tmp_path, words, line):
 
 @pytest.mark.parametrize(("names", "allowed"), [({}, False), ({"TORCHELASTIC_MAX_RESTARTS": "2"}, True)])
 def test_restarts_need_resume(capture, tmp_path, monkeypatch, capsys, names, allowed):
-    """A restart that did not resume would fail, because the folder holds a run."""
+    """A restart without --resume fails, because the folder has a run."""
     for name, value in {
         "RANK": "0",
         "WORLD_SIZE": "2",

@@ -1,4 +1,4 @@
-"""A run with every remedy on at once: resumed from a checkpoint, it has the same bits for any number of threads."""
+"""A run with all remedies has the same bits after resuming from a checkpoint, on any number of threads."""
 
 import json
 
@@ -21,14 +21,14 @@ EVERYTHING = ("--refine", "both", "--appearance", "exposure", "--transients", "m
 EVERYTHING += ("--outside-masks", "empty", "--random-background")
 
 ITERATIONS = 60
-"""Masks of transients are found before the 7th, 13th, 22nd and 31st step; the cameras move from the 4th on."""
+"""Masks of transients are found before the 7th, 13th, 22nd and 31st step; cameras move from the 4th step on."""
 
 LEARNED = (TWISTS, LENSES, "exposures")
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """Photos of 64 x 48 px under a sky, with pasted things, and masks that exclude a corner."""
+    """Photos of 64 x 48 px under a sky, with pasted objects, and masks that exclude a corner."""
     made = outdoor_capture(64, 48, 16, points=500)
     struck, _ = pasted(made.views)
     mask = np.ones((48, 64), dtype=bool)
@@ -59,7 +59,7 @@ def opened(capture, folder, *more):
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory):
-    """The state of a run without interruption, on one thread, in which every remedy is at work."""
+    """The state of an uninterrupted run with all remedies, on one thread."""
     run, outside = opened(capture, tmp_path_factory.mktemp("whole") / "run"), []
 
     def watch(_trainer, event):
@@ -76,7 +76,7 @@ def whole(capture, tmp_path_factory):
 
 
 def interrupt(capture, folder, at):
-    """Train to an iteration and leave nothing but the folder, as after a kill."""
+    """Train to an iteration and keep only the folder, as after a kill."""
     run = opened(capture, folder)
     assert run.train(lambda: run.trainer.iteration >= at)
     assert run.trainer.state()[0]["transients.masks"].any(), "the checkpoint has masks"

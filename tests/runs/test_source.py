@@ -17,7 +17,7 @@ def test_a_scene_of_a_run_has_the_runs_cameras_and_settings(tmp_path, by_file):
     assert source.scene.antialiased is True and source.settings.antialiased
     assert source.settings.background == (1.0, 0.5, 0.0)
     np.testing.assert_allclose(source.scene.up, RUN_UP, atol=1e-12)
-    # The run's file lists the training views first; the source has them in the capture's order.
+    # The run's file lists training views first, the source has the capture's order.
     assert [name for name, _ in source.cameras] == [
         "0.00.jpg",
         "1.26.jpg",
@@ -35,12 +35,13 @@ def test_far_from_zero_scene_and_cameras_are_relative_to_the_runs_origin(tmp_pat
     folder, gaussians, cameras = make_run(tmp_path / "run", origin)
     source = open_source(folder.path)
     assert source.origin == origin
-    # The file holds float32 numbers near 16384, 2^-10 apart: half a step, plus the rounding of the sum.
+    # The file has float32 numbers near 16384, in steps of 2^-10, and is off by half a step plus the rounding of the
+    # sum.
     torch.testing.assert_close(source.scene.gaussians.means, gaussians.means, rtol=0, atol=2**-10)
     np.testing.assert_allclose(source.cameras[1][1].eye, cameras[0].eye, atol=1e-11)
 
 
-def test_a_bare_file_is_rendered_with_its_own_settings(tmp_path):
+def test_a_scene_file_is_rendered_with_its_own_settings(tmp_path):
     write_scene(tmp_path / "a.ply", random_scene(10))
     source = open_source(tmp_path / "a.ply")
     assert source.cameras == () and source.scene.up == (0.0, -1.0, 0.0)
@@ -50,7 +51,7 @@ def test_a_bare_file_is_rendered_with_its_own_settings(tmp_path):
     assert len(probes) == 3 and all((camera.W, camera.H) == (64, 64) for _, camera in probes)
 
 
-def test_probes_are_spread_over_the_cameras_and_small(tmp_path):
+def test_probe_cameras_are_small_and_spread_evenly(tmp_path):
     source = open_source(make_run(tmp_path / "run")[0].path)
     assert [name for name, _ in source.probes(2, 30)] == ["0.00.jpg", "2.51.jpg"]
     assert [(camera.W, camera.H) for _, camera in source.probes(9, 30)] == [(30, 20)] * 5

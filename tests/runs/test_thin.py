@@ -1,4 +1,4 @@
-"""A capture of few photos is tried: where longer trainings make unseen photos worse, the run ends early."""
+"""Captures of few photos get trials; if longer trials score worse on unseen photos, the run is shorter."""
 
 import dataclasses
 import shutil
@@ -23,7 +23,7 @@ COUNT = 10
 
 
 def turned(camera, angle):
-    """Turn a camera about its vertical axis."""
+    """Rotate a camera about its vertical axis."""
     s, c = np.sin(angle), np.cos(angle)
     return Camera.posed(
         np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ camera.R, camera.eye, camera.intrinsics
@@ -31,7 +31,7 @@ def turned(camera, angle):
 
 
 def capture(folder, error):
-    """Write ten photos whose cameras are turned by an error, radians, to the right and to the left in turn."""
+    """Write ten photos whose cameras are rotated by an error, radians, alternately to the right and to the left."""
     views, *rest = procedural_capture(size=64, count=COUNT)
     moved = [
         View(turned(view.camera, error if i % 2 else -error), view.read().image, name=view.name)
@@ -49,7 +49,7 @@ def given(request, tmp_path_factory):
     return request.param, options, CaptureReader(folder)
 
 
-def test_wrong_poses_end_a_training_early_and_exact_ones_do_not(given, monkeypatch):
+def test_wrong_poses_shorten_a_training_and_exact_poses_do_not(given, monkeypatch):
     error, options, reader = given
     steps = []
     trial = try_lengths(options, reader, lambda: steps.append(1))
@@ -61,20 +61,22 @@ def test_wrong_poses_end_a_training_early_and_exact_ones_do_not(given, monkeypat
         assert trial.longest is None and list(trial.scores) == list(thin.LENGTHS) and str(trial) == ""
 
 
-def test_the_plan_follows_the_trial_and_says_why(given, monkeypatch):
+def test_the_plan_follows_the_trial_and_gives_the_reason(given, monkeypatch):
     _, options, reader = given
     monkeypatch.setattr(
         "gsplat_edu.budget.length.try_lengths", lambda *_: ThinTrial(200, {200: 20.0, 400: 19.0}, 2)
     )
     found = plan(options, Limits(), reader=reader, quality="standard")
-    assert found.iterations == 200 and found.options.config.fast.stop == 120, "the schedule ends with the run"
+    assert found.iterations == 200 and found.options.config.fast.stop == 120, (
+        "the schedule has the length of the run"
+    )
     assert "standard is 200 iterations (longer trainings make photos worse" in found.sentences[0]
     assert "20.0 dB after 200 iterations and 19.0 dB after 400" in found.sentences[0]
     stayed = plan(options, Limits(), ["fast_stop"], reader=reader, quality="standard")
     assert stayed.options.config.fast.stop == options.config.fast.stop
 
 
-def test_only_thin_captures_from_points_are_tried(given, monkeypatch):
+def test_only_captures_of_few_photos_that_start_from_points_are_tried(given, monkeypatch):
     _, options, reader = given
     assert [needs_trial(views) for views in (1, 3, 4, 29, 30)] == [False, False, True, True, False]
 

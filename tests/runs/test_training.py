@@ -1,4 +1,4 @@
-"""Whole runs through the command line: the folder's contents, and the effect of a kill, a full disk or a mistake."""
+"""Runs through the command line: the contents of the folder, and the effects of kills, full disks and mistakes."""
 
 import dataclasses
 import errno
@@ -27,7 +27,7 @@ from processes import Program
 SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--set", "densify_start=5"]
 SHORT += ["--set", "densify_every=10"]
 
-# Long enough to be killed midway: about two seconds.
+# about two seconds, long enough to be killed midway
 LONG = ["--iterations", "600", "--eval-every", "150", "--save-every", "40", "--set", "densify_start=20"]
 LONG += ["--set", "densify_every=20", "sh_every=100"]
 ADC = ["--strategy", "adc", "--set", "densify_stop=500", "grad_threshold=5e-5"]
@@ -82,7 +82,7 @@ def test_a_run_folder_has_the_expected_contents(finished):
 
 
 def test_the_saved_scene_renders_bit_identical_images(capture, tmp_path):
-    """Compare the trained scene with the written one at every training camera."""
+    """The trained and the written scene are compared at every training camera."""
     words = [
         "train",
         str(capture),
@@ -99,7 +99,7 @@ def test_the_saved_scene_renders_bit_identical_images(capture, tmp_path):
     run.train()
     run.finish()
     scene = read_scene(run.folder.latest_scene()[0])
-    assert scene.antialiased is True, "the file itself records it, for other programs"
+    assert scene.antialiased is True, "the file records it for other programs"
     loaded = scene.gaussians
     settings = render_settings(run.folder.read_config())
     cameras = {name: camera for name, _, camera in run.folder.read_cameras()}
@@ -223,7 +223,7 @@ DEATHS = (
 @pytest.mark.slow
 @pytest.mark.own_process
 def test_a_run_killed_around_the_renaming_of_any_file_resumes(capture, finished, tmp_path):
-    """One run is killed thirteen times, while a file still has its temporary name or just after its renaming."""
+    """A run is killed thirteen times, just before or just after a file is renamed from its temporary name."""
     out = tmp_path / "run"
     words = ["train", str(capture), "--out", str(out), *SHORT]
     for name, moment in DEATHS:
@@ -234,7 +234,7 @@ def test_a_run_killed_around_the_renaming_of_any_file_resumes(capture, finished,
     assert ply(out, 40) == ply(finished, 40)
     names = {path.relative_to(out) for path in out.rglob("*")}
     assert names == {path.relative_to(finished) for path in finished.rglob("*")}, (
-        "nothing is missing or left over"
+        "no file is missing and no temporary file is left"
     )
 
 
@@ -245,7 +245,7 @@ def with_another_lens(view):
 
 
 def test_another_capture_is_refused(capture, finished, tmp_path, capsys):
-    """Fewer views, another camera, other photos and other points are each named. A moved capture is accepted."""
+    """The message names what differs: views, a camera, photos or points. A moved capture is accepted."""
     views, points, colors = procedural_capture(64, 16)
     darker = [type(view)(view.camera, view.image // 2, name=view.name) for view in views]
     captures = {
@@ -393,7 +393,7 @@ def test_a_time_limit_leaves_a_scene_and_metrics_and_can_be_lifted(capture, fini
 
 @pytest.mark.own_process
 def test_a_full_disk_leaves_the_last_checkpoint(capture, tmp_path):
-    """A limit on file size stands in for a full disk: the log still fits, the larger checkpoint does not."""
+    """A limit on file size simulates a full disk: the log fits, the larger checkpoint does not."""
     out = tmp_path / "run"
     assert train(capture, out, *LONG, "--time-limit", "0.001s") == 0
     good = checkpoints(out)[-1]
@@ -406,7 +406,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(capture, tmp_path):
 
 
 def test_an_unwritable_folder_costs_one_line_before_photos_are_read(capture, tmp_path, capsys, monkeypatch):
-    """The failure of a read-only folder is simulated, because root may write everywhere."""
+    """The test simulates a read-only folder, because root may write everywhere."""
 
     def refuse(*words, **options):
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -432,7 +432,7 @@ def test_a_file_in_place_of_the_run_folder_is_a_one_line_error(capture, tmp_path
 )
 @pytest.mark.sliced(2)
 def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, strategy, cap):
-    """The start cloud has more points than the lower cap."""
+    """The start has more points than the lower cap."""
     options = [*LONG[2:], "--iterations", "150", "--strategy", strategy, "--max-gaussians", str(cap)]
     options += ADC if strategy == "adc" else []
     assert train(capture, tmp_path / "run", *options, "--eval-every", "0", "--save-every", "0") == 0

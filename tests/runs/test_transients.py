@@ -1,4 +1,4 @@
-"""The masks of a run: a killed and resumed run writes the same bytes, names stay inside the folder."""
+"""Masks of a run have the same bytes after a kill and a resumption, and their names stay inside the folder."""
 
 from pathlib import Path
 
@@ -58,13 +58,13 @@ def test_a_killed_and_resumed_run_writes_the_same_bytes(capture, tmp_path):
     with pytest.raises(KilledError):
         killed.train(callbacks=[kill])
     resumed = run_of(capture, tmp_path / "killed", resume=True)
-    assert resumed.trainer.iteration == 50, "masks of the 21st and 41st step come from the checkpoint"
+    assert resumed.trainer.iteration == 50, "the checkpoint has the masks of the 21st and 41st step"
     assert any(mask is not None for mask in resumed.trainer.transients.masks)
     resumed.train()
     assert written(resumed) == (scene, masks) and masks
 
 
-def test_masks_have_the_size_of_the_files_and_old_ones_go(capture, tmp_path):
+def test_masks_have_the_size_of_the_files_and_old_masks_are_removed(capture, tmp_path):
     dataset = load_dataset(capture)
     found = Transients(dataset.train, 100, render)
     found.masks[2] = np.zeros((36, 48), dtype=bool)
@@ -88,7 +88,7 @@ def test_masks_have_the_size_of_the_files_and_old_ones_go(capture, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../../up.png", "/root/photo.png", "C:\\photo.png"])
-def test_names_lead_out_of_no_folder(tmp_path, name):
+def test_names_cannot_leave_the_folder(tmp_path, name):
     folder = RunFolder(tmp_path / "run")
     assert mask_path(folder, name).parent == folder.transients
     assert mask_path(folder, "left/a.jpg") == folder.transients / Path("left/a.jpg.png")
