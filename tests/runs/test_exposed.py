@@ -1,4 +1,4 @@
-"""Photos are converted to the exposure of the scene: scaled photos are recovered, masks count, and `clean` uses them."""
+"""Photos are converted to the exposure of the scene: scaled photos are recovered, masks count, `clean` uses them."""
 
 import dataclasses
 
