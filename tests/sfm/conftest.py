@@ -21,7 +21,7 @@ def colmap():
 
 @pytest.fixture(scope="session")
 def phone(tmp_path_factory):
-    """14 photos as a phone writes them: pixels as on the sensor, orientation in EXIF. Half are portraits."""
+    """14 photos as a phone writes them, with the sensor's pixels and the orientation in EXIF. Half are portraits."""
     folder = tmp_path_factory.mktemp("phone") / "photos"
     truth = {}
     landscape, portrait = box_orbit(14), box_orbit(14, size=(240, 320))
@@ -32,8 +32,8 @@ def phone(tmp_path_factory):
         pixels = photograph_box(truth[name])
         exif = Image.Exif()
         if i % 2:
-            pixels = np.ascontiguousarray(np.rot90(pixels))  # the sensor lies on its side
-            exif[0x0112] = 6  # display turned clockwise
+            pixels = np.ascontiguousarray(np.rot90(pixels))  # portrait: the sensor is on its side
+            exif[0x0112] = 6  # to be rotated clockwise for display
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).save(folder / name, quality=95, exif=exif)
     return SimpleNamespace(folder=folder, truth=truth)
@@ -41,7 +41,8 @@ def phone(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def done(colmap, phone, tmp_path_factory):
-    """The capture that one thread makes from the phone's photos, with the run's messages (said) and progress."""
+    """The capture that one thread makes from the phone's photos, with the messages (`said`) and the progress of the
+    run."""
     out = tmp_path_factory.mktemp("done") / "capture"
     said, progress = [], []
     options = SfmOptions(phone.folder, out, max_features=LIMIT, threads=1)

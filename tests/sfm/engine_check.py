@@ -1,4 +1,4 @@
-"""Run a script that can import the engine in its own process, so that the tests' process never loads pycolmap."""
+"""Run a script that imports the engine in a process of its own, so that the tests' process never loads pycolmap."""
 
 import subprocess
 import sys

@@ -9,7 +9,7 @@ from gsplat_edu.sfm.align import upright
 
 
 def ring(count=8, radius=3.0, height=1.0, inwards=True):
-    """Level cameras on a circle, looking at the origin or outwards, as from the middle of a room."""
+    """Return level cameras on a circle that look at the origin, or outwards, as from the middle of a room."""
     cameras = []
     for angle in 2 * np.pi * np.arange(count) / count:
         eye = np.array([radius * np.sin(angle), -height, -radius * np.cos(angle)])
@@ -32,11 +32,11 @@ def test_cameras_are_level_five_away_and_look_at_the_origin():
     for camera in cameras:
         np.testing.assert_allclose(camera.R[0, 1], 0.0, atol=1e-9, err_msg="right is level")
         np.testing.assert_allclose(np.linalg.norm(camera.eye), 5.0, rtol=1e-9)
-        assert camera.eye[1] < 0, "above its target, since y points down"
+        assert camera.eye[1] < 0, "above its target, because y points down"
     assert abs(cameras[0].R[2, 0]) < 1e-9 and cameras[0].R[2, 2] > 0
 
 
-def test_for_cameras_looking_outwards_the_origin_is_their_centre_and_walls_are_five_away():
+def test_cameras_that_look_outwards_are_centred_and_walls_are_five_away():
     rng = np.random.default_rng(1)
     walls = rng.normal(size=(2000, 3))
     walls *= 20.0 / np.linalg.norm(walls, axis=1, keepdims=True)

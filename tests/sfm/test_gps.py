@@ -1,4 +1,4 @@
-"""The fit of GPS positions: geodesy, robustness, and when it is not used."""
+"""The fit of GPS positions: geodesy, robustness, and cases in which it is not used."""
 
 import os
 from pathlib import Path
@@ -18,7 +18,7 @@ def orbit(count, size=40.0):
 
 
 def moved(places):
-    """Return the same positions in an arbitrary world, and its scale in m per unit."""
+    """Return the positions in the coordinates of an arbitrary world, and its scale in m per unit."""
     R = Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix()
     return (places - [3.0, 5.0, 7.0]) @ R / 8.0 + [1.0, 2.0, 3.0], 8.0
 
@@ -27,7 +27,8 @@ def moved(places):
 def test_distances_are_those_of_the_ellipsoid(latitude):
     """One degree of latitude is 110.574 km at the equator and 111.694 at a pole, one of longitude 111.320 cos phi km.
 
-    Source of the figures: the meridional radius a (1 - e²) / (1 - e² sin² phi)^1.5 and the transverse one, restated.
+    The test computes them from the meridional radius a (1 - e²) / (1 - e² sin² phi)^1.5 and from the transverse
+    radius.
     """
     a, e2 = 6378137.0, 0.0066943799901413165
     phi, step = np.radians(latitude), 1e-4
@@ -58,7 +59,7 @@ def test_a_similarity_is_recovered():
 
 @pytest.mark.parametrize("count", [10, 45])
 def test_a_third_of_wrong_positions_does_not_matter(count):
-    """Noise of 1 m on positions spread over 40 m, and every third one off by 30 to 300 m."""
+    """Positions spread over 40 m have noise of 1 m, and every third is wrong by 30 to 300 m."""
     rng = np.random.default_rng(count)
     places = orbit(count)
     eyes, scale = moved(places)
@@ -81,8 +82,8 @@ def test_exact_positions_give_the_exact_scale():
     assert fit.move.s == pytest.approx(scale, rel=1e-9) and fit.inside.all() and fit.residual < 1e-8
 
 
-def test_positions_that_say_nothing_are_not_used():
-    """A phone around a statue: 5 m of error on an orbit of 3 m. Also too few photos, and all in one place."""
+def test_positions_without_information_are_not_used():
+    """The cases are a phone's error of 5 m on an orbit of 3 m, too few photos, and photos from one place."""
     rng = np.random.default_rng(3)
     places = orbit(30, size=3.0)
     eyes, _ = moved(places)
@@ -92,7 +93,7 @@ def test_positions_that_say_nothing_are_not_used():
     assert fit_positions(eyes, np.zeros_like(places)) is None
 
 
-def test_a_straight_flight_tells_the_scale_but_not_up():
+def test_a_straight_flight_determines_scale_but_not_up():
     rng = np.random.default_rng(4)
     places = np.outer(np.linspace(-100, 100, 25), [0.8, 0.6, 0.0])
     eyes, scale = moved(places)
@@ -101,7 +102,7 @@ def test_a_straight_flight_tells_the_scale_but_not_up():
 
 
 def test_a_drones_positions_are_read_and_fit():
-    """167 photos of a drone: their own positions, in another world and with noise of 1.5 m, give the scale to 1 %."""
+    """The positions of a drone's 167 photos, in another world and with noise of 1.5 m, give the scale to 1 %."""
     shared = Path(__file__).parents[3] / "shared" / "data"
     folder = Path(os.environ.get("GSPLAT_EDU_DATA", shared)) / "seneca167" / "images"
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""Which poses count: each test spoils a model in one way and expects exactly the spoiled poses to be found."""
+"""Wrong poses are found: each test spoils a model in one way and expects exactly the spoiled poses."""
 
 import json
 
@@ -14,7 +14,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def work(done):
-    """The beginning of a script that loads the model of a finished run."""
+    """Beginning of a script that loads the model of a finished run."""
     stages = json.loads((done.out / "sfm" / "stages.json").read_text())["stages"]
     chosen = done.out / "sfm" / stages["mapping"]["facts"]["folder"]
     return f"""
@@ -78,7 +78,7 @@ print(_supported(np.where(np.arange(60) < 10, 2, 1), spread, 320))  # only ten p
 
 
 def test_of_two_weakly_connected_parts_the_larger_is_kept(work):
-    """Each part supports itself, but only a handful of points connect them."""
+    """Both parts are sound, but only a few points connect them."""
     script = """
 part = {1, 2, 3, 4, 5}
 names = {i: model.image(i).name for i in model.reg_image_ids()}
@@ -98,7 +98,7 @@ print(set(judge.unsupported(model)) >= part or sorted(judge.unsupported(model)))
 
 
 def test_wrong_cameras_are_removed_and_registered_again(work, tmp_path):
-    """One camera is far away with few points, one is misplaced, as after a mapper that gives every photo a pose."""
+    """One camera is far away with few points and one is misplaced, as by a mapper that gives every photo a pose."""
     script = f"""
 truth = {{i: model.image(i).projection_center() for i in (5, 9)}}
 keep(9, seen(9)[0][:8])
@@ -113,11 +113,11 @@ print(max(abs(repaired.image(i).projection_center() - truth[i]).max() for i in t
     broken, after, off = printed(work + script)
     assert set(json.loads(broken)) >= {5, 9}
     assert after == "{} set() 14"
-    assert float(off) < 0.2, "a fifth of the smaller displacement"
+    assert float(off) < 0.2, "errors are below a fifth of the smaller displacement"
 
 
 def test_scattered_focal_lengths_are_detected(work):
-    """Focal lengths scatter if their 10th and 90th percentiles differ by more than a factor of two."""
+    """They are scattered if their 10th and 90th percentiles differ by more than a factor of two."""
     script = """
 from engine.judge import scattered
 

@@ -1,4 +1,4 @@
-"""How many lens parameters are freed, on synthetic matches from a known camera."""
+"""The number of lens parameters that are freed, on synthetic matches from a known camera."""
 
 import json
 
@@ -74,7 +74,7 @@ found(scene("OPENCV", crooked, 12, points=800, noise=0.1))
     many, few = outcome(script)
     assert many[0].startswith("OPENCV")
     assert many[1:3] == pytest.approx([815, 815], rel=0.01)
-    assert few[0] == "SIMPLE_RADIAL", "six photos per half are too few to judge"
+    assert few[0] == "SIMPLE_RADIAL", "six photos per half are too few to judge distortion"
 
 
 def test_an_off_centre_principal_point_is_freed():
@@ -85,7 +85,7 @@ def test_an_off_centre_principal_point_is_freed():
 
 
 def test_a_lens_freed_during_mapping_is_simplified_and_judged_again():
-    """Start from a free lens as mapping leaves it: fx, fy and the distortion have fitted the noise."""
+    """Mapping with a free lens has fitted fx, fy and distortion to the noise."""
     script = """
 def free(model, params):
     for number in list(model.cameras):
@@ -105,5 +105,5 @@ free(scene("OPENCV", crooked, 20, points=500, noise=0.1), [*crooked[:4], -0.19, 
     plain, crooked = outcome(script)
     assert plain[0] == "SIMPLE_RADIAL" and plain[1] == plain[2] == pytest.approx(815, rel=0.01)
     assert crooked[0].startswith("OPENCV") and crooked[1:3] == pytest.approx([815, 815], rel=0.01)
-    k1, _, p1, p2 = crooked[3]  # only the corners constrain k2
+    k1, _, p1, p2 = crooked[3]  # k2 matters only in the corners
     assert (k1, p1, p2) == pytest.approx((-0.2, 0.02, -0.03), abs=0.02)

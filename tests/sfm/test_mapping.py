@@ -25,7 +25,7 @@ def test_video_frames_always_share_a_camera():
 
 
 def test_a_lens_is_freed_only_with_twenty_photos_per_camera():
-    """A free lens is judged on held-out photos, which needs enough of them, and no unjudged lens is kept."""
+    """A free lens is judged on held-out photos, so with too few photos no lens is freed."""
     for photos, cameras, free in ((19, 1, False), (20, 1, True), (59, 3, False)):
         ways = attempts("auto", "auto", photos, cameras, one_lens=True)
         assert {way.model for way in ways} == {"auto"}
@@ -46,7 +46,7 @@ def test_many_photos_are_mapped_globally_first():
     assert attempts("auto", "auto", MANY_PHOTOS, 1, one_lens=True)[0].mapper == "incremental"
 
 
-def test_an_attempt_describes_itself():
+def test_attempts_have_descriptions():
     assert str(Attempt("global", "OPENCV")) == "global mapper, OPENCV"
     last = attempts("auto", "auto", 50, 1, one_lens=False)[-1]
     assert str(last) == "incremental mapper, a camera per photo, lower thresholds"
@@ -54,7 +54,7 @@ def test_an_attempt_describes_itself():
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
 def test_a_turned_lens_projects_to_the_turned_pixel(turns):
-    """After the turn, a point projects to the place that its pixel has in the turned photo."""
+    """A point projects to the place of its pixel in the rotated photo."""
     lens = Lens(40, 30, 50.0, 55.0, 18.0, 16.5)
     point = np.array([0.11, -0.07, 0.9])
     u, v, _ = Camera(np.eye(3), np.zeros(3), 50.0, 55.0, 18.0, 16.5, 30, 40).project(point)
@@ -79,7 +79,7 @@ WAYS = attempts("auto", "auto", 9, 1, one_lens=True)
 
 
 def model(numbers, agreement=1.0, steady=100, error=0.5):
-    """Return what the job "mapping" returns for a model of the given photos."""
+    """Return the result of the job "mapping" for a model of the given photos."""
     names = [f"{i}.jpg" for i in numbers]
     facts = {
         "folder": "0",
@@ -126,11 +126,11 @@ def test_attempts_stop_once_most_photos_are_registered(mapped):
     assert tried == 2 and len(best["names"]) == 9
     assert best["folder"] == "models/2/0" and best["way"] == f"{WAYS[1]}, SIMPLE_RADIAL"
     assert said == [f"{WAYS[0]}: 4 of 10 photos have a pose that counts"]
-    assert mapped(8, 9, 10)[1] == 1, "80 % is enough"
+    assert mapped(8, 9, 10)[1] == 1, "an attempt that registers 80 % is the last"
 
 
 def test_the_largest_model_is_kept_if_no_attempt_registers_most_photos(mapped):
-    best, tried, said = mapped(4, 7, 5)  # no two models agree
+    best, tried, said = mapped(4, 7, 5)  # no two models have the same photos
     assert tried == 3 and len(best["names"]) == 7 and best["way"] == f"{WAYS[1]}, SIMPLE_RADIAL"
     assert said == [
         f"{way}: {count} of 10 photos have a pose that counts"
@@ -185,7 +185,7 @@ def test_ties_between_models_are_broken_by_steady_points_then_error():
 
 
 def test_photos_with_their_own_camera_count_six_eighths():
-    """Such a photo has eight unknowns instead of six: 26.7 of them are worth 20 that share a camera."""
+    """Such a photo has eight unknowns instead of six, so 26.7 of them count as 20 photos that share a camera."""
     shared = model(range(20))
     for count, taken in ((25, False), (27, False), (28, True)):
         free = model(range(count), error=0.1) | {"per_photo": True}
@@ -205,10 +205,10 @@ def test_photos_of_many_sizes_share_a_camera():
         group(1, 401, 301),
         group(1, 280, 210),
     ]
-    assert shared_cameras(sizes) == {1: 3, 2: 3, 4: 3, 5: 3}, "the largest photos lead"
+    assert shared_cameras(sizes) == {1: 3, 2: 3, 4: 3, 5: 3}, "the group has the camera of the largest photos"
     others = [group(1, 240, 320), group(1, 320, 180), group(1, 160, 120, kind="Canon"), group(10, 320, 240)]
     assert shared_cameras([*sizes, *others[:3]]) == {1: 3, 2: 3, 4: 3, 5: 3}, (
-        "other aspect ratios or another camera"
+        "other aspect ratios and other cameras are not merged"
     )
     assert shared_cameras([*sizes, others[3]]) == {}, "most photos have one size, so no cameras are merged"
     mixed = [*sizes, group(9, 800, 450), group(10, 800, 600)]
@@ -220,7 +220,7 @@ def test_attempts_stop_once_two_models_agree(mapped):
     assert tried == 2 and len(best["names"]) == 6, "two attempts register the same six photos"
 
 
-def test_without_poses_the_error_gives_the_reason(mapped):
+def test_the_error_gives_the_reason_why_there_are_no_poses(mapped):
     best, _, _ = mapped(0, 0, 0)
     assert "10 of 10 photos match one another, but their matches yield no poses" in str(best)
     assert "too little in common" not in str(best)

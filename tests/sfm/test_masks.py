@@ -17,7 +17,7 @@ from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 
 HIDDEN = np.s_[:, :120]
-"""The part that masks hide in photos 320 px wide. Unmasked photos have features there."""
+"""The part of photos 320 px wide that masks exclude; without masks, it has features."""
 
 
 def image(path, pixels=None):
@@ -62,10 +62,10 @@ def test_a_mask_of_another_size_is_refused(tmp_path):
 
 
 ORIENTATIONS = {1: 6, 2: 3, 3: 8}
-"""EXIF orientation by the number of clockwise quarter turns that make the photo upright."""
+"""EXIF orientation of a photo, by the number of clockwise quarter turns that make it upright."""
 
 CORNER = np.zeros((30, 40), np.uint8)
-CORNER[:10, :25] = 200  # differs from itself under every turn
+CORNER[:10, :25] = 200  # different after every rotation
 
 
 def turned_photo(path, turns, pixels):
@@ -77,7 +77,7 @@ def turned_photo(path, turns, pixels):
 
 
 def masks_of(tmp_path, photos):
-    """Return the masks as they go into the capture, and as COLMAP reads them."""
+    """Return the masks of the capture, and those that COLMAP reads."""
     facts, unreadable = copy_photos(photos, tmp_path, tmp_path / "work" / "photos", 1600)
     assert not unreadable
     read = [decode_mask(tmp_path / "work" / "masks" / f"{photo.copy}.png") for photo in facts]
@@ -117,11 +117,11 @@ def test_unrelated_masks_are_not_used(tmp_path):
     assert unused_folders(photos, find_masks(photos)) == [tmp_path / "masks"]
     assert find_masks(photos) == {photos[1]: ours}
     inside = [image(tmp_path / "two" / "masks" / name) for name in ("a.png", "b.png")]
-    assert find_masks(inside) == {}, "photos in a folder named masks are not their own masks"
+    assert find_masks(inside) == {}, "photos in a folder named masks are not taken for their own masks"
 
 
 def test_a_mask_that_cannot_be_decoded_is_named(tmp_path):
-    """The message names the mask, not the photo, which is sound."""
+    """The message names the mask, because the photo is intact."""
     photo = image(tmp_path / "a.png")
     mask = image(
         tmp_path / "masks" / "a.png", np.random.default_rng(0).integers(0, 255, (30, 40)).astype(np.uint8)
@@ -134,18 +134,18 @@ def test_a_mask_that_cannot_be_decoded_is_named(tmp_path):
 @pytest.mark.usefixtures("colmap")
 @pytest.mark.sliced(1, group="captures from photos")
 def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
-    """Some photos have a mask, some are transparent in the same place, and one has neither."""
+    """Some photos have a mask, some are transparent at the same place, and one has neither."""
     source, out = tmp_path / "photos", tmp_path / "capture"
     counts = np.full((240, 320), 255, np.uint8)
     counts[HIDDEN] = 0
-    image(tmp_path / "masks" / "house.png")  # unrelated
+    image(tmp_path / "masks" / "house.png")  # a mask of no photo
     for i, camera in enumerate(box_orbit(8, turn=2.5)):
         pixels = photograph_box(camera)
         if i == 7:
             image(source / "7.png", pixels)
         elif i % 2:
             image(source / f"{i}.png", np.dstack([pixels, counts]))
-        elif i == 2:  # stored on its side, with an upright mask
+        elif i == 2:  # a photo stored on its side with an upright mask
             turned_photo(source / "2.png", 1, np.ascontiguousarray(np.rot90(pixels)))
             image(source / "masks" / "2.png", counts)
         else:
@@ -174,5 +174,5 @@ def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
             continue
         photo = view.read()
         seen = photo.mask if int(view.name[0]) % 2 == 0 else photo.alpha > 127
-        # The estimated lens shifts the edge by a few pixels but neither smooths nor loses it.
+        # The estimated lens shifts the edge by a few pixels, but the edge stays sharp.
         assert not seen[40:-40, :110].any() and seen[40:-40, 130:-20].all(), view.name

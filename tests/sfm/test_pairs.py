@@ -24,7 +24,7 @@ def test_sequential_pairs_reach_near_and_far():
 
 def test_nearest_pairs_match_brute_force():
     rng = np.random.default_rng(0)
-    points = rng.normal(size=(600, 3)) + 1e4  # several blocks, and far from the origin
+    points = rng.normal(size=(600, 3)) + 1e4  # several blocks of positions far from the origin
     distances = np.linalg.norm(points[:, None] - points, axis=2)
     np.fill_diagonal(distances, np.inf)
     order = np.argsort(distances, axis=1)[:, :3]
@@ -38,7 +38,7 @@ def test_neighbours_in_the_list_can_be_skipped():
 
 
 def test_places_on_the_ground_are_metres_apart():
-    # A minute of latitude is a nautical mile: 1852 m, to within 0.1 % on this mean sphere.
+    # A minute of latitude is a nautical mile, 1852 m, within 0.1 % on this mean sphere.
     points = on_the_ground([(47.0, 8.0, 0.0), (47.0 + 1 / 60, 8.0, 0.0), (47.0, 8.0, 30.0), (0.0, 8.0, 0.0)])
     np.testing.assert_allclose(np.linalg.norm(points[1] - points[0]), 1852, rtol=2e-3)
     np.testing.assert_allclose(np.linalg.norm(points[2] - points[0]), 30, rtol=1e-6)
@@ -52,7 +52,7 @@ def test_the_nearest_photos_by_appearance_are_neighbours(done):
     np.testing.assert_allclose(np.linalg.norm(described, axis=1), 1.0, rtol=1e-5)
     np.testing.assert_array_equal(described, photo_descriptors(done.out / "sfm" / "database.db", names, 0))
     nearest = nearest_pairs(described, 2)
-    # Photos are sorted by folder, so their order in the list is not that on the circle.
+    # Photos are sorted by folder, so their order in the list differs from that on the circle.
     place = {name: i for i, name in enumerate(sorted(done.truth))}
     turn = {place[name]: int(name[-6:-4]) for name in done.truth}
     steps = [min((turn[i] - turn[j]) % 14, (turn[j] - turn[i]) % 14) for i, j in nearest]

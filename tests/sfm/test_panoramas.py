@@ -1,4 +1,4 @@
-"""360-degree panoramas: recognised, cut, mapped as a rig, and trained like pinhole photos."""
+"""360-degree panoramas are recognised, cut, mapped as a rig, and trained like pinhole photos."""
 
 import io
 import json
@@ -52,11 +52,11 @@ def face_cameras(side=SIDE):
 
 @pytest.fixture(scope="module")
 def room(colmap, tmp_path_factory):
-    """The capture made from panoramas whose XMP says what they are."""
+    """The capture made from panoramas that XMP declares as such."""
     folder = tmp_path_factory.mktemp("room")
     (folder / "photos" / "masks").mkdir(parents=True)
     mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
-    mask[WIDTH * 5 // 12 :] = 0  # what is more than 60 degrees below the horizon, such as a tripod
+    mask[WIDTH * 5 // 12 :] = 0  # masks exclude more than 60 degrees below the horizon, such as a tripod
     for i, eye in enumerate(walk(COUNT)):
         Image.fromarray(mask).save(folder / "photos" / "masks" / f"p{i}.png")
         picture = Image.fromarray(panorama(eye, TURN * i, WIDTH))
@@ -103,12 +103,12 @@ def test_masks_of_panoramas_become_masks_of_faces(room):
         below = np.degrees(np.arcsin(rays[..., 1] / np.linalg.norm(rays, axis=2)))
         counts = views[f"p2_{number}.jpg"].read().mask
         assert counts[below < 59].all() and not counts[below > 61].any()
-        assert (below > 61).any() == (number >= 4)  # only the lower ring sees so far down
+        assert (below > 61).any() == (number >= 4)  # only faces of the lower ring see so far down
 
 
 @pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_whole_panoramas_are_held_out(room):
-    """A face is never tested by a scene that was trained on its neighbours from the same place."""
+    """A face is never held out from a training on other faces from the same place."""
     dataset = load_dataset(room.capture, DataSettings(test_every=3))
     places = [{view.name.partition("_")[0] for view in part} for part in (dataset.train, dataset.test)]
     assert places == [{"p1", "p2", "p4", "p5"}, {"p0", "p3", "p6"}]
@@ -119,10 +119,9 @@ def test_whole_panoramas_are_held_out(room):
 @pytest.mark.slow
 @pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_panoramas_train_as_well_as_pinhole_photos(room, tmp_path):
-    """The same places, directions and start points; cut panoramas against photos drawn ray by ray, with true poses.
-
-    Both scenes are compared with pinhole photos from places and in directions that neither has. The bound of 0.3 dB is
-    the one promised.
+    """Trainings on cut panoramas, and on photos drawn ray by ray with true poses, have the same places, directions
+    and start points. Both scenes are compared with pinhole photos of other places and directions. README promises the
+    bound of 0.3 dB.
     """
     dataset = load_dataset(room.capture, DataSettings(test_every=0))
     truth = face_cameras()
@@ -156,7 +155,7 @@ def score(gaussians, camera, move):
 
 @pytest.fixture
 def files(tmp_path):
-    """Write images of given sizes; those with `xmp` say that they are panoramas."""
+    """Write images of given sizes; XMP declares those with `xmp` to be panoramas."""
 
     def write(*sizes, xmp=()):
         found = []
@@ -169,8 +168,8 @@ def files(tmp_path):
     return write
 
 
-def test_the_shape_alone_is_no_panorama(files):
-    """A photo cropped to 2:1 stays a photo; a note names the option."""
+def test_the_shape_alone_makes_no_panorama(files):
+    """A photo cropped to 2:1 is treated as a photo, and a note names the option."""
     said = []
     assert not are_panoramas(files((64, 32), (64, 32)), "auto", said.append)
     assert "if they are 360-degree panoramas, give --panorama yes" in said[0]
@@ -188,7 +187,9 @@ def test_xmp_decides(files):
         "1 of 2 photos are 360-degree panoramas according to their XMP, first 0.jpg: used as plain" in said[0]
     )
     said.clear()
-    assert not are_panoramas(files((64, 20), (64, 20), xmp=(0, 1)), "auto", said.append)  # parts of a sphere
+    assert not are_panoramas(
+        files((64, 20), (64, 20), xmp=(0, 1)), "auto", said.append
+    )  # panoramas of a part of the sphere
 
 
 def test_photos_of_another_shape_are_refused(files, capsys, tmp_path):
@@ -201,7 +202,7 @@ def test_photos_of_another_shape_are_refused(files, capsys, tmp_path):
 
 
 def test_orientation_alpha_masks_and_names(tmp_path):
-    """EXIF turns a panorama before it is cut; masks are found; two files with one stem give distinct faces."""
+    """EXIF rotates a panorama before it is cut, masks are found, and two files with one stem give distinct faces."""
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (32, 64, 3), dtype=np.uint8)
     exif = Image.Exif()
@@ -222,7 +223,7 @@ def test_orientation_alpha_masks_and_names(tmp_path):
     for one, other in zip(found[0].faces, found[1].faces, strict=True):
         np.testing.assert_array_equal(np.asarray(Image.open(out / one)), np.asarray(Image.open(out / other)))
     counts = [np.asarray(Image.open(out / "masks" / f"{name}.png")) != 0 for name in found[0].faces]
-    assert not counts[3].any() and counts[1].all()  # 90 degrees to the left, to the right
+    assert not counts[3].any() and counts[1].all()  # 90 degrees to the left and to the right
     half = counts[0]
     assert not half[:, :10].any() and half[:, 11:].all()
 
@@ -240,5 +241,5 @@ def test_the_work_folder_records_what_was_cut(room):
     facts = json.loads((room.capture / "sfm" / "stages.json").read_text())["stages"]["faces"]["facts"]
     assert [one["name"] for one in facts["panoramas"]] == [f"p{i}.jpg" for i in range(COUNT)]
     data = (room.capture / "images" / "p0_0.jpg").read_bytes()
-    assert data == (room.capture / "sfm" / "faces" / "p0_0.jpg").read_bytes()  # no second loss
+    assert data == (room.capture / "sfm" / "faces" / "p0_0.jpg").read_bytes()  # no second lossy copy
     assert Image.open(io.BytesIO(data)).size == (SIDE, SIDE)

@@ -1,4 +1,4 @@
-"""Structure from motion with photos as phones write them: HEIC, turned, mirrored and in Display P3."""
+"""Structure from motion with photos of phones: HEIC, rotated, mirrored and in Display P3."""
 
 import sys
 
@@ -20,7 +20,7 @@ from sfm.textured_box import LIMIT, cameras_of, check
 pytest.importorskip("pillow_heif")
 
 LOSS = 6
-"""Largest error of the working copies' JPEG on flat quarters, away from their edges."""
+"""Largest JPEG error of working copies in flat quarters, away from their edges."""
 
 
 def inside(pixels):
@@ -33,13 +33,13 @@ def inside(pixels):
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.heic"])
-def test_every_photo_comes_out_upright_with_the_lens_of_the_sensor(tmp_path, name, orientation):
-    """Features are sought in the sensor's picture, mirrored back if necessary; its turns make it upright."""
+def test_every_photo_becomes_upright_and_keeps_the_lens_of_the_sensor(tmp_path, name, orientation):
+    """Features are extracted from the sensor's picture, unmirrored if necessary; quarter turns make it upright."""
     upright = quarters(128, 96)
     path = save(tmp_path / "photos" / name, upright, orientation)
     (photo,), unreadable = copy_photos([path], path.parent, tmp_path / "copies", 1600)
     assert unreadable == []
-    assert as_stored(upright, orientation).shape[1::-1] == (photo.W, photo.H), "also of a HEIC"
+    assert as_stored(upright, orientation).shape[1::-1] == (photo.W, photo.H), "a HEIC has turns as well"
     with Image.open(tmp_path / "copies" / photo.copy) as file:
         copy = np.asarray(file)
     assert copy.shape == (photo.H, photo.W, 3)
@@ -51,9 +51,10 @@ def test_every_photo_comes_out_upright_with_the_lens_of_the_sensor(tmp_path, nam
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize(("name", "kind"), [("a.jpg", "upright"), ("a.jpg", "stored"), ("a.heic", "upright")])
-def test_masks_lie_like_the_working_copies(tmp_path, name, orientation, kind):
-    """A mask is upright or stored like its photo. A HEIC's is upright, because every program shows a HEIC upright."""
-    # a second photo in portrait tells how masks lie, where the size does not: half turns and mirrored photos
+def test_masks_have_the_orientation_of_the_working_copies(tmp_path, name, orientation, kind):
+    """A mask is upright or stored like its photo. That of a HEIC is upright, because every program shows a HEIC
+    upright."""
+    # where the size does not decide (half turns, mirrored photos), the mask of a second photo in portrait does
     source = tmp_path / "photos"
     files = [
         save(source / name, quarters(128, 96), orientation),
@@ -74,7 +75,7 @@ def test_masks_lie_like_the_working_copies(tmp_path, name, orientation, kind):
             counts = np.rot90(np.asarray(mask), -photo.turns)
         H, W = counts.shape
         assert counts[: H // 2, : W // 2].all() and np.count_nonzero(counts) == H * W // 4, (
-            "the first quarter"
+            "the mask excludes the first quarter"
         )
         assert shown.shape[:2] == counts.shape
         with Image.open(photo.mask) as kept:
@@ -83,7 +84,7 @@ def test_masks_lie_like_the_working_copies(tmp_path, name, orientation, kind):
 
 @pytest.mark.sliced(1, group="captures from photos")
 def test_photos_of_a_phone_become_an_upright_capture_in_srgb(colmap, tmp_path):
-    """HEIC in Display P3 in all rotations, and a mirrored JPEG, from one camera."""
+    """One camera took HEICs in Display P3 of all orientations, and a mirrored JPEG."""
     truth, written = {}, {}
     landscape, portrait = box_orbit(14), box_orbit(14, size=(240, 320))
     for i in range(14):
@@ -102,7 +103,7 @@ def test_photos_of_a_phone_become_an_upright_capture_in_srgb(colmap, tmp_path):
     out = reconstruct(
         SfmOptions(tmp_path / "photos", tmp_path / "capture", max_features=LIMIT, threads=1), said.append
     )
-    assert "14 from one camera" in said[0], "portraits have the camera of the landscapes"
+    assert "14 from one camera" in said[0], "portraits share the camera of the landscapes"
     found = cameras_of(out)
     assert set(found) == set(truth)
     check(found, truth)
@@ -112,7 +113,7 @@ def test_photos_of_a_phone_become_an_upright_capture_in_srgb(colmap, tmp_path):
         blurred = [
             np.asarray(Image.fromarray(np.uint8(np.rint(p))).resize((8, 8), 4)) for p in (image, expected)
         ]
-        # means of 1/64 of a photo: undistortion moves less than a pixel, and the codecs keep means
+        # Means of 1/64 of a photo change little: undistortion moves less than a pixel, and the codecs keep means.
         assert np.abs(blurred[0].astype(int) - blurred[1]).max() < 12, view.name
 
 
@@ -121,7 +122,7 @@ def test_sfm_without_pillow_heif_stops_with_the_command_that_installs_it(
 ):
     for i in range(3):
         save(tmp_path / "photos" / f"{i}.heic", quarters())
-    monkeypatch.setitem(sys.modules, "pillow_heif", None)  # as if it were not installed
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)  # pillow-heif is not installed
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert (
@@ -129,7 +130,7 @@ def test_sfm_without_pillow_heif_stops_with_the_command_that_installs_it(
     )
 
 
-def test_a_broken_profile_is_said_once(tmp_path):
+def test_a_broken_profile_is_reported_once(tmp_path):
     path = save(tmp_path / "photos" / "a.jpg", quarters(), icc_profile=b"not a profile")
     (photo,), _ = copy_photos([path], path.parent, tmp_path / "copies", 1600)
     assert photo.problem == "its colour profile is damaged"

@@ -33,8 +33,8 @@ def test_photos_are_recognised_by_their_contents(tmp_path):
         photo(tmp_path / "named.png", format="JPEG"),
     ]
     (tmp_path / "torn.jpeg").write_bytes(b"")
-    wanted.append(tmp_path / "torn.jpeg")  # listed here, reported later as undecodable
-    photo(tmp_path / "textures" / "atlas.png")  # belongs to a mesh made from these photos
+    wanted.append(tmp_path / "torn.jpeg")  # listed here, and reported later as undecodable
+    photo(tmp_path / "textures" / "atlas.png")  # the texture of a mesh made from these photos
     photo(tmp_path / "masks" / "IMG_1.png")
     photo(tmp_path / "b.mask.png")
     photo(tmp_path / "._IMG_1.JPG", format="JPEG")
@@ -122,17 +122,17 @@ def test_the_focal_length_comes_from_exif(tmp_path):
     details[0xA405] = 0  # unknown; instead 5 mm, at 50 px per cm
     details[0x920A], details[0xA20E], details[0xA210] = 5.0, 50.0, 3
     np.testing.assert_allclose(facts(tmp_path, exif).focal, 25.0, rtol=1e-4)
-    details[0xA002] = 80  # the photo was halved after it was taken
+    details[0xA002] = 80  # the photo was reduced to half its size later
     np.testing.assert_allclose(facts(tmp_path, exif).focal, 12.5, rtol=1e-4)
 
     details[0xA20E] = "0"
-    assert facts(tmp_path, exif).focal is None, "no resolution, written as text"
+    assert facts(tmp_path, exif).focal is None, "a resolution written as text does not count"
 
     details[0x920A], details[0xA20E] = 500.0, 50.0
     assert facts(tmp_path, exif).focal is None, "more than twenty times the width is implausible"
 
 
-def test_photos_of_one_lens_and_zoom_share_a_camera(tmp_path):
+def test_photos_with_equal_lens_and_zoom_share_a_camera(tmp_path):
     cameras = []
     for model, zoom, pixels in (
         ("Phone", 26, PIXELS),
@@ -163,7 +163,7 @@ def test_the_place_comes_from_exif_gps(tmp_path):
     np.testing.assert_allclose(facts(tmp_path, exif).place, (-33.86, 151.2, 25.0))
     gps[2] = (0.0, 0.0, 0.0)
     gps[4] = (0.0, 0.0, 0.0)
-    assert facts(tmp_path, exif).place is None, "zeros mean that the device did not know"
+    assert facts(tmp_path, exif).place is None, "zeros mean that the device had no position"
 
 
 def test_the_fingerprint_depends_on_names_and_contents(tmp_path):
@@ -203,8 +203,8 @@ def test_broken_links_and_pipes_are_not_photos(tmp_path, monkeypatch):
     assert photo_files(tmp_path) == asked == [wanted], "opening a pipe would block for ever"
 
 
-def test_a_camera_that_was_turned_counts_once():
-    """EXIF's orientation turns photos before they are compared; without it, sides and kind tell."""
+def test_a_rotated_camera_counts_once():
+    """Photos are compared after the rotation by EXIF; without EXIF, by their sides and the kind of camera."""
 
     def kinds(*cameras):
         return camera_kinds([PhotoFacts("a", "b", 4, 3, 0, None, camera) for camera in cameras])
@@ -215,5 +215,5 @@ def test_a_camera_that_was_turned_counts_once():
     )
     assert kinds("4000x3000 Phone 5.4 26", "3000x4000 Phone 2.2 13") == "2 kinds of camera or zoom"
     assert kinds("4000x3000", "3000x4000") == "2 kinds of camera or zoom", (
-        "nothing says that it is one camera"
+        "without EXIF, they may be two cameras"
     )

@@ -1,6 +1,6 @@
-"""Choosing between a global model with wrong poses and a smaller, sound one, and what `doctor` reports of them.
+"""A smaller, sound model is preferred to a global model with wrong poses, which `doctor` reports.
 
-The models are synthetic, because a mapper cannot be made to fail in a given way. The code that judges them is real.
+The models are synthetic, because no input makes a mapper fail in a given way.
 """
 
 import json
@@ -107,7 +107,7 @@ print(json.dumps(jobs.mapping(lambda done: None, **json.loads({order!r}))))
 
 @pytest.fixture(scope="module")
 def models(colmap, tmp_path_factory):
-    """Two models of the photos, each written as a capture, and the matches shared by both."""
+    """Two models of the photos, each written as a capture, and the matches that both have."""
     root = tmp_path_factory.mktemp("models")
     printed(MODELS.format(root=str(root), sound=SOUND, all=ALL))
     rng = np.random.default_rng(1)
@@ -121,7 +121,7 @@ def models(colmap, tmp_path_factory):
 
 
 def test_the_sound_model_is_chosen_over_one_with_more_poses(models, tmp_path, monkeypatch):
-    """By the number of poses alone the global model would win: all of its 40 photos have one."""
+    """The global model has more poses, one for each of the 40 photos."""
 
     answers = {}
 
@@ -142,12 +142,12 @@ def test_the_sound_model_is_chosen_over_one_with_more_poses(models, tmp_path, mo
     assert best["names"] == sound
     assert said[0] == "incremental mapper, SIMPLE_RADIAL: 26 of 40 photos have a pose that counts"
     assert [line.partition(":")[0] for line in said] == ["incremental mapper, SIMPLE_RADIAL"], (
-        "one message: both attempts agree"
+        "one message, because both attempts agree"
     )
     centres = [np.linalg.norm(pose.shift) for pose in read_images(tmp_path / best["folder"] / "images.bin")]
     assert len(centres) == SOUND and max(centres) < 1.5 * min(centres), "no camera is far away"
     (left,) = answers["global"]["models"]
-    assert left["names"] == sound and left["doubtful"] == models.weak, "if it were the only model"
+    assert left["names"] == sound and left["doubtful"] == models.weak, "alone, the model would be accepted"
 
 
 def test_doctor_names_the_wrong_poses_of_the_global_model(models):

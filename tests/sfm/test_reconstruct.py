@@ -32,10 +32,12 @@ def test_every_photo_gets_its_pose(done):
     assert set(found) == set(done.truth)
     R = check(found, done.truth)
     for name, camera in found.items():
-        assert (camera.W, camera.H) == (done.truth[name].W, done.truth[name].H), "upright and full size"
+        assert (camera.W, camera.H) == (done.truth[name].W, done.truth[name].H), (
+            "photos are upright and of full size"
+        )
         assert abs(camera.fx / 352 - 1) < 0.03
 
-    # The result's up is the true up, because the true cameras are level.
+    # up is the true one, because the true cameras are level
     assert np.degrees(np.arccos(R[1, 1])) < TURNED
     eyes = np.stack([camera.eye for camera in found.values()])
     first = found[min(found)]
@@ -44,11 +46,9 @@ def test_every_photo_gets_its_pose(done):
 
 
 def test_photos_are_upright_and_undistorted(done):
-    """Undistortion moves no quarter of a photo by a pixel.
-
-    The true cameras have no distortion, so undistortion moves pixels only by the error of the estimated lens, which is
-    below a pixel. A texture of white noise, blurred by s px and moved by d px, keeps a correlation of exp(-d²/4s²)
-    with itself: 0.94 at d = 1 and s = 2.
+    """Undistortion moves each quarter of a photo by less than a pixel. The true cameras have no distortion, so
+    undistortion moves pixels only by the error of the estimated lens. A texture of white noise, blurred by s px and
+    moved by d px, keeps a correlation of exp(-d²/4s²) with itself: 0.94 at d = 1 and s = 2.
     """
     for view in load_dataset(done.out, DataSettings(test_every=0)).train:
         taken, written = (
@@ -84,7 +84,7 @@ def test_points_lie_on_the_box_and_the_floor(done):
     # Two pixels at a distance of 4, along a ray that meets the floor at 45 degrees or less.
     assert np.mean(np.minimum(floor, box) < 4 * 2 * 4 / 352) > 0.9
     assert len(points) > 300
-    assert dataset.colors.std() > 0.05, "points have the photos' colours"
+    assert dataset.colors.std() > 0.05, "points have the colours of the photos"
 
 
 def test_progress_counts_photos_and_pairs(done):
@@ -96,7 +96,7 @@ def test_progress_counts_photos_and_pairs(done):
     assert [sentence.split(":")[0] for sentence in done.said] == list(STAGES)
     assert "14 from one camera" in done.said[0], "the sensor is the same in either orientation"
     assert "14 of 14 photos have a pose (incremental mapper, SIMPLE_RADIAL)" in done.said[3], (
-        "few photos constrain only a simple lens"
+        "few photos determine only a simple lens"
     )
     assert "COLMAP" not in done.said[0] and (done.out / "sfm" / "log.txt").stat().st_size > 1000
 
@@ -145,7 +145,7 @@ def test_an_interrupted_run_resumes_after_the_last_completed_stage(done, phone, 
         np.testing.assert_array_equal(parts[name].R, whole[name].R)
         np.testing.assert_array_equal(parts[name].eye, whole[name].eye)
 
-    # Changed options repeat the first stage that uses them and all later ones. The new result replaces the old one.
+    # With changed options, the first stage that uses them and all later stages run again, and replace the result.
     said = []
     reconstruct(replace(options, camera_model="SIMPLE_RADIAL", threads=0), said.append)
     assert said[3] == "mapping: camera_model changed; repeating this stage and the later ones"
@@ -172,7 +172,7 @@ def test_masks_that_no_run_wrote_are_kept(copied):
     mask = copied.out / "masks" / "mine.png"
     mask.parent.mkdir()
     mask.write_text("mine")
-    (copied.out / "sfm" / "published.json").unlink()  # earlier versions did not write it
+    (copied.out / "sfm" / "published.json").unlink()  # earlier versions did not write this file
     reconstruct(replace(copied, camera_model="SIMPLE_RADIAL"))
     assert mask.read_text() == "mine" and published(copied.out / "sfm") == ("images", "sparse")
 
@@ -192,7 +192,7 @@ def test_publishing_over_foreign_files_is_refused(tmp_path):
     (work / "result" / "images").mkdir(parents=True)
     publish(work, out)
     assert sorted(path.name for path in out.iterdir()) == ["images", "kept", "sfm"], (
-        "what a run published is replaced"
+        "the files of an earlier run are replaced"
     )
 
 
@@ -205,7 +205,7 @@ def test_photos_added_before_a_run_finished_are_not_overwritten(phone, tmp_path)
     with pytest.raises(StoppedError):
         reconstruct(options, progress=stop)
     with pytest.raises(StoppedError):
-        reconstruct(options, progress=stop)  # resumes: its own work folder is no obstacle
+        reconstruct(options, progress=stop)  # a resumed run accepts its own work folder
     (options.out / "images").mkdir()
     with pytest.raises(ArgumentError, match="already holds photos or poses"):
         reconstruct(options)
@@ -217,7 +217,7 @@ def test_matches_of_an_earlier_matcher_are_removed(copied, monkeypatch):
             return reader.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
 
     features = count("descriptors")
-    chosen = {(0, 5), (5, 10)}  # IMG_00, IMG_01 and IMG_02, side by side
+    chosen = {(0, 5), (5, 10)}  # the neighbours IMG_00, IMG_01 and IMG_02
     monkeypatch.setattr("gsplat_edu.sfm.pairs.sequential_pairs", lambda total, overlap: chosen)
     assert count("matches") == 91
     with pytest.raises(StoppedError):
@@ -301,7 +301,7 @@ def test_which_sources_need_poses(done, phone, tmp_path):
 
 
 def test_the_feature_limit_is_exact(done):
-    """COLMAP's own limit keeps whole scale levels and counts keypoints, some of which yield two features."""
+    """COLMAP's own limit keeps whole scale levels, and counts keypoints, some of which have two features."""
     with closing(sqlite3.connect(done.out / "sfm" / "database.db")) as reader:
         (most,) = reader.execute("SELECT MAX(rows) FROM keypoints").fetchone()
     assert most == LIMIT
@@ -313,7 +313,7 @@ def test_the_feature_limit_is_exact(done):
 
 @pytest.mark.sliced(1, group="reconstructions")
 def test_focal_lengths_from_exif_separate_two_cameras(tmp_path):
-    """One camera zooms further than the other, and their photos differ in size."""
+    """The two cameras have different zooms and photo sizes."""
     folder, truth = tmp_path / "photos", {}
     folder.mkdir()
     for i, near in enumerate(box_orbit(12, turn=3.5)):

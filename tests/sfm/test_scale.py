@@ -1,4 +1,4 @@
-"""Scale and up: from two marked points, from GPS, and through the whole way to a scene."""
+"""Scale and up from two marked points and from GPS, up to the scene."""
 
 import json
 import re
@@ -23,14 +23,14 @@ from gsplat_edu.sfm.scale_text import Mark, marks_of, points_of
 from sfm.textured_box import LIMIT, cameras_of
 
 A, B = np.array([-0.7, -1.0, -0.5]), np.array([0.7, -1.0, 0.5])
-"""Two opposite corners of the box's top, which are 1.720 units apart in its world."""
+"""Two opposite corners of the top of the box, 1.720 units of its world apart."""
 
 METRES = 2.5
-"""What one unit of the box's world is meant to be, m."""
+"""Assumed length of one unit of the box's world, m."""
 
 
 def marked(camera, point):
-    """Return where an upright photo shows a point, px from its left and upper edges, to a tenth of a pixel."""
+    """Return the pixel of a point in an upright photo, px from its left and upper edges, to a tenth of a pixel."""
     u, v, z = camera.project(camera.world_to_cam(point[None]))
     assert z[0] > 0 and 0 < u[0] < camera.W and 0 < v[0] < camera.H
     return f"{u[0] + 0.5:.1f},{v[0] + 0.5:.1f}"
@@ -43,10 +43,9 @@ def marks_in(truth, names, length):
 
 
 def test_marks_give_the_scale_end_to_end(done, tmp_path, capsys):
-    """Marks in a landscape, a portrait that EXIF turns, and names with blanks: the distance is right to 0.5 %.
-
-    The stages before the last one are reused, so this takes a second. The capture, the run and its scene have the
-    scale, and `info` says so of both.
+    """Marks in a landscape, in a portrait that EXIF rotates, and names with blanks give the distance to 0.5 %. The
+    stages before the last one are reused, so this takes a second. The capture, the run and its scene have the scale,
+    and `info` prints it.
     """
     names = list(done.truth)[:4]
     assert any(done.truth[name].W < done.truth[name].H for name in names)
@@ -78,12 +77,12 @@ def test_marks_give_the_scale_end_to_end(done, tmp_path, capsys):
         assert "units      1 unit = 1 m, from a given distance" in capsys.readouterr().out
         assert main(["convert", str(run), str(tmp_path / "x.compressed.ply")]) == 0
         assert read_scene(tmp_path / "x.compressed.ply").unit == "m"
-        # What is written has the capture's coordinates, in metres.
+        # written files have the capture's coordinates, in metres
         eyes = np.array([one["position"] for one in json.loads((run / "cameras.json").read_text())])
         given = np.stack([camera.eye for camera in cameras_of(capture).values()])
         np.testing.assert_allclose(np.sort(eyes, axis=0), np.sort(given, axis=0), atol=1e-6)
     finally:
-        reconstruct(done.options)  # the other tests use this capture
+        reconstruct(done.options)  # other tests use this capture
     assert read_scale(capture) is None
 
 
@@ -97,9 +96,8 @@ def at_scale(camera):
 @pytest.mark.usefixtures("colmap")
 @pytest.mark.sliced(1, group="captures from photos")
 def test_gps_gives_scale_and_up_end_to_end(tmp_path):
-    """Photos with GPS, from a world that is tilted against the cameras' own up: scale to 0.5 %, up to a degree.
-
-    EXIF stores hundredths of arc seconds here, 0.3 m; the box is 20 m per unit, so the positions spread over 80 m.
+    """Photos with GPS, in a world that is tilted relative to the cameras' mean up, give scale to 0.5 % and up to a
+    degree. EXIF has hundredths of arc seconds, 0.3 m. The box has 20 m per unit, so the positions spread over 80 m.
     """
     truth = {f"{i:02d}.jpg": camera for i, camera in enumerate(box_orbit(14))}
     metres, tilt = 20.0, np.radians(25.0)
@@ -131,10 +129,10 @@ def test_gps_gives_scale_and_up_end_to_end(tmp_path):
     brief = "--iterations 1 --strategy none --no-rescale --eval-every 0"
     assert main(["train", str(tmp_path / "out"), "--out", str(run), *brief.split()]) == 0
     scene = open_source(run).scene
-    assert scene.up == (0.0, -1.0, 0.0) and scene.unit == "m"  # not the photos' up, which is 25 degrees off
+    assert scene.up == (0.0, -1.0, 0.0) and scene.unit == "m"  # the cameras' mean up is 25 degrees off
     found = cameras_of(tmp_path / "out")
     move = align_cameras(found, truth)  # from the capture to the box's world
-    # one degree of latitude is 111.194 km here by the ellipsoid, one of longitude 74.628 km: 0.05 % apart at most
+    # One degree of latitude is 111.194 km on this ellipsoid, one of longitude 74.628 km, at most 0.05 % apart.
     assert 1 / move.s == pytest.approx(metres, rel=0.005)
     up = ground @ move.R @ [0.0, -1.0, 0.0]
     north = ground @ move.R @ [0.0, 0.0, 1.0]
@@ -177,7 +175,7 @@ def test_marks_are_triangulated_exactly():
     assert scale.unit == "cm"
     arbitrary, none = placed(CAMERAS, CLOUD, SIGHTS, "none", print)
     assert none is None
-    # the same point stays at the origin
+    # the origin is the same point as before
     np.testing.assert_allclose(move.t / move.s, arbitrary.t / arbitrary.s, atol=1e-12)
 
 
@@ -249,7 +247,7 @@ def test_texts_that_cannot_be_read_end_in_one_line(text, tmp_path, capsys):
         points_of(text)
 
 
-def test_a_scale_for_poses_that_are_given_is_refused(done, tmp_path, capsys):
+def test_a_scale_is_refused_if_poses_are_given(done, tmp_path, capsys):
     arguments = ["train", str(done.out), "--out", str(tmp_path / "run")]
     assert main([*arguments, "--scale", "none"]) == 2
     assert "--scale: has an effect only if DATA has no poses" in capsys.readouterr().err

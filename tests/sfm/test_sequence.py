@@ -1,4 +1,4 @@
-"""Photos taken in sequence are recognised, and photos in any other order are not."""
+"""Photos taken in sequence are recognised, photos in other orders are not."""
 
 import sqlite3
 from contextlib import closing
@@ -13,7 +13,7 @@ from gsplat_edu.sfm.sequence import CHANCE, FIRST, by_chance, find_sequence, nat
 
 
 def described(turns):
-    """Descriptors of photos of a circle: each shares with the others what lies in both fields of view, as VLAD does."""
+    """Return descriptors of photos on a circle. Like VLAD, two have in common what both fields of view contain."""
     rng = np.random.default_rng(1)
     around = np.radians(np.arange(0.0, 360.0, 2.0))
     seen = np.exp(-0.5 * (np.angle(np.exp(1j * (turns[:, None] - around))) / 0.25) ** 2)
@@ -22,7 +22,7 @@ def described(turns):
 
 
 def laps(count, number):
-    """Angles of photos on a circle that is walked so often, with uneven steps."""
+    """Return the angles of photos on several laps of a circle, with uneven steps."""
     steps = np.random.default_rng(2).uniform(0.5, 1.5, count)
     return 2.0 * np.pi * number * np.cumsum(steps) / steps.sum()
 
@@ -47,7 +47,7 @@ def test_numbers_in_names_are_compared_as_numbers():
 
 @pytest.mark.parametrize(("count", "number"), [(SEQUENCE, 1), (SEQUENCE, 2), (120, 1), (120, 2), (400, 3)])
 def test_one_or_more_laps_are_a_sequence(count, number):
-    files = sorted(names(count))  # as the photos are listed: IMG_1, IMG_10, IMG_100, ...
+    files = sorted(names(count))  # the order in which photos are listed: IMG_1, IMG_10, IMG_100, ...
     turns = laps(count, number)[[int(name[4:-4]) for name in files]]
     found = find_sequence(files, [""] * count, described(turns))
     assert found is not None and [files[i] for i in found.order] == names(count)
@@ -65,7 +65,7 @@ def test_shuffled_photos_are_no_sequence():
     assert 0 < most <= by_chance(120)
 
 
-def test_times_give_the_order_where_names_do_not():
+def test_times_give_the_order_if_names_do_not():
     vectors = described(laps(90, 1))
     shuffled = np.random.default_rng(4).permutation(90)
     times = [f"2024:02:12 00:{i // 60:02}:{i % 60:02}" for i in range(90)]
@@ -79,7 +79,7 @@ def test_times_give_the_order_where_names_do_not():
     assert find_sequence(names(90), [times[0]] * 90, vectors[shuffled]) is None
 
 
-def test_photos_without_features_or_all_alike_prove_nothing():
+def test_photos_without_features_or_of_equal_features_are_no_sequence():
     assert successors_alike(np.zeros((100, 8), np.float32)) == 0
     alike = np.zeros((100, 8), np.float32)
     alike[:, 0] = 1.0
@@ -87,8 +87,8 @@ def test_photos_without_features_or_all_alike_prove_nothing():
     assert find_sequence(names(100), [""] * 100, alike) is None
 
 
-def test_similarities_are_counted_as_by_hand():
-    vectors = described(laps(300, 1))  # more than one block
+def test_similarities_equal_a_plain_count():
+    vectors = described(laps(300, 1))  # several blocks
     similarity = vectors @ vectors.T
     expected = 0
     for i in range(299):
@@ -98,7 +98,7 @@ def test_similarities_are_counted_as_by_hand():
 
 
 def test_the_bound_on_chance_covers_random_orders():
-    """The bound's distribution lies above the simulated one, whose tail it is meant to bound, at several quantiles."""
+    """At several quantiles, the bound exceeds the tail of a simulated distribution."""
     count, rounds = 60, 4000
     rng = np.random.default_rng(5)
     vectors = described(laps(count, 1))
@@ -118,13 +118,13 @@ def test_the_bound_on_chance_covers_random_orders():
         q = bound[least]
         assert np.mean(hits >= least) <= q + 3.0 * np.sqrt(q * (1.0 - q) / rounds) + 1.0 / rounds
     assert bound[by_chance(count)] > CHANCE >= bound[by_chance(count) + 1]
-    assert by_chance(6) == 5, "so few prove nothing"
+    assert by_chance(6) == 5, "so few photos prove nothing"
     assert [by_chance(n) for n in (60, 120, 1000)] == sorted(by_chance(n) for n in (60, 120, 1000))
 
 
 @pytest.fixture
 def lap_of(tmp_path):
-    """Return what makes the candidates for photos of a circle, with a database like COLMAP's."""
+    """Return a function that makes the candidate pairs of photos on a circle, from a database like COLMAP's."""
 
     def make(turns, places=None, **changes):
         rng = np.random.default_rng(6)
@@ -162,7 +162,7 @@ def test_photos_in_sequence_get_the_pairs_of_a_video_and_closed_loops(lap_of):
     first, last = order[0], order[89]
     assert (min(first, last), max(first, last)) in chosen, "the loop is closed"
     assert len(chosen) < len(all_pairs(90)) / 2
-    assert found.farther("sequence") == all_pairs(90), "where photos do not connect, all pairs are tried"
+    assert found.farther("sequence") == all_pairs(90), "all pairs are tried where photos do not connect"
     assert str(found.sequence).startswith("the photos were taken in sequence: sorted by name, 8")
 
 
@@ -176,17 +176,17 @@ def test_few_photos_keep_all_pairs(lap_of):
     assert few.automatic() == "exhaustive" and few.of("exhaustive") == all_pairs(SEQUENCE - 1)
 
 
-def test_many_photos_without_an_order_get_those_nearby(lap_of):
+def test_many_photos_without_an_order_are_paired_with_nearby_photos(lap_of):
     count = EXHAUSTIVE + 1
     places = [(47.0 + 0.001 * i, 8.0, 0.0) for i in range(count)]
     found = lap_of(np.random.default_rng(8).permutation(laps(count, 1)), places)
     assert found.automatic() == "nearest"
     assert {(i, i + 1) for i in range(count - 1)} <= found.of("nearest"), (
-        "EXIF positions count in their own order"
+        "positions are those of the photos' own order"
     )
 
 
-def test_the_reason_for_fewer_pairs_is_told(lap_of):
+def test_the_reason_for_fewer_pairs_is_reported(lap_of):
     in_order = lap_of(turns_by_name(90, 1))
     assert in_order.reason("sequence").startswith("the photos were taken in sequence: sorted by name")
     assert in_order.reason("exhaustive") == ""

@@ -1,4 +1,4 @@
-"""Unusable sources are refused in one line before any work, and a failure leaves nothing behind."""
+"""Unusable sources are refused in one line before any work, and a failure leaves no files."""
 
 import json
 
@@ -22,7 +22,7 @@ def photos(folder, count):
 
 @pytest.fixture
 def run(tmp_path):
-    """A folder with the files by which a run is recognised."""
+    """Make a folder with the files by which a run is recognised."""
     folder = photos(tmp_path / "run" / "renders", 4).parent
     (folder / "config.json").write_text(json.dumps({"data": {"path": "captures/desk"}}))
     (folder / "cameras.json").write_text("[]")
@@ -74,4 +74,4 @@ def test_a_failure_before_any_result_leaves_no_folder(tmp_path):
     for out in (tmp_path / "deep" / "out", mine):
         assert main(["sfm", str(tmp_path / "broken.mp4"), str(out)]) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "mine"]
-    assert not any(mine.iterdir()), "a folder that existed before stays, and stays empty"
+    assert not any(mine.iterdir()), "an existing folder is not removed and stays empty"

@@ -1,4 +1,4 @@
-"""The record of completed stages may come from somebody else: its facts are checked before a resumed run uses them."""
+"""The record of completed stages may come from somebody else, so a resumed run checks its facts before using them."""
 
 import json
 
@@ -54,6 +54,6 @@ def test_facts_that_lead_elsewhere_or_have_another_type_are_refused(tmp_path, na
 
 
 def test_photos_are_described_by_their_files_and_not_by_the_record(done):
-    """The record holds no paths of photos or masks, so that a resumed run opens only what the source contains."""
+    """The record has no paths of photos or masks, so a resumed run opens only files of the source."""
     stages = json.loads((done.out / "sfm" / "stages.json").read_text())["stages"]
     assert set(stages["photos"]["facts"]) == {"summary", "names", "unreadable", "seconds"}

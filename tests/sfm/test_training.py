@@ -37,14 +37,14 @@ def a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys):
     assert cameras.keys() == truth.keys()
     check(cameras, truth)
 
-    # The same points, moved to the true world: the two runs differ only in poses and lens.
+    # Both runs have the same points, moved to the true world for one, so they differ only in poses and lens.
     move = align_cameras(cameras, truth)
     points = move.s * dataset.points @ move.R.T + move.t
     views = [View(camera, photograph_box(camera), name=name) for name, camera in truth.items()]
     write_colmap(tmp_path / "given", views, points, dataset.colors)
     given, _ = trained(tmp_path / "given", tmp_path / "true")
     assert reached > given - 0.5
-    # Photos 26 degrees apart predict each other badly with any poses, so check that the training views are learned.
+    # Photos 26 degrees apart predict each other badly even with true poses, so compare the training views.
     _, untrained = trained(tmp_path / "given", tmp_path / "untrained", 1)
     assert fitted > untrained + 4.0
 
@@ -70,5 +70,5 @@ def a_video_becomes_a_scene(tmp_path, _):
     "claim", [a_dozen_photos_train_as_well_as_with_their_true_poses, a_video_becomes_a_scene]
 )
 def test_one_command(tmp_path, capsys, claim):
-    """Each commit checks one claim: both run the same steps, of which other tests here check each."""
+    """A commit checks one of two claims, which run the same steps; other tests check each step."""
     claim(tmp_path, capsys)

@@ -1,4 +1,4 @@
-"""Points triangulated from given poses lie on the scene; a run starts from them, and resumes with them."""
+"""Points triangulated from given poses lie on the scene, and a run starts and resumes with them."""
 
 import importlib.util
 import math
@@ -62,10 +62,11 @@ def test_the_points_lie_on_the_scene(views, tmp_path):
     cloud = triangulate(views, tmp_path / "work", lambda *told_now: told.append(told_now))
     assert len(cloud.points) >= LEAST_POINTS and {stage for stage, *_ in told} == set(STAGES)
     off = distances(cloud.points)
-    # A pixel is 1/280 of the distance of 3, about 0.011; two rays off by half a pixel meet within a few of them.
+    # A pixel is 1/280 of the distance of 3, about 0.011. Two rays with errors of half a pixel meet within a few
+    # pixels.
     assert np.median(off) < 0.01 and np.quantile(off, 0.9) < 0.05
     assert cloud.colors.min() >= 0 and cloud.colors.max() <= 1 and cloud.colors.std() > 0.05
-    assert not (tmp_path / "work").exists(), "the work folder is gone"
+    assert not (tmp_path / "work").exists(), "the work folder is removed"
 
 
 def test_the_points_are_the_same_bits_for_any_number_of_threads(views, tmp_path):
@@ -73,7 +74,7 @@ def test_the_points_are_the_same_bits_for_any_number_of_threads(views, tmp_path)
     assert np.array_equal(one.points, two.points) and np.array_equal(one.colors, two.colors)
 
 
-def test_photos_that_do_not_match_give_none(tmp_path):
+def test_photos_that_do_not_match_give_no_points(tmp_path):
     plain = procedural_capture(size=32, count=4)[0]
     assert triangulate(plain, tmp_path / "work") is None
 

@@ -19,7 +19,7 @@ from sfm.textured_box import cameras_of, check
 from systems import needs_posix
 
 BLURRED = range(7, 90, 9)
-"""Frames blurred on purpose, as by camera shake."""
+"""Frames that the test blurs as camera shake does."""
 
 
 def silent(stage, done, total):
@@ -36,7 +36,7 @@ def write_video(path, frames):
 
 
 def turn_metadata(path, matrix):
-    """Write the phone's orientation into the track header of an mp4 (ISO 14496-12, box tkhd, version 0)."""
+    """Write an orientation into the track header of an mp4, as phones do (ISO 14496-12, box tkhd, version 0)."""
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 4 + 4 + 5 * 4 + 8 + 8
     assert struct.unpack_from(">9i", data, at) == (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
@@ -46,7 +46,7 @@ def turn_metadata(path, matrix):
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
-    """A walk around the box: 20 frames standing still, then 100 that move, slower in the second half."""
+    """A video of a walk around the box: 20 frames without motion, then 100 with motion, slower in the second half."""
     path = tmp_path_factory.mktemp("walk") / "walk.mp4"
     angles = np.concatenate([np.zeros(20), np.linspace(0, 2.6, 50), np.linspace(2.6, 3.9, 50)])
     cameras = [box_camera(angle, 0.45 + 0.15 * np.sin(3 * angle)) for angle in angles]
@@ -65,11 +65,12 @@ def test_sharp_frames_are_chosen_at_equal_steps_of_motion(walk):
     assert len(chosen) == 24
     assert sum(number < 20 for number in chosen) == 1, "one of the frames in which the camera stands still"
     fast, slow = (sum(low <= n < high for n in chosen) for low, high in ((20, 70), (70, 120)))
-    # The camera turns twice as far in the first half. Flow is not proportional to the angle: short sides move less.
+    # The camera covers twice the angle in the first half. Flow is not proportional to the angle, as short sides move
+    # less.
     assert 1.4 < fast / slow < 2.8
 
     steps = np.diff(walk.angles[chosen])
-    # Neighbours are less than two intervals apart wherever in them they are. The factor 1.5 allows for uneven flow.
+    # Chosen frames are less than two intervals apart. The factor 1.5 allows for uneven flow.
     assert steps.max() < 2 * 1.5 * walk.angles[-1] / 24
 
 
@@ -90,7 +91,7 @@ def test_frames_become_a_capture(walk, colmap, tmp_path):
 
 @needs_posix
 def test_a_video_name_need_not_be_utf8(walk, tmp_path):
-    """OpenCV ends the process when given a name that is not UTF-8."""
+    """OpenCV ends the process if a name is not UTF-8."""
     odd = tmp_path / os.fsdecode(b"raw\xff.mp4")
     odd.symlink_to(walk.path)
     chosen = choose_frames(odd, 3, silent)
@@ -103,7 +104,7 @@ def test_a_video_name_need_not_be_utf8(walk, tmp_path):
 
 
 def test_frames_without_motion_are_left_out(tmp_path):
-    """Noise is no motion: a camera on a table gives one photo, not one per interval."""
+    """Noise is not motion, so a video from a table gives one photo instead of one per interval."""
     rng = np.random.default_rng(0)
     still = photograph_box(box_camera(0.3)).astype(int)
     frames = [np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(40)]
@@ -126,7 +127,7 @@ def test_a_short_video_gives_all_its_frames(tmp_path):
         (
             (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30),
             (0, -1),
-        ),  # a quarter turn clockwise moves the top left corner to the top right
+        ),  # rotating clockwise by a quarter moves the top left corner to the top right
         ((-65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30), (-1, -1)),
         ((0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30), (-1, 0)),
     ],
@@ -153,7 +154,7 @@ def test_a_long_video_is_sampled_in_steps(tmp_path, monkeypatch):
         tmp_path / "long.mp4", [photograph_box(box_camera(0.03 * i, size=(96, 64))) for i in range(64)]
     )
     chosen = choose_frames(tmp_path / "long.mp4", 8, silent)
-    assert {number % 4 for number in chosen} == {0}, "of 64 frames, 16 for 8 intervals"
+    assert {number % 4 for number in chosen} == {0}, "two frames for each of 8 intervals, of 64 frames"
 
 
 def test_videos_are_recognised_by_their_suffix(tmp_path):
@@ -171,7 +172,7 @@ def test_an_unreadable_video_is_refused_in_one_line(tmp_path, contents):
 
 @pytest.mark.own_process
 def test_ffmpeg_prints_nothing_of_its_own(tmp_path):
-    """Test in a new process, like the command line's: OpenCV is silenced once, before it opens its first video."""
+    """OpenCV is silenced once, before it opens its first video, so the test needs a new process."""
     (tmp_path / "broken.mp4").write_bytes(b"")
     code = f"""
 import sys

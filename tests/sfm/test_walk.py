@@ -1,4 +1,4 @@
-"""Photos of a walk around a subject go through COLMAP: their order is found and used, and all of them get poses."""
+"""COLMAP finds the poses of all photos of a walk around a subject, whose order is found and used."""
 
 import math
 import re
@@ -12,12 +12,12 @@ from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from sfm.textured_box import MOVED, TURNED, cameras_of
 
 COARSER = 2
-"""How much smaller the photos are than those of the tolerances."""
+"""Factor by which the photos are smaller than those for which the tolerances hold."""
 
 
 @pytest.mark.usefixtures("colmap")
 def test_photos_in_order_are_matched_in_sequence_and_all_get_a_pose(tmp_path):
-    """IMG_0 to IMG_59, a lap; files are listed as IMG_0, IMG_1, IMG_10, so the order has to be found."""
+    """Photos IMG_0 to IMG_59 are a lap, listed as IMG_0, IMG_1, IMG_10, so the order has to be found."""
     photos, truth = tmp_path / "photos", {}
     photos.mkdir()
     for i, camera in enumerate(box_orbit(SEQUENCE, size=(320 // COARSER, 240 // COARSER))):
@@ -33,7 +33,9 @@ def test_photos_in_order_are_matched_in_sequence_and_all_get_a_pose(tmp_path):
     every = math.comb(SEQUENCE, 2)
     pairs = int(re.search(rf"(\d+) pairs are matched instead of all {every:,}", sentence)[1])
     assert SEQUENCE - 1 <= pairs < every / 2
-    assert max(total for stage, _, total in progress if stage == "matches") == pairs, "no others were needed"
+    assert max(total for stage, _, total in progress if stage == "matches") == pairs, (
+        "no other pairs were matched"
+    )
     assert any(line.startswith(f"mapping: {SEQUENCE} of {SEQUENCE} photos have a pose") for line in said)
 
     found = cameras_of(options.out)

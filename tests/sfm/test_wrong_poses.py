@@ -1,4 +1,4 @@
-"""Captures that provoke wrong poses: every kept pose is right, and the photos left out are named."""
+"""Of captures that provoke wrong poses, all kept poses are right, and omitted photos are named."""
 
 import math
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ pytestmark = [
 
 
 def captured(folder, photos, **options):
-    """Reconstruct photos; return the cameras found, the true ones, and the messages."""
+    """Reconstruct photos; return the estimated and the true cameras, and the messages."""
     (folder / "photos").mkdir()
     for name, (pixels, _) in photos.items():
         Image.fromarray(np.ascontiguousarray(pixels)).save(folder / "photos" / name, quality=92)
@@ -48,7 +48,8 @@ def _lens(camera, focal, W, H):
 
 @pytest.fixture(scope="module")
 def sizes(colmap, tmp_path_factory):
-    """Nine photos of one size and five others; few features and a short path constrain the focal length weakly."""
+    """Nine photos of one size and five of others, with few features and a short path, which hardly determine the
+    focal length."""
     photos = {}
     for i in range(14):
         size = (240, 320) if i == 8 else (320, 240)
@@ -59,7 +60,7 @@ def sizes(colmap, tmp_path_factory):
         elif i == 5:
             photo = cropped(*photo, 200, 150)
         elif i == 7:
-            photo = cropped(*photo, 160, 120)  # the size of photo 3, but another lens
+            photo = cropped(*photo, 160, 120)  # the size of photo 3 with another lens
         elif i == 11:
             photo = cropped(*photo, 240, 240)
         photos[f"{i:02d}.jpg"] = photo
@@ -69,7 +70,7 @@ def sizes(colmap, tmp_path_factory):
 def test_scaled_and_cropped_photos_get_the_focal_length_of_the_main_ones(sizes):
     assert len(sizes.found) >= 12
     alignment = align_cameras(sizes.found, sizes.truth)
-    # A twentieth of the distance, and five degrees. A wrong focal length causes ten times as much.
+    # The bounds are a twentieth of the distance, and five degrees; a wrong focal length causes ten times as much.
     assert alignment.moved.max() < 0.05 and alignment.turned.max() < 5
     for name, camera in sizes.found.items():
         assert camera.fx == pytest.approx(sizes.truth[name].fx, rel=0.05), name
@@ -84,7 +85,7 @@ def test_photos_of_equal_size_but_other_lenses_are_left_out_if_unexplained(sizes
 
 @pytest.fixture(scope="module")
 def two_sides(colmap, tmp_path_factory):
-    """Photos all around; those at the left and right are too blurred and flat to connect front and back."""
+    """Photos from all sides, of which those from left and right are too blurred and flat to connect front and back."""
     photos, rng = {}, np.random.default_rng(1)
     for i in range(18):
         angle = 2 * math.pi * i / 18

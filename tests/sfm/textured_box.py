@@ -5,14 +5,14 @@ import numpy as np
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.textured_box import align_cameras
 
-# At a focal length of 352 px, a pixel is 1/352 rad, or 4/352 of a unit at the distance of the box. Reprojection errors
-# are a quarter of a pixel, but so few and small photos constrain the lens weakly, and its errors leak into the poses.
-# Two pixels are allowed.
+# At a focal length of 352 px, a pixel is 1/352 rad, or 4/352 of a unit at the distance of the box. Reprojection
+# errors are a quarter of a pixel. Poses also have errors of the lens, which so few and small photos hardly determine,
+# so two pixels are allowed.
 TURNED = np.degrees(2 / 352)
-"""Largest angle between a rotation and its truth, degrees."""
+"""Largest angle between an estimated and a true rotation, degrees."""
 
 MOVED = 2 * 4 / 352 / 3.6
-"""Largest distance of a centre from its truth, as a share of the cameras' extent of 3.6."""
+"""Largest distance between an estimated and a true centre, as a fraction of the cameras' extent of 3.6."""
 
 
 LIMIT = 1200
@@ -27,7 +27,7 @@ def cameras_of(capture):
 
 
 def check(found, truth):
-    """Compare cameras with their truth; return the rotation between the two worlds."""
+    """Compare estimated with true cameras; return the rotation between the two worlds."""
     alignment = align_cameras(found, truth)
     assert alignment.moved.max() < MOVED
     assert alignment.turned.max() < TURNED

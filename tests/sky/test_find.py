@@ -1,4 +1,4 @@
-"""The sky is found where it is at infinity, however the cameras are held; nearer colours are no sky."""
+"""The sky is found if it is at infinity, with any orientation of the cameras; the same colours nearby are no sky."""
 
 import math
 
@@ -27,14 +27,14 @@ def searched(capture, points=None, images=None, cameras=None):
     )
 
 
-def test_the_sky_is_found_where_it_is(outdoors):
+def test_the_sky_is_found_above_the_horizon(outdoors):
     sky = searched(outdoors)
     assert sky.is_certain and sky.lies_at_infinity and sky.photos == 20
     assert np.abs(sky.up - (0, -1, 0)).max() < 0.05
     true = sum(int(part.sum()) for part in outdoors.sky)
     assert 0.6 * true < len(sky.directions) <= true
-    assert sky.directions[:, 1].max() < math.sin(math.radians(2.5)), "nothing lies below the horizon"
-    # what is found is the sky: its pixels have the colours of their directions, and few are mistaken
+    assert sky.directions[:, 1].max() < math.sin(math.radians(2.5)), "no direction is below the horizon"
+    # the found pixels have the colours of their directions, and few are wrong
     error = np.abs(sky.colors - sky_colors(sky.directions)).max(axis=1)
     assert np.mean(error > 0.06) < 0.02
     assert sky.spread < 0.6 * sky.spread_near
@@ -44,7 +44,7 @@ def test_the_same_colours_on_a_dome_are_no_sky():
     for dome in (8.0, 14.0):
         near = outdoor_capture(96, 72, 20, points=1_000, dome=dome)
         sky = searched(near)
-        assert sky.share > 0.1, "single photos look alike"
+        assert sky.share > 0.1, "single photos of sky and dome look alike"
         assert not sky.is_certain and not sky.lies_at_infinity
 
 
@@ -63,11 +63,11 @@ def test_a_sky_of_one_colour_counts_only_if_it_is_white(outdoors):
         np.where(part[..., None], np.uint8(170), view.image)
         for part, view in zip(grey.sky, grey.views, strict=True)
     ]
-    assert not searched(grey, images=images).is_certain, "a plain grey wall looks the same"
+    assert not searched(grey, images=images).is_certain, "a plain grey wall would look the same"
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_cameras_held_in_portrait_or_upside_down_see_it_too(outdoors, quarters):
+def test_the_sky_is_found_by_cameras_in_portrait_or_upside_down(outdoors, quarters):
     cameras, images = [], []
     for view in outdoors.views:
         c = view.camera
@@ -86,7 +86,7 @@ def test_cameras_held_in_portrait_or_upside_down_see_it_too(outdoors, quarters):
     assert sky.share == pytest.approx(upright.share, rel=0.05)
 
 
-def test_noise_and_exposures_that_wander_do_not_hide_it(outdoors):
+def test_noise_and_varying_exposures_do_not_hide_the_sky(outdoors):
     rng = np.random.default_rng(0)
     images = []
     for view in outdoors.views:
@@ -130,8 +130,8 @@ def test_the_size_of_a_scene():
     assert scene_size(cameras[:1], NO_POINTS) == 1.0
 
 
-def test_what_cannot_be_compared_is_no_sky():
-    """White photos that share no direction: nothing says that the white is far."""
+def test_photos_without_common_directions_show_no_sky():
+    """White photos share no direction, so the white may be near."""
     turns = np.arange(4) * math.pi / 2
     cameras = [
         Camera.looking_at((0.0, 0.0, 0.0), (math.cos(t), -0.5, math.sin(t)), 60, 60, 20, 20) for t in turns
@@ -145,7 +145,7 @@ def test_what_cannot_be_compared_is_no_sky():
 
 
 def test_ground_seen_from_above_is_no_sky():
-    """Photos of a drone that looks down; their smooth ground is below every horizon, also if they are upside down."""
+    """A drone looks down on smooth ground, which is below every horizon, also if photos are upside down."""
     cameras, images = [], []
     for i in range(16):
         eye = np.array([3.0 * (i % 4), -9.0, 3.0 * (i // 4)])

@@ -1,4 +1,4 @@
-"""Splats of the sky: where they are, what they look like, how many there are."""
+"""Splats of the sky: their places, shapes, colours and number."""
 
 import math
 
@@ -39,7 +39,7 @@ def splats():
     return sky_splats(hemisphere(), Shell(CENTRE, RADIUS), 1)
 
 
-def test_they_lie_on_the_shell_where_the_sky_is(splats):
+def test_splats_lie_on_the_shell_where_the_sky_is(splats):
     offsets = splats.means.double().numpy() - CENTRE
     assert np.linalg.norm(offsets, axis=1) == pytest.approx(np.full(len(offsets), RADIUS), rel=1e-6)
     assert offsets[:, 1].max() < RADIUS * math.sin(0.05)
@@ -50,7 +50,7 @@ def test_they_lie_on_the_shell_where_the_sky_is(splats):
     )
 
 
-def test_they_are_flat_and_face_the_centre(splats):
+def test_splats_are_flat_and_face_the_centre(splats):
     axes = quat_to_R_t(splats.quats)[:, :, 2].double().numpy()
     outward = (splats.means.double().numpy() - CENTRE) / RADIUS
     assert np.abs((axes * outward).sum(axis=1)) == pytest.approx(np.ones(len(axes)), abs=1e-5)
@@ -59,7 +59,7 @@ def test_they_are_flat_and_face_the_centre(splats):
     assert torch.sigmoid(splats.logit_opacities).numpy() == pytest.approx(np.full(len(axes), OPACITY))
 
 
-def test_they_show_the_sky_without_gaps(splats):
+def test_splats_show_the_sky_without_gaps(splats):
     camera = Camera.looking_at(CENTRE, CENTRE + np.array([0.0, -1.0, 0.8]), 60, 60, 64, 64)
     output = render(splats, camera, settings=RenderSettings(jacobian_limit=1.3), backend="cpu")
     assert float(output.transmittance.max()) < 0.1
@@ -69,13 +69,13 @@ def test_they_show_the_sky_without_gaps(splats):
     assert np.abs(output.image.numpy() - wanted).max() < 0.08
 
 
-def test_their_number_is_capped_and_fine_enough_for_small_skies():
+def test_the_number_of_splats_is_capped_but_fine_enough_for_small_skies():
     few = sky_splats(hemisphere(), Shell(CENTRE, RADIUS), 0, most=40)
     assert 20 < len(few) <= 40
     sky = hemisphere()
-    patch = sky.directions[:, 1] < -0.995  # 6 degrees around the zenith
+    patch = sky.directions[:, 1] < -0.995  # a sky of 6 degrees around the zenith
     small = Sky(sky.up, sky.directions[patch], sky.colors[patch], sky.photo[patch], 0.01, 0.0, 1.0, 5.0, 0.01)
     count = len(sky_splats(small, Shell(CENTRE, RADIUS), 0))
-    assert 60 < count < 400, "a degree apart, not 3,000 of them"
+    assert 60 < count < 400, "splats a degree apart, instead of 3,000"
     dot = Sky(sky.up, sky.directions[:1], sky.colors[:1], sky.photo[:1], 1e-6, 0.0, 0.0, 0.0, 1e-4)
     assert len(sky_splats(dot, Shell(CENTRE, RADIUS), 0, most=5)) >= 1
