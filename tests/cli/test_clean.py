@@ -65,9 +65,8 @@ def test_a_run_is_cleaned_into_a_new_file(made, cli, capsys):
     written = folder.scene(30).with_name("point_cloud.clean.ply")
     printed = capsys.readouterr().out
     removed = own + 8 - len(read_scene(written).gaussians)
-    assert (
-        removed >= 4
-    )  # half of the 8 floaters: the scene is not trained, so the photos judge it with a large error
+    # half of the 8 floaters: the scene is not trained, so the photos judge it with a large error
+    assert removed >= 4
     assert f"removed {removed:,} of {own + 8:,} splats, judged by 12 views" in printed
     assert "PSNR of 4 held-out views: " in printed
     assert f"wrote {written}: {own + 8 - removed:,} splats" in printed

@@ -88,9 +88,8 @@ def test_a_process_with_little_memory_left(tmp_path):
     words = [sys.executable, "-c", CHILD, photo, scene, tmp_path, out]
     ended = subprocess.run(words, capture_output=True, text=True, timeout=600, check=False)
     assert ended.returncode == 0, ended.stderr
-    codes = [
-        line for line in ended.stdout.splitlines() if line.isdigit()
-    ]  # render also prints its camera path
+    # render also prints its camera path
+    codes = [line for line in ended.stdout.splitlines() if line.isdigit()]
     assert codes == ["2", "2", "2"], ended.stderr
     first, second, third = ended.stderr.splitlines()
     assert re.fullmatch(

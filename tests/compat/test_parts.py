@@ -61,9 +61,8 @@ def test_the_projection_is_gsplats(covars, limits):
     assert 10 < int(drawn.sum()) < drawn.numel()
     assert len(found) == len(wanted) == 5
     leaves = [tensors[name] for name in ("means", "quats", "scales", "viewmats", "Ks")]
-    used = torch.tensor(
-        [[1, 0, 1], [0, 1, 1], [0, 0, 0]]
-    )  # entries of Ks that are used; only gsplat's torch function reads a skew
+    # entries of Ks that are used; only gsplat's torch function reads a skew
+    used = torch.tensor([[1, 0, 1], [0, 1, 1], [0, 0, 0]])
     for one, other in zip(found[1:], wanted[1:], strict=True):
         torch.testing.assert_close(one[drawn], other[drawn], **CLOSE)
         weights = torch.linspace(-1, 1, one[drawn].numel(), dtype=one.dtype).view(one[drawn].shape)

@@ -8,6 +8,7 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.lens import BAND, Lens, bands, lens_of, undistortion
 from gsplat_edu.data.lens_formulas import PERSPECTIVE
 
+# the first pixel's centre is (0.5, 0.5), as in files
 W, H, FX, FY, CX, CY = (
     160,
     120,
@@ -15,7 +16,7 @@ W, H, FX, FY, CX, CY = (
     133.0,
     83.0,
     57.0,
-)  # the first pixel's centre is (0.5, 0.5), as in files
+)
 
 
 def perspective(x, y, **given):
@@ -142,10 +143,11 @@ def test_pinholes_have_no_maps(one_photo):
         (Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 1e300)), "focal length would change"),
         (Lens(640, 480, 100.0, 100.0, 319.5, 239.5, (1e-9,)), "73 degrees to the side"),
         (Lens(640, 480, 560.0, 560.0, 319.5, 239.5, (9.0,)), "focal length would change"),
+        # one pixel has no slope and no fold
         (
             Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,)),
             "no rectangle",
-        ),  # one pixel has no slope and no fold
+        ),
         (Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,), "fisheye"), "no rectangle"),
         (Lens(64, 48, 20.0, 20.0, 31.5, 23.5, (1e300,), "fisheye"), "no rectangle"),
         (Lens(32767, 48, 20000.0, 20000.0, 16383.0, 23.5, (0.1,)), "32767x48 px cannot be undistorted"),

@@ -176,9 +176,8 @@ def tiff16(path, values, order, extra=()):
     tags = [(256, 4, [W]), (257, 4, [H]), (258, 3, [16] * channels), (259, 3, [1])]
     tags += [(262, 3, [1 if channels == 1 else 2]), (273, 4, [0]), (277, 3, [channels]), (278, 4, [H])]
     tags += [(279, 4, [len(data)])] + ([(338, 3, list(extra))] if extra else [])
-    depths = (
-        8 + 2 + 12 * len(tags) + 4
-    )  # BitsPerSample does not fit into its entry, so it stands before the pixels
+    # BitsPerSample does not fit into its entry, so it stands before the pixels
+    depths = 8 + 2 + 12 * len(tags) + 4
     tags[5] = (273, 4, [depths + 2 * channels])
     table = packed([len(tags)], 2)
     for tag, kind, numbers in tags:

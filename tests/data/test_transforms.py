@@ -178,9 +178,8 @@ def test_colmaps_points_are_moved_by_applied_transform(tmp_path, small):
     views, points, colors = small
     write_colmap(tmp_path, views, points, colors)
     write_transforms(tmp_path, views)
-    assert (
-        len(load_dataset(tmp_path).points) == 100_000
-    )  # the file does not say how the two frames are related
+    # the file does not say how the two frames are related
+    assert len(load_dataset(tmp_path).points) == 100_000
     transform = np.array([[0, 1, 0, 3.0], [0, 0, 1, -2.0], [1, 0, 0, 0.5]])  # not symmetric
     write_transforms(tmp_path, views, extra={"applied_transform": transform.tolist()})
     dataset = load_dataset(tmp_path)

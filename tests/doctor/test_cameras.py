@@ -91,9 +91,8 @@ def test_without_points_only_cameras_with_one_centre_are_hopeless(diagnosed):
 @pytest.mark.parametrize(("degrees", "is_named"), [(8, False), (95, True), (175, True)])
 def test_cameras_that_look_away(named, layout, degrees, is_named, with_points):
     views, points = room(layout, 96)
-    points = (
-        points[np.abs(points).max(axis=1) < 4.5] if layout == "orbit" else points
-    )  # the points of the ball
+    # the points of the ball
+    points = points[np.abs(points).max(axis=1) < 4.5] if layout == "orbit" else points
     spoiled = replaced(views, {5: turned(views[5], degrees), 16: turned(views[16], -degrees)})
     found = named(spoiled, points if with_points else None).get("facing away", ())
     ends = tuple(name.rpartition("/")[2] for name in found)
@@ -184,9 +183,8 @@ def with_tracks(folder, counts):
     path.write_bytes(b"".join(written))
     cloud = path.with_name("points3D.bin")
     measured = bytearray(cloud.read_bytes())
-    struct.pack_into(
-        "<d", measured, 8 + struct.calcsize("<Q3d3B"), 0.7
-    )  # a mapper writes the reprojection error; here the first point has one
+    # a mapper writes the reprojection error; here the first point has one
+    struct.pack_into("<d", measured, 8 + struct.calcsize("<Q3d3B"), 0.7)
     cloud.write_bytes(measured)
 
 

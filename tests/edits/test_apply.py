@@ -107,9 +107,8 @@ def turned(axis, angle):
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 2.0, 3.1, np.pi])
 def test_the_floor_becomes_horizontal(angle):
-    tilt = turned(
-        (0.3, 0.0, 1.0), angle
-    )  # about a horizontal axis, so the shortest rotation back is the inverse
+    # about a horizontal axis, so the shortest rotation back is the inverse
+    tilt = turned((0.3, 0.0, 1.0), angle)
     R = upright_rotation(floor(tilt))
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)

@@ -30,9 +30,8 @@ def refused(path):
 def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
     path = small_file(tmp_path, suffix)
     data = path.read_bytes()
-    odd = (
-        7 if suffix == ".splat" else 0
-    )  # the format has no header, so a cut between two splats leaves a valid scene
+    # the format has no header, so a cut between two splats leaves a valid scene
+    odd = 7 if suffix == ".splat" else 0
     for end in range(0, len(data), 64):
         if end + odd < len(data) and end + odd > 0:
             path.write_bytes(data[: end + odd])

@@ -104,9 +104,8 @@ def test_a_handmade_file_is_read(tmp_path, colored, order):
     code = np.sqrt(2.0) * (np.array([[512, 100, 900], [0, 1023, 100]]) / 1023 - 0.5)
     np.testing.assert_allclose(first[1:], code[0], atol=1e-7)  # w is the largest
     assert first[0] == pytest.approx(np.sqrt(1 - (code[0] ** 2).sum()), abs=1e-7)
-    np.testing.assert_allclose(
-        second, [*code[1], 0.0], atol=1e-7
-    )  # z is omitted, but the other components have length 1 already
+    # z is omitted, but the other components have length 1 already
+    np.testing.assert_allclose(second, [*code[1], 0.0], atol=1e-7)
 
 
 @pytest.mark.parametrize("rest", [3, 8, 15])

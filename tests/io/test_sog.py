@@ -251,9 +251,8 @@ def test_palettes_beat_a_subset_of_the_vectors(size, spread):
     def loss(read):
         return float((weights * ((vectors - read) ** 2).sum(axis=1)).sum())
 
-    kept = vectors[
-        np.argsort(-weights, kind="stable")[:4096]
-    ]  # the baseline keeps the heaviest vectors and maps the others to the nearest of these
+    # the baseline keeps the heaviest vectors and maps the others to the nearest of these
+    kept = vectors[np.argsort(-weights, kind="stable")[:4096]]
     nearest = np.argmin((kept**2).sum(axis=1) - 2 * vectors @ kept.T, axis=1)
     assert loss(entries[labels].astype(np.float64) / size) < 0.8 * loss(kept[nearest])
 

@@ -434,9 +434,8 @@ def bombs():
     one = random_scene(1, 0).gaussians
     yield gzip.compress(old_body(3, one) + zeros)  # it unpacks to more than it declares
     yield gzip.compress(old_body(3, one, flags=2) + zeros)  # the bomb is in the extensions
-    yield gzip.compress(
-        old_body(3, one)[:8] + struct.pack("<IBBBB", 1 << 20, 0, 12, 0, 0) + zeros
-    )  # it unpacks to as much as it declares
+    # it unpacks to as much as it declares
+    yield gzip.compress(old_body(3, one)[:8] + struct.pack("<IBBBB", 1 << 20, 0, 12, 0, 0) + zeros)
     for declared in (True, False):  # the frame may or may not declare its size
         packed = zstandard.ZstdCompressor(write_content_size=declared).compress(zeros)
         data = new_file(one)

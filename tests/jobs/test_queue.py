@@ -204,9 +204,8 @@ def test_a_job_that_ended_without_a_queue_is_not_run_again(opened, tmp_path):
     abandon(queue)
     (tmp_path / "a").touch()
     os.waitpid(queue.get(done.id).pid, 0)
-    folder = JobFolder(
-        queue.folder / killed.id
-    )  # the record of a job that ran when the computer was switched off
+    # the record of a job that ran when the computer was switched off
+    folder = JobFolder(queue.folder / killed.id)
     folder.write(
         Job(**{**vars(queue.get(killed.id)), "state": State.RUNNING, "pid": 2, "identity": "other boot"})
     )

@@ -346,11 +346,12 @@ GOOD = [("_PyInit__native", None), ("_malloc", 1), ("_PyList_New", 0xFE)]
         (GOOD, {}, []),
         (GOOD[1:], {}, ["does not export PyInit__native"]),
         ([*GOOD, ("_new_in_macos_27", 1)], {}, ["_new_in_macos_27 is not in libSystem"]),
+        # since Python 3.13
         (
             [*GOOD, ("_PyList_GetItemRef", 0xFE)],
             {},
             ["_PyList_GetItemRef is not in the stable ABI"],
-        ),  # since Python 3.13
+        ),
         ([*GOOD, ("_PyDict_Clear", 0)], {}, []),
         (GOOD, {"library": "/opt/lib/libc++.1.dylib"}, ["loads /opt/lib/libc++.1.dylib"]),
         (GOOD, {"oldest": (14, 2)}, ["needs macOS 14.2"]),
@@ -359,9 +360,8 @@ GOOD = [("_PyInit__native", None), ("_malloc", 1), ("_PyList_New", 0xFE)]
     ],
 )
 def test_the_symbols_that_a_module_needs_from_macos_are_found(monkeypatch, symbols, options, wrong):
-    monkeypatch.setattr(
-        binaries, "system_symbols", lambda: {"_malloc", "_free"}
-    )  # zig, which has the list, is not installed
+    # zig, which has the list, is not installed
+    monkeypatch.setattr(binaries, "system_symbols", lambda: {"_malloc", "_free"})
     assert binaries.macos_problems(macho(symbols, **options), 12, (13, 0), arm=True) == wrong
 
 

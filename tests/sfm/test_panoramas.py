@@ -120,8 +120,8 @@ def test_whole_panoramas_are_held_out(room):
 @pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_panoramas_train_as_well_as_pinhole_photos(room, tmp_path):
     """Trainings on cut panoramas, and on photos drawn ray by ray with true poses, have the same places, directions
-    and start points. Both scenes are compared with pinhole photos of other places and directions. README promises the
-    bound of 0.3 dB.
+    and start points. Both scenes are compared with pinhole photos of other places and directions. Their PSNR may
+    differ by 0.3 dB.
     """
     dataset = load_dataset(room.capture, DataSettings(test_every=0))
     truth = face_cameras()
@@ -187,9 +187,8 @@ def test_xmp_decides(files):
         "1 of 2 photos are 360-degree panoramas according to their XMP, first 0.jpg: used as plain" in said[0]
     )
     said.clear()
-    assert not are_panoramas(
-        files((64, 20), (64, 20), xmp=(0, 1)), "auto", said.append
-    )  # panoramas of a part of the sphere
+    # parts of the sphere
+    assert not are_panoramas(files((64, 20), (64, 20), xmp=(0, 1)), "auto", said.append)
 
 
 def test_photos_of_another_shape_are_refused(files, capsys, tmp_path):

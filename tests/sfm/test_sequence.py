@@ -98,7 +98,7 @@ def test_similarities_equal_a_plain_count():
 
 
 def test_the_bound_on_chance_covers_random_orders():
-    """At several quantiles, the bound exceeds the tail of a simulated distribution."""
+    """For each number of similar successors, the bound is at least its frequency in random orders."""
     count, rounds = 60, 4000
     rng = np.random.default_rng(5)
     vectors = described(laps(count, 1))

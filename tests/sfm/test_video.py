@@ -124,10 +124,11 @@ def test_a_short_video_gives_all_its_frames(tmp_path):
 @pytest.mark.parametrize(
     ("matrix", "corner"),
     [
+        # rotating clockwise by a quarter moves the top left corner to the top right
         (
             (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30),
             (0, -1),
-        ),  # rotating clockwise by a quarter moves the top left corner to the top right
+        ),
         ((-65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30), (-1, -1)),
         ((0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30), (-1, 0)),
     ],

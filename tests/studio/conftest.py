@@ -1,4 +1,4 @@
-"""A studio in the test's process, without its queue starting anything unless a test asks for it."""
+"""A studio in the test's process, whose queue starts no jobs unless a test asks for it."""
 
 import io
 
@@ -24,7 +24,7 @@ HOST = "http://127.0.0.1:8090"
 
 
 class Inline:
-    """The worker's tasks in this process, which has imported torch already."""
+    """Runs the worker's tasks in this process, which has imported torch already."""
 
     def ask(self, task, **arguments):
         import json
@@ -40,7 +40,7 @@ class Inline:
 
 @pytest.fixture(autouse=True, scope="session")
 def _own_list_of_adopted_places(tmp_path_factory):
-    """Tests do not write into the user's list; servers that they start inherit it."""
+    """Keep tests, and servers that they start, from writing into the user's list of adopted places."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -59,7 +59,7 @@ def studio(tmp_path, request):
 
 @pytest.fixture
 def page(studio):
-    """A client like the studio's page: with the cookie, and the Origin that browsers add."""
+    """A client like the studio's page, with the cookie and the Origin that browsers add."""
     with TestClient(application(studio, TOKEN), base_url=HOST) as client:
         assert client.get("/", params={"token": TOKEN}).status_code == 200
         client.headers["Origin"] = HOST
@@ -68,7 +68,7 @@ def page(studio):
 
 @pytest.fixture
 def jpeg():
-    """The bytes of a small photo."""
+    """Return a function that makes the bytes of a small photo."""
     return picture("JPEG")
 
 
@@ -93,7 +93,7 @@ def library(tmp_path_factory):
 
 @pytest.fixture
 def visitor(browser, library):
-    """Open the page, in a tab of a person who has not been here before."""
+    """Open the page in a tab without cookies or storage."""
     context = browser.new_context(accept_downloads=True, viewport={"width": 480, "height": 400})
     context.set_default_timeout(60_000)
     made = []
@@ -110,7 +110,7 @@ def visitor(browser, library):
 
 @pytest.fixture(scope="module")
 def wall_entry(library):
-    """A wall of splats as an entry of scenes; returns the entry's folder."""
+    """Write a wall of splats as an entry of scenes; return the entry's folder."""
     x, y = torch.meshgrid(torch.linspace(-1.5, 1.5, 16), torch.linspace(-1, 1, 11), indexing="ij")
     n = x.numel()
     folder = library[0].library.root / "scenes" / "wall"

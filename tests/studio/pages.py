@@ -1,4 +1,4 @@
-"""A studio with real jobs whose page is open in a real browser."""
+"""A studio that runs jobs, with its page open in a browser."""
 
 import base64
 import contextlib
@@ -30,10 +30,10 @@ new PerformanceObserver((list) => {
   for (const { value, hadRecentInput } of list.getEntries()) if (!hadRecentInput) shifted += value;
 }).observe({ type: "layout-shift", buffered: true });
 """
-"""Adds up the layout shifts of a page that follow no input."""
+"""Script that adds up the layout shifts of a page without a preceding input."""
 
 OUTPUTS = {"sfm": 2, "convert": 2, "train": 3}
-"""Which word of a printed command names what it writes."""
+"""Index of the word of a printed command that names its output."""
 
 DROP = """([files, place]) => {
   const transfer = new DataTransfer();
@@ -46,7 +46,7 @@ DROP = """([files, place]) => {
     document.querySelector(place).dispatchEvent(new DragEvent(type, options));
   }
 }"""
-"""Drops files on an element of the page: a list of [name, base64], and a selector."""
+"""Script that drops files, a list of [name, base64], on the element of a selector."""
 
 
 @contextlib.contextmanager
@@ -78,7 +78,7 @@ def served(folder, worker, limits=None):
 
 
 class Visitor:
-    """A person at the page, in one tab. Errors of scripts and violations of the page's policy are collected."""
+    """Uses the page in a tab like a person, and collects script errors and violations of the page's policy."""
 
     def __init__(self, context, url):
         self.tab = context.new_page()
@@ -99,23 +99,23 @@ class Visitor:
         return self.tab.evaluate("location.hash")
 
     def reach(self, place, patience=60):
-        """Wait until the page is somewhere."""
+        """Wait until the page shows a screen."""
         end = time.monotonic() + patience
         while self.place() != place:
             assert time.monotonic() < end, (self.place(), self.tab.inner_text("main"))
             self.tab.wait_for_timeout(30)
 
     def shift(self):
-        """How much the page has moved by itself since it was loaded (cumulative layout shift)."""
+        """Cumulative layout shift since the page was loaded."""
         return self.tab.evaluate("shifted")
 
     def command(self, job):
-        """The printed command of a job's card, by the job's title."""
+        """Return the printed command of a job's card, by the job's title."""
         return self.tab.get_by_role("article", name=job).get_by_role("textbox", name="command").inner_text()
 
 
 def until(tab, frame, condition, patience=60):
-    """Wait until an expression is true in a frame; Playwright's own way needs eval, which our policies forbid."""
+    """Wait until an expression is true in a frame. Playwright's function needs eval, which our policies forbid."""
     end = time.monotonic() + patience
     while not _holds(frame, condition):
         assert time.monotonic() < end, condition
@@ -123,7 +123,7 @@ def until(tab, frame, condition, patience=60):
 
 
 def _holds(frame, condition):
-    """Evaluate the expression; a frame that is just navigating has none yet."""
+    """Evaluate the expression; false in a frame that is navigating."""
     try:
         return frame.evaluate(condition)
     except Error as error:
@@ -144,7 +144,7 @@ def png(seed, size=(24, 18)):
 
 
 def train_and_download(person, name, iterations):
-    """From a capture's screen to a downloaded .spz by clicks; returns its bytes and the commands that were shown."""
+    """Click from a capture's screen to a downloaded .spz; return its bytes and the commands that were shown."""
     tab = person.tab
     tab.locator("summary", has_text="Options").click()
     tab.get_by_label("Iterations instead of a quality").fill(str(iterations))
@@ -164,7 +164,7 @@ def train_and_download(person, name, iterations):
 
 
 def repeated(commands, library, folder):
-    """Run printed commands so that they write below a folder instead of the library; return the bytes of the .spz."""
+    """Run printed commands with outputs below a folder instead of the library; return the bytes of the .spz."""
     (folder / "runs").mkdir(parents=True)
     made = []
     for command in commands:
@@ -182,7 +182,7 @@ def repeated(commands, library, folder):
 
 
 def visitor_of(person, url):
-    """Another tab of the same person."""
+    """Open another tab with the same cookies and storage."""
     tab = person.tab.context.new_page()
     tab.goto(url)
     return tab

@@ -1,4 +1,4 @@
-"""Requests become the command lines that the command line accepts, and nothing else does."""
+"""Requests become command lines that the command line accepts; other requests are refused."""
 
 import argparse
 import time
@@ -44,7 +44,7 @@ def library(tmp_path):
 
 
 def begun(library, request):
-    """The command line of a request."""
+    """Return the command line of a request that begins."""
     return command_line(library, work_of(library, request), Purpose.BEGIN).argv
 
 
@@ -133,7 +133,7 @@ def test_a_training_resumes_once_its_run_has_begun(library):
         command_line(library, work, Purpose.BEGIN)
 
 
-def test_what_is_gone_can_be_shown_but_not_started(library):
+def test_work_on_a_removed_entry_can_be_shown_but_not_started(library):
     work = work_of(library, {"command": "train", "subject": "captures/a"})
     argv = command_line(library, work, Purpose.BEGIN).argv
     (library.root / "captures" / "a").rmdir()
@@ -151,7 +151,8 @@ def test_work_follows_a_rename(library):
     export = work_of(library, {"command": "convert", "subject": "runs/a", "format": "ply"}).renamed(
         "runs/a", "runs/b"
     )
-    assert export == Work("convert", ("runs/b",), ("runs/b/exports/a.ply",))  # its file keeps its name
+    # the exported file keeps its name
+    assert export == Work("convert", ("runs/b",), ("runs/b/exports/a.ply",))
 
 
 SAMPLES = {
@@ -285,7 +286,8 @@ def test_other_requests_are_refused_in_one_line(library, request_):
         Work("train", ("captures/a",), ("runs/b/c",)),
         Work("train", ("captures/a",), ("runs/../x",)),
         Work("train", ("captures//a",), ("runs/b",)),
-        Work("train", ("captures/a",), ("runs/e\u0301",)),  # composed, it would be another name for one place
+        # not in composed form
+        Work("train", ("captures/a",), ("runs/e\u0301",)),
         Work("doctor", ("captures/a",), ("runs/b",)),
         Work("doctor", ("runs/a",), (), {"resolution": 2.0}),
         Work("clean", ("runs/a",), ("scenes/b/b.ply",)),

@@ -19,7 +19,7 @@ def test_the_url_with_the_token_opens_the_page_and_sets_the_cookie(stranger):
     assert answer.status_code == 200 and "<title>" in answer.text
     cookie = answer.headers["set-cookie"]
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie and "Path=/" in cookie
-    assert stranger.get("/api/library").status_code == 200  # the cookie suffices
+    assert stranger.get("/api/library").status_code == 200  # the cookie is enough
     assert "set-cookie" not in stranger.get("/api/library").headers
 
 
@@ -41,7 +41,7 @@ def test_the_url_with_the_token_opens_the_page_and_sets_the_cookie(stranger):
     ],
     ids=str,
 )
-def test_others_are_refused(stranger, headers):
+def test_requests_without_cookie_or_token_are_refused(stranger, headers):
     for path in ("/api/library", "/", "/web/index.html", "/api/events", "/nothing"):
         answer = stranger.get(path, headers=headers)
         assert answer.status_code == 403 and answer.text.startswith("403 Forbidden: "), path
@@ -49,7 +49,7 @@ def test_others_are_refused(stranger, headers):
 
 
 @pytest.mark.parametrize("path", ["/?token=wrong", "/api/library?token=a-token"])
-def test_a_token_elsewhere_opens_nothing(stranger, path):
+def test_a_token_in_other_places_is_not_accepted(stranger, path):
     assert stranger.get(path).status_code == 403
 
 
@@ -66,7 +66,7 @@ def test_programs_use_the_token_in_a_header(stranger):
     assert stranger.delete("/api/trash", headers=headers).status_code == 200
 
 
-def test_every_answer_keeps_others_out(page, stranger):
+def test_every_answer_has_the_headers_that_keep_other_pages_out(page, stranger):
     for answer in (page.get("/"), page.get("/api/library"), page.get("/api/nothing/x"), stranger.get("/")):
         policy = answer.headers["content-security-policy"]
         assert (
@@ -111,6 +111,6 @@ def test_the_scripts_of_the_viewer_are_served(page):
     ],
     ids=lambda value: str(value)[:30],
 )
-def test_other_bodies_are_refused_in_one_line(page, body, kind, status):
+def test_bodies_that_are_no_json_objects_are_refused_in_one_line(page, body, kind, status):
     answer = page.post("/api/adopt", content=body, headers={"Content-Type": kind})
     assert answer.status_code == status and answer.json()["error"].count("\n") == 0

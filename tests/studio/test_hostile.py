@@ -1,6 +1,5 @@
-"""A library that somebody else made: opening it runs nothing, writes nothing outside of it and connects to nowhere.
-
-Everything is checked from outside of the server's process.
+"""Opening a library from somebody else starts no program, writes nothing outside of the library and opens no
+connection. All checks are made from outside of the server's process.
 """
 
 import contextlib
@@ -27,12 +26,12 @@ LONG = "x" * 5_000
 
 
 def work(command, inputs, outputs=(), **options):
-    """What a record says of a job's work."""
+    """Return the work of a job as a record has it."""
     return {"command": command, "inputs": list(inputs), "outputs": list(outputs), "options": options}
 
 
 def record(library, name, *, events=None, **changes):
-    """Write a record of a job that asks for something harmless, with changes; returns its folder."""
+    """Write the record of a harmless job with changes; return its folder."""
     folder = library / ".studio" / "jobs" / name
     folder.mkdir(parents=True)
     harmless = work("doctor", ["captures/box"])
@@ -58,7 +57,7 @@ def record(library, name, *, events=None, **changes):
 
 
 def snapshot(folder):
-    """Return what a folder holds: names, kinds, contents and times."""
+    """Return names, kinds, contents and times of a folder's files."""
     return {
         str(path): (path.lstat().st_mode, path.lstat().st_mtime_ns, path.is_file() and path.read_bytes())
         for path in sorted(folder.rglob("*"))
@@ -66,7 +65,7 @@ def snapshot(folder):
 
 
 def children(pid):
-    """Return the command lines of a process's children, from outside."""
+    """Return the command lines of a process's children."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -76,7 +75,7 @@ def children(pid):
 
 
 def sockets(pid):
-    """Return the TCP sockets of a process, as (local, remote, state), from outside."""
+    """Return the TCP sockets of a process as (local, remote, state)."""
     held = set()
     for fd in Path(f"/proc/{pid}/fd").iterdir():
         with contextlib.suppress(OSError):
@@ -93,7 +92,7 @@ def _rows(pid, table):
 
 @pytest.fixture
 def victim():
-    """A process of the same user that no job has started."""
+    """A process of the same user that is not a job's."""
     process = subprocess.Popen(["sleep", "600"], start_new_session=True)
     yield process
     process.kill()
@@ -101,7 +100,7 @@ def victim():
 
 
 def outside_of(tmp_path):
-    """Make what a hostile library would like to reach."""
+    """Make files outside that a hostile library tries to reach."""
     outside = tmp_path / "outside"
     for name in ("run/live", "thumbs", "job", "trash/secret", "exports"):
         (outside / name).mkdir(parents=True)
@@ -133,7 +132,7 @@ def hostile_folders(library, outside):
 
 
 def forbidden_work(library, outside, victim, port):
-    """Write records that ask for what no request may."""
+    """Write records of work that no request may ask for."""
     old = {"version": 1, "title": "t", "subject": "runs/inner", "request": None}
     scheduler = f"tcp://127.0.0.1:{port}"
     convert = ["convert", str(library / "scenes" / "s" / "s.ply"), str(outside / "written.ply")]
@@ -167,7 +166,7 @@ def forbidden_work(library, outside, victim, port):
 
 
 def impossible_values(library):
-    """Write records whose fields hold what no record has."""
+    """Write records whose fields have impossible values."""
     record(library, "000015", work=work("train", ["captures/box"], [f"runs/{LONG}"]))
     record(library, "000016", line=LONG)
     record(library, "000017", created=1e400)
@@ -183,7 +182,7 @@ def impossible_values(library):
 
 
 def others_processes(library, victim):
-    """Write records whose work is allowed, with a process that is not theirs; returns their states once opened."""
+    """Write records of allowed work that name a process which is not theirs; return their states once opened."""
     proof = identity(victim.pid)
     started = json.dumps({"event": "started", "time": 1, "pid": victim.pid, "identity": proof}) + "\n"
     record(library, "000031")
@@ -218,8 +217,8 @@ def test_a_strangers_library_runs_nothing_until_a_click_that_shows_what(tmp_path
             assert snapshot(outside) == before and snapshot(library / "runs") == entries
             assert victim.poll() is None
             state = Path(f"/proc/{victim.pid}/stat").read_text().rpartition(")")[2].split()[0]
-            assert state == "S"  # it was not stopped either
-            # the click: exactly the command that was shown runs
+            assert state == "S"  # the process was not stopped either
+            # a click runs exactly the command that was shown
             assert server.client.post("/api/jobs/000031/resume").json()["state"] == "queued"
             end = time.monotonic() + 20
             # until it executes its program, a forked child has the server's command line
@@ -237,7 +236,7 @@ def test_a_strangers_library_runs_nothing_until_a_click_that_shows_what(tmp_path
 
 
 def check_hostile(server, allowed, library, victim):
-    """Look at the server, and ask it for everything that a page would offer."""
+    """Check the server's process, and request everything that the page offers."""
     found = server.get("jobs")
     assert {job["id"]: job["state"] for job in found["jobs"]} == allowed
     damaged = {entry["id"]: entry["line"] for entry in found["damaged"]}
@@ -250,9 +249,8 @@ def check_hostile(server, allowed, library, victim):
             assert server.client.post(f"/api/jobs/{name}/{action}").status_code == 404
     for name in allowed:
         assert server.client.post(f"/api/jobs/{name}/pause").status_code == 409
-    assert (
-        server.client.post("/api/jobs/000036/resume").status_code == 409
-    )  # its run has a link that leads out
+    # this run has a link that leads out
+    assert server.client.post("/api/jobs/000036/resume").status_code == 409
     listed = server.get("library")
     assert [entry["name"] for entry in listed["runs"]] == ["inner"]
     assert any(line.startswith("runs/linked: leads out of the library") for line in listed["trouble"])
@@ -261,12 +259,12 @@ def check_hostile(server, allowed, library, victim):
     assert server.get("trash") == {"trash": []} and server.get("scenes/s/exports") == {"exports": []}
     for number in (1, 12, 14):
         assert server.client.delete(f"/api/jobs/{number:06d}").status_code == 200
-    assert not os.path.lexists(library / ".studio" / "jobs" / "000012")  # the link, not what it leads to
+    assert not os.path.lexists(library / ".studio" / "jobs" / "000012")  # only the link is removed
     assert children(server.process.pid) == []
     listening = [local for local, _, state in sockets(server.process.pid) if state == "0A"]
     assert [int(local.rpartition(":")[2], 16) for local in listening] == [server.port]
     connected = {local.rpartition(":")[2] for local, _, state in sockets(server.process.pid) if state == "01"}
-    assert connected <= {f"{server.port:04X}"}  # only connections that others have opened to it
+    assert connected <= {f"{server.port:04X}"}  # only connections that clients have opened
     assert victim.poll() is None
 
 

@@ -1,4 +1,4 @@
-"""Entries: listed, adopted, renamed, removed and restored; names of every kind."""
+"""Entries with all kinds of names are listed, adopted, renamed, removed and restored."""
 
 import re
 import shutil
@@ -90,7 +90,7 @@ def test_a_folder_elsewhere_is_adopted_and_only_its_link_removed(page, studio, t
     assert (outside / "day 1" / "a.jpg").is_file() and listed(page, "photos") == []
 
 
-def test_what_cannot_be_adopted(page, studio, tmp_path):
+def test_places_that_cannot_be_adopted_are_refused(page, studio, tmp_path):
     (tmp_path / "notes.txt").touch()
     for path in (
         "relative",
@@ -122,13 +122,13 @@ def test_rename_remove_and_restore(page, studio, jpeg):
     assert page.get("/api/captures/a").status_code == 404
     first = page.delete("/api/captures/c").json()["trash"]
     entry(studio, "captures", "c")
-    assert page.post(f"/api/trash/{first}/restore").status_code == 409  # another one has its name now
+    assert page.post(f"/api/trash/{first}/restore").status_code == 409  # another entry has its name now
     shutil.rmtree(studio.library.root / "captures" / "c")
     assert page.post(f"/api/trash/{first}/restore").json()["photos"] == 1
     assert page.post(f"/api/trash/{first}/restore").status_code == 404
 
 
-def test_what_a_job_uses_stays_where_it_is(page, studio):
+def test_entries_that_a_job_uses_cannot_be_moved(page, studio):
     entry(studio, "captures", "a")
     entry(studio, "captures", "ab")
     job = page.post("/api/jobs", json={"command": "train", "subject": "captures/a", "to": "r"}).json()
@@ -166,7 +166,7 @@ def test_no_path_leads_out_of_an_entry(page, studio, jpeg, path):
     ]  # fmt: skip
 
 
-def test_a_link_inside_an_entry_leads_nowhere(page, studio, tmp_path, jpeg):
+def test_links_inside_an_entry_are_not_followed(page, studio, tmp_path, jpeg):
     (tmp_path / "secret.jpg").write_bytes(jpeg)
     (entry(studio, "photos", "a") / "link.jpg").symlink_to(tmp_path / "secret.jpg")
     assert page.get("/api/photos/a/thumbs/link.jpg").status_code == 400
@@ -176,7 +176,7 @@ def test_thumbnails_are_upright_small_and_cached(page, studio):
     from PIL import Image
 
     exif = Image.Exif()
-    exif[0x0112] = 6  # the camera was held upright
+    exif[0x0112] = 6  # a portrait
     entry(studio, "photos", "a", a__jpg=picture("JPEG", (400, 200), exif=exif), broken__jpg=b"no photo")
     photos = {photo["name"]: photo for photo in page.get("/api/photos/a/photos").json()["photos"]}
     assert (photos["a.jpg"]["W"], photos["a.jpg"]["H"]) == (200, 400)
@@ -194,14 +194,14 @@ def test_thumbnails_are_upright_small_and_cached(page, studio):
 
 
 def test_photos_are_decoded_by_another_process_within_limits(page, studio):
-    """The server's own memory never holds a photo, whatever somebody uploads."""
+    """No uploaded photo is ever decoded in the server's process."""
     entry(studio, "photos", "a", a__jpg=picture("JPEG", (400, 200)), b__png=blank_png(17_290, 17_290))
     answer = page.get("/api/photos/a/thumbs/b.png")
     assert answer.status_code == 422 and "is too much for a photo" in answer.json()["error"]
     assert page.get("/api/photos/a/thumbs/a.jpg").status_code == 200
     studio.decoder.close()
-    assert page.get("/api/photos/a/thumbs/a.jpg").status_code == 200, "cached"
-    assert page.get("/api/photos/a/thumbs/a.jpg?side=128").status_code == 500, "nobody else decodes it"
+    assert page.get("/api/photos/a/thumbs/a.jpg").status_code == 200, "the thumbnail is cached"
+    assert page.get("/api/photos/a/thumbs/a.jpg?side=128").status_code == 500, "the server does not decode it"
 
 
 def test_fifty_clients_get_the_same_list(page, studio, jpeg):
@@ -215,12 +215,12 @@ def test_fifty_clients_get_the_same_list(page, studio, jpeg):
     for thread in threads:
         thread.join()
     for answer in answers:
-        del answer["free_bytes"]  # of the disk, which others use too
+        del answer["free_bytes"]  # free space of the disk, which other programs use, too
     assert len(answers) == 50 and all(answer == answers[0] for answer in answers)
 
 
 def test_the_page_names_all_its_modules_at_once(page):
-    """Otherwise a browser finds them one import after the other, each a round trip later."""
+    """Otherwise a browser finds each module only after loading the one that imports it."""
     text = page.get("/").text
     asked = set(re.findall(r'(?:rel="modulepreload" href|script type="module" src)="/web/(\w+\.js)"', text))
     assert asked == {

@@ -1,4 +1,4 @@
-"""The live view of a job's training: its files are asked for only while somebody watches, and pause is the job's."""
+"""The live view of a job's training requests files only while somebody watches, and pausing it pauses the job."""
 
 import json
 import os
@@ -18,10 +18,11 @@ STATE = {"state": "training", "iteration": 30, "scene": 30}
 
 @pytest.fixture
 def training(studio, page):
-    """A run whose training is a job, as far as the server can see; its folder's live files."""
+    """The live files of a run that the server takes for the training of a job."""
     (studio.library.root / "captures" / "a").mkdir()
     job = page.post("/api/jobs", json={"command": "train", "subject": "captures/a", "to": "r"}).json()["id"]
-    studio.queue._look = lambda: None  # nobody looks whether its process, which is this one, has ended
+    # the queue does not check whether the process, which is this one, has ended
+    studio.queue._look = lambda: None
     pid = os.getpid()
     running = {"state": State.RUNNING, "pid": pid, "identity": identity(pid)}
     studio.queue._jobs[job] = Job(**{**vars(studio.queue.get(job)), **running})
@@ -34,7 +35,7 @@ def training(studio, page):
     studio.queue._jobs[job] = Job(**{**vars(studio.queue.get(job)), "state": State.DONE, "pid": None})
 
 
-def test_files_are_asked_for_while_somebody_asks(page, training):
+def test_files_are_requested_only_while_somebody_watches(page, training):
     assert not training.is_wanted()
     training.path.mkdir()
     training.write(training.state, STATE)
@@ -45,7 +46,7 @@ def test_files_are_asked_for_while_somebody_asks(page, training):
     assert scene.content == training.scene.read_bytes()
 
 
-def test_requests_wait_for_something_new(page, training, monkeypatch):
+def test_requests_wait_for_a_new_state(page, training, monkeypatch):
     monkeypatch.setattr(live_routes, "WAIT", 0.2)
     training.path.mkdir()
     assert page.get("/api/runs/r/live/state").status_code == 204
@@ -65,14 +66,14 @@ def test_requests_wait_for_something_new(page, training, monkeypatch):
     thread.join()
 
 
-def test_pause_is_that_of_the_job(page, studio, training):
+def test_pausing_the_view_pauses_the_job(page, studio, training):
     training.path.mkdir()
     training.write(training.state, STATE)
     before = page.get("/api/runs/r/live/state").json()["version"]
     assert page.post("/api/runs/r/live/control", content=json.dumps({"do": "pause"})).status_code == 204
     assert training.is_paused() and studio.queue.get("000001").state is State.PAUSED
     said = page.get(f"/api/runs/r/live/state?after={before}").json()
-    assert said["state"] == "paused"  # at once, before the training says so
+    assert said["state"] == "paused"  # at once, before the training reports it
     assert page.post("/api/runs/r/live/control", content=json.dumps({"do": "pause"})).status_code == 409
     assert page.post("/api/jobs/000001/resume").json()["state"] == "running" and not training.is_paused()
     assert page.post("/api/runs/r/live/control", content=json.dumps({"do": "explode"})).status_code == 400

@@ -1,4 +1,4 @@
-"""The studio's page in Chromium, used as a person would: from a capture, or photos, to a downloaded scene."""
+"""The studio's page in Chromium, used like a person does, from a capture or photos to a downloaded scene."""
 
 import io
 import re
@@ -15,8 +15,8 @@ from studio.pages import DROP, encoded, png, repeated, train_and_download, visit
 HOSTILE = "<img src=x onerror=hacked=1>"
 
 
-def nothing_moves(person, address):
-    """The screens of a run, opened by their addresses, fill without moving what is there."""
+def check_that_screens_load_without_shifts(person, address):
+    """The screens of a run, opened by their addresses, load without layout shifts."""
     tab = person.tab
     before = tab.viewport_size
     tab.set_viewport_size({"width": 1440, "height": 900})
@@ -25,12 +25,12 @@ def nothing_moves(person, address):
         tab.goto(f"{address}#/runs/box/{screen}")
         tab.locator(".tab h2").first.wait_for()
         tab.wait_for_load_state("networkidle")
-        assert person.shift() < 0.02, screen  # a fifth of what the Core Web Vitals call good
+        assert person.shift() < 0.02, screen  # a fifth of the bound of the Core Web Vitals
     tab.set_viewport_size(before)
 
 
 def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path):
-    """Also: a reload and a second tab show the same place, and the printed commands give the same bytes."""
+    """A reload and a second tab show the same screen, and the printed commands give the same bytes."""
     write_colmap(tmp_path / "box", *procedural_capture(24, 14))
     zipped = io.BytesIO()
     with zipfile.ZipFile(zipped, "w") as archive:
@@ -40,10 +40,10 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     tab = person.tab
     assert "token" not in tab.url
     address = tab.url.split("#")[0]
-    assert person.shift() < 0.1  # the empty library
+    assert person.shift() < 0.1  # the library is empty
     assert "Drop photos" in tab.inner_text(".first")
     tab.evaluate(DROP, [[["box.zip", encoded(zipped.getvalue())]], ".drop"])
-    person.reach("#/captures/box")  # its names say that it has poses
+    person.reach("#/captures/box")  # the file names show that it has poses
     tab.locator(".thumbs img").nth(13).wait_for()
     tab.locator(".forecast", has_text="of memory").nth(2).wait_for()
 
@@ -56,7 +56,7 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     assert tab.locator(".figures-list").inner_text().split("\n")[1] == "60 of 60"
     tab.get_by_role("img", name=re.compile("^Loss: .*from")).wait_for()
 
-    tab.keyboard.press("2")  # judge
+    tab.keyboard.press("2")  # judge the result
     person.reach("#/runs/box/judge")
     tab.locator(".views li").first.locator("img").nth(2).wait_for()
     tab.locator(".views a").first.click()
@@ -65,9 +65,9 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     tab.keyboard.press("ArrowRight")
     assert slider.get_attribute("aria-valuetext") == "photo 51 %, render 49 %"
 
-    nothing_moves(person, address)
+    check_that_screens_load_without_shifts(person, address)
 
-    tab.keyboard.press("4")  # share
+    tab.keyboard.press("4")  # share the scene
     person.reach("#/runs/box/share")
     tab.get_by_role("radio", name=re.compile("^SPZ")).check()
     tab.get_by_role("button", name="Export", exact=True).click()

@@ -1,4 +1,4 @@
-"""The studio's editor in Chromium: what is edited there is saved, kept, guarded and exported."""
+"""The studio's editor in Chromium: edits are saved, kept, guarded against overwriting, and exported."""
 
 import json
 import re
@@ -20,7 +20,7 @@ def opened(tab, address):
 
 
 def select_and_delete(tab, frame, corners):
-    """Drag a rectangle over a part of the picture, by shares of its size, and delete what it holds."""
+    """Drag a rectangle over a part of the picture, in fractions of its size, and delete the selected splats."""
     frame.get_by_role("button", name="rectangle", exact=True).click()
     box = frame.locator("#canvas").bounding_box()
     (a, b), (c, d) = corners
@@ -40,7 +40,7 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     frame = opened(tab, address)
     late = tab.context.new_page()
     late.set_viewport_size({"width": 1000, "height": 620})
-    older = opened(late, address)  # before the first tab saves
+    older = opened(late, address)  # opened before the first tab saves
 
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
     left = frame.inner_text("#edit-count")
@@ -64,7 +64,7 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     assert frame.inner_text("#edit-count") == left
     assert frame.inner_text("#edit-list summary") == "operations (2)"
 
-    tab.keyboard.press("3")  # the page's key, not the editor's: the focus is outside of the frame
+    tab.keyboard.press("3")  # the focus is outside of the frame, so the key is the page's
     person.reach("#/scenes/wall/share")
     tab.get_by_role("radio", name=re.compile("^SPZ")).check()
     assert tab.get_by_label("apply the edits").is_checked()
@@ -83,7 +83,7 @@ def focused(frame):
 
 
 @pytest.mark.sliced(1, group="the studio in a browser")
-def test_the_keyboard_keeps_its_place(visitor, wall_entry, library):
+def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
     person = visitor()
     tab = person.tab
     tab.set_viewport_size({"width": 1000, "height": 620})
@@ -99,7 +99,7 @@ def test_the_keyboard_keeps_its_place(visitor, wall_entry, library):
     ):
         frame.get_by_role("button", name=name, exact=True).focus()
         tab.keyboard.press("Enter")
-        assert focused(frame) == then, name  # not the page: the next Tab would begin at its top
+        assert focused(frame) == then, name  # if the page had the focus, the next Tab would begin at its top
     tab.keyboard.press("h")
     listed = frame.locator("#help tr:visible td:first-child").all_inner_texts()
     keys = frame.evaluate("Object.keys(EDIT_KEYS)")
@@ -121,6 +121,5 @@ def test_the_keyboard_keeps_its_place(visitor, wall_entry, library):
     tab.keyboard.press("?")
     until(tab, tab, "document.getElementById('keys').open")
     tab.keyboard.press("Escape")
-    until(
-        tab, tab, "document.activeElement.textContent === 'Restore'"
-    )  # where it was before the list of keys
+    # the element that had the focus before the list of keys
+    until(tab, tab, "document.activeElement.textContent === 'Restore'")

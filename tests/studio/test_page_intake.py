@@ -1,4 +1,4 @@
-"""Taking in videos and folders in Chromium, as a person drops and chooses them."""
+"""In Chromium, a person drops and chooses videos and folders."""
 
 import re
 
@@ -20,7 +20,7 @@ def video_of(path, frames):
 
 
 def drop_paths(tab, place, *paths):
-    """Drop files or folders of the disk, as a file manager does; the browser makes their entries."""
+    """Drop files or folders of the disk like a file manager; the browser makes their entries."""
     box = tab.locator(place).bounding_box()
     at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
     session = tab.context.new_cdp_session(tab)
@@ -31,7 +31,7 @@ def drop_paths(tab, place, *paths):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with photos in folders, and what systems leave in them."""
+    """A folder with photos in folders, and with files that operating systems add."""
     for number, path in enumerate(("left/a.png", "left/b.png", "right/deep/c.png")):
         place = tmp_path / "walk round" / path
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,7 @@ def test_a_dropped_folder_becomes_an_entry_with_its_folders(visitor, library, fo
     }
 
 
-def test_a_chosen_folder_is_taken_in_the_same_way(visitor, library, folder):
+def test_a_chosen_folder_becomes_the_same_entry(visitor, library, folder):
     person = visitor()
     again = folder.rename(folder.with_name("chosen"))
     person.tab.locator("input[type=file][webkitdirectory]").set_input_files(again)
@@ -61,7 +61,7 @@ def test_a_chosen_folder_is_taken_in_the_same_way(visitor, library, folder):
     assert sorted(path.name for path in stored.rglob("*.png")) == ["a.png", "b.png", "c.png"]
 
 
-def test_a_dropped_video_is_taken_in_under_its_name(visitor, library, tmp_path):
+def test_a_dropped_video_becomes_an_entry_of_its_name(visitor, library, tmp_path):
     path = video_of(tmp_path / "a walk.mp4", [photograph_box(camera) for camera in box_orbit(3, 0.2)])
     person = visitor()
     drop_paths(person.tab, ".drop", path)
@@ -87,4 +87,4 @@ def test_a_dropped_video_becomes_a_capture(visitor, library, tmp_path):
     tab.get_by_role("link", name=re.compile("^Continue with the capture")).click(timeout=240_000)
     person.reach("#/captures/orbit")
     tab.locator(".facts", has_text="COLMAP").wait_for()
-    tab.locator(".thumbs img").nth(20).wait_for()  # most of the 30 frames have a pose
+    tab.locator(".thumbs img").nth(20).wait_for()  # most of the 30 frames get a pose

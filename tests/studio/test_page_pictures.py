@@ -1,4 +1,4 @@
-"""The studio in a Chromium without WebGL: the server's computer draws, by our own renderer, on request."""
+"""In a Chromium without WebGL, the server draws pictures on request by our renderer."""
 
 import base64
 import io
@@ -36,14 +36,14 @@ def browser():
 
 
 def framed_viewer(tab):
-    """The viewer in the screen's frame, once it has a picture."""
+    """Wait for a picture in the screen's frame; return the frame."""
     frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
     until(tab, frame, "Boolean(window.viewer) && !viewer.renderer.asking && !viewer.frameAsked")
     return frame
 
 
 def shown(frame):
-    """What is drawn on the frame's canvas, without what lies on it, (H, W, 3)."""
+    """Return the canvas of the frame without the elements on top of it, (H, W, 3)."""
     data = base64.b64decode(frame.evaluate("document.getElementById('canvas').toDataURL()").partition(",")[2])
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), dtype=float)
 
@@ -77,17 +77,17 @@ def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     found = open_source(wall_entry / "wall.ply")
     truth = render(found.scene.gaussians, picture_camera(camera), settings=found.settings).image.clamp(0, 1)
     sent = np.asarray(Image.open(io.BytesIO(answer.body())), dtype=np.float64) / 255
-    assert psnr(sent, truth.double().numpy()) > 35  # JPEG of quality 85
+    assert psnr(sent, truth.double().numpy()) > 35  # the loss of JPEG of quality 85
 
     box = frame.locator("#canvas").bounding_box()
     tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"])
     tab.mouse.down()
     tab.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 0.6 * box["height"], steps=2)
     tab.mouse.up()
-    drawn(tab, frame, lambda pixels: np.abs(pixels - before).mean() > 2)  # from another side
+    drawn(tab, frame, lambda pixels: np.abs(pixels - before).mean() > 2)  # seen from another side
 
 
-def test_the_editor_says_in_one_line_what_is_missing(visitor, wall_entry):
+def test_the_editor_reports_missing_webgl_in_one_line(visitor, wall_entry):
     tab = visitor().tab
     tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall/edit")
     frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
@@ -115,35 +115,35 @@ def test_a_training_is_drawn_while_it_runs(visitor, library, tmp_path):
 
 
 def camera_at(z, focal, W, H):
-    """A page's camera on the z axis that looks along it."""
+    """Return a page's camera on the z axis that looks along it."""
     turn = np.eye(3).tolist()
     return {"R": turn, "eye": [0, 0, z], "fx": focal, "fy": focal, "cx": W / 2, "cy": H / 2, "W": W, "H": H}
 
 
 def painter_here():
-    """A painter that draws in this process."""
+    """Return a painter that draws in this process."""
     painter = Painter()
     painter.worker = Inline()
     return painter
 
 
-def test_pictures_wait_for_one_another_only_while_a_training_runs(wall_entry):
+def test_pictures_wait_only_while_a_training_runs(wall_entry):
     painter = painter_here()
     camera = camera_at(-4, 20, 20, 20)
     task = {"source": str(wall_entry / "wall.ply"), "camera": camera, "live": False}
     first = painter.paint(lambda: True, **task)
-    painter._free_at += 1e6  # as if the picture had taken long
+    painter._free_at += 1e6  # the clock makes the picture seem slow
     asked = []
 
     def ends_soon():
         asked.append(len(asked))
         return len(asked) < 4
 
-    assert (
-        painter.paint(ends_soon, **task) == first and len(asked) == 5
-    )  # it waited until the training had ended
+    # it waited for the end of the training
+    assert painter.paint(ends_soon, **task) == first and len(asked) == 5
     painter._free_at += 1e6
-    assert painter.paint(lambda: False, **task) == first  # nothing is slowed, so nothing waits
+    # no training is slowed down, so pictures do not wait
+    assert painter.paint(lambda: False, **task) == first
 
 
 def test_a_snapshot_is_drawn_with_the_settings_of_its_training(wall_entry, tmp_path):

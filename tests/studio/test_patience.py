@@ -1,4 +1,4 @@
-"""Bodies that stall are given up, odd numbers and long values are one short line, and the terminal stays clean."""
+"""Stalled bodies are given up, odd numbers and long values are refused in a short line, the terminal stays clean."""
 
 import asyncio
 import logging
@@ -20,7 +20,7 @@ LONG = "x" * 5_000
 
 
 def read(piece, wait, count, seconds):
-    """Read a body of pieces that come after a wait each, with this patience; return its bytes."""
+    """Read a body whose pieces each come after a wait, with this patience; return its bytes."""
     found, came = bytearray(), 0
 
     async def receive():
@@ -40,9 +40,13 @@ def read(piece, wait, count, seconds):
     return len(found)
 
 
-def test_a_body_has_to_go_on():
+def test_a_stalled_body_is_given_up():
     assert read(LEAST_GAIN, 0.0, 100, 30.0) == 100 * LEAST_GAIN and read(1, 0.0, 10, 30.0) == 10
-    for piece, wait in ((1, 0.01), (LEAST_GAIN // 1000, 0.01), (LEAST_GAIN, 60.0)):  # trickles, and stops
+    for piece, wait in (
+        (1, 0.01),
+        (LEAST_GAIN // 1000, 0.01),
+        (LEAST_GAIN, 60.0),
+    ):  # sends a few bytes and stops
         with pytest.raises(RefusedError, match=r"fewer than 4,096 bytes of it came in 0.1 s"):
             read(piece, wait, 1_000, 0.1)
 
@@ -53,7 +57,7 @@ REQUESTS = {
     "PUT /api/photos/a/zip": b"PK",
     "PUT /api/scenes/s/edits.json": b"{",
     "POST /api/runs/r/live/control": b"",
-    "GET /api/library": b"x",  # which reads no body
+    "GET /api/library": b"x",  # this route reads no body
     "DELETE /api/trash": b"",
     "PUT /api/nowhere": b"x",
 }
@@ -89,7 +93,7 @@ def test_a_stream_whose_reader_is_gone_is_not_written_to(tmp_path, caplog):
             request = f"GET /api/events {head}Last-Event-ID: {studio.stream.boot}-1\r\n\r\n"
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             connection.sendall(request.encode())
-            connection.close()  # with a reset
+            connection.close()  # by a reset of the connection
         connection, head = connected(url)
         connection.sendall(f"GET /api/events {head}Last-Event-ID: {studio.stream.boot}-990\r\n\r\n".encode())
         found = b""
@@ -100,7 +104,7 @@ def test_a_stream_whose_reader_is_gone_is_not_written_to(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("number", ODD)
-def test_odd_numbers_are_none(page, studio, number):
+def test_other_spellings_of_numbers_are_refused(page, studio, number):
     (studio.library.root / "runs" / "r").mkdir()
     (studio.library.root / "runs" / "r" / "log.jsonl").write_text("")
     (studio.library.hidden("trash") / number[:20]).mkdir()
@@ -113,7 +117,7 @@ def test_odd_numbers_are_none(page, studio, number):
     assert page.get("/api/trash").json() == {"trash": []}
 
 
-def test_answers_stay_short_whatever_they_quote(page, studio):
+def test_answers_that_quote_long_values_are_short(page, studio):
     (studio.library.root / "captures" / "a").mkdir()
     train = {"command": "train", "subject": "captures/a"}
     answers = [
@@ -158,7 +162,7 @@ def test_answers_stay_short_whatever_they_quote(page, studio):
     ],
     ids=lambda words: " ".join(word[:12] for word in words),
 )
-def test_lines_of_commands_stay_short_whatever_they_quote(capsys, monkeypatch, tmp_path, words):
+def test_lines_of_commands_that_quote_long_values_are_short(capsys, monkeypatch, tmp_path, words):
     monkeypatch.chdir(tmp_path)
     try:
         code = main(words)

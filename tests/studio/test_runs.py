@@ -1,4 +1,4 @@
-"""Runs over HTTP: a real run's curves, views, comparison, page and edits."""
+"""Curves, views, comparison, page and edits of a run over HTTP."""
 
 import io
 import json
@@ -83,12 +83,12 @@ def test_curves_are_read_as_they_grow(page, run):
     )
     again = page.get("/api/runs/r/curves", params={"after": token}).json()
     assert again["points"]["iteration"] == [] and again["next"] == token and not again["reset"]
-    run.log_file.write_text(log[:half])  # shorter: a resumed run has cut it
+    run.log_file.write_text(log[:half])  # shorter, as after a resumption
     assert run.log_file.stat().st_ino == inode
     assert page.get("/api/runs/r/curves", params={"after": token}).json()["reset"]
     other = run.log_file.with_name("other")
     other.write_text(log + log)
-    other.replace(run.log_file)  # another file, even if it is longer
+    other.replace(run.log_file)  # another file, although it is longer
     assert page.get("/api/runs/r/curves", params={"after": token}).json()["reset"]
 
 
@@ -105,7 +105,7 @@ def test_held_out_views_are_sorted_and_have_pictures(page, run):
     apart = abs(pictures["render"] - pictures["photo"])
     np.testing.assert_array_equal(pictures["difference"], np.minimum(GAIN * apart, 255))
     score = -10 * np.log10(np.mean((apart / 255) ** 2))
-    assert abs(score - views[0]["psnr_8bit"]) < 0.01  # the pictures are the scored ones, of this view
+    assert abs(score - views[0]["psnr_8bit"]) < 0.01  # the pictures are those of this view that were scored
     assert (views[0]["H"], views[0]["W"]) == pictures["photo"].shape[:2]
     for path in ("9/photo.png", "9/photo.jpg", "0/secret.jpg", "x/photo.png", "0/secret.png"):
         assert page.get(f"/api/runs/r/views/{path}").status_code == 404
@@ -123,10 +123,10 @@ def test_previews_are_small_and_made_once(page, run, studio):
         assert answer.headers["content-type"] == "image/jpeg"
         with Image.open(io.BytesIO(answer.content)) as image:
             assert image.size == (512, 341)
-            assert np.abs(np.asarray(image, int) - color).max() <= 3  # of 8-bit levels, by JPEG's rounding
+            assert np.abs(np.asarray(image, int) - color).max() <= 3  # 8-bit levels, rounded by JPEG
         etag = answer.headers["etag"]
         assert page.get(answer.request.url, headers={"If-None-Match": etag}).status_code == 304
-    studio.decoder.close()  # nothing is decoded again
+    studio.decoder.close()  # no picture is decoded again
     assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 200
     path.unlink()
     assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 404
@@ -146,7 +146,7 @@ def test_two_runs_are_compared_view_by_view(page, run):
     assert page.get("/api/compare", params={"a": "r", "b": "none"}).status_code == 404
 
 
-def test_the_report_has_no_rights(page, run):
+def test_the_report_is_served_without_rights(page, run):
     answer = page.get("/api/runs/r/report")
     assert answer.status_code == 200
     policy = answer.headers["content-security-policy"]
@@ -162,7 +162,7 @@ def test_the_page_of_a_scene_brings_its_own_policy(page, run):
     assert page.get("/api/runs/r/scene").content == run.latest_scene()[0].read_bytes()
 
 
-def test_a_scene_that_is_none_ends_in_one_line(page, studio):
+def test_a_file_that_is_no_scene_ends_in_one_line(page, studio):
     folder = studio.library.root / "scenes" / "a"
     folder.mkdir()
     assert page.get("/api/scenes/a/page").status_code == 400
@@ -220,7 +220,7 @@ def test_findings_name_photos(page, studio, trained):
         events.Diagnosed((("a", "b"),), ("files",), ("train",)),
     ]
     path = studio.queue.files("000001").events
-    path.write_text("".join(events.line_of(event, 1.0) for event in [*log, *log]))  # it was run twice
+    path.write_text("".join(events.line_of(event, 1.0) for event in [*log, *log]))  # the command ran twice
     answer = page.get("/api/captures/box/findings").json()
     (finding,) = answer["findings"]
     assert finding["photos"] == ["captures/box/images/view_001.png", None]

@@ -1,4 +1,4 @@
-"""The real server in a process of its own, with real sockets, real trainings, and kill -9."""
+"""The server in a process of its own, with sockets, trainings, and kill -9."""
 
 import contextlib
 import io
@@ -73,7 +73,7 @@ class Server:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """A capture in a folder, and as the bytes of a zip file."""
+    """A capture as a folder, and as the bytes of a zip file."""
     folder = tmp_path_factory.mktemp("capture") / "box"
     write_colmap(folder, *procedural_capture(24, 14))
     data = io.BytesIO()
@@ -85,7 +85,7 @@ def capture(tmp_path_factory):
 
 @pytest.fixture
 def served(tmp_path):
-    """Start servers on a folder; what still runs at the end is killed."""
+    """Start servers on a folder; those that still run at the end are killed."""
     made = []
 
     def serve(*words):
@@ -113,7 +113,7 @@ def logged(folder):
 
 
 def check_that_an_export_waits(server, training):
-    """An export of the run that is being trained waits, although another job could run; it is cancelled then."""
+    """Check that an export of a run in training waits, although another job could run; then cancel it."""
     end = time.monotonic() + PATIENCE
     late = server.start(command="convert", subject="runs/box", format="ply")
     while not (found := server.get(f"jobs/{late}"))["waits_for"]:
@@ -124,7 +124,7 @@ def check_that_an_export_waits(server, training):
 
 
 def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, capture, tmp_path):
-    """Upload, train, kill the server, find the job, kill both, rename, resume, export: the bytes of the commands."""
+    """Upload, train, kill the server, find the job, kill both, rename, resume and export give the commands' bytes."""
     folder, zipped = capture
     library, run = tmp_path / "library", tmp_path / "library" / "runs" / "box"
     server = served("--jobs", "2")
@@ -159,7 +159,8 @@ def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, captu
     assert done["attempts"] == 2 and done["command"].endswith("--resume")
     run = library / "runs" / "egg"
     assert done["argv"][1:4] == [str(library / "captures" / "egg"), "--out", str(run)]
-    assert [path.name for path in run.parent.iterdir()] == ["egg"]  # it did not begin anew at the old place
+    # the job did not start again at the old place
+    assert [path.name for path in run.parent.iterdir()] == ["egg"]
     export = server.start(command="convert", subject="runs/egg", format="spz")
     found = server.reached(export, "done")
     assert server.client.post("/api/runs/egg/rename", json={"to": "box"}).status_code == 200
@@ -185,7 +186,7 @@ def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, captu
 
 
 def raw(server, request, wait=5.0):
-    """Send bytes; return what comes back until the connection closes."""
+    """Send bytes; return the answer until the connection is closed."""
     with socket.create_connection(("127.0.0.1", server.port), timeout=wait) as connection:
         connection.sendall(request)
         found = b""
@@ -196,13 +197,11 @@ def raw(server, request, wait=5.0):
 
 
 def check_refusals(server):
-    """Requests that others send, or that would cost too much, are refused."""
+    """Check that requests of other pages, and requests that cost too much, are refused."""
     head = f"Host: 127.0.0.1:{server.port}\r\nAuthorization: Bearer {server.token}\r\n"
     huge = f"PUT /api/photos/a/files/a.jpg HTTP/1.1\r\n{head}Content-Length: 10737418240\r\n\r\n"
     answer = raw(server, huge.encode() + bytes(1000))
-    assert (
-        answer.startswith(b"HTTP/1.1 413 ") and b"one file may have" in answer
-    )  # and the connection is closed
+    assert answer.startswith(b"HTTP/1.1 413 ") and b"one file may have" in answer  # the connection is closed
     assert raw(server, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 20_000 + b"\r\n").startswith(b"HTTP/1.1 4")
     assert raw(server, b"\x16\x03\x01nonsense\r\n\r\n").startswith(b"HTTP/1.1 400")
     foreign = f"GET /api/library HTTP/1.1\r\n{head}Origin: http://evil.example\r\n\r\n"
@@ -211,7 +210,7 @@ def check_refusals(server):
     assert raw(server, rebound.encode()).startswith(b"HTTP/1.1 403")
     twice = f"GET /api/library HTTP/1.1\r\n{head}Host: evil.example\r\n\r\n"
     assert raw(server, twice.encode()).startswith(b"HTTP/1.1 4")
-    # a browser that is still sending when it is refused gets the answer, too
+    # a browser that is refused while it sends gets the answer, too
     text = f"PUT /api/photos/a/files/a.txt HTTP/1.1\r\n{head}Content-Length: 300000\r\n\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=5) as connection:
         connection.sendall(text.encode())
@@ -220,7 +219,7 @@ def check_refusals(server):
             connection.sendall(bytes(100_000))
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
         assert b"neither a photo nor a video" in answer
-    # an upload that stops in the middle leaves nothing; see the caller
+    # an interrupted upload leaves no files, as the caller checks
     cut = f"PUT /api/photos/a/files/a.jpg HTTP/1.1\r\n{head}Content-Length: 1000\r\n\r\n"
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
         connection.sendall(cut.encode() + bytes(500))
@@ -244,7 +243,7 @@ def test_a_server_under_attack_answers_its_page_and_works_on(served, tmp_path):
         assert time.monotonic() < end
         time.sleep(0.05)
 
-    # events come while all that goes on, and come again after a break
+    # events arrive in the meantime, and again after a pause
     (tmp_path / "library" / "captures" / "none").mkdir()
     with server.client.stream("GET", "/api/events") as stream:
         lines = stream.iter_lines()
@@ -267,7 +266,7 @@ def test_a_server_under_attack_answers_its_page_and_works_on(served, tmp_path):
     ]
     second = subprocess.run(words, capture_output=True, text=True, check=False)
     assert second.returncode == 2 and "is in use by" in second.stderr and second.stderr.count("\n") == 1
-    # half-open connections are closed by now, or soon
+    # half-open connections are closed by now, or will be soon
     half_open[0].settimeout(REQUEST_SECONDS + 5)
     assert half_open[0].recv(1) == b""
     for connection in half_open:

@@ -1,4 +1,4 @@
-"""The stream of events: complete, in order, resumed by its ids."""
+"""The stream of events is complete and in order, and is resumed by its ids."""
 
 import asyncio
 import json
@@ -9,7 +9,7 @@ from gsplat_edu.studio import stream as stream_module
 from gsplat_edu.studio.stream import Stream
 
 ODD = ("\u00b2", "\u0663", "+6", "-6", " 6", "6_0", "6.0", "9" * 5_000)
-"""What `str.isdigit`, `str.isdecimal` or `int` take for numbers."""
+"""Texts that `str.isdigit`, `str.isdecimal` or `int` accept as numbers."""
 
 
 def collected(stream, last_id, count):
@@ -31,7 +31,7 @@ def collected(stream, last_id, count):
     return asyncio.run(asyncio.wait_for(run(), 10))
 
 
-def test_a_watcher_resumes_behind_the_event_it_has():
+def test_a_watcher_resumes_after_the_last_event_it_has():
     stream = Stream()
     for number in range(5):
         stream.publish("job", {"number": number})
@@ -65,14 +65,14 @@ def test_the_events_of_jobs_are_published_once_and_in_order(studio):
     studio.queue._jobs[job.id] = running = type(job)(
         **{**vars(job), "state": stream_module.ACTIVE[0], "pid": 1}
     )
-    studio.queue._look = lambda: None  # process 1 is none of ours
+    studio.queue._look = lambda: None  # process 1 is not a job's
     path.write_text(
         events.line_of(events.Stage("photos"), 1.0) + events.line_of(events.Progress("photos", 1, 2), 2.0)
     )
     studio.stream.look(studio.queue)
     with path.open("a") as file:
         file.write(events.line_of(events.Finished(("x",)), 3.0))
-    studio.queue._jobs[job.id] = job  # it has ended before the next look
+    studio.queue._jobs[job.id] = job  # the job ends before the next look
     studio.stream.look(studio.queue)
     studio.stream.look(studio.queue)
     found = collected(studio.stream, f"{studio.stream.boot}-1", 3)

@@ -1,4 +1,4 @@
-"""Uploads: limits hold before and while bytes come in, and nothing incomplete is ever seen."""
+"""Limits of uploads are checked before and while bytes arrive, and incomplete files are never visible."""
 
 import contextlib
 import io
@@ -56,7 +56,7 @@ def test_the_library_has_a_limit(page, studio):
 
 
 @pytest.mark.parametrize("studio", [SMALL], indirect=True)
-def test_uploads_without_a_length_count_as_they_come(page, studio):
+def test_uploads_without_a_length_count_as_they_arrive(page, studio):
     noise = picture("PNG", (36, 36))
     for name in "abc":
         assert page.put(f"/api/photos/{name}/files/a.png", content=in_pieces(noise)).status_code == 201
@@ -64,11 +64,11 @@ def test_uploads_without_a_length_count_as_they_come(page, studio):
     assert nothing_left(studio)
     page.delete("/api/photos/a")
     again = page.put("/api/photos/d/files/a.png", content=in_pieces(noise))
-    assert again.status_code == 201, "the refused upload reserves nothing any more"
+    assert again.status_code == 201, "a refused upload reserves no space"
 
 
 @pytest.mark.parametrize("studio", [SMALL], indirect=True)
-def test_uploads_that_are_on_their_way_count(page, studio, jpeg):
+def test_uploads_in_progress_count(page, studio, jpeg):
     studio.uploads._reserve(5_000, begins=True)
     studio.uploads._reserve(5_000, begins=True)
     headers = {"Content-Length": "3000"}
@@ -84,12 +84,12 @@ def test_the_disk_is_not_filled(page, studio, jpeg):
 
 
 @pytest.mark.parametrize("studio", [SMALL], indirect=True)
-def test_an_entry_has_a_number_of_files(page, studio, jpeg):
+def test_the_number_of_files_of_an_entry_is_limited(page, studio, jpeg):
     statuses = [page.put(f"/api/photos/a/files/{i}.jpg", content=jpeg).status_code for i in range(4)]
     assert statuses == [201, 201, 201, 413]
 
 
-def test_a_file_is_whole_or_not_there(page, studio, jpeg):
+def test_an_incomplete_file_is_not_visible(page, studio, jpeg):
     answer = page.put(
         "/api/photos/a/files/a.jpg", content=jpeg, headers={"Content-Length": str(len(jpeg) + 1)}
     )
@@ -135,7 +135,7 @@ def linked():
 
 
 def lying():
-    """A zip file whose entry unpacks to more than it claims."""
+    """Return a zip file whose entry unpacks to more than it declares."""
     data = bytearray(zipped({"a.jpg": bytes(50_000)}))
     for at in (data.index(b"PK\x03\x04") + 22, data.index(b"PK\x01\x02") + 24):
         struct.pack_into("<I", data, at, 10)
@@ -143,7 +143,7 @@ def lying():
 
 
 def many_claimed():
-    """A zip file whose end claims more entries than memory could hold."""
+    """Return a zip file whose end record declares more entries than fit into memory."""
     data = bytearray(zipped({"a.jpg": b"x"}))
     struct.pack_into("<HHI", data, len(data) - 22 + 8, 0xFFFF, 0xFFFF, 0xFFFFFFF0)
     return bytes(data)
@@ -201,7 +201,7 @@ def test_an_encrypted_entry_is_refused(tmp_path):
 
 
 def wide(plain, *, fields=None, offset=None, extra=b"", end=None):
-    """Give a zip file the records of zip64, with the fields of its end or others."""
+    """Add zip64 records to a zip file, with the fields of its end record or with others."""
     count, length, begin = struct.unpack_from("<HII", plain, len(plain) - 12)
     fields = (0, 0, count, count, length, begin) if fields is None else fields
     record = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44 + len(extra), 45, 45, *fields) + extra
@@ -210,7 +210,7 @@ def wide(plain, *, fields=None, offset=None, extra=b"", end=None):
 
 
 MAXIMAL = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
-"""An end record that leaves everything to that of zip64."""
+"""An end record that refers to the zip64 record for all fields."""
 
 
 def test_a_zip64_file_is_unpacked(tmp_path):
@@ -220,7 +220,7 @@ def test_a_zip64_file_is_unpacked(tmp_path):
 
 
 def two_ends():
-    """A locator leads to a harmless end record at the start of the file; another one lies directly before it."""
+    """Return a zip file whose locator refers to a harmless end record at the start, with another directly before it."""
     many = zipped({f"{i}.jpg": b"" for i in range(300)})
     harmless = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44, 45, 45, 0, 0, 1, 1, 50, 0)
     count, length, begin = struct.unpack_from("<HII", many, len(many) - 12)
@@ -240,7 +240,7 @@ def changed_end(plain, **values):
 
 
 def nameless():
-    """A zip file whose only entry has an empty name, which `zipfile` reads but does not write."""
+    """Return a zip file whose only entry has an empty name, which `zipfile` reads but does not write."""
     local = struct.pack("<4s5H3I2H", b"PK\x03\x04", 20, 0, 0, 0, 33, 0, 0, 0, 0, 0)
     entry = struct.pack("<4s6H3I5H2I", b"PK\x01\x02", 20, 20, 0, 0, 0, 33, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     return local + entry + struct.pack("<4s4H2IH", b"PK\x05\x06", 0, 0, 1, 1, len(entry), len(local), 0)
@@ -272,26 +272,27 @@ AMBIGUOUS = {
 
 
 @pytest.mark.parametrize("name", AMBIGUOUS)
-def test_a_zip_file_that_readers_could_read_differently_is_refused(page, tmp_path, name):
+def test_an_ambiguous_zip_file_is_refused(page, tmp_path, name):
     (tmp_path / "a.zip").write_bytes(AMBIGUOUS[name])
     with pytest.raises(RefusedError, match=r"^zip: [^\n]*$"):
         unpack(tmp_path / "a.zip", tmp_path / "into", ZipLimits(entries=250))
     assert not (tmp_path / "into").exists()
-    if "name" not in name:  # before `zipfile` reads the directory
+    if "name" not in name:  # refused before `zipfile` reads the directory
         with pytest.raises(RefusedError):
             _check_directory(tmp_path / "a.zip", ZipLimits(entries=250))
     answer = page.put("/api/photos/x/zip", content=AMBIGUOUS[name])
     assert answer.status_code in (400, 413) and answer.json()["error"].startswith("zip: ")
 
 
-def test_a_comment_is_no_harm(tmp_path):
+def test_a_zip_file_may_have_a_comment(tmp_path):
     (tmp_path / "a.zip").write_bytes(with_comment(PLAIN, b"holidays"))
     assert unpack(tmp_path / "a.zip", tmp_path / "into", ZipLimits())[0] == 2
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_zipfile_reads_the_directory_that_was_measured(tmp_path, seed):
-    """Damaged ends, of both kinds: whatever passes the check has as many entries for `zipfile` as were counted."""
+def test_zipfile_reads_as_many_entries_as_were_counted(tmp_path, seed):
+    """A zip file with damaged end records of both kinds is refused, or `zipfile` reads as many entries as were
+    counted."""
     draw, passed = random.Random(seed), 0
     for number in range(150):
         data = bytearray(wide(PLAIN) if number % 2 else with_comment(PLAIN, b"PK\5\6" + bytes(30)))

@@ -1,4 +1,4 @@
-"""The worker process: one line in, one line out, and another process if it ends."""
+"""The worker process answers a line by a line, and is replaced if it ends."""
 
 import threading
 import time
@@ -23,7 +23,7 @@ def test_a_worker_answers_and_is_replaced():
 
 
 @pytest.mark.own_process
-def test_a_worker_that_hangs_is_ended(monkeypatch):
+def test_a_worker_that_hangs_is_killed(monkeypatch):
     monkeypatch.setattr(workers, "COMMAND", ("sleep", "100"))
     monkeypatch.setattr(workers, "PATIENCE", 0.2)
     worker = Worker()
@@ -33,7 +33,7 @@ def test_a_worker_that_hangs_is_ended(monkeypatch):
 
 
 @pytest.mark.own_process
-def test_few_requests_wait_for_a_worker(monkeypatch):
+def test_the_number_of_waiting_requests_is_limited(monkeypatch):
     monkeypatch.setattr(workers, "COMMAND", ("sleep", "100"))
     monkeypatch.setattr(workers, "PATIENCE", 0.5)
     monkeypatch.setattr(workers, "MOST_WAITING", 1)

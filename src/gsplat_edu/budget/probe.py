@@ -108,9 +108,8 @@ def probe(
         photo = view.read()
         reading.append(time.perf_counter() - began)
         photos.append(View(view.camera, photo.image, alpha=photo.alpha, mask=photo.mask, name=view.name))
-    plain = replace(
-        config, strategy="none"
-    )  # mcmc starts with fainter and smaller Gaussians than it has later
+    # mcmc starts with fainter and smaller Gaussians than it has later
+    plain = replace(config, strategy="none")
     start, usual = (
         scene or from_points(dataset.points, dataset.colors, settings) for settings in (config, plain)
     )

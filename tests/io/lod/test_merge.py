@@ -86,9 +86,8 @@ def test_a_scene_keeps_its_total_moments():
     before, after = moments(blobs_of(gaussians)), moments(blobs_of(merged))
     assert len(merged) == 108
     for a, b in zip(before, after, strict=True):
-        np.testing.assert_allclose(
-            b, a, rtol=1e-5, atol=1e-6 * before[0]
-        )  # rounding of the parameters to float32
+        # rounding of the parameters to float32
+        np.testing.assert_allclose(b, a, rtol=1e-5, atol=1e-6 * before[0])
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 10, 501])
