@@ -42,7 +42,7 @@ def config(name="adc", batch=4, **changes):
 
 
 def trainer(settings, team=ALONE, splats=900, callbacks=(), **parts):
-    """A training of a procedural capture whose 600 Gaussians fill two pages and a part of a third."""
+    """Make a training of a procedural capture whose 600 Gaussians fill two pages and a part of a third."""
     views, points, colors = procedural_capture(24, 6, splats=splats)
     start = from_points(points, colors, settings)
     model = make_view_model(settings, [view.camera for view in views], 2.0, start)
@@ -59,7 +59,7 @@ def trainer(settings, team=ALONE, splats=900, callbacks=(), **parts):
 
 
 def bits(run):
-    """The whole state as comparable values; ranks have to ask for it together."""
+    """Return the whole state as comparable values; all ranks have to call this together."""
     tensors, numbers = run.state()
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, numbers
 
@@ -71,14 +71,14 @@ def trained(settings, team=ALONE, **parts):
 
 
 def contents_of(path):
-    """The contents of a checkpoint; safetensors writes the header's entries in a random order."""
+    """Return the contents of a checkpoint, because safetensors writes the header's entries in a random order."""
     tensors, metadata = checkpoints.read(path)
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, metadata
 
 
 @pytest.mark.parametrize("count", range(1, 18))
-def test_partial_sums_have_the_bits_of_the_whole_tree_for_any_runs(count):
-    """Numbers of very different sizes, so that another order of the sum shows."""
+def test_partial_sums_of_any_ranges_have_the_bits_of_the_whole_sum(count):
+    """The numbers have very different sizes, so that another order of the sum gives other bits."""
     rng = np.random.default_rng(count)
     values = torch.from_numpy(rng.normal(size=(count, 64)) * 10.0 ** rng.integers(-6, 6, (count, 64))).float()
 
@@ -103,7 +103,7 @@ def test_partial_sums_have_the_bits_of_the_whole_tree_for_any_runs(count):
         assert torch.equal(completed.total["a"], whole), parts
 
 
-def test_a_sum_without_all_places_is_refused():
+def test_a_sum_with_missing_terms_is_refused():
     found = PartialSums(3)
     found.add((0, 1), {})
     with pytest.raises(ArgumentError, match="^batch: places of its 3 views are missing"):
@@ -111,7 +111,7 @@ def test_a_sum_without_all_places_is_refused():
 
 
 def test_the_gradient_of_a_batch_is_the_mean_of_those_of_its_views():
-    """In float64 each sum of four rounds three times by at most 2^-53 of the sum of magnitudes, the mean not at all."""
+    """In float64, a sum of four rounds three times by at most 2^-53 of the sum of magnitudes, and the mean is exact."""
     settings = config(random_background=False, densify_start=40)
     views, points, colors = procedural_capture(24, 6, splats=60)
     start = from_points(points, colors, settings).map(torch.Tensor.double)
@@ -151,7 +151,7 @@ def test_the_gradient_of_a_batch_is_the_mean_of_those_of_its_views():
 
 
 def test_adam_follows_the_rule_for_batches():
-    """Zhao et al. 2024: rate sqrt(B), eps / sqrt(B), b^B; here by hand in float64."""
+    """The test computes the rule of Zhao et al. 2024 in float64: rate sqrt(B), eps / sqrt(B), b^B."""
     p, g, B, rate, eps, b1, b2 = 1.0, 0.3, 4, 0.01, 1e-3, 0.9, 0.999
     tensors = {"p": torch.tensor([p], dtype=torch.float64, requires_grad=True)}
     adam = Adam(tensors, {"p": ParameterGroup(rate, eps, (b1, b2))})
@@ -174,7 +174,7 @@ def test_milestones_count_images():
 
 
 @pytest.mark.parametrize("batch", [1, 2, 3, 4])
-def test_densification_comes_as_often_per_image_for_any_batch(batch):
+def test_the_number_of_densifications_per_image_does_not_depend_on_the_batch(batch):
     changes = []
     watch = [lambda _, event: changes.append(event)]
     run = trainer(config("adc", batch), callbacks=watch)
@@ -210,7 +210,7 @@ def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_imag
 @pytest.mark.parametrize("extra", [{}, {"appearance": "exposure", "refine": "both"}], ids=["plain", "models"])
 @pytest.mark.sliced(2)
 def test_ranks_train_to_the_same_bits(name, extra):
-    """Gaussians change their number, and with it the ranges that the ranks move."""
+    """The number of Gaussians changes, and with it the range of each rank."""
     settings = config(name, **extra) if not extra else config(name, **extra, random_background=False)
     losses, expected = trained(settings)
     for size in (2, 4):
@@ -219,7 +219,7 @@ def test_ranks_train_to_the_same_bits(name, extra):
             assert found == expected
 
 
-def test_batches_that_no_power_of_two_divides_are_shared_too():
+def test_batches_of_any_size_are_shared_among_ranks():
     settings = config("adc", 6)
     _, expected = trained(settings)
     for size in (2, 3):
@@ -240,7 +240,7 @@ def test_the_number_of_threads_does_not_change_a_batch(threads):
         torch.set_num_threads(before)
 
 
-def test_a_run_goes_on_with_another_number_of_ranks(tmp_path):
+def test_a_run_is_resumed_by_another_number_of_ranks(tmp_path):
     settings = config("adc", appearance="exposure", random_background=False)
     _, expected = trained(settings)
 
@@ -266,7 +266,7 @@ def test_a_run_goes_on_with_another_number_of_ranks(tmp_path):
     assert second(ALONE) == expected
 
 
-def test_moments_are_shared_out():
+def test_moments_are_divided_among_ranks():
     def held(team):
         run = trainer(config(), team)
         return len(run.stepper.optimizer.first["means"]), len(run.stepper.optimizer.first["sh_rest"])
@@ -282,7 +282,7 @@ def test_what_a_view_model_measures_is_the_same_for_every_view_of_a_batch():
     before, measure = rows.clone(), run.view_model.measure
 
     def watching(*arguments):
-        assert torch.equal(rows, before), "no view sees what another one measured"
+        assert torch.equal(rows, before), "no view uses a measurement of another view of its batch"
         return measure(*arguments)
 
     run.view_model.measure = watching
@@ -292,7 +292,7 @@ def test_what_a_view_model_measures_is_the_same_for_every_view_of_a_batch():
     assert all((rows[i] != before[i]).any() == (i in drawn) for i in range(6))
 
 
-def test_a_photo_that_cannot_be_read_leaves_all_views_of_the_batch_due(monkeypatch):
+def test_after_an_unreadable_photo_all_views_of_the_batch_are_drawn_again(monkeypatch):
     run = trainer(config())
     before, read, calls = run.state()[1]["feed"], run._feed._read, []
 
@@ -314,7 +314,7 @@ def test_a_photo_that_cannot_be_read_leaves_all_views_of_the_batch_due(monkeypat
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_what_does_not_fit_a_batch_is_refused():
+def test_options_that_contradict_a_batch_are_refused():
     with pytest.raises(ArgumentError, match="^iterations: is 10, but .* of batch = 4, for example 12"):
         recipe(10, batch=4)
     with pytest.raises(ArgumentError, match="^batch: "):
@@ -325,7 +325,7 @@ def test_what_does_not_fit_a_batch_is_refused():
 
 @pytest.mark.sliced(1, group="quality that comes back")
 def test_batches_learn_as_well_from_as_many_images():
-    """Measured: 29.5, 29.3 and 29.3 dB for batches of 1, 2 and 4; at the rates of one view 29.5, 28.5 and 27.3 dB."""
+    """Batches of 1, 2 and 4 gave 29.5, 29.3 and 29.3 dB; with unscaled rates 29.5, 28.5 and 27.3 dB."""
     views, points, colors = procedural_capture(24, 9, splats=300)
     found = {}
     for batch in (1, 2, 4):

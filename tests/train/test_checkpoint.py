@@ -134,7 +134,7 @@ def double_gaussians(tensors, state):
 
 
 def generator_past_its_end(tensors, state):
-    """Claim 500 numbers left from position 600 of 624, so that torch would read past its block."""
+    """Declare 500 numbers left from position 600 of 624, so that torch would read past its block."""
     words = tensors["density.generator"].numpy().view("<i4")
     words[2], words[4] = 500, 600
 
@@ -210,7 +210,7 @@ def test_a_hostile_checkpoint_changes_nothing(tiny, tmp_path, message):
 
 
 def test_a_checkpoint_with_nan_parameters_is_resumed(tiny, tmp_path):
-    """Gaussians that are not finite are pruned only by the next densification, so checkpoints may contain them."""
+    """Only a densification prunes Gaussians that are not finite, so checkpoints may contain them."""
     make, (tensors, metadata) = tiny
     tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     for name in ("gaussians.means", "first.means", "second.means"):
@@ -225,7 +225,7 @@ def test_a_checkpoint_with_nan_parameters_is_resumed(tiny, tmp_path):
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
 def test_running_out_of_memory_is_not_reported_as_damage(tiny, tmp_path, monkeypatch, error):
-    """Users delete damaged files, and this one is intact."""
+    """A user would delete a damaged file, but this file is intact."""
     make, (tensors, metadata) = tiny
     path = tmp_path / "iteration_3.safetensors"
     write(path, tensors, metadata)

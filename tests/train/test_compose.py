@@ -1,4 +1,4 @@
-"""`training` makes what a configuration asks for, or refuses; nothing that it asks for is ignored."""
+"""`training` honours every field of a configuration, or refuses it; it ignores none."""
 
 from dataclasses import replace
 
@@ -132,7 +132,7 @@ def test_a_sky_needs_its_splats(capture):
     assert run.stepper.objective.terms["scale"].shell is shell and run.density.shell is shell
 
 
-def test_extent_and_generator_of_the_start_are_used(capture):
+def test_the_extent_and_generator_of_a_start_are_used(capture):
     generator = torch.Generator().manual_seed(7)
     run = training(
         recipe(4), capture, CPU, Start(random_ball(30, generator), extent=7.0, generator=generator)
@@ -159,7 +159,7 @@ def test_a_trainer_without_a_part_that_its_configuration_asks_for_is_refused(cap
 
 
 def test_every_kernel_of_the_backend_is_used(capture):
-    """The kernels count their calls; a training with exposures and noise takes every one of them."""
+    """The kernels count their calls; a training with exposures and noise calls each kernel."""
     calls = dict.fromkeys(("rasterize", "loss", "adam", "add_noise", "recolored"), 0)
 
     def counted(name):
@@ -175,11 +175,11 @@ def test_every_kernel_of_the_backend_is_used(capture):
     config = recipe(6, strategy="mcmc", max_gaussians=80, appearance="exposure")
     training(config, capture, backend, fused=False).run()
     assert calls["rasterize"] == calls["loss"] == calls["add_noise"] == calls["recolored"] == 6
-    assert calls["adam"] == 6 * 6, "each raw parameter in each step"
+    assert calls["adam"] == 6 * 6, "Adam steps each raw parameter in each step"
 
 
 @pytest.mark.parametrize("feature", FEATURES)
-def test_what_a_backend_lacks_is_refused_by_name(feature):
+def test_features_that_a_backend_lacks_are_refused_by_name(feature):
     lacking = replace(CPU, name="toy", lacks=frozenset({feature}))
     with pytest.raises(
         ArgumentError, match=f"^{feature}: 3 needs a backend that .* toy does not; use the backend cpu"
@@ -188,11 +188,10 @@ def test_what_a_backend_lacks_is_refused_by_name(feature):
     CPU.require(feature, "anything")
 
 
-def test_the_backends_train_alike(capture):
-    """The same two steps with native and dense kernels.
-
-    Adam divides a gradient by its size, so a step differs by up to a rate only where a gradient is rounding; the loss
-    depends on all Gaussians and differs by far less than the 1e-4 allowed.
+def test_the_backends_give_the_same_training(capture):
+    """Native and dense kernels take the same two steps. Adam divides a gradient by its size, so where a gradient is
+    only rounding, a step differs by up to a rate. The loss depends on all Gaussians and differs by far less than the
+    bound of 1e-4.
     """
     config = recipe(2, strategy="mcmc", max_gaussians=80, appearance="exposure", sh_degree=1)
     losses = [training(config, capture, load_backend(name)).run().losses for name in ("cpu", "torch")]

@@ -22,7 +22,7 @@ EXTENT = 3.0
 
 
 def four(dtype=torch.float64) -> Gaussians:
-    """Return four Gaussians: small, large, large, and small but so faint that it is pruned."""
+    """Return four Gaussians: a small one, two large ones, and a small one so faint that it is pruned."""
     n = 4
     return Gaussians(
         means=torch.arange(n * 3, dtype=dtype).reshape(n, 3),
@@ -35,7 +35,7 @@ def four(dtype=torch.float64) -> Gaussians:
 
 
 def controlled(hot, config=CONFIG):
-    """Set up density control as after two renders; `hot` gives the gradients in units of the threshold."""
+    """Return density control after two renders; `hot` are the gradients in units of the threshold."""
     gaussians = four()
     optimizer = Adam(gaussians.tensors(), {"means": 1e-3})
     optimizer.first["means"] = torch.arange(12.0, dtype=torch.float64).reshape(4, 3) + 1
@@ -45,11 +45,11 @@ def controlled(hot, config=CONFIG):
     return control, gaussians, optimizer
 
 
-def test_small_ones_are_cloned_large_ones_split_and_faint_ones_pruned():
+def test_small_gaussians_are_cloned_large_ones_split_and_faint_ones_pruned():
     control, gaussians, optimizer = controlled(hot=[1, 1, 0, 1])
     changed, (event,) = control.update(100, gaussians, optimizer)
     assert dataclasses.astuple(event) == (100, 1, 2, 1, 5)
-    # Sorted in space: survivor 0 and its clone; two children of 1; survivor 2.
+    # sorted in space: Gaussian 0 and its clone, two children of 1, Gaussian 2
     assert changed.sh0[:, 0, 0].tolist() == [0, 0, 1, 1, 2]
     torch.testing.assert_close(changed.means[[0, 1, 4]], gaussians.means[[0, 0, 2]])
     expected = torch.tensor([SMALL, SMALL, LARGE - math.log(1.6), LARGE - math.log(1.6), LARGE])
@@ -60,7 +60,7 @@ def test_small_ones_are_cloned_large_ones_split_and_faint_ones_pruned():
     torch.testing.assert_close(optimizer.first["means"][[0, 4]], moments)
     assert (optimizer.first["means"][1:4] == 0).all()
     assert all(t.requires_grad and t.is_leaf for t in changed.tensors().values())
-    assert len(control.norm_sums) == 5 and (control.norm_sums == 0).all(), "the sums start again at zero"
+    assert len(control.norm_sums) == 5 and (control.norm_sums == 0).all(), "the sums of gradients are reset"
 
 
 def test_the_threshold_applies_to_the_mean_over_views_that_see_it():
@@ -71,7 +71,7 @@ def test_the_threshold_applies_to_the_mean_over_views_that_see_it():
     control, gaussians, optimizer = controlled(hot=[0.5, 0, 0, 0])
     control.times_visible[0] = 1
     _, (event,) = control.update(100, gaussians, optimizer)
-    assert event.num_cloned == 1, "after one view the sum is the mean"
+    assert event.num_cloned == 1, "a Gaussian seen by one view has that view's gradient as its mean"
 
 
 @pytest.mark.parametrize(
@@ -101,9 +101,8 @@ def test_all_gaussians_may_be_pruned():
 
 
 def test_children_are_drawn_from_the_parents_distribution():
-    """20,000 children of one parent have the parent's covariance.
-
-    The relative error of the sample covariance is about sqrt(2 / 20,000) = 1 %. Allow five of those.
+    """20,000 children of one parent have the parent's covariance. The relative error of the sample covariance is
+    about sqrt(2 / 20,000) = 1 %, of which five are allowed.
     """
     from gsplat_edu import build_cov3d, quat_to_R
 
@@ -135,7 +134,7 @@ def test_replace_without_change_is_the_identity():
 
 
 def scattered(count):
-    """Return Gaussians at random places, numbered by their opacities; some places are no numbers, some are equal."""
+    """Return Gaussians at random places, of which some are NaN and some are equal; their opacities number them."""
     draw = torch.Generator().manual_seed(5)
     gaussians = four(torch.float32).map(lambda t: t.detach()[torch.arange(count) % 4])
     means = torch.randn(count, 3, generator=draw)
@@ -146,8 +145,8 @@ def scattered(count):
     ).trainable()
 
 
-def test_everything_of_a_gaussian_moves_with_it():
-    """Each survivor keeps its parameters and moments; newborn ones come with theirs and have zero moments."""
+def test_parameters_and_moments_of_a_gaussian_move_together():
+    """Surviving Gaussians keep their parameters and moments; new ones have zero moments."""
     count = 3000
     gaussians = scattered(count)
     optimizer = Adam(gaussians.tensors(), dict.fromkeys(gaussians.tensors(), 1e-3))
@@ -179,7 +178,7 @@ def test_the_order_is_the_same_on_any_number_of_threads():
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_observed_norms_are_ndc_gradients_of_visible_gaussians(backend):
-    """The observed norm is |(gx W/2, gy H/2)|. The image is not square, so the two factors differ."""
+    """The norm is |(gx W/2, gy H/2)|. The image is not square, so the two factors differ."""
     camera = Camera.looking_at((0, 0, -3), (0, 0, 0), 20, 20, 12, 30)
     gaussians = four().map(lambda t: t.detach().clone())
     means = torch.tensor([[0.1, 0.1, 0], [-0.2, 0.1, 0.5], [0, 0, -9.0], [0.3, -0.1, 0]], dtype=torch.float64)

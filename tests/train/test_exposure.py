@@ -1,4 +1,4 @@
-"""Photos of unequal exposure: the gains come back, the gauge holds, and a resumed run has the same bits."""
+"""Photos of unequal exposure: gains are recovered, their mean is fixed, and a resumed run has the same bits."""
 
 import json
 
@@ -24,7 +24,7 @@ HELD_OUT = slice(3, None, 6)
 
 @pytest.fixture(scope="module")
 def capture():
-    """Views of 64 px, the same with drawn exposures and tints, points, and the factors drawn."""
+    """Views of 64 px, the same views with random exposures and tints, points, and the random factors."""
     even, points, colors = procedural_capture(64, 16, splats=300)
     count, rng = len(even), np.random.default_rng(5)
     scales = 2.0 ** rng.uniform(-0.7, 0.7, (count, 1)) * rng.uniform(0.85, 1.15, (count, 3))
@@ -47,7 +47,7 @@ def fitted(run, views):
 
 
 @pytest.mark.sliced(1, group="quality that comes back")
-def test_exposures_come_back_and_the_held_out_quality_with_them(capture):
+def test_exposures_are_recovered_and_held_out_quality_with_them(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]
     kept = [i for i, view in enumerate(even) if view not in held_out]
@@ -60,10 +60,11 @@ def test_exposures_come_back_and_the_held_out_quality_with_them(capture):
     found = stops(regained.view_model.log_gains()).numpy()
     wanted = np.log2(scales[kept])
     wanted = wanted - wanted.mean(axis=0)
-    # Differences of up to 1.4 stops. 400 steps at 64 px leave errors of a tenth; benchmarks/faults.py has real sizes.
+    # Exposures differ by up to 1.4 stops. 400 steps at 64 px leave errors of a tenth; benchmarks/faults.py uses real
+    # sizes.
     assert np.abs(found - wanted).max() < 0.3 and np.sqrt(np.mean((found - wanted) ** 2)) < 0.15
     best, worst, ours = (fitted(run, held_out) for run in (plain, lost, regained))
-    assert best - worst > 1.0, "the exposures harm"
+    assert best - worst > 1.0, "uncorrected exposures reduce the quality"
     assert ours - worst > 0.7 * (best - worst)
 
 
@@ -72,7 +73,7 @@ def test_the_mean_correction_is_the_identity(capture):
     run.run()
     model = run.view_model
     assert model.log_gains().abs().max() > 0.1
-    # A mean of ten float32 numbers below 1 rounds by less than 1e-6.
+    # the mean of ten float32 numbers below 1 rounds by less than 1e-6
     assert model.log_gains().mean(dim=0).abs().max() < 1e-6
 
 

@@ -1,4 +1,4 @@
-"""Exposure of photos that are not opaque: only the object is corrected, in training, in scores and in other users."""
+"""Exposure of photos that are not opaque: trainings, scores and other uses correct only the object."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ HELD_OUT = slice(3, None, 6)
 
 @pytest.fixture(scope="module")
 def capture():
-    """Views of 64 px with alpha, the same with drawn exposures and tints, points, and the factors drawn."""
+    """Views of 64 px with alpha, the same views with random exposures and tints, points, and the random factors."""
     even, points, colors = procedural.procedural_capture(64, 16, splats=300)
     scene = procedural._scene(np.random.default_rng(0), 300)
     rng = np.random.default_rng(5)
@@ -58,7 +58,7 @@ def trained(capture, views, appearance):
 
 
 @pytest.mark.sliced(1, group="quality that comes back")
-def test_exposures_of_transparent_photos_come_back(capture):
+def test_exposures_of_transparent_photos_are_recovered(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]
     kept = [i for i, view in enumerate(even) if view not in held_out]
@@ -69,18 +69,19 @@ def test_exposures_of_transparent_photos_come_back(capture):
     found = stops(regained.view_model.log_gains()).numpy()
     wanted = np.log2(scales[kept])
     wanted = wanted - wanted.mean(axis=0)
-    # As for opaque photos: 400 steps at 64 px leave errors of a tenth of the differences of up to 1.4 stops.
+    # As for opaque photos, 400 steps at 64 px leave errors of a tenth of the differences of up to 1.4 stops.
     assert np.abs(found - wanted).max() < 0.3 and np.sqrt(np.mean((found - wanted) ** 2)) < 0.15
     best, worst, ours = (
         summarize(score_views(run.gaussians, held_out, shown, GREY))["psnr_fitted"]
         for run in (plain, lost, regained)
     )
-    assert best - worst > 1.0, "the exposures harm"
+    assert best - worst > 1.0, "uncorrected exposures reduce the quality"
     assert ours - worst > 0.7 * (best - worst)
 
 
 def test_gradients_pass_through_the_view_model_to_image_and_transmittance():
-    """float64; the model is linear in both once its gains are measured, and no value is cut: the photo is not 255."""
+    """In float64. With measured gains, the model is linear in both, and no value is clipped, as the photo is below
+    255."""
     generator = torch.Generator().manual_seed(2)
     model = Exposure(2, 100, torch.zeros(1, dtype=torch.float64), recolored_natively)
     model.parameters()["exposures"][:, :3] = torch.tensor([[0.2, 0.1, 0.0], [-0.2, 0.0, 0.1]])
@@ -96,7 +97,7 @@ def test_gradients_pass_through_the_view_model_to_image_and_transmittance():
 
 
 def test_gains_are_measured_where_photo_and_render_are_opaque():
-    """A floater in front of the background is no part of the object, whatever its colour."""
+    """A floater in front of the background is no part of the object and does not change the gains."""
     rng = np.random.default_rng(3)
     colors = torch.from_numpy(rng.uniform(0.2, 0.6, (20, 24, 3))).float()
     photo = torch.from_numpy(photographed(colors.numpy(), np.full(3, 1.5)))
@@ -107,14 +108,14 @@ def test_gains_are_measured_where_photo_and_render_are_opaque():
     model = Exposure(2, 100, colors, recolored_natively)
     before = model.parameters()["exposures"].clone()
     rows = model.measure(0, ViewRender(colors, torch.zeros(20, 24), GREY), target, 50)
-    assert torch.equal(model.parameters()["exposures"], before), "measuring changes nothing"
+    assert torch.equal(model.parameters()["exposures"], before), "measuring does not change the state"
     model.parameters()["exposures"][0] = rows["exposures"]
-    # Half of the gain, since the mean over the two photos is taken off; bytes round by 1/255.
+    # half of the gain, because the mean over the two photos is subtracted; bytes round by 1/255
     np.testing.assert_allclose(stops(model.log_gains())[0].numpy(), np.log2(1.5) / 2, atol=0.01)
 
 
 def darker_render(scale):
-    """A photo with alpha, a render of it at another exposure before a background, and what shows through."""
+    """Return a photo with alpha, a render of it at another exposure over a background, and the transmittance."""
     rng = np.random.default_rng(6)
     straight, opacity = rng.uniform(0.2, 0.6, (30, 40, 3)), np.ones((30, 40))
     opacity[:12] = 0.0
@@ -133,15 +134,15 @@ def test_scores_fit_the_object_and_leave_the_background():
     photo, output = darker_render(1.6)
     truth = photo.over(GREY)
     given = transparency_of(photo, output, GREY)
-    # Rounded to bytes twice, by the camera and by compositing: 1/255 at most, so 48 dB at least.
+    # Camera and compositing round to bytes, together by at most 1/255, so at least 48 dB.
     assert psnr_fitted(output.image, truth, None, given) > 48
-    assert psnr_fitted(output.image, truth) < 30, "the background changes with the object"
+    assert psnr_fitted(output.image, truth) < 30, "without the transparency, the background is fitted too"
     found = at_exposure_of(truth, output.image, None, given)
     np.testing.assert_allclose(found.numpy(), truth / 255.0, atol=1.5 / 255)
     assert transparency_of(Photo(truth), output, GREY) is None
 
 
-def test_the_scene_is_judged_by_photos_of_its_exposure_with_their_alpha(tmp_path):
+def test_photos_converted_to_the_scenes_exposure_keep_their_alpha(tmp_path):
     from gsplat_edu.data.dataset import load_dataset
     from gsplat_edu.data.settings import DataSettings
     from gsplat_edu.data.writers import write_blender

@@ -1,4 +1,4 @@
-"""Splats of a shell are large because they are far: neither pruned nor shrunk for it; all others are as before."""
+"""Splats of a far shell are large, but are neither pruned nor shrunk for their size. Others are treated as usual."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ SHELL = Shell(np.array([1.0, 0.0, 0.0]), 300.0)
 
 
 def scene():
-    """Four Gaussians: small, too large, and two of the shell, of which one is faint."""
+    """Return four Gaussians: a small one, one that is too large, and two of the shell, of which one is faint."""
     return Gaussians(
         means=torch.tensor([[0.0, 0, 0], [1.0, 1, 1], [301.0, 0, 0], [1.0, -300, 0]]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1),
@@ -62,7 +62,7 @@ def test_splits_do_not_let_the_shell_outgrow_the_scene():
     selected = torch.ones(10, dtype=torch.bool)
     scores = torch.tensor([1.0, 3.0, 2.0, *[0.5] * 7])
     assert SHELL.within_quota(selected, scores, means).tolist() == [False, True, False, *[True] * 7]
-    means[3, 0] = 400.0  # four of ten
+    means[3, 0] = 400.0  # 4 of 10 Gaussians
     assert SHELL.within_quota(selected, scores, means).tolist() == [False] * 4 + [True] * 6
     means[:4, 0] = 0.0
     assert SHELL.within_quota(selected, scores, means) is selected
@@ -76,5 +76,5 @@ def test_noise_of_mcmc_leaves_the_shell_in_place():
         optimizer = Adam(gaussians.tensors(), {"means": 1.0})
         MCMC(config, torch.Generator().manual_seed(0), shell).update(1, gaussians, optimizer)
         moved = (gaussians.means.detach() != before).any(dim=1).tolist()
-        assert moved[3] == (shell is None), "faint and far"
-        assert moved[0], "others move"
+        assert moved[3] == (shell is None), "a faint splat of the shell does not move"
+        assert moved[0], "a faint splat of the scene moves"

@@ -1,4 +1,4 @@
-"""The fast recipe: children that look like their parent, a planned number, photos that grow, rates that fall."""
+"""The fast recipe: children that resemble their parent, a planned number, growing photos, falling rates."""
 
 import functools
 import itertools
@@ -56,7 +56,7 @@ def stretched(count=50, dtype=torch.float64):
 
 
 def test_children_have_the_mean_and_the_covariance_of_their_parent():
-    """Of two equal parts at m + d and m - d the mixture has covariance S' + d d'."""
+    """A mixture of two equal parts at m + d and m - d has the covariance S' + d d'."""
     parents = stretched()
     up, down = long_axis_children(parents)
     offset = (up.means - down.means) / 2
@@ -74,16 +74,16 @@ def test_children_have_the_opacity_of_the_formula(logit):
     (child, _) = long_axis_children(parents)
     o, rest = 1 / (1 + np.exp(-logit)), 1 / (1 + np.exp(logit))
     expected = np.sqrt(0.5) * o if logit < -30 else 1 - rest ** np.sqrt(0.5)
-    # one rounding of exp and log each; near 1 that of 1 - o' counts, which is relative to it
+    # exp and log round once each; near 1, the rounding relative to 1 - o' matters
     assert float(torch.sigmoid(child.logit_opacities)) == pytest.approx(expected, rel=1e-12)
     if logit > 0:
         assert float(torch.sigmoid(-child.logit_opacities)) == pytest.approx(rest ** np.sqrt(0.5), rel=1e-12)
 
 
 def test_a_split_changes_the_image_little():
-    """The light of two children is 2 o' / (sqrt(2) o) = 1.03 times their parent's at o = 0.18, less where they overlap.
-
-    The largest change is at the centre, one sigma' from each: 1 - (1 - o' e^(-1/2))^2 is 0.85 o.
+    """At o = 0.18, two children have 2 o' / (sqrt(2) o) = 1.03 times the light of their parent, less where they
+    overlap. The largest change is at the centre, one sigma' from both, where alpha is 1 - (1 - o' e^(-1/2))^2 = 0.85
+    o.
     """
     camera = orbit_camera(0.3, 0.2, 64, 80.0, 3.0)
     parent = random_ball(1, torch.Generator().manual_seed(0), torch.float64).map(torch.clone)
@@ -101,12 +101,12 @@ def test_a_split_changes_the_image_little():
 
 
 def observed(control, norms):
-    """Let the strategy see every Gaussian with these gradient norms."""
+    """Make the strategy observe every Gaussian with these gradient norms."""
     control.norm_sums += torch.as_tensor(norms).to(control.norm_sums)
     control.times_visible += 1
 
 
-def test_the_number_follows_the_plan_and_replaces_what_was_pruned():
+def test_the_number_follows_the_plan_and_pruned_gaussians_are_replaced():
     gaussians = random_ball(40, torch.Generator().manual_seed(0)).map(lambda t: t + 0).trainable()
     run = config(3_000, max_gaussians=100, densify_start=100, fast_stop=600)
     control = PlannedDensity(run, gaussians)
@@ -124,8 +124,8 @@ def test_the_number_follows_the_plan_and_replaces_what_was_pruned():
     assert all(len(m) == 100 for m in optimizer.first.values())
 
 
-def test_after_the_plan_nothing_is_added_and_only_what_is_never_drawn_goes():
-    """At an opacity of 0.01 a Gaussian is faint, but drawn; below 1/255 it is not."""
+def test_after_the_plan_only_invisible_gaussians_are_removed_and_none_is_added():
+    """A Gaussian of opacity 0.01 is faint but drawn, and below 1/255 it is not drawn."""
     gaussians = random_ball(40, torch.Generator().manual_seed(0)).trainable()
     run = config(max_gaussians=100, densify_start=100, fast_stop=200)
     control = PlannedDensity(run, gaussians)
@@ -139,15 +139,15 @@ def test_after_the_plan_nothing_is_added_and_only_what_is_never_drawn_goes():
     assert float(gaussians.opacities.detach().min()) == pytest.approx(1 / (1 + np.exp(4.6)))
 
 
-def test_those_of_the_highest_score_are_split():
+def test_gaussians_of_the_highest_score_are_split():
     gaussians = random_ball(5, torch.Generator().manual_seed(0))
     control = PlannedDensity(config(), gaussians)
     observed(control, [0.0, 1.0, 3.0, 1.0, 2.0])
     everyone = torch.ones(5, dtype=torch.bool)
     assert control._highest(everyone, 3).tolist() == [False, True, True, False, True], (
-        "of equal ones the first"
+        "the first of equal scores are split"
     )
-    assert int(control._highest(everyone, 9).sum()) == 4, "never one without a score"
+    assert int(control._highest(everyone, 9).sum()) == 4, "a Gaussian without a score is never split"
     assert not control._highest(~everyone, 2).any()
     assert not control._highest(everyone, -2).any()
 
@@ -179,7 +179,7 @@ def test_photos_grow_by_equal_steps_to_their_full_size():
 
 @pytest.mark.parametrize("start", [1.0, 1.2, 2.0, 3.0, 16.0])
 @pytest.mark.parametrize("full_size", [0, 1, 3, 50])
-def test_any_start_falls_to_one(start, full_size):
+def test_any_start_factor_falls_to_one(start, full_size):
     run = config(50, fast_start_factor=start, fast_full_size=full_size)
     factors = [photo_factor(run, i) for i in range(50)]
     assert factors == sorted(factors, reverse=True) and factors[full_size:] == [1.0] * (50 - full_size)
@@ -194,7 +194,7 @@ def test_other_strategies_keep_photos_and_rates(strategy):
     assert all(groups[name].rate_at(99) == groups[name].rate_at(0) for name in PARAMETERS)
 
 
-def test_rates_fall_tenfold_over_the_last_part_of_the_run_and_stay():
+def test_rates_fall_tenfold_over_the_last_part_of_the_run():
     run = config(1_000)
     groups = gaussian_groups(run, 1.0)
     for name in PARAMETERS:
@@ -232,7 +232,7 @@ def test_a_reduced_view_shows_the_same_rays_and_the_mean_colour():
     for a, b in edges:
         assert a == pytest.approx(b, abs=1e-15)
     means = small.read().image.mean((0, 1)), view.read().image.mean((0, 1))
-    np.testing.assert_allclose(*means, atol=0.5)  # each byte was rounded by up to a half
+    np.testing.assert_allclose(*means, atol=0.5)  # bytes are rounded by at most a half
     assert view.scaled(1.0) is view
 
 
@@ -263,7 +263,7 @@ def test_the_order_of_the_views_does_not_depend_on_their_size():
 
 @pytest.mark.parametrize("kinds", [{}, {"alpha": True}, {"mask": True}, {"alpha": True, "mask": True}])
 @pytest.mark.parametrize("background", [(1.0, 0.0, 0.5), None])
-def test_reduced_photos_are_made_once_and_do_not_depend_on_that(kinds, background, monkeypatch):
+def test_reduced_photos_are_kept_and_equal_those_that_are_not(kinds, background, monkeypatch):
     view = checkerboard(100, 80, **kinds)
     reads = []
     stored = View.stored(view.camera, lambda: reads.append(1) or view.read(), "x")
@@ -286,7 +286,7 @@ def test_reduced_photos_are_made_once_and_do_not_depend_on_that(kinds, backgroun
     assert REDUCED_ROOM > 10
 
 
-def test_small_photos_are_not_reduced_below_what_ssim_needs():
+def test_photos_are_not_reduced_below_the_size_that_ssim_needs():
     feed = ViewFeed([checkerboard(40, 64), checkerboard(300, 200)], "shuffled", 0)
     feed.use_factor(4.0)
     assert min(min(v.camera.W, v.camera.H) for v in feed.views) == SMALLEST_SIDE
@@ -340,7 +340,7 @@ def test_any_number_of_threads_gives_the_same_bits(set_threads):
 @pytest.mark.sliced(3)
 @pytest.mark.parametrize("stop", [1, 17, 18, 27, 36, 37, 50])
 def test_a_resumed_training_has_the_same_bits(tmp_path, stop):
-    """Killed in every phase: at each change of the photos' size, while growing and while the rates fall."""
+    """Runs are interrupted in every phase: at each change of the photo size, while growing, and while rates fall."""
     whole = trainer(config(60, **SHORT))
     losses = whole.run().losses
     first = trainer(config(60, **SHORT))
@@ -352,7 +352,7 @@ def test_a_resumed_training_has_the_same_bits(tmp_path, stop):
 
 
 def views_of(size):
-    """Return the capture's views with photos of `size` px; one that is smaller than the smallest side stays."""
+    """Return the capture's views with photos of `size` px; photos below the smallest side keep their size."""
     known, _, _ = capture()
     return [view.scaled(96 / size) for view in known]
 
@@ -377,7 +377,7 @@ def test_extreme_runs_train_to_their_end(iterations, size, cap, points):
 
 
 def test_the_recipe_learns_the_scene():
-    """The loss at full size falls to a third of that of the start points, and the number reaches the plan."""
+    """The loss at full size falls to a third of that at the start, and the number reaches the plan."""
     run = trainer(config(150, densify_every=10, max_gaussians=300))
     events = []
     full = trainer(config(1, fast_full_size=0)).run().losses[0]

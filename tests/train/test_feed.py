@@ -1,6 +1,5 @@
-"""Targets of the loss: they are made once if they never change, and read again only if they must be.
-
-The room on a GPU is a number of bytes. torch's device "meta" stands in for a GPU, because the code is the same.
+"""Targets of the loss are made once if they never change, and read again only if necessary. The room on a GPU is a
+number of bytes. The tests use torch's device "meta" as a GPU, because the code is the same.
 """
 
 import collections
@@ -30,7 +29,7 @@ def photos(count, alpha=False, mask=False):
 
 
 def stored(count, reads, **kinds):
-    """Make views whose photos are read from somewhere; `reads` counts how often."""
+    """Make views whose photos are read on demand; `reads` counts the reads."""
     camera = orbit_camera(0.0, 0.0, SIZE, 20.0, 3.0)
 
     def reading(i, photo):
@@ -56,7 +55,7 @@ def draw(feed, background):
 
 def drawn(feed, count, background=WHITE):
     targets = [draw(feed, background) for _ in range(count)]
-    feed._reader.shutdown()  # prefetched photos are counted too
+    feed._reader.shutdown()  # prefetched photos count as well
     return targets
 
 
@@ -68,18 +67,18 @@ def test_a_gpu_keeps_photos_that_fit_and_the_rest_is_read_again(room, kept):
     feed = ViewFeed(stored(6, reads), "shuffled", 0, WHITE, META, room)
     targets = drawn(feed, 60)
     assert sum(len({id(t) for v, t in targets if v is view}) == 1 for view in feed.views) == kept
-    assert sorted(reads.values())[:kept] == [1] * kept, "a kept photo is read only once"
+    assert sorted(reads.values())[:kept] == [1] * kept, "a kept photo is read once"
     assert all(count >= 10 for count in sorted(reads.values())[kept:])
 
 
-def test_masks_use_up_room_too():
+def test_masks_take_room_as_well():
     reads = collections.Counter()
     drawn(ViewFeed(stored(4, reads, mask=True), "shuffled", 0, WHITE, META, 2 * BYTES), 12)
-    assert sum(count == 1 for count in reads.values()) == 1, "a kept photo is read only once"
+    assert sum(count == 1 for count in reads.values()) == 1, "a kept photo is read once"
 
 
 def test_kept_targets_equal_the_photos():
-    """The same code on the CPU gives the photo's own bytes."""
+    """On the CPU, the same code returns the photo's bytes."""
     views = stored(3, collections.Counter(), mask=True)
     for view, target in drawn(ViewFeed(views, "shuffled", 0, WHITE), 6):
         assert np.array_equal(target.image.numpy(), view.read().image)
@@ -119,7 +118,7 @@ def test_every_draw_has_its_own_background():
 @pytest.mark.parametrize(("H", "W"), [(1, 3), (37, 500), (5, AT_ONCE + 1), (0, 4)])
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 def test_compositing_in_rows_equals_the_formula_to_the_bit(H, W, kind):
-    """`Photo.over` works on a few rows at a time and gives the same result as on the whole image."""
+    """`Photo.over` processes a few rows at a time, with the same result as for the whole image."""
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (H, W, 3), dtype=np.uint8)
     if kind is np.float32:
@@ -133,7 +132,8 @@ def test_compositing_in_rows_equals_the_formula_to_the_bit(H, W, kind):
 
 @pytest.mark.parametrize("background", [WHITE, None])
 def test_a_target_knows_where_its_photo_was_opaque(background):
-    """For photos in memory, composited once and drawn again, and for those that are read again; None without alpha."""
+    """The pixels are known for photos in memory, which are composited once, and for photos that are read again; None
+    without alpha."""
     views = in_memory(2, alpha=True)
     for given in (views, [View.stored(view.camera, view.read) for view in views]):
         for view, target in drawn(ViewFeed(given, "shuffled", 0, background), 6):

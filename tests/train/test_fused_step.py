@@ -1,4 +1,4 @@
-"""Adam in the backward pass gives the same bits as gradients followed by Adam, wherever the trainer chooses it."""
+"""Adam in the backward pass, where the trainer chooses it, gives the bits of gradients followed by Adam."""
 
 import functools
 from dataclasses import replace
@@ -37,7 +37,7 @@ def capture():
 
 
 class Deferrals:
-    """A backend that records for every render whether its step was deferred.
+    """Wraps a backend and records for every render whether its step was deferred.
 
     Args:
         name: Its kernels.
@@ -97,7 +97,7 @@ def test_a_training_has_the_same_bits(capture, case):
 
 
 def test_masks_depth_view_models_and_several_regularisers(capture):
-    """Terms reach a parameter through autograd, two of them the same one; one reads depth and transmittance."""
+    """Terms change parameters through autograd, two terms the same parameter; one term reads depth and transmittance."""
     views, rng = capture[0], np.random.default_rng(0)
     masked = []
     for view in views:
@@ -112,14 +112,15 @@ def test_masks_depth_view_models_and_several_regularisers(capture):
 
     terms = {"photo": PhotoTerm(0.2), "opacity": MeanOpacity(0.3), "scale": MeanScale(0.2)}
     terms |= {"more": MeanScale(0.07), "depth": Depth()}
-    terms["means"] = lambda rendered: 1e-3 * rendered.gaussians.means.sum()  # an expanded gradient
+    # its gradient is an expanded tensor
+    terms["means"] = lambda rendered: 1e-3 * rendered.gaussians.means.sum()
     make = lambda fused: StepParts(objective=Objective(terms), view_model=Gains(4), fused=fused)  # noqa: E731
     run = pair(capture, CASES["adc"], make, views=masked)
     assert not torch.equal(run.stepper.parameters()["gains"].detach(), torch.ones(4))
 
 
 def test_poisoned_gradients_and_parameters(capture):
-    """NaN from a term, an infinite gradient, and Gaussians that are not finite at the start."""
+    """A term returns NaN, a gradient is infinite, and some Gaussians are not finite at the start."""
 
     def poison(rendered):
         factors = torch.zeros_like(rendered.gaussians.log_scales)
@@ -158,9 +159,9 @@ def test_a_fused_run_resumes_to_the_same_bits(capture, case, tmp_path):
     check_same(whole, second)
 
 
-def test_gradients_are_stored_where_something_needs_them(capture):
+def test_gradients_are_stored_if_something_reads_them(capture):
     class Watching:
-        """A strategy that reads gradients, and says nothing of what it observes."""
+        """A strategy that reads gradients and does not declare what it observes."""
 
         def __init__(self):
             self.seen = []

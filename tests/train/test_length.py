@@ -1,4 +1,4 @@
-"""The planned length follows from the photos: monotone, bounded, and the same on every machine."""
+"""The planned length is monotone in the photos, bounded, and the same on every machine."""
 
 import pytest
 
@@ -19,7 +19,7 @@ PLANS = {
 
 
 @pytest.mark.parametrize("views", PLANS)
-def test_the_lengths_are_those_of_every_machine(views):
+def test_the_planned_lengths_have_these_values(views):
     assert tuple(planned_iterations(name, views) for name in QUALITIES) == PLANS[views]
 
 
@@ -37,7 +37,7 @@ def test_a_random_start_takes_longer_unless_the_photos_are_too_few(views):
     assert ("random start points" in reasons(views, False)) and "random" not in reasons(views, True)
 
 
-def test_a_batch_is_whole():
+def test_a_length_is_a_multiple_of_the_batch():
     assert planned_iterations("draft", 60, batch=7) == 1_001
 
 

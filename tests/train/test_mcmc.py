@@ -1,4 +1,4 @@
-"""MCMC: relocation keeps the image, the cap holds, and noise moves faint Gaussians."""
+"""MCMC: relocation preserves the image, the cap is kept, and noise moves faint Gaussians."""
 
 import math
 
@@ -27,7 +27,7 @@ def make(gaussians, config=CONFIG, seed=0):
 @pytest.mark.parametrize("n", [1, 2, 3, 7, MOST_SHARERS])
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
 def test_copies_have_the_opacity_and_scale_of_the_paper(n, opacity):
-    """Compare with the double sum of eq. 9, computed term by term with exact binomials."""
+    """They equal the double sum of eq. 9, computed term by term with exact binomials."""
     each, factor = shared_shape(torch.tensor([opacity], dtype=torch.float64), torch.tensor([n]))
     assert 1 - (1 - float(each)) ** n == pytest.approx(opacity, rel=1e-12)
     o = float(each)
@@ -36,7 +36,7 @@ def test_copies_have_the_opacity_and_scale_of_the_paper(n, opacity):
         for i in range(1, n + 1)
         for k in range(i)
     )
-    # The terms cancel. They reach (1 + o')^n, here at most 500, in float64.
+    # The terms cancel, and reach (1 + o')^n, at most 500, in float64.
     assert float(factor) == pytest.approx(opacity / total, rel=1e-9)
 
 
@@ -108,7 +108,7 @@ def test_noise_follows_the_covariance_of_faint_gaussians():
     moves = (changed.means - before).detach().numpy()
     sigma = cov3d_t(gaussians.log_scales[:1], gaussians.quats[:1])[0].detach().numpy()
     expected = (1e-6 * 5e5 * 0.5) ** 2 * sigma @ sigma
-    # The relative error of a sample covariance is sqrt(2 / 20,000) = 1 %. Allow five of those.
+    # The relative error of a sample covariance is sqrt(2 / 20,000) = 1 %, of which five are allowed.
     assert np.abs(np.cov(moves.T) - expected).max() < 0.05 * np.abs(expected).max()
 
 

@@ -10,7 +10,7 @@ import pytest
 import soak
 
 WARM_UP = 120
-"""Iterations after which every photo size, every step of the strategy and every log buffer has occurred repeatedly."""
+"""Iterations after which every photo size, step of the strategy and log buffer has occurred repeatedly."""
 
 IMAGE = 320 * 240 * 3 * 4
 """Bytes of a float image of 320 x 240 px. Photos of mixed sizes have at least as many pixels on average."""
@@ -21,11 +21,10 @@ IMAGE = 320 * 240 * 3 * 4
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc")
 @pytest.mark.parametrize("case", soak.CASES)
 def test_memory_is_flat_after_the_warm_up(tmp_path, case):
-    """RSS grows by less than four images in 120 iterations.
-
-    A leak or an unusable hole in the heap of one image per step would add 120 images. The heap may still settle by what
-    one step allocates besides the buffers, to decode a photo and composite it over its background. That is below 4
-    images: RGBA bytes are a third of a float image, and are held twice while they are copied.
+    """RSS grows by less than four images in 120 iterations. A leak, or an unusable hole in the heap, of one image per
+    step would add 120 images. The heap may still grow by the memory that a step allocates besides the buffers, to
+    decode a photo and composite it over its background. This is below 4 images, because RGBA bytes are a third of a
+    float image and are held twice while they are copied.
     """
     run = [sys.executable, soak.__file__, case, str(tmp_path / "capture")]
     done = subprocess.run(run, check=False, capture_output=True, text=True, timeout=1800)

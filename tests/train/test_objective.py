@@ -1,4 +1,4 @@
-"""The parts of a step that can be replaced: named terms, view models, and the reduction of gradients over views."""
+"""The replaceable parts of a step: named terms, view models, and the reduction of gradients over views."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ def grads(run):
 
 
 def test_regularisers_match_the_paper(capture):
-    """Values and gradients against autograd of weight mean(opacity) + weight mean(scale)."""
+    """Values and gradients equal those of autograd of weight mean(opacity) + weight mean(scale)."""
     run, seen = trainer(capture, MCMC), []
     run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
     run.stepper.gradients(step_views(run), 0)
@@ -74,11 +74,10 @@ def test_regularisers_match_the_paper(capture):
     assert torch.equal(with_all["means"], run.gaussians.means.grad)
 
 
-def test_fast_weighs_the_opacity_of_what_a_view_shows_if_that_is_little(capture):
-    """Value and gradient against autograd of the mean over those. The others get none, so Adam leaves them alone.
-
-    Four fifths of the Gaussians are where no camera looks. A gradient that is tiny but always there would move them by
-    the full rate in each step: 60 steps at 0.1 would take them from an opacity of 0.1 to below 0.001.
+def test_fast_regularises_the_opacity_of_visible_gaussians_if_they_are_few(capture):
+    """Value and gradient equal those of autograd of the mean over the visible ones. Four fifths of the Gaussians are
+    in no view and get no gradient, so Adam does not move them. A tiny but constant gradient would move them by the
+    full rate in each step, in 60 steps at 0.1 from an opacity of 0.1 to below 0.001.
     """
     views, points, colors = capture
     more = np.concatenate([points, *(points + np.array([0.0, 100.0 + 10 * k, 0.0]) for k in range(4))])
@@ -102,7 +101,7 @@ def test_fast_weighs_the_opacity_of_what_a_view_shows_if_that_is_little(capture)
     assert torch.equal(run.gaussians.logit_opacities[far], before) and len(before) == 4 * len(points)
 
 
-def test_fast_weighs_the_opacity_of_all_if_a_view_shows_many(capture):
+def test_fast_regularises_the_opacity_of_all_if_many_are_visible(capture):
     run, seen = trainer(capture, recipe(60, strategy="fast", max_gaussians=100, sh_degree=0)), []
     run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
     run.stepper.gradients(step_views(run), 0)
@@ -136,14 +135,14 @@ def test_a_batch_has_the_mean_gradient_of_its_views(capture):
     run.stepper.parts.reduce(run.stepper.parameters(), 3)
     torch.testing.assert_close(terms["photo"], sum(losses) / 3)
     for name, found in grads(run).items():
-        # Two sums of three float32 numbers in different orders differ by at most four roundings of the largest.
+        # two sums of three float32 numbers in different orders differ by at most four roundings of the largest
         largest = float(torch.stack([each[name].abs() for each in single]).max())
         expected = sum(each[name] for each in single) / 3
         assert float((found - expected).abs().max()) <= 4 * 2**-24 * largest, name
 
 
 def test_only_gradients_left_by_reduce_are_applied(capture):
-    """If a reduction leaves no gradients, as a process without work might, the parameters do not change."""
+    """If a reduction returns no gradients, as in a process without work, the parameters do not change."""
     seen = []
 
     def nothing(parameters, num_views):
@@ -175,7 +174,7 @@ def test_terms_are_summed_and_logged_by_name(capture, tmp_path):
     run = trainer(capture, config, StepParts(objective=objective), [note])
     plain = trainer(capture, config)
     result = run.run()
-    assert result.losses[0] == plain.run().losses[0], "the reported loss is the photo term"
+    assert result.losses[0] == plain.run().losses[0], "the reported loss is that of the photo term"
     assert not torch.equal(run.gaussians.logit_opacities, plain.gaussians.logit_opacities)
     log.close()
     (line,) = RunFolder(tmp_path).log()
@@ -187,7 +186,7 @@ def test_terms_are_summed_and_logged_by_name(capture, tmp_path):
 
 
 def test_a_depth_term_gets_the_depth_and_moves_the_gaussians(capture):
-    """With a large enough weight, the mean depth falls: Gaussians move towards the cameras or fade."""
+    """With a large enough weight, the mean depth falls, because Gaussians move towards the cameras or fade."""
     found = []
 
     class Depth:
@@ -209,7 +208,7 @@ def test_an_objective_needs_the_photo_term():
 
 
 def test_a_view_model_learns_brightness_differences(capture):
-    """Two of the four photos are half as bright, so their gains end near half of the others'."""
+    """Two of four photos are half as bright, so their gains become nearly half of the others'."""
     views, brightness = capture[0], [1.0, 0.5, 1.0, 0.5]
     dimmed = [
         View(view.camera, (view.read().image * factor).astype("uint8"), name=view.name)
@@ -222,7 +221,7 @@ def test_a_view_model_learns_brightness_differences(capture):
     run.run()
     gains = model.gains.detach()
     ratio = float((gains[1] + gains[3]) / (gains[0] + gains[2]))
-    # 150 steps are 37 per gain, of at most 0.02 each: enough to reach 0.5. The untrained ratio is 1.
+    # 150 steps are 37 steps of at most 0.02 per gain, enough to reach 0.5. The untrained ratio is 1.
     assert 0.4 < ratio < 0.65, gains
 
 

@@ -78,7 +78,7 @@ def test_strided_parameters_step_in_torch_and_autograd_notices_the_step():
 
 
 def test_each_group_has_its_own_rate_eps_and_schedule():
-    """A constant gradient g has corrected moments g and g², so every step is rate g / (|g| + eps)."""
+    """For a constant gradient g the corrected moments are g and g², so every step is rate g / (|g| + eps)."""
     tensors = {name: torch.zeros(4, dtype=torch.float64).requires_grad_() for name in ("a", "b", "c")}
     groups = {
         "a": ParameterGroup(0.5, eps=3.0),
@@ -108,7 +108,7 @@ def test_groups_that_are_not_per_gaussian_ignore_surgery():
     assert adam.second["exposures"].shape == (2,) and (adam.second["exposures"] > 0).all()
 
 
-def test_the_kernel_is_injected():
+def test_the_given_kernel_takes_the_steps():
     called = []
 
     def kernel(parameter, first, second, gradient, numbers):
@@ -117,7 +117,7 @@ def test_the_kernel_is_injected():
     tensors = {"a": torch.zeros(3).requires_grad_(), "b": torch.zeros(2).requires_grad_()}
     tensors["a"].grad = torch.ones(3)
     Adam(tensors, {"a": ParameterGroup(0.5, eps=1e-3), "b": 0.1}, kernel).step(tensors)
-    assert called == [((3,), 0.5, 1e-3)], "the kernel skips a tensor without a gradient"
+    assert called == [((3,), 0.5, 1e-3)], "the kernel is not called for a tensor without a gradient"
 
 
 def test_parameters_that_do_not_match_the_moments_are_refused():

@@ -1,4 +1,4 @@
-"""`outside_masks`: where the masks of an object exclude pixels, the scene may show anything, or nothing."""
+"""`outside_masks`: where masks of an object exclude pixels, the scene may show anything, or has to be empty."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def trainer(views, points, colors, outside, iterations=200):
 
 
 def shown(gaussians, views):
-    """Return the mean alpha two pixels and more outside the masks, and the mean PSNR inside them."""
+    """Return the mean alpha at least two pixels outside the masks, and the mean PSNR inside them."""
     alphas, scores = [], []
     for view in views:
         output, mask = render(gaussians, view.camera, settings=RenderSettings()), view.read().mask
@@ -47,8 +47,8 @@ def shown(gaussians, views):
     return np.mean(alphas), np.mean(scores)
 
 
-def test_a_masked_object_stands_in_the_empty():
-    """Held-out photos: fog covers everything outside the masks if nothing forbids it, and the object behind it."""
+def test_the_surroundings_of_a_masked_object_stay_empty():
+    """In held-out views, fog covers all pixels outside the masks, and parts of the object, unless it is forbidden."""
     views, points, colors = masked_object(32, 16, splats=120)
     train, test = [v for i, v in enumerate(views) if i % 4], views[::4]
     found = {}
@@ -70,10 +70,9 @@ def rendered(gaussians, view, target, backend):
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_value_and_gradient_are_those_of_the_formula(backend):
-    """In float64 against autograd of weight sum_outside(1 - T) / (H W) on the dense backend, and gradcheck.
-
-    45 Gaussians of opacity 0.1 leave T > 0.008, so no tile stops early and both backends sum the same terms. The sums
-    round by 400 pixels times 1e-16; 1e-9 leaves room for the order of the factors of T.
+    """In float64, they equal autograd of weight sum_outside(1 - T) / (H W) on the dense backend, and pass gradcheck.
+    With 45 Gaussians of opacity 0.1, T > 0.008, so no tile stops early and both backends sum the same terms. The sums
+    round by 400 pixels times 1e-16; the bound of 1e-9 also covers the order of the factors of T.
     """
     (view, *_), points, colors = masked_object(24, 1, splats=30)
     config = recipe(10, sh_degree=0)
@@ -126,8 +125,9 @@ def target_of(view, factor=1.0):
     return feed.target(feed.next(), (0.0, 0.0, 0.0))
 
 
-def test_what_is_outside():
-    """Neither a pixel that is partly excluded after downscaling, nor its neighbour, nor one that no lens saw."""
+def test_only_excluded_pixels_that_the_lens_saw_are_outside():
+    """Pixels that are partly excluded after downscaling, their neighbours, and pixels outside the lens's view are not
+    outside."""
     (view, *_), *_ = masked_object(128, 1, splats=30)
     mask = np.zeros((96, 128), bool)
     mask[9:60, 21:] = True
@@ -136,10 +136,10 @@ def test_what_is_outside():
     expected[8:61, 20:] = False
     np.testing.assert_array_equal(target_of(view).outside, expected)
     half = np.ones((48, 64), bool)
-    half[3:31, 9:] = False  # pixels 4 and 10 are partly excluded, their neighbours border them
+    half[3:31, 9:] = False  # pixels 4 and 10 are partly excluded, and their neighbours do not count either
     np.testing.assert_array_equal(target_of(view, 2.0).outside, half)
     lost = np.zeros_like(mask)
-    lost[:2] = True  # excluded by nobody, and not seen
+    lost[:2] = True  # not excluded by the mask, and not seen by the lens
     photo = Photo(view.image, None, mask & ~lost, ~mask & ~lost)
     stored = View.stored(view.camera, lambda: photo)
     assert not target_of(stored).outside[:3].any() and target_of(stored).outside[4:7].all()

@@ -1,4 +1,4 @@
-"""Wrong poses and intrinsics come back, the gauge holds, gradients are proven, and resumed runs have the same bits."""
+"""Wrong poses and intrinsics are corrected, the gauge is fixed, gradients are checked, resumed runs have equal bits."""
 
 import json
 
@@ -20,13 +20,13 @@ from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.poses import LENSES, TWISTS, Refinement, gauge
 
 EXTENT = 4.0
-"""World units; the procedural cameras are about 4 from the centre."""
+"""Distance of the procedural cameras from the centre, about, world units."""
 
 HELD_OUT = 12
 
 
 def turned(camera, twist):
-    """Turn by twist[:3] radians and shift by twist[3:] world units."""
+    """Rotate a camera by twist[:3] radians and shift it by twist[3:] world units."""
     return CameraTensors.of(camera).moved(torch.from_numpy(np.asarray(twist, float))).value()
 
 
@@ -60,7 +60,7 @@ def aligned(run, views):
 
 
 def pose_errors(cameras, views):
-    """Mean error of rotation, degrees, and of position, per cent of the extent."""
+    """Return the mean error of rotations, degrees, and of positions, per cent of the extent."""
     angles, shifts = [], []
     for camera, view in zip(cameras, views, strict=True):
         cosine = (np.trace(camera.R @ view.camera.R.T) - 1) / 2
@@ -70,7 +70,7 @@ def pose_errors(cameras, views):
 
 
 @pytest.mark.sliced(1, group="quality that comes back")
-def test_wrong_poses_come_back_and_the_held_out_quality_with_them(capture):
+def test_wrong_poses_are_corrected_and_held_out_quality_with_them(capture):
     views, wrong, *_ = capture
     best, lost, regained = (
         trainer(capture, given, refine)
@@ -82,10 +82,10 @@ def test_wrong_poses_come_back_and_the_held_out_quality_with_them(capture):
     cameras = [regained.view_model.refined(i, view.camera) for i, view in enumerate(wrong)]
     after = pose_errors(cameras, views[:HELD_OUT])
     assert before == pytest.approx((0.5, 1.0), rel=1e-3)
-    # At 64 px half a degree is half a pixel: the photos tell little more of the rotations than that.
+    # Half a degree is half a pixel at 64 px, so the photos hardly determine rotations better than that.
     assert after[0] < before[0] and after[1] < 0.7 * before[1]
     good, bad, ours = (aligned(run, views[HELD_OUT:]) for run in (best, lost, regained))
-    assert good - bad > 1.0, "wrong poses harm"
+    assert good - bad > 1.0, "wrong poses reduce the quality"
     assert ours - bad > 0.8 * (good - bad)
 
 
@@ -103,13 +103,13 @@ def test_a_wrong_focal_length_is_recovered(capture):
         for camera in (run.view_model.refined(i, view.camera) for i, view in enumerate(off))
     ]
     true = views[0].camera.fx / views[0].camera.fy
-    # Only fx is off, so the ratio is what the photos determine; the scale of both goes with the scene's depth.
-    assert np.ptp(ratio) == 0.0, "one lens"
+    # Only fx is wrong. Photos determine the ratio fx / fy, while the scale of both depends on the scene's depth.
+    assert np.ptp(ratio) == 0.0, "all views share one lens"
     assert abs(ratio[0] / true - 1) < 0.01
 
 
-def test_moves_of_all_cameras_together_are_not_learned(capture):
-    """Shifting, turning and scaling the whole capture lies in the gauge, up to second order in the move."""
+def test_common_moves_of_all_cameras_are_not_learned(capture):
+    """Shifting, rotating and scaling the whole capture is in the gauge, up to second order in the move."""
     cameras = [view.camera for view in capture[0]]
     basis = gauge(cameras, EXTENT)
     flat = basis.reshape(-1, basis.shape[2])
@@ -129,7 +129,7 @@ def test_moves_of_all_cameras_together_are_not_learned(capture):
 
 
 def test_gradients_of_the_corrected_camera_are_proven_by_finite_differences(capture):
-    """float64, around corrections that are not 0; exponentials and products are smooth."""
+    """In float64, at corrections other than 0; exponentials and products are smooth."""
     cameras, config = [view.camera for view in capture[0]], recipe(10, refine="both")
     model, generator = Refinement(cameras, config, EXTENT), torch.Generator().manual_seed(1)
     model._twists = 0.1 * torch.randn(len(cameras), 6, dtype=torch.float64, generator=generator)

@@ -1,4 +1,4 @@
-"""The recipe: its defaults against the papers, rescaling, and the schedule."""
+"""The recipe: its defaults are those of the papers; rescaling, and the schedule."""
 
 import math
 
@@ -64,7 +64,7 @@ def test_milestones_are_rescaled_and_intervals_are_not():
     assert recipe() == TrainConfig()
 
 
-def test_rescaling_can_be_disabled_and_spares_explicit_values():
+def test_rescaling_can_be_disabled_and_keeps_explicit_values():
     plain = recipe(7_000, rescale=False)
     assert plain == TrainConfig(iterations=7_000)
     assert recipe(7_000, densify_stop=6_000).adc.densify_stop == 6_000
@@ -80,7 +80,7 @@ def test_the_rate_of_the_means_falls_log_linearly():
     config = TrainConfig()
     assert means_rate(config, 2.0, 0) == pytest.approx(3.2e-4)
     assert means_rate(config, 2.0, 15_000) == pytest.approx(3.2e-5), (
-        "half way down a factor of 100 is a factor of 10"
+        "half way through a fall by 100, the rate has fallen by 10"
     )
     assert means_rate(config, 2.0, 30_000) == pytest.approx(3.2e-6)
     assert means_rate(config, 2.0, 40_000) == pytest.approx(3.2e-6)
@@ -139,7 +139,7 @@ def test_a_reset_lowers_opacities_and_clears_only_their_moments():
         for tensor in moments.values():
             tensor.fill_(1.0)
     with torch.no_grad():
-        gaussians.logit_opacities[0] = -5.0  # 0.0067: below the ceiling of a reset, but not pruned
+        gaussians.logit_opacities[0] = -5.0  # 0.0067, below the ceiling of a reset but not pruned
     control = AdaptiveDensityControl(config, 1.0, torch.Generator(), gaussians)
     changed, _ = control.update(3_000, gaussians, optimizer)
     logits = changed.logit_opacities.detach().sort().values
@@ -165,7 +165,7 @@ def test_large_gaussians_are_pruned_once_opacities_have_been_reset():
 
 @pytest.mark.parametrize("cap", [50, 53, 60])
 def test_near_the_cap_the_largest_gradients_densify_first(cap):
-    """Of 50 Gaussians, 20 are due: half are to be cloned and half to be split. Each adds one."""
+    """20 of 50 Gaussians exceed the threshold, half of them to be cloned and half to be split. Each adds one."""
     config, gaussians = recipe(max_gaussians=cap, percent_dense=0.01), scene()
     with torch.no_grad():
         gaussians.log_scales[:10] = math.log(0.001)
@@ -174,13 +174,13 @@ def test_near_the_cap_the_largest_gradients_densify_first(cap):
     control.norm_sums[:20] = 1.0 + torch.arange(20.0)
     changed, (event,) = control.update(600, gaussians, Adam(gaussians.tensors(), config.learning_rates))
     assert len(changed) == cap
-    # Numbers 19, 18 ... have the largest gradients, and they are large, so they are split.
+    # Gaussians 19, 18 ... have the largest gradients and are large, so they are split.
     assert event.num_split_children == 2 * min(cap - 50, 10) and event.num_cloned == 0
     assert event.num_pruned == 0
 
 
 def test_start_from_points():
-    """With four points in a row, the distances to three neighbours can be computed by hand."""
+    """The distances of four points in a row to their three neighbours are obvious."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0]])
     colors = np.array([[0.5, 0.5, 0.5], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     gaussians = from_points(points, colors, TrainConfig())
@@ -199,13 +199,15 @@ def test_a_point_cloud_larger_than_the_cap_is_subsampled():
     config = TrainConfig(max_gaussians=80, seed=4)
     some = from_points(points, np.zeros((200, 3)), config)
     assert len(some) == 80 and torch.equal(some.means, from_points(points, np.zeros((200, 3)), config).means)
-    assert not torch.equal(some.means, torch.tensor(points[:80], dtype=torch.float32)), "not the first 80"
+    assert not torch.equal(some.means, torch.tensor(points[:80], dtype=torch.float32)), (
+        "not simply the first 80"
+    )
 
 
 def test_degenerate_point_clouds():
     one = from_points([[1.0, 2, 3]], [[0, 0, 0]], TrainConfig())
     assert len(one) == 1 and torch.isfinite(one.log_scales).all()
     same = from_points(np.ones((5, 3)), np.ones((5, 3)), TrainConfig())
-    assert torch.isfinite(same.log_scales).all(), "the scale of coinciding points has a floor"
+    assert torch.isfinite(same.log_scales).all(), "coinciding points have a minimum scale"
     with pytest.raises(ArgumentError, match="^points: is empty"):
         from_points(np.zeros((0, 3)), np.zeros((0, 3)), TrainConfig())

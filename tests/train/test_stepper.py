@@ -1,4 +1,4 @@
-"""A backend may bring a stepper of its own, which keeps a run on its device and reads back only when it is asked."""
+"""A backend may have its own stepper, which keeps a run on its device and reads back only on request."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ CPU = load_backend("cpu")
 
 
 class Resident(TensorStepper):
-    """Keeps its Gaussians apart, as on a device, and counts how often somebody reads them back."""
+    """Keeps its Gaussians separate, as on a device, and counts how often they are read back."""
 
     def __init__(self, *arguments):
         self.reads, self._inside = 0, True
@@ -73,7 +73,7 @@ def test_a_stepper_of_the_backend_trains_to_the_same_bits_without_reading_back(c
     resident = training(config, Views(views), replace(CPU, stepper=Resident), start)
     stepper = resident.stepper
     assert plain.run().losses == resident.run().losses
-    assert stepper.reads == 1, "the dtype of the losses, and nothing in 30 steps"
+    assert stepper.reads == 1, "read once for the dtype of the losses, and never in 30 steps"
     assert isinstance(stepper, Resident) and isinstance(stepper, Stepper)
     for name, tensor in plain.gaussians.tensors().items():
         assert torch.equal(tensor, resident.gaussians.tensors()[name]), name

@@ -1,4 +1,4 @@
-"""The tempo maps a run's iterations onto those of its recipe, once each and in order."""
+"""The tempo maps a run's iterations to those of its recipe, in order."""
 
 import pytest
 import torch
@@ -23,21 +23,21 @@ def test_every_position_is_passed_once_and_in_order(text, batch):
     iterations = tempo.iterations // batch * batch
     passed = [position for i in range(0, iterations, batch) for position in tempo.passed(i)]
     assert passed == list(range(0, tempo.position(iterations), batch))
-    assert tempo.position(iterations) == 400, "the run's end is the recipe's"
+    assert tempo.position(iterations) == 400, "the run ends at the end of the recipe"
     assert all(tempo.position(i) < 400 for i in range(0, iterations, batch))
 
 
-def test_a_change_does_not_move_what_is_past():
+def test_a_change_does_not_affect_past_iterations():
     before = Tempo.parsed("1000,200:800", 1000)
     after = before.changed(500, 2_000)
     assert [after.position(i) for i in range(501)] == [before.position(i) for i in range(501)]
     assert str(after) == "1000,200:800,500:2000" and Tempo.parsed(str(after), 7) == after
     assert str(after.changed(500, 600)) == "1000,200:800,500:600", (
-        "a second thought at the same iteration replaces"
+        "a second change at the same iteration replaces the first"
     )
 
 
-def test_an_extended_run_goes_on_one_by_one():
+def test_an_extended_run_continues_one_by_one():
     tempo = Tempo.parsed("100,50:70", 100)
     assert [tempo.position(i) for i in (69, 70, 71, 90)] == [97, 100, 101, 120]
     assert [Tempo.parsed("", 100).position(i) for i in (0, 99, 130)] == [0, 99, 130]
@@ -69,7 +69,7 @@ def test_a_damaged_tempo_is_refused_by_name(text):
 
 
 def run(tempo, iterations, **changes):
-    """Train a tiny fast recipe of 120 iterations at a tempo; return the trainer, its scene and its events."""
+    """Train a tiny fast recipe of 120 iterations with a tempo; return the trainer, its scene and its events."""
     settings = {
         "strategy": "fast",
         "max_gaussians": 300,
@@ -102,14 +102,14 @@ def test_a_stretched_run_passes_the_whole_schedule(tempo, iterations):
     steps, densified = ([e for e in events if isinstance(e, kind)] for kind in (StepEvent, DensifyEvent))
     assert [step.iteration for step in steps] == list(range(iterations))
     assert len(densified) == sum(isinstance(event, DensifyEvent) for event in plain), (
-        "each densification once"
+        "each densification happens once"
     )
     assert [event.iteration for event in densified] == sorted(event.iteration for event in densified)
-    assert all(event.iteration < iterations for event in densified), "events have the run's own iterations"
+    assert all(event.iteration < iterations for event in densified), "events have the iterations of the run"
     assert len(trainer.gaussians) > 60 and steps[0].photo_factor > steps[-1].photo_factor == 1.0
     final = trainer.stepper.optimizer.learning_rates["means"]
     assert final == pytest.approx(trainer.config.means_rate_final, rel=0.1), (
-        "the rates have fallen to the end"
+        "the rates have fallen completely"
     )
 
 

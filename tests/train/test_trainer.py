@@ -49,7 +49,7 @@ def set_threads():
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.sliced(1)
 def test_two_runs_give_the_same_bits(set_threads, threads):
-    """64 px and chunks of 16 splats are 65,536 numbers per operation, twice the size at which torch uses threads."""
+    """64 px and chunks of 16 splats are 65,536 numbers per operation, twice as many as torch needs to use threads."""
     set_threads(threads)
     views = sphere_capture(64).train
     runs = [trainer(views) for _ in range(2)]
@@ -95,10 +95,8 @@ def test_views_are_drawn_with_the_seed(views):
 
 
 def test_one_gaussian_fits_one_blob(views):
-    """The loop fits a view of a single blob.
-
-    Every raw parameter starts 0.05 off. Adam's slowest rate, 1e-3, covers that in 50 steps. With a wrong gradient, or
-    none, the loss would not fall tenfold in 150 steps.
+    """The loop fits a view of a single blob whose raw parameters are all off by 0.05. Adam's slowest rate, 1e-3,
+    needs 50 steps for that. With a wrong gradient, or none, the loss would not fall tenfold in 150 steps.
     """
     camera = views[0].camera
     blob = Gaussians(
@@ -176,7 +174,7 @@ def test_random_ball_is_the_documented_start():
     gaussians = random_ball(5000, torch.Generator().manual_seed(0), torch.float64)
     radii = gaussians.means.norm(dim=-1)
     assert radii.max() <= 1
-    # Uniform by volume: the median radius is 0.5^(1/3) = 0.794, with a standard error below 0.006.
+    # For a uniform density, the median radius is 0.5^(1/3) = 0.794, with a standard error below 0.006.
     assert abs(float(radii.median()) - 0.5 ** (1 / 3)) < 0.02
     torch.testing.assert_close(gaussians.scales, torch.full((5000, 3), 0.09, dtype=torch.float64))
     assert gaussians.sh_degree == 0

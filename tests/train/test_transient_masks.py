@@ -1,4 +1,4 @@
-"""Masks of what single photos show, on scenes whose photos are their own renders, so that the truth is known."""
+"""Masks of objects in single photos, tested on scenes whose photos are their own renders, so the truth is known."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ HOW = Compared(render, RenderSettings(), lambda index, camera: camera)
 
 @pytest.fixture(scope="module")
 def scene():
-    """Opaque splats on a ball, and what 20 cameras around it see."""
+    """Opaque splats on a ball, and the views of 20 cameras around it."""
     means, _, colors, _ = sphere_shell(1_500)
     start = from_points(means, colors, recipe(100, sh_degree=0, start_opacity=0.9, start_scale=1.5))
     views = []
@@ -42,17 +42,17 @@ def changed(view, image, mask=None):
     return View(view.camera, image, mask=mask, name=view.name)
 
 
-def test_pasted_things_are_masked_and_nothing_else(scene):
+def test_only_pasted_objects_are_masked(scene):
     gaussians, views = scene
     assert not any(one.mask.any() or one.too_large for one in find_masks(gaussians, views, HOW))
     struck, truth = pasted(views)
     found = find_masks(gaussians, struck, HOW)
     precision, recall = overlap(found, truth)
-    assert recall > 0.9 and precision > 0.5, "the rim belongs to the mask too"
+    assert recall > 0.9 and precision > 0.5, "masks include the rim"
     assert all(one.mask.any() == true.any() for one, true in zip(found, truth, strict=True))
 
 
-def test_what_the_scene_shows_wrongly_in_every_view_is_not_masked(scene):
+def test_errors_of_the_scene_in_every_view_are_not_masked(scene):
     gaussians, views = scene
     wrong = gaussians.map(lambda tensor: tensor.clone())
     wrong.sh0[gaussians.means[:, 1] > 0.3] = -1.5
@@ -60,7 +60,7 @@ def test_what_the_scene_shows_wrongly_in_every_view_is_not_masked(scene):
     assert sum(one.mask.mean() for one in find_masks(wrong, views, HOW)) / len(views) < 0.005
 
 
-def test_a_darker_photo_is_neither_masked_nor_left_alone(scene):
+def test_a_darker_photo_is_compared_and_nothing_is_masked(scene):
     gaussians, views = scene
     dark = changed(views[4], np.round(0.5 * views[4].image).astype(np.uint8))
     assert not any(
@@ -75,7 +75,7 @@ def test_pixels_that_a_given_mask_excludes_are_no_evidence(scene):
     assert not any(one.mask.any() for one in find_masks(gaussians, given, HOW))
 
 
-def test_a_photo_that_differs_everywhere_is_left_alone_and_named(scene):
+def test_a_photo_that_differs_everywhere_is_not_masked_but_named(scene):
     gaussians, views = scene
     noise = np.random.default_rng(0).integers(0, 2, (3, 4, 3)) * 255
     image = np.kron(noise, np.ones((16, 16, 1))).astype(np.uint8)
@@ -84,7 +84,7 @@ def test_a_photo_that_differs_everywhere_is_left_alone_and_named(scene):
     assert not any(one.too_large for one in found[:7] + found[8:])
 
 
-def test_what_too_few_views_see_is_not_masked(scene):
+def test_places_that_too_few_views_see_are_not_masked(scene):
     gaussians, views = scene
     few, truth = pasted(views[:3], share=1.0)
     assert any(true.any() for true in truth)
@@ -110,18 +110,18 @@ def test_spots_have_to_be_large_and_connected_to_clear_pixels():
     error = np.full((60, 80), 0.02, np.float32)
     error[10:12, 10:12] = 0.9  # 4 of 4,800 pixels
     error[30:40, 30:40] = 0.9
-    error[30:40, 40:44] = 0.22  # connected, above GROW of the limit
-    error[50:58, 60:70] = 0.22  # the same, alone
+    error[30:40, 40:44] = 0.22  # connected to a clear pixel, above GROW of the limit
+    error[50:58, 60:70] = 0.22  # equally high, but not connected
     expected, based = np.full((60, 80, len(RULES)), 0.02, np.float32), np.ones((60, 80), np.float32)
     limit = min(k * 0.02 + floor for _, k, floor in RULES)
     error[error == np.float32(0.22)] = 0.85 * limit
     mask = outstanding(error, expected, based).mask
     assert mask[30:40, 30:44].all() and not mask[:20].any() and not mask[50:, 55:].any()
-    assert not outstanding(error, expected, np.zeros_like(based)).mask.any(), "no splat has a base"
+    assert not outstanding(error, expected, np.zeros_like(based)).mask.any(), "no splat has a base error"
 
 
 def test_a_camera_of_the_caller_is_used(scene):
-    """Refined cameras: photos taken from elsewhere fit once the camera says so."""
+    """With the refined camera, a photo taken from elsewhere fits and is not masked."""
     gaussians, views = scene
     shifted = [
         View(Camera.posed(v.camera.R, v.camera.eye + 0.4, v.camera.intrinsics), v.image, name=v.name)

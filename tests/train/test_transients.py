@@ -1,4 +1,4 @@
-"""Training with pasted things: most of the loss comes back, and a resumed run has the same bits."""
+"""Training on photos with pasted objects: masks recover most of the lost quality, and resumed runs have equal bits."""
 
 import json
 
@@ -51,7 +51,7 @@ def quality(run, capture):
 
 
 @pytest.mark.sliced(1, group="quality that comes back")
-def test_most_of_what_true_masks_give_comes_back(capture):
+def test_found_masks_recover_most_of_the_quality_of_true_masks(capture):
     lost, ours, best = [], [], []
     for seed in SEEDS:
         struck, truth = pasted(capture[0], seed=seed)
@@ -62,8 +62,8 @@ def test_most_of_what_true_masks_give_comes_back(capture):
         for scores, (views, transients) in zip((lost, ours, best), runs, strict=True):
             scores.append(quality(trained(capture, views, transients), capture))
     lost, ours, best = (float(np.mean(scores)) for scores in (lost, ours, best))
-    assert best - lost > 0.7, "the things harm"
-    # benchmarks/faults.py measures it on photos.
+    assert best - lost > 0.7, "unmasked objects reduce the quality"
+    # benchmarks/faults.py measures this on photos
     assert ours - lost > 0.6 * (best - lost)
 
 
@@ -142,7 +142,7 @@ def test_given_masks_still_count(capture):
     index = next(i for i, mask in enumerate(run.transients.masks) if mask is not None and truth[i].any())
     photo = torch.from_numpy(struck[index].image)
     target = run.transients.applied(index, Target(photo, torch.from_numpy(given)))
-    assert not target.mask[:10].any(), "the given mask"
+    assert not target.mask[:10].any(), "the given mask is kept"
     found = resized_mask(run.transients.masks[index], 48, 64)
     assert not target.mask.numpy()[found].any() and target.mask.numpy()[given & ~found].all()
     half = run.transients.applied(index, Target(photo[::2, ::2].contiguous(), None))
@@ -152,7 +152,7 @@ def test_given_masks_still_count(capture):
     assert run.transients.applied(kept, unchanged) is unchanged
 
 
-def test_a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing(capture, tmp_path):
+def test_a_checkpoint_that_does_not_fit_is_refused_without_changes(capture, tmp_path):
     run = trainer(capture, capture[0], "mask", 100)
     tensors, numbers = run.state()
     bits, flags = tensors[f"transients.{MASKS}"], tensors[f"transients.{TOO_LARGE}"]

@@ -1,4 +1,4 @@
-"""Vignetting: planted dark corners come back, one lens is corrected alike, and the gauge holds."""
+"""Vignetting: dark corners are recovered, photos of one lens are corrected equally, and the mean is fixed."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ HELD_OUT = slice(3, None, 6)
 
 @pytest.fixture(scope="module")
 def capture():
-    """Views of 64 px in a room, those that are not held out with dark corners, points, and the k planted."""
+    """Views of 64 px in a room, with dark corners unless held out; points; and the true k of each view."""
     clean, points = room("orbit", 64)
     views: tuple[list[View], list[View]] = [], []
     ks = np.random.default_rng(5).uniform(-0.5, 0.0, len(clean))
@@ -44,7 +44,7 @@ def score(run, views):
 
 
 @pytest.mark.sliced(1, group="quality that comes back")
-def test_dark_corners_come_back_and_the_held_out_quality_with_them(capture):
+def test_dark_corners_are_corrected_and_held_out_quality_with_them(capture):
     clean, dark, *_, ks = capture
     held_out = clean[HELD_OUT]
     kept = [i for i, view in enumerate(clean) if view not in held_out]
@@ -55,11 +55,11 @@ def test_dark_corners_come_back_and_the_held_out_quality_with_them(capture):
     for run in (plain, lost, regained):
         run.run()
     found, wanted = regained.view_model.vignetting().numpy(), ks[kept]
-    # 20 photos of 64 px, 560 steps with measurements: two thirds of the depth, in the right order.
+    # 560 steps with measurements of 20 photos of 64 px recover two thirds of the depth, in the right order.
     assert np.corrcoef(found, wanted)[0, 1] > 0.7
     assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.6 * np.sqrt(np.mean(wanted**2))
     best, worst, ours = (score(run, held_out) for run in (plain, lost, regained))
-    assert best - worst > 1.0, "dark corners harm"
+    assert best - worst > 1.0, "dark corners reduce the quality"
     assert ours - worst > 0.5 * (best - worst)
 
 
@@ -71,7 +71,7 @@ def model_with(ks, measured=None):
     return model
 
 
-def test_photos_of_one_lens_are_corrected_alike_and_others_are_not():
+def test_only_photos_of_one_lens_are_corrected_equally():
     alike = model_with([-0.3, -0.3 + VIGNETTING_ERROR, -0.3 - VIGNETTING_ERROR, -0.3]).vignetting()
     np.testing.assert_allclose(alike.numpy(), -0.3, atol=1e-12)
     apart = np.array([-0.6, -0.1, -0.2, -0.4])
@@ -88,7 +88,7 @@ def test_a_photo_that_was_not_measured_has_the_mean_of_the_others():
 
 
 def test_the_mean_correction_is_the_identity():
-    """The geometric mean over photos and pixels of the factors that the corrections multiply x + 0.055 with."""
+    """Corrections multiply x + 0.055 by factors whose geometric mean over photos and pixels is 1."""
     model = model_with([-0.6, -0.1, 0.0, -0.4])
     model.parameters()[NAME][:, :3] = torch.randn(4, 3, dtype=torch.float64) / 5
     image = torch.full((12, 17, 3), 0.5, dtype=torch.float64)
