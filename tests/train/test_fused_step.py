@@ -97,7 +97,7 @@ def test_a_training_has_the_same_bits(capture, case):
 
 
 def test_masks_depth_view_models_and_several_regularisers(capture):
-    """Terms change parameters through autograd, two terms the same parameter; one term reads depth and transmittance."""
+    """Terms change parameters through autograd, two of them the same parameter; one reads depth and transmittance."""
     views, rng = capture[0], np.random.default_rng(0)
     masked = []
     for view in views:

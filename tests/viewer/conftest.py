@@ -1,4 +1,4 @@
-"""Fixtures: scenes to view, and a real browser without a network."""
+"""Fixtures: scenes, and a browser without a network."""
 
 import base64
 from collections import defaultdict
@@ -31,14 +31,14 @@ def described(camera):
 
 
 def picture_of(tab, camera):
-    """Return the picture that a tab's page draws from this camera, (H, W, 3) float32."""
+    """Return the picture that the page in a tab draws from this camera, (H, W, 3) float32."""
     encoded = tab.evaluate(PIXELS, described(camera))
     return np.frombuffer(base64.b64decode(encoded), "<f4").reshape(camera.H, camera.W, 3)
 
 
 READING = "GPU stall due to ReadPixels"
-"""What Chromium's driver says, now and then, of tests that read the page's pixels. A page that watches a training must
-not give it a reason: `test_live_browser.py` hears everything."""
+"""Message that Chromium's driver sometimes logs if a test reads the page's pixels. A page that watches a training
+must not cause it, so `test_live_browser.py` does not ignore it."""
 
 
 class Visit:
@@ -75,7 +75,7 @@ class Visit:
         self.tab.wait_for_selector(f'#message:has-text("{text}")')
 
     def camera(self):
-        """The camera of the window's view."""
+        """Return the camera of the current view."""
         found = self.tab.evaluate("viewer.camera()")
         for other in ("name", "held_out"):
             found.pop(other, None)
@@ -88,7 +88,7 @@ class Visit:
 
 @pytest.fixture
 def picture():
-    """What a tab of any page draws from a camera."""
+    """Return a function that draws a camera's picture in a tab of any page."""
     return picture_of
 
 
@@ -100,17 +100,18 @@ def browser():
 
 @pytest.fixture(scope="module")
 def tabs(browser):
-    """Empty tabs by the options they were made with. A new tab takes as long as everything else in most tests."""
+    """Empty tabs by their options. Opening a tab takes as long as the rest of most tests."""
     return defaultdict(list)
 
 
 @pytest.fixture
 def visit(browser, tabs):
-    """Make tabs without a network. No tab may log a complaint or request anything from elsewhere."""
+    """Return a function that opens tabs without a network. A tab that logs a complaint or requests another address
+    fails."""
     visits = []
 
     def make(width=320, height=200, *, fresh=False, **options):
-        """Visit in a tab of this size; `fresh` if a test leaves traces in the tab: init scripts, keys, clicks."""
+        """Open a tab of this size; a `fresh` one if the test leaves init scripts, keys or clicks in it."""
         free = None if fresh else tabs[repr(sorted(options.items()))]
         if free:
             tab = free.pop()
@@ -170,7 +171,7 @@ def random_gaussians():
 
 @pytest.fixture
 def camera():
-    """A camera whose image is not square and whose principal point is off-centre."""
+    """A camera with an image that is not square and an off-centre principal point."""
     eye = (0.4, -0.6, -2.2)
     return Camera(look_at(eye, (0.1, 0.0, 0.0)), eye, fx=230.0, fy=250.0, cx=150.3, cy=108.6, H=200, W=320)
 

@@ -1,4 +1,4 @@
-"""The content policy of pages and reports, in a real browser: our own code works, injected code does not run."""
+"""The content policy of pages and reports in a browser: our code works, injected code does not run."""
 
 import numpy as np
 import pytest
@@ -34,13 +34,13 @@ def test_our_own_code_works_without_complaints(visit, tmp_path, write, random_ga
     seen = visit().open(tmp_path / "a.html")
     if write is written_page:
         seen.ready()
-        return  # tests/viewer/test_page_drawing.py compares the pictures, including the worker
+        return  # tests/viewer/test_page_drawing.py compares the pictures, which need the worker
     figure = seen.tab.locator("svg").first
     assert figure.is_visible()
     strokes = figure.locator("path").evaluate_all(
         "paths => paths.map((path) => getComputedStyle(path).stroke)"
     )
-    assert len({stroke for stroke in strokes if stroke != "none"}) >= 2, "the curves have their colours"
+    assert len({stroke for stroke in strokes if stroke != "none"}) >= 2, "the style sheet colours the curves"
 
 
 @pytest.mark.parametrize("write", [written_page, written_report])
@@ -59,7 +59,7 @@ def test_injected_code_does_not_run(browser, tmp_path, write, random_gaussians, 
     assert tab.evaluate("window.ran") is None
     assert tab.evaluate("getComputedStyle(document.body).color") != "rgb(1, 2, 3)"
     assert len([text for text in refusals if "Content Security Policy" in text]) >= 4
-    # Without the policy everything runs, so the test can fail.
+    # without the policy, the injected code runs
     start = document.index('<meta http-equiv="Content-Security-Policy"')
     unguarded = document[:start] + document[document.index(">", start) + 1 :]
     path.write_text(unguarded.replace("<body>", f"<body>{INJECTED}"), "utf-8")
@@ -69,7 +69,7 @@ def test_injected_code_does_not_run(browser, tmp_path, write, random_gaussians, 
 
 
 def test_nothing_leaves_the_page(visit, tmp_path):
-    """Not even its own scripts may send a request."""
+    """Not even the page's own scripts may send a request."""
     script = (
         "fetch('http://127.0.0.1:9/').catch(() => { document.title = 'refused' });"
         "new Image().src = 'http://127.0.0.1:9/a.png';"
@@ -85,14 +85,14 @@ def test_nothing_leaves_the_page(visit, tmp_path):
     refused = [text for text in seen.complaints if "Content Security Policy" in text]
     assert len(refused) >= 2
     seen.complaints.clear()
-    seen.requests.clear()  # Chromium also lists requests that it refused
+    seen.requests.clear()  # Chromium lists refused requests as well
 
 
-def test_a_policy_allows_only_what_it_is_given():
+def test_a_policy_allows_only_the_given_scripts_and_styles():
     rules = dict(rule.split(" ", 1) for rule in content_policy().split("; "))
     assert {rules[name] for name in ("default-src", "script-src", "style-src", "worker-src")} == {"'none'"}
     assert rules["img-src"] == "data: blob:" and rules["connect-src"] == "'none'"
-    # the known SHA-256 of "a"
+    # the published SHA-256 of "a"
     known = "'sha256-ypeBEsobvcr6wjGzmiPcTaeG7/gUfE5yuYB3ha/uSLs='"
     rules = dict(rule.split(" ", 1) for rule in content_policy(["a"], ["a"], workers=True).split("; "))
     assert rules["script-src"] == rules["style-src"] == known and rules["worker-src"] == "blob:"

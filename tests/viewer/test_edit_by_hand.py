@@ -1,4 +1,4 @@
-"""The editor as a person uses it: real mouse, keys and fingers, a server that saves, a second tab."""
+"""The editor in a browser, used by mouse, keys and fingers, with a server that saves and a second tab."""
 
 import json
 import threading
@@ -21,7 +21,7 @@ from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 
 
 def wall():
-    """A solid wall of splats at z = 0, so that every click in its middle meets a surface."""
+    """A wall of splats at z = 0, so that every click near its middle hits a surface."""
     x, y = torch.meshgrid(torch.linspace(-1.5, 1.5, 16), torch.linspace(-1, 1, 11), indexing="ij")
     n = x.numel()
     means = torch.stack([x.ravel(), y.ravel(), torch.zeros(n)], dim=1)
@@ -40,7 +40,7 @@ def wall():
 
 @pytest.fixture
 def served(tmp_path):
-    """The wall as a file, served with the editor."""
+    """Serve the wall as a file with the editor."""
     scene, file = tmp_path / "wall.ply", tmp_path / "edits.json"
     write_scene(scene, Scene(wall()))
     source = open_source(scene)
@@ -57,7 +57,7 @@ def served(tmp_path):
 
 @pytest.fixture
 def opened(browser, served):
-    """Open the served page in tabs; none may complain."""
+    """Return a function that opens the served page in a tab without complaints."""
     tabs, complaints = [], []
 
     def make(width=900, height=420, **options):
@@ -96,7 +96,7 @@ def drag(tab, *points, button="left"):
 
 
 def place(tab, x, y):
-    """Where the page shows the point (x, y, 0)."""
+    """Return the pixel at which the page shows the point (x, y, 0)."""
     return tab.evaluate(
         "(p) => { const c = viewer.camera(), { u, v } = seenAt(c, p); return [u + 0.5, v + 0.5]; }", [x, y, 0]
     )
@@ -133,7 +133,7 @@ def use_every_tool(tab):
     tab.fill("#edit-half input >> nth=0", "0.25")
     tab.keyboard.press("Enter")
     assert last(tab)["by"] == "box" and last(tab)["half"][0] == 0.25
-    tab.keyboard.press("Escape")  # leaves the field
+    tab.keyboard.press("Escape")  # the field loses the focus
     tab.keyboard.press("g")
     tab.mouse.click(*place(tab, 0.3, 0.2))
     tab.keyboard.press("Enter")
@@ -142,15 +142,15 @@ def use_every_tool(tab):
 
 
 def mark_points(tab):
-    """Turn upright, scale and measure by clicks."""
+    """Level the scene, scale and measure by clicks."""
     before = tab.evaluate("viewer.view.up")
     tab.keyboard.press("z")
     for point in ((0.1, -0.6), (0.5, -0.5), (0.3, 0.8)):
         tab.mouse.click(*place(tab, *point))
     assert last(tab)["op"] == "upright"
     up = tab.evaluate("viewer.view.up")
-    assert up != before and abs(up[2]) > 0.99, "the wall is the floor now"
-    assert up[2] * tab.evaluate("viewer.view.camera.eye[2]") > 0, "seen from above"
+    assert up != before and abs(up[2]) > 0.99, "the wall is now the floor"
+    assert up[2] * tab.evaluate("viewer.view.camera.eye[2]") > 0, "the view is from above"
     tab.keyboard.press("Control+z")
     assert tab.evaluate("viewer.view.up") == before
     tab.keyboard.press("c")
@@ -163,7 +163,7 @@ def mark_points(tab):
         tab.mouse.click(*place(tab, *point))
     assert float(tab.inner_text("#edit-hint").split()[1]) == pytest.approx(2, rel=0.02)
     tab.click("#edit-note")
-    tab.keyboard.type("rk <b>pfu")  # letters that are keys elsewhere
+    tab.keyboard.type("rk <b>pfu")  # letters that are shortcuts outside of fields
     tab.keyboard.press("Enter")
     assert last(tab)["note"] == "rk <b>pfu" and len(tab.evaluate("viewer.keyframes.path.keyframes")) == 0
     tab.keyboard.press("Escape")
@@ -225,7 +225,7 @@ def test_everything_by_mouse_and_keyboard_then_saved_reopened_and_converted(open
     tab.keyboard.press("i")
     tab.keyboard.press("Control+s")
     tab.wait_for_selector('#edit-message:has-text("was changed elsewhere")')
-    assert served.file.read_text() == empty, "the second tab's edits are not overwritten"
+    assert served.file.read_text() == empty, "the edits of the second tab are not overwritten"
 
 
 def test_the_view_moves_while_a_tool_is_chosen_and_keys_draw(opened):
@@ -240,7 +240,7 @@ def test_the_view_moves_while_a_tool_is_chosen_and_keys_draw(opened):
     drag(tab, (300, 200), (330, 220))
     tab.keyboard.up("Space")
     assert tab.evaluate("viewer.view.camera.eye") != panned and operations(tab) == []
-    tab.keyboard.press("Enter")  # nothing is chosen and there is no cross yet
+    tab.keyboard.press("Enter")  # no point is chosen, and no cross is shown yet
     assert operations(tab) == []
     for key, times in (
         ("ArrowLeft", 20),
@@ -258,7 +258,7 @@ def test_the_view_moves_while_a_tool_is_chosen_and_keys_draw(opened):
     tab.keyboard.press("Escape")
     assert tab.get_attribute("[data-tool=navigate]", "aria-pressed") == "true"
     tab.click("#edit-list summary")
-    tab.click("#edit-list li button >> nth=0")  # as opened
+    tab.click("#edit-list li button >> nth=0")  # the view as opened
     assert selected(tab) == 0 and tab.evaluate("editor.history.undone.length") == 1
 
 
@@ -286,7 +286,7 @@ def test_one_finger_draws_and_two_move_the_view_on_a_phone(opened):
     assert len(operations(tab)) == 1 and tab.evaluate("viewer.view.camera.eye") != eye
     touch(session, "touchStart", (150, 250))
     touch(session, "touchEnd")
-    assert len(operations(tab)) == 2, "a finger draws again"
+    assert len(operations(tab)) == 2, "one finger draws again"
     sizes = tab.evaluate(
         "[...document.querySelectorAll('#edit button')].map((b) => b.getBoundingClientRect().height)"
     )
@@ -294,7 +294,7 @@ def test_one_finger_draws_and_two_move_the_view_on_a_phone(opened):
     assert tab.evaluate("document.documentElement.scrollWidth") == 390
 
 
-def test_the_editor_has_names_for_every_control_and_no_key_of_the_page(opened):
+def test_every_control_of_the_editor_has_a_name_and_its_keys_are_its_own(opened):
     tab = opened()
     unnamed = tab.evaluate("""() => [...document.querySelectorAll("#edit :is(button, input, select)")].filter(
       (e) => !(e.textContent || e.closest("label")?.textContent || e.getAttribute("aria-label"))).length""")

@@ -1,4 +1,4 @@
-"""The editor in a real browser: what it selects, deletes and stores is what Python applies, to the last splat."""
+"""The editor in a browser selects, deletes and stores exactly the splats that Python does."""
 
 import json
 
@@ -23,9 +23,9 @@ from gsplat_edu.viewer.edit_page import editing_of
 SEEDS = 20
 GESTURES = 25
 SIZE = (360, 240)
-"""Small, so that a picture takes little time. The panel takes the lower part."""
+"""Small, so that a picture takes little time; the panel covers the lower part."""
 
-# Plays gestures by the events that a browser sends: clicks of buttons, input into fields, pointers on the canvas.
+# Plays gestures by the events of a browser: clicks on buttons, input into fields, pointers on the canvas.
 PLAY = """async (gestures) => {
   const canvas = document.getElementById("canvas");
   const fire = (target, kind, [x, y], keys = {}) => target.dispatchEvent(new PointerEvent(kind, {
@@ -60,7 +60,7 @@ def source_of(gaussians, path="scene.ply", origin=(0.0, 0.0, 0.0)):
 
 @pytest.fixture
 def edit(visit, tmp_path):
-    """Write a scene and its page with the editor; open the page."""
+    """Return a function that writes a scene and its page with the editor, and opens the page."""
 
     def make(gaussians, origin=(0.0, 0.0, 0.0), width=SIZE[0], height=SIZE[1], **options):
         source = source_of(gaussians, tmp_path / "scene.ply", origin)
@@ -93,7 +93,7 @@ def fill(name, value):
 
 
 class Hand:
-    """Random gestures."""
+    """Makes random gestures."""
 
     def __init__(self, seed):
         self.rng = np.random.default_rng(seed)
@@ -118,7 +118,7 @@ class Hand:
         return round(float(self.rng.uniform(low, high)), 3)
 
     def shapes(self):
-        """Gestures that select."""
+        """Return gestures that select."""
         half, center = "#edit-half input", "#edit-center label:last-child input"
         return {
             "rectangle": [tool("rectangle"), self.stroke(4)],
@@ -141,7 +141,7 @@ class Hand:
         }
 
     def others(self):
-        """Everything else."""
+        """Return all other gestures."""
         how = self.rng.choice(["replace", "add", "subtract", "intersect"])
         state = self.rng.choice(["all", "none", "invert", "delete", "hide", "show"])
         name = f"view {self.rng.integers(3)}"
@@ -161,7 +161,7 @@ class Hand:
 
 
 def gestures_of(seed):
-    """Random gestures with every tool; selections come often, so that deleting has something to delete."""
+    """Return random gestures with every tool, many of them selections, so that there are splats to delete."""
     hand, found = Hand(seed), []
     for _ in range(GESTURES):
         kinds = hand.shapes() if hand.rng.random() < 0.55 else hand.others()
@@ -170,7 +170,7 @@ def gestures_of(seed):
 
 
 def exported(folder, edits, gaussians, left):
-    """Compare what the command writes with the splats that are left in the page."""
+    """Check that the command writes the splats that remain in the page."""
     words = ["convert", str(folder / "scene.ply"), "--edits", str(folder / "edits.json")]
     assert main([*words, str(folder / "out.ply")]) == (0 if left.any() else 2)
     if left.any():
@@ -188,7 +188,8 @@ CLICK = "([name, count]) => { for (let i = 0; i < count; ++i) document.querySele
 def test_random_sequences_select_and_delete_the_same_splats_as_the_command(
     edit, random_gaussians, tmp_path, degree
 ):
-    """The page and `convert --edits` agree on every splat; undoing all returns the first bytes, redoing the last."""
+    """The page and `convert --edits` agree on every splat. Undoing everything gives the first bytes, redoing the
+    last."""
     gaussians = random_gaussians(300, rest=(degree + 1) ** 2 - 1, seed=degree)
     shown = edit(gaussians)
     opened = state(shown)
@@ -201,7 +202,7 @@ def test_random_sequences_select_and_delete_the_same_splats_as_the_command(
         edits = read_edits(tmp_path / "edits.json")
         np.testing.assert_array_equal(flags_after(edits.operations, gaussians), flags, err_msg=f"seed {seed}")
         exported(tmp_path, edits, gaussians, flags <= SELECTED)
-        if seed % 8 > 3:  # without what was remembered, undo repeats the operations before
+        if seed % 8 > 3:  # without stored states, undo repeats the operations before
             shown.tab.evaluate("editor.history.changes.forEach((_, i) => editor.history.forget(i))")
         count = len(edits.operations)
         assert count > 5
@@ -242,7 +243,7 @@ HOLDS = """([regions, { count, ...arrays }]) => {
 
 
 def random_regions(rng, count):
-    """Regions as a file has them, with numbers of every kind: whole, tiny, huge, and exactly those of splats."""
+    """Return regions as in a file, with numbers of all kinds: whole, tiny, huge, and equal to those of splats."""
 
     def numbers(n, spread=1.0):
         return (spread * rng.normal(size=n)).round(int(rng.integers(0, 17))).tolist()
@@ -281,8 +282,8 @@ def random_regions(rng, count):
     return made
 
 
-def test_both_languages_find_the_same_splats_whatever_their_values(edit, random_gaussians):
-    """NaN, infinity, denormal and huge numbers, and centres exactly on borders."""
+def test_both_languages_find_the_same_splats_of_any_values(edit, random_gaussians):
+    """Splats have NaN, infinite, denormal and huge numbers, and centres exactly on borders."""
     rng, n = np.random.default_rng(0), 400
     odd = np.array([np.nan, np.inf, -np.inf, 3e38, -1e-45, 0.0, 1.0, -1.0, 0.1], dtype=np.float32)
 
@@ -306,8 +307,8 @@ def test_both_languages_find_the_same_splats_whatever_their_values(edit, random_
         expected = members(select.region, values, work)
         np.testing.assert_array_equal(np.array(inside, bool), expected, err_msg=str(region))
         some += 0 < expected.sum() < n
-    assert some > 50, "most regions hold some splats and not others"
-    assert tests == MOST_TESTS - work.left > 0, "both count the same tests, so both refuse the same file"
+    assert some > 50, "most regions contain some splats but not all"
+    assert tests == MOST_TESTS - work.left > 0, "both count equally many tests, so both refuse the same files"
 
 
 def test_a_scene_without_splats_can_be_opened(edit, random_gaussians):
@@ -329,9 +330,8 @@ DEPTHS = """async (places) => {
 
 
 def test_a_click_finds_the_surface_that_all_splats_show(edit, random_gaussians):
-    """The processor finds the depth that drawing finds, for thin, large and tilted splats.
-
-    Drawing bisects the depth to 0.07 % and returns the upper end (`SURFACE_STEPS` in draw.js).
+    """The processor finds the same depth as drawing, for thin, large and tilted splats. Drawing bisects the depth to
+    0.07 % and returns the upper end (`SURFACE_STEPS` in draw.js).
     """
     shown = edit(random_gaussians(900), width=120, height=120)
     places = [[u, v] for u in range(2, 118, 24) for v in range(3, 68, 13)]

@@ -1,4 +1,4 @@
-"""The editor's server, with real sockets: only its own page may write, and only valid, newest edits of its scene."""
+"""The editor's server, over sockets: only its own page may write, and only valid edits that follow the stored ones."""
 
 import http.client
 import json
@@ -112,7 +112,7 @@ def test_a_write_from_elsewhere_is_refused(server, headers):
 
 
 @pytest.mark.parametrize("path", ["/", ADDRESS, "/?token=", "/?token=wrong", f"{ADDRESS}?token=wrong"])
-def test_nothing_is_read_without_the_token(server, path):
+def test_no_file_is_served_without_the_token(server, path):
     for method in ("GET", "HEAD"):
         status, headers, body = ask(server, method, path)
         assert status == 403 and PAGE not in body and "Set-Cookie" not in headers
@@ -156,7 +156,7 @@ def test_lengths_are_checked_before_anything_is_read(server):
     assert put(server, b"", Content_Length="-1")[0] == 411
     assert put(server, None)[0] == 411
     large = TEXT.replace(b"[]", b"[" + b'{"op": "invert"},' * 5000 + b'{"op": "show"}]')
-    assert len(large) > 65_536, "more than a request without a body may have"
+    assert len(large) > 65_536, "more than the headers of a request may have"
     assert put(server, large)[0] == 200
     assert len(json.loads(server.file.read_bytes())["operations"]) == 5001
 

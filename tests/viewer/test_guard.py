@@ -1,4 +1,4 @@
-"""Only the live view's own pages may connect, with the token and under its own host name."""
+"""Only the live view's own pages may connect, with the token and by its host name."""
 
 import socket
 import time
@@ -14,17 +14,17 @@ from live_clients import PATIENCE, Client, Training
 
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory):
-    """A view whose training never starts; access does not depend on the training."""
+    """A live view whose training never starts, because access does not depend on the training."""
     folder = tmp_path_factory.mktemp("captures")
     write_colmap(folder / "egg", *procedural_capture(24, 6, splats=60))
     made = Training(folder / "egg", folder / "run", "--iterations", "30")
-    made.view.take_state({})  # requests for a state need not wait
+    made.view.take_state({})  # requests for a state do not wait
     with made.view:
         yield Client(made.view.url)
 
 
 def status(client, method="GET", path="/state", **headers):
-    """Return the status of a request that has the cookie; a POST has the origin, too."""
+    """Return the status of a request with the cookie; a POST has the origin as well."""
     given = {"Cookie": client.own["Cookie"]} | ({"Origin": client.own["Origin"]} if method == "POST" else {})
     body = b"{}" if method == "POST" else None
     headers = {**given, **{name.replace("_", "-"): value for name, value in headers.items()}}
@@ -35,14 +35,14 @@ def status(client, method="GET", path="/state", **headers):
 def test_only_pages_of_its_own_origin_are_let_in(guarded):
     host, port = guarded.host, guarded.port
     assert status(guarded, Origin=f"http://{host}:{port}") == status(guarded) == 200
-    assert status(guarded, "POST", "/control") == 400, "let in; the command is missing"
+    assert status(guarded, "POST", "/control") == 400, "access is granted, but the command is missing"
     for origin in (
         "null",
         "http://example.org",
         f"http://localhost.example.org:{port}",
         f"http://{host}:{port + 1}",
         f"http://{host}",
-        f"http://localhost:{port}",  # the page was not requested under this name
+        f"http://localhost:{port}",  # the page was not requested by this name
         f"http://{host}:{port}.example.org",
         f"http://{host}:{port}/",
         "",
@@ -50,24 +50,26 @@ def test_only_pages_of_its_own_origin_are_let_in(guarded):
         assert status(guarded, Origin=origin) == 403, origin
         assert status(guarded, "POST", "/control", Origin=origin) == 403, origin
         assert status(guarded, "POST", "/picture", Origin=origin) == 403, origin
-    assert status(guarded, "POST", "/control", Origin=None) == 403, "whoever changes something says who he is"
+    assert status(guarded, "POST", "/control", Origin=None) == 403, "a change needs an Origin"
 
 
 def test_other_sites_on_this_computer_cannot_load_anything(guarded):
-    """A page on another port is of the same site, so its requests carry the cookie, and images have no Origin."""
+    """A page on another port is the same site, so its requests have the cookie, and images have no Origin."""
     for site in ("same-site", "cross-site"):
         assert status(guarded, path="/scene", Sec_Fetch_Site=site) == 403
         assert status(guarded, Sec_Fetch_Site=site) == 403
     assert status(guarded, Sec_Fetch_Site="same-origin") == status(guarded, Sec_Fetch_Site="none") == 200
     page = f"/?token={guarded.token}"
-    assert guarded.ask("GET", page, None, {"Sec-Fetch-Site": "cross-site"})[0] == 200, "a link with the token"
+    assert guarded.ask("GET", page, None, {"Sec-Fetch-Site": "cross-site"})[0] == 200, (
+        "a link with the token opens the page"
+    )
     assert guarded.ask("GET", "/", None, {"Sec-Fetch-Site": "cross-site"})[0] == 403
     headers = guarded.ask("GET", "/state", None, {"Cookie": guarded.own["Cookie"]})[1]
     assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
     assert "Access-Control-Allow-Origin" not in headers
 
 
-def test_without_the_token_there_is_no_page_and_nothing_else(guarded):
+def test_without_the_token_no_address_is_served(guarded):
     port, token = guarded.port, guarded.token
     wrong = token[:-1] + ("A" if token[-1] != "A" else "B")
     for path in (
@@ -96,10 +98,10 @@ def test_without_the_token_there_is_no_page_and_nothing_else(guarded):
 
 @pytest.mark.parametrize("name", ["evil.example.org:PORT", "192.168.0.7:PORT", "", "a:PORT"])
 def test_a_foreign_host_name_is_refused(guarded, name):
-    """DNS rebinding: the page has the same origin and even the token."""
+    """With DNS rebinding, a foreign page has the same origin and even the token."""
     port, page = guarded.port, f"/?token={guarded.token}"
     assert guarded.ask("GET", page, None, {"Host": name.replace("PORT", str(port))})[0] == 403
-    # Through a tunnel the port differs, and the origin's port must differ in the same way.
+    # through a tunnel the port differs, but host and origin have the same port
     assert guarded.ask("GET", page, None, {"Host": "localhost:9000"})[0] == 200
     headers = {"Host": "localhost:9000", "Origin": f"http://localhost:{port}"}
     assert guarded.ask("GET", page, None, headers)[0] == 403
@@ -116,7 +118,7 @@ def test_a_request_that_trickles_in_is_cut_off(guarded, monkeypatch):
         socket.create_connection((guarded.host, guarded.port), timeout=PATIENCE) as connection,
         pytest.raises((BrokenPipeError, ConnectionResetError)),
     ):
-        for _ in range(2000):  # a byte every 10 ms
+        for _ in range(2000):  # one byte every 10 ms
             connection.sendall(b"G")
             time.sleep(0.01)
     assert status(guarded) == 200

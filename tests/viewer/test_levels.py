@@ -1,4 +1,4 @@
-"""The page of a folder with levels of detail, in a real browser: what it draws, loads and is given."""
+"""The page of a folder with levels of detail in a browser: drawing, loading, and served files."""
 
 import http.client
 import threading
@@ -19,7 +19,7 @@ from gsplat_edu.viewer.serve import PageServer
 from gsplat_edu.viewer.stream import folder_page
 
 ALIKE = 55.0
-"""Required PSNR against our renderer, dB: that of the plain page is 60, and positions are decoded in float32 here."""
+"""Required PSNR relative to our renderer, dB. For the plain page it is 60; here positions are decoded in float32."""
 
 COUNT = 3000
 
@@ -33,7 +33,7 @@ WATCH = """() => {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Random splats in 16 leaves of five levels; positions, sizes and colours like those of a scene."""
+    """Random splats in 16 leaves and five levels, with positions, sizes and colours like those of a scene."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape):
@@ -55,7 +55,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def served(folder):
-    """Make a server of the folder with a budget."""
+    """Return a function that serves the folder with a budget."""
     servers = []
 
     def make(budget):
@@ -75,7 +75,7 @@ def served(folder):
 
 @pytest.fixture
 def open_page(served, browser):
-    """Open the folder's page with a budget; no complaint and no request to elsewhere is allowed."""
+    """Return a function that opens the folder's page with a budget; complaints and requests to other addresses fail."""
     complaints, urls, tabs = [], [], []
 
     def make(budget):
@@ -115,10 +115,10 @@ def test_with_room_for_all_the_page_draws_the_finest_level(
     assert tab.inner_text("#count") == "3,000 of 3,000 splats"
 
 
-def test_with_a_small_budget_everything_is_there_coarsely(
+def test_a_small_budget_draws_the_whole_scene_coarsely(
     folder, open_page, camera, three_views, record_property, picture
 ):
-    """From several sides; nothing is left out, and the budget holds at any time."""
+    """From several sides, no region is missing, and the budget is never exceeded."""
     index = codec.read_index(folder)
     least = index.counts()[-1]
     budget = 2 * least + 50
@@ -129,7 +129,7 @@ def test_with_a_small_budget_everything_is_there_coarsely(
         assert least <= count <= most <= budget and order <= budget
         assert min(shown) >= 0, "a region is missing"
         assert len(set(shown)) > 1 and max(shown) >= 3, "the budget allows finer levels only in some places"
-    # nearly all of the picture is like the coarsest level drawn alone, or better
+    # nearly everywhere, the picture is at least as good as the coarsest level alone
     exact = drawn(codec.read(folder), camera)
     coarse = psnr(drawn(codec.read_level(folder, index, index.levels - 1), camera), exact)
     mixed = psnr(picture(tab, camera), exact)
@@ -146,7 +146,7 @@ def test_nearer_regions_are_finer(folder, open_page, camera, picture):
     assert np.mean([level for _, level in found[:half]]) < np.mean([level for _, level in found[half:]]) - 0.3
 
 
-def test_memory_is_given_back(open_page, three_views, picture):
+def test_memory_of_unused_files_is_released(open_page, three_views, picture):
     tab = open_page(700)
     for _ in range(3):
         for _, view in three_views:

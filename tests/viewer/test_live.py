@@ -1,4 +1,4 @@
-"""The live view by its requests: states, snapshots, pictures, pauses, and trainings that it leaves bit-identical."""
+"""The live view's requests: states, snapshots, pictures and pauses; watching does not change a training's bits."""
 
 import io
 import json
@@ -55,7 +55,7 @@ def test_the_first_scene_and_state_describe_the_same_paused_training(capture, tm
         assert torch.equal(shown.means, trainer.gaussians.means.detach())
         assert torch.equal(shown.log_scales, trainer.gaussians.log_scales.detach())
         assert state["psnr"] == psnr(*trainer.last) and state["iterations"] == 100_000
-        assert client.ask("GET", f"/scene?after={header['iteration']}")[0] == 204, "there is no newer one"
+        assert client.ask("GET", f"/scene?after={header['iteration']}")[0] == 204, "there is no newer scene"
         assert client.ask("GET", f"/state?after={state['version']}")[0] in (200, 204)
 
 
@@ -69,7 +69,7 @@ def test_pause_step_and_resume(capture, tmp_path):
             client.control("step")
             client.states(state="paused", iteration=held + k)
             time.sleep(3 * snapshots.POLL)
-            assert made.iteration == held + k, "exactly one"
+            assert made.iteration == held + k, "a step is exactly one iteration"
         client.control("resume")
         until(lambda: made.iteration > held + 50, "many more iterations")
         client.states(state="training")
@@ -88,7 +88,7 @@ def test_a_paused_training_continues_when_nobody_watches(capture, tmp_path, monk
         until(lambda: made.iteration > held + 20, "more iterations")
         client.states(state="training")
         client.control("pause")
-        assert client.states(state="paused")["iteration"] > held, "it can be paused again"
+        assert client.states(state="paused")["iteration"] > held, "the training can be paused again"
 
 
 def test_stopping_the_program_ends_a_pause(capture, tmp_path):
@@ -98,11 +98,13 @@ def test_stopping_the_program_ends_a_pause(capture, tmp_path):
         held = client.states(state="paused")["iteration"]
         made.stopped.set()
         made.ended()
-        assert list_checkpoints(made.run.folder.checkpoints)[-1].stem == f"iteration_{held}", "it is saved"
+        assert list_checkpoints(made.run.folder.checkpoints)[-1].stem == f"iteration_{held}", (
+            "the paused training is saved"
+        )
 
 
 def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
-    """The clock jumps by an hour during the pause; the run's own time must be less."""
+    """The clock jumps by an hour during the pause, which the run's time does not include."""
     clock, ahead = time.perf_counter, []
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + sum(ahead))
     monkeypatch.setattr(live, "GRACE", 1e9)
@@ -127,13 +129,13 @@ def test_nothing_is_packed_unless_a_page_asks(capture, tmp_path, monkeypatch):
         client = Client(made.view.url)
         state = client.state()
         until(lambda: made.iteration > state["iteration"] + 50, "more iterations")
-        assert made_of == [], "a state needs no snapshot"
+        assert made_of == [], "asking for a state packs no snapshot"
         client.scene()
         client.control("pause")
         client.states(state="paused")
         packs = len(made_of)
         until(lambda: client.ask("GET", f"/scene?after={made.iteration}")[0] == 204, "no newer scene")
-        assert packs >= 1 and len(made_of) <= packs + 1, "a waiting training is packed once"
+        assert packs >= 1 and len(made_of) <= packs + 1, "a paused training is packed once"
 
 
 def bits(run):
@@ -144,7 +146,7 @@ def bits(run):
 @pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_watching_does_not_change_the_bits_of_a_training(capture, tmp_path, strategy, monkeypatch):
-    """One training runs alone, the other with two pages, pictures, pauses and steps."""
+    """One training runs without a page, the other with two pages, pictures, pauses and steps."""
     monkeypatch.setattr(snapshots, "SHARE", 1.0)
     words = ("--iterations", "120", "--random-background", *STRATEGIES[strategy])
     alone = made_run(capture, tmp_path / "alone", *words)
@@ -161,7 +163,7 @@ def test_watching_does_not_change_the_bits_of_a_training(capture, tmp_path, stra
             assert two.ask("POST", "/picture", camera)[0] == 200
         one.control("resume")
         last = -1
-        # Four scenes came between the steps; how many come now depends on the machine.
+        # Four scenes were sent between the steps; how many follow depends on the machine.
         while made.thread.is_alive():
             status, _, data = two.ask("GET", f"/scene?after={last}")
             if status == 200:
@@ -181,7 +183,7 @@ def test_a_picture_equals_our_own_render(capture, tmp_path, monkeypatch):
         assert (status, headers["Content-Type"]) == (200, "image/jpeg")
         shown = np.asarray(Image.open(io.BytesIO(body)))
         truth = render(made.run.trainer.gaussians, camera, settings=made.run.options.render_settings).image
-        # JPEG of quality 85 is off by about three levels, which is 38 dB or more; another camera scores far lower.
+        # JPEG of quality 85 is off by about three levels, 38 dB or more; another camera scores far lower.
         assert psnr(shown / 255.0, truth.detach().clamp(0, 1).numpy()) > 32 and shown.std() > 20
 
         def fail(gaussians, camera):
@@ -258,7 +260,7 @@ def test_clients_that_send_nonsense_do_no_harm(capture, tmp_path, capfd):
 
 
 def new_threads(before):
-    """Return the new threads, except the trainer's own that reads photos."""
+    """Return the new threads, except the one with which the trainer reads photos."""
     return {thread for thread in set(threading.enumerate()) - before if not thread.name.startswith("photo")}
 
 
@@ -289,4 +291,4 @@ def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_
         assert staying.is_alive()
         staying.join(PATIENCE)
         assert not staying.is_alive() and not made.view.watched
-        made.broadcast.stay(lambda: made.view.watched)  # without a browser it does not stay open
+        made.broadcast.stay(lambda: made.view.watched)  # without a browser, the view closes

@@ -1,4 +1,4 @@
-"""The live view in a real browser, and the whole command until Ctrl-C."""
+"""The live view in a browser, and the command until Ctrl-C."""
 
 import io
 import re
@@ -57,12 +57,12 @@ class Tab:
         self.page.get_by_role("button", name=label, exact=True).click()
 
     def says(self, pattern):
-        """Wait for words in the panel; return the number among them."""
+        """Wait for a text in the panel; return the number in it."""
         found = until(lambda: re.search(pattern, self.page.inner_text("#panel")), pattern)
         return int(found[1].replace(",", ""))
 
     def picture(self):
-        """Return the right part of the screen, beside the panel, (H, W, 3)."""
+        """Return the screen right of the panel, (H, W, 3)."""
         shown = Image.open(
             io.BytesIO(self.page.screenshot(clip={"x": 380, "y": 0, "width": 260, "height": 300}))
         )
@@ -86,10 +86,12 @@ def test_a_page_shows_a_training_pauses_it_and_may_vanish(capture, tmp_path, bro
             assert np.abs(tab.picture() - begun).mean() > 0.05, "the picture changes with the training"
             trainer, camera = made.run.trainer, made.run.dataset.test[0].camera
             truth = render(trainer.gaussians, camera, settings=made.run.options.render_settings).image
-            assert psnr(picture(tab.page, camera), truth.detach().numpy()) > 50, "as our renderer draws it"
+            assert psnr(picture(tab.page, camera), truth.detach().numpy()) > 50, (
+                "the picture equals our renderer's"
+            )
             assert tab.page.locator("#curves svg").evaluate_all("all => all.every((one) => one.ariaLabel)")
             assert "token" not in tab.page.url
-            tab.page.reload()  # the cookie suffices
+            tab.page.reload()  # the cookie is enough
             tab.says(rf"paused, iteration ({held + 1:,}) of")
             tab.press("resume")
             until(lambda: made.iteration > held + 20, "more iterations")
@@ -126,7 +128,7 @@ def output(folder):
 
 
 def test_after_the_training_the_view_stays_until_ctrl_c_and_exits_with_0(capture, tmp_path):
-    """The whole command, watched by a page's requests and by files."""
+    """The test watches the command by the requests of a page and by files."""
     out = tmp_path / "run"
     words = ["train", capture, "--out", out, "--view", "--view-port", 0, "--view-host", "0.0.0.0", *GROWING]
     program = Program(COMMAND, [*words, "--iterations", 60], tmp_path)
@@ -153,4 +155,4 @@ def test_after_the_training_the_view_stays_until_ctrl_c_and_exits_with_0(capture
         in printed
     )
     assert printed.endswith("the live view stays open until its last browser is closed, or Ctrl-C\n")
-    assert sorted(path.name for path in files.path.iterdir()) == ["wanted"], "it tidies up"
+    assert sorted(path.name for path in files.path.iterdir()) == ["wanted"], "temporary files are removed"

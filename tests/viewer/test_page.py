@@ -1,4 +1,4 @@
-"""The file of a page: its contents, and reading it back."""
+"""The contents of a page's file, and reading it."""
 
 import base64
 import gzip
@@ -25,7 +25,7 @@ NASTY = 'a </script><script>alert(1)</script> {{facts}} "&" äöü 兎 🐕'
 
 
 class Elements(HTMLParser):
-    """The elements of a page with their attributes and texts, as a browser would parse them."""
+    """Collects the elements of a page with their attributes and texts, like a browser."""
 
     def __init__(self, document):
         super().__init__()
@@ -77,10 +77,10 @@ def test_a_scene_is_read_back_within_its_quantization(tmp_path, random_gaussians
     for name in ("means", "log_scales"):
         assert torch.equal(given[name], found[name])
     unit = given["quats"] / given["quats"].norm(dim=1, keepdim=True)
-    # half a step of 1/32767, plus float32's rounding of numbers up to 1
+    # half a step of 1/32767, plus the float32 rounding of numbers up to 1
     np.testing.assert_allclose(found["quats"], unit, rtol=0, atol=0.5 / 32767 + 2e-7)
     for name in ("sh0", "sh_rest", "logit_opacities"):
-        # Half floats have 11 bits: half a step is 2^-11 of the number, or 2^-25 below 2^-14.
+        # Half floats have 11 bits, so half a step is 2^-11 of the number, or 2^-25 below 2^-14.
         np.testing.assert_allclose(found[name], given[name], rtol=2**-11, atol=2**-25)
 
 
@@ -122,7 +122,7 @@ def test_numbers_outside_the_range_of_16_bits(tmp_path):
     page.write(tmp_path / "a.html", Scene(gaussians))
     found = page.read(tmp_path / "a.html").gaussians
     assert torch.equal(found.quats[0], torch.zeros(4)), (
-        "without a rotation the page leaves it out, as the kernels do"
+        "the page does not draw a splat without a rotation, as the kernels do not"
     )
     # half a step of 1/32767 of a component
     np.testing.assert_allclose(found.quats[1], [0.5**0.5, 0.5**0.5, 0, 0], atol=0.5 / 32767 + 2e-7)
@@ -151,9 +151,8 @@ def test_names_are_only_text(tmp_path, random_gaussians, camera):
 
 
 def test_a_title_with_undecodable_bytes(random_gaussians):
-    document = page.html(
-        Scene(random_gaussians(3)), title="a\udcff"
-    )  # as Python decodes a file name with stray bytes
+    # a file name with invalid bytes, as Python decodes it
+    document = page.html(Scene(random_gaussians(3)), title="a\udcff")
     assert Elements(document).texts("title") == ["a?"]
 
 
@@ -217,7 +216,7 @@ def test_every_changed_byte_of_the_splats_is_reported(tmp_path, whole):
     path = tmp_path / "a.html"
     begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
     end = whole.index(page.CLOSE, begin)
-    # Of the gzip header's 10 bytes, only the first 4 affect the contents.
+    # only the first 4 of the 10 bytes of a gzip header affect the contents
     for at in [0, 3, *range(20, end - begin - 3, 13)]:
         changed = bytearray(whole)
         changed[begin + at] = ord("A") if changed[begin + at] != ord("A") else ord("B")
@@ -301,7 +300,7 @@ def test_the_start_is_the_first_camera(random_gaussians, three_views, camera):
     assert facts["start"]["camera"] == first and facts["start"]["index"] == 0
     assert facts["start"]["camera"]["eye"] == camera.eye.tolist()
     assert [one["name"] for one in facts["cameras"]] == [name for name, _ in three_views]
-    # the cameras look at points at most 0.1 apart
+    # the points that the cameras look at are at most 0.1 apart
     assert np.abs(facts["start"]["pivot"]).max() < 0.2
 
 
@@ -318,7 +317,8 @@ def test_the_start_is_the_first_camera_that_was_trained_on(random_gaussians, thr
 
 
 def facing_one_way(turn):
-    """Cameras side by side, each turned by `turn` from its neighbour: their axes cross anywhere, or behind them."""
+    """Return cameras side by side, each rotated by `turn` relative to the last; their axes cross anywhere, or behind
+    them."""
     cameras = []
     for i in range(-4, 5):
         eye = np.array([0.3 * i, 0.02 * (-1) ** i, 0.0])
@@ -328,14 +328,14 @@ def facing_one_way(turn):
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.001, 0.05, -0.05, 0.2])
-def test_if_cameras_face_one_way_the_pivot_is_on_what_they_see(turn):
-    """The point where their axes cross (6 ahead, behind them, or nowhere) is no good pivot."""
+def test_if_cameras_face_one_way_the_pivot_is_on_a_visible_surface(turn):
+    """The point where their axes cross, 6 ahead, behind them, or nowhere, is not a good pivot."""
     generator = np.random.default_rng(0)
     points = generator.uniform((-30, -30, 9.5), (30, 30, 10.5), (4000, 3))
     cameras = facing_one_way(turn)
     pivot = pivot_of(cameras, 4, points)
     np.testing.assert_allclose(pivot[:2], cameras[4].eye[:2], atol=1e-9)
-    if turn == -0.05:  # they do look at one point, 6 ahead: either is fine
+    if turn == -0.05:  # their axes do meet 6 ahead, so both pivots are good
         assert 5 < pivot[2] < 10.6
     else:
         assert 9.5 < pivot[2] < 10.5
@@ -348,21 +348,25 @@ def test_if_cameras_surround_something_the_pivot_is_its_centre():
     cameras[3] = Camera(look_at(eyes[3], (9, 0, 9)), eyes[3], 200.0, 200.0, 80.0, 60.0, 120, 160)
     surface = np.random.default_rng(0).normal(size=(900, 3))
     surface /= np.linalg.norm(surface, axis=1, keepdims=True)
-    # This holds although one camera looks away and the surface is nearer than the centre.
+    # one camera looks away, and the surface is nearer than the centre
     np.testing.assert_allclose(pivot_of(cameras, 0, surface), 0, atol=1e-6)
     assert pivot_of(cameras[:1], 0, np.zeros((0, 3))) @ cameras[0].R[2] > cameras[0].eye @ cameras[0].R[2]
 
 
 def test_a_flight_or_an_arc_starts_in_the_middle_and_a_ring_at_its_first_camera():
-    """A page of 164 aerial photos used to start at a corner of the fields, with half of the window empty."""
-    down = np.diag([1.0, -1.0, -1.0])  # looking along -z, from z = 10
+    """A page of 164 aerial photos used to start at a corner of the fields, with half an empty window."""
+    down = np.diag([1.0, -1.0, -1.0])  # from z = 10 along -z
     flight = [
         Camera(down, np.array([x, y, 10.0]), 80, 80, 40, 30, 60, 80) for y in range(5) for x in range(7)
     ]
     everywhere = range(len(flight))
-    assert first_camera(flight, everywhere) == 17, "row 2 of 5, column 3 of 7"
-    assert first_camera(flight, [i for i in everywhere if i != 17]) in (10, 16, 18, 24), "17 is held out"
-    assert first_camera(flight[17:] + flight[:17], everywhere) == 0, "the first camera is already central"
+    assert first_camera(flight, everywhere) == 17, "camera in row 2 of 5, column 3 of 7"
+    assert first_camera(flight, [i for i in everywhere if i != 17]) in (10, 16, 18, 24), (
+        "camera 17 is held out"
+    )
+    assert first_camera(flight[17:] + flight[:17], everywhere) == 0, (
+        "the first camera of a ring is as good as any"
+    )
     assert first_camera(flight[:1], [0]) == 0
     for turn, chosen in ((np.radians(90), 5), (np.radians(330), 1)):
         around = [
@@ -373,12 +377,12 @@ def test_a_flight_or_an_arc_starts_in_the_middle_and_a_ring_at_its_first_camera(
 
 
 def test_a_page_opens_on_the_scene_and_not_on_its_sky():
-    """Cameras that look one way at a wall of few splats under a sky of many."""
+    """Cameras face one way, to a wall of few splats under a sky of many."""
     cameras = [Camera.looking_at((x, 0.0, 0.0), (x, 0.0, 5.0), 50, 50, 60, 60) for x in (-0.2, 0.0, 0.2)]
     rng = np.random.default_rng(0)
     wall = np.c_[rng.uniform(-3, 3, (900, 2)), np.full(900, 5.0)]
     sky = rng.normal(size=(800, 3))
-    sky = np.c_[0.2 * sky[:, :2], 1 + abs(sky[:, 2])]  # mostly in the middle of the image
+    sky = np.c_[0.2 * sky[:, :2], 1 + abs(sky[:, 2])]  # the wall is near the middle of the image
     sky = 300 * sky / np.linalg.norm(sky, axis=1, keepdims=True)
     starts = []
     for means in (wall, np.concatenate([wall, sky])):

@@ -1,4 +1,4 @@
-"""Mouse, fingers and keys of a page, in a real browser."""
+"""Mouse, finger and key controls of a page in a browser."""
 
 import time
 
@@ -12,12 +12,12 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 
 SIZE = (640, 400)
-MIDDLE = (400, 250)  # beside the panel
+MIDDLE = (400, 250)  # right of the panel
 
 
 @pytest.fixture
 def tour(show, random_gaussians, three_views):
-    """A small page with three cameras, opened."""
+    """Open a small page with three cameras."""
     return show(random_gaussians(60), three_views, width=SIZE[0], height=SIZE[1], has_touch=True, fresh=True)
 
 
@@ -35,7 +35,7 @@ def drag(visit, dx, dy, button="left", steps=3):
 
 
 def touch(visit, before, after):
-    """Put fingers down, move them and lift them; positions are (right, down) from the middle."""
+    """Put fingers down, move and lift them; positions are (right, down) from the middle."""
     session = visit.tab.context.new_cdp_session(visit.tab)
     for kind, places in (("touchStart", before), ("touchMove", after), ("touchEnd", ())):
         fingers = [{"x": MIDDLE[0] + x, "y": MIDDLE[1] + y, "id": i} for i, (x, y) in enumerate(places)]
@@ -52,9 +52,9 @@ def test_a_drag_orbits_about_the_point_ahead(tour):
     distance = np.linalg.norm(before.eye - centre)
     assert np.linalg.norm(after.eye - centre) == pytest.approx(distance)
     moved = before.R @ (after.eye - before.eye)
-    # The scene follows the pointer right and down, so the camera moves left and up.
+    # the scene follows the pointer right and down, so the camera moves left and up
     assert moved[0] < -0.2 and moved[1] < -0.1
-    # The cameras stand all around, so a drag across the longer side, 640 px, is half a turn.
+    # the cameras surround the scene, so a drag across the longer side, 640 px, is half a turn
     angles = np.pi / 640 * np.array([50, 20])
     between = np.arccos(after.R[2] @ before.R[2])
     assert max(angles) * 0.9 < between < np.hypot(*angles)
@@ -73,7 +73,7 @@ def test_a_right_drag_pans(tour):
             tour.tab.keyboard.down("Shift")
         after = drag(tour, 40, -30, button)
         np.testing.assert_array_equal(after.R, before.R)
-        # The point ahead stays under the pointer.
+        # the point ahead stays under the pointer
         was, is_now = (np.array(one.project(one.world_to_cam(centre))[:2]) for one in (before, after))
         np.testing.assert_allclose(is_now - was, (40, -30), atol=1e-6)
 
@@ -124,7 +124,9 @@ def test_flying_a_drag_looks_around(tour):
     assert tour.tab.get_attribute("#fly", "aria-pressed") == "true"
     after = drag(tour, 40, 10)
     np.testing.assert_array_equal(after.eye, before.eye)
-    assert before.R[0] @ after.R[2] > 0.1 and before.R[1] @ after.R[2] > 0.05, "the view turns right and down"
+    assert before.R[0] @ after.R[2] > 0.1 and before.R[1] @ after.R[2] > 0.05, (
+        "the view rotates right and down"
+    )
     tour.tab.mouse.wheel(0, -200)
     tour.tab.wait_for_timeout(100)
     assert after.R[2] @ (tour.camera().eye - after.eye) > 0.1, "the wheel moves forward"
@@ -149,7 +151,7 @@ def test_the_captures_cameras(tour, three_views):
     assert marked() == ["first"]
     tour.tab.click("text='second'")
     assert stands_at(tour, second) and marked() == ["second"]
-    # At 2.5 times its size, the 200 x 160 image would fill the window's height; at most a fifth of it is cropped.
+    # Enlarged 2.5 times, the 200 x 160 image fills the window's height; at most a fifth of it may be cropped.
     assert tour.camera().fx == pytest.approx(1.25 * 2.5 * second.fx)
     tour.tab.keyboard.press("ArrowRight")
     assert stands_at(tour, third)
@@ -175,19 +177,19 @@ def test_a_window_of_any_shape_keeps_the_middle_of_the_photo(tour, three_views, 
         scale = shown.fx / camera.fx
         assert width == shown.W and height == shown.H
         assert shown.fy == pytest.approx(scale * camera.fy)
-        # the window's edges in the photo's pixels
+        # edges of the window, px of the photo
         left, right = (np.array([-0.5, width - 0.5]) - shown.cx) / scale + camera.cx
         top, bottom = (np.array([-0.5, height - 0.5]) - shown.cy) / scale + camera.cy
         assert left + right == pytest.approx(camera.W - 1) and top + bottom == pytest.approx(camera.H - 1)
-        if width / height < camera.W / camera.H:  # narrow: shows exactly the whole height
+        if width / height < camera.W / camera.H:  # a narrow window shows exactly the whole height
             assert top == pytest.approx(-0.5)
-        else:  # wide: shows at least four fifths of the height, and the whole width
+        else:  # a wide window shows at least four fifths of the height, and the whole width
             assert bottom - top >= 0.8 * camera.H - 1e-9 and bottom - top <= camera.H + 1e-9
             assert right - left >= camera.W - 1e-9
 
 
 def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, random_gaussians):
-    """Twelve cameras surround a ball; each photo shows it in its left half, and a wall on the right."""
+    """Twelve cameras surround a ball; each photo shows the ball on the left, and a wall on the right."""
     ball = random_gaussians(300)
     ball.means.mul_(0.35 / 0.6)
     ball.logit_opacities.fill_(3.0)
@@ -206,13 +208,13 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
             seen.tab.evaluate(f"viewer.goTo({index})")
         shown = seen.camera()
         u, v, _ = shown.project(shown.world_to_cam(inner))
-        assert u.min() > 0 and u.max() < 390 and v.min() > 0 and v.max() < 844, "all of it is in view"
-        assert u.max() - u.min() > 0.5 * 390, "and fills the window"
-        assert abs(u.max() + u.min() - 390) < 0.2 * 390, "in the middle"
+        assert u.min() > 0 and u.max() < 390 and v.min() > 0 and v.max() < 844, "the whole ball is in view"
+        assert u.max() - u.min() > 0.5 * 390, "the ball fills the window"
+        assert abs(u.max() + u.min() - 390) < 0.2 * 390, "the ball is in the middle"
 
 
-def test_the_scene_cannot_be_lost(tour):
-    """Zooming and panning end somewhere, and R goes back."""
+def test_zooming_and_panning_are_limited_and_r_returns_to_the_start(tour):
+    """The scene stays within reach, so a visitor cannot lose it."""
     start, farthest = tour.camera(), max(np.linalg.norm(eye) for eye in ((2.0, -0.5, 0.3), (-1.0, -0.4, 2.0)))
     tour.tab.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(1.2); viewer.moved(-1)")
     out = np.linalg.norm(tour.camera().eye - pivot(tour))
@@ -235,7 +237,7 @@ def test_the_page_fits_a_phone_and_follows_its_colours(
 ):
     page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views)
     seen = visit(390, 844, color_scheme=scheme, has_touch=True).open(tmp_path / "a.html").ready()
-    assert not seen.tab.is_visible("#tools"), "the scene has the room first"
+    assert not seen.tab.is_visible("#tools"), "the panel is closed at first"
     seen.tab.click("#fold")
     ground = seen.tab.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (sum(map(int, ground[4:-1].split(","))) > 384) == (scheme == "light")
@@ -267,7 +269,7 @@ def test_held_out_cameras_are_marked_and_none_is_the_start(visit, tmp_path, rand
 
 
 def forward_cameras():
-    """Eleven cameras side by side that face one way, at a subject 4 ahead."""
+    """Return eleven cameras side by side that face one way, towards a subject 4 ahead."""
     eyes = [(0.2 * i, 0.05 * (i % 3), 0.0) for i in range(-5, 6)]
     return [
         (f"{i:02}", Camera(np.eye(3), eye, 250.0, 250.0, 160.0, 100.0, 200, 320))
@@ -283,7 +285,7 @@ def forward(show, random_gaussians):
 
 
 def off_the_cameras(visit):
-    """Return the angle in degrees, seen from the pivot, between the view and the nearest camera."""
+    """Return the angle between the view and the nearest camera, seen from the pivot, degrees."""
     centre, eye = pivot(visit), visit.camera().eye
 
     def unit(a):
@@ -295,18 +297,20 @@ def off_the_cameras(visit):
 
 def test_a_drag_across_a_quarter_of_the_window_stays_near_the_cameras(forward):
     distance = np.linalg.norm(forward.camera().eye - pivot(forward))
-    assert 3 < distance < 5, "the pivot is on what the cameras see, although their axes cross nowhere"
+    assert 3 < distance < 5, (
+        "the pivot is on a visible surface, although the axes of the cameras do not cross"
+    )
     for dx, dy in ((160, 0), (-160, 0), (0, 100), (0, -100), (160, 100)):
         for steps in (1, 20):
             forward.tab.keyboard.press("r")
             after = drag(forward, dx, dy, steps=steps)
-            # 6 degrees are free; beyond them, moving gets harder and harder.
+            # 6 degrees are free; beyond them, dragging moves the view less and less
             assert 0.5 < off_the_cameras(forward) < 15
             assert np.linalg.norm(after.eye - pivot(forward)) == pytest.approx(distance)
     moved = off_the_cameras(forward)
     for _ in range(4):
         drag(forward, 160, 100, steps=4)
-    assert moved < off_the_cameras(forward) < 35, "repeated drags still move on, slowly"
+    assert moved < off_the_cameras(forward) < 35, "repeated drags still move the view, slowly"
 
 
 def test_after_flying_outside_one_can_orbit_there(forward):
@@ -327,7 +331,7 @@ def on_the_screen(visit, point):
 
 @pytest.fixture
 def wall(show):
-    """A near ball in front of a far wall of balls, at the right: hard to hit by chance, with something behind it."""
+    """A near ball at the right, in front of a far wall of balls; a wrong click would hit the wall."""
     x, y = np.meshgrid(np.linspace(-4, 4, 15), np.linspace(-3, 3, 11))
     means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 6.0)], axis=1)
     means = np.concatenate([means, [[0.8, 0.3, 2.0]]])
@@ -345,7 +349,7 @@ def wall(show):
 
 
 def click_twice(visit, by, x, y, pause):
-    """Click or tap twice, `pause` seconds apart by the events' own clock, even on a slow computer."""
+    """Click or tap twice, `pause` seconds apart by the times of the events, also on a slow computer."""
     session = visit.tab.context.new_cdp_session(visit.tab)
     start = time.time()
     for moment in (start, start + pause):
@@ -363,7 +367,7 @@ def click_twice(visit, by, x, y, pause):
                 kind = {"type": "touchStart" if pressed else "touchEnd", "touchPoints": places}
                 session.send("Input.dispatchTouchEvent", {**kind, **at})
     session.detach()
-    visit.tab.wait_for_timeout(1000 * pause + 500)  # until the last event's time has passed
+    visit.tab.wait_for_timeout(1000 * pause + 500)  # wait until the time of the last event has passed
 
 
 @pytest.mark.parametrize("by", ["mouse", "finger"])
@@ -373,21 +377,21 @@ def test_a_double_click_or_tap_sets_the_pivot_on_the_surface_there(wall, by):
     click_twice(wall, by, column, row, pause=0.3)
     wall.tab.wait_for_function("element('point').style.left !== ''")
     found = pivot(wall)
-    # The ball's sigma is 0.08, and half of its opacity is reached at or before its centre.
+    # the ball's sigma is 0.08, and half of its opacity is reached at or before its centre
     np.testing.assert_allclose(found, (0.8, 0.3, 2.0), atol=0.1)
     np.testing.assert_array_equal(wall.camera().eye, before.eye)
     np.testing.assert_array_equal(wall.camera().R, before.R)
     after = drag(wall, 0, 30)
     np.testing.assert_allclose(pivot(wall), found)
     assert not np.array_equal(after.R, before.R)
-    # The point stays in place in the window, because the view orbits about it.
+    # the point keeps its place in the window, because the view orbits about it
     np.testing.assert_allclose(on_the_screen(wall, found) + 0.5, (column, row), atol=1)
     wall.tab.wait_for_selector("#point", state="hidden")
     wall.tab.keyboard.press("r")
-    assert np.linalg.norm(pivot(wall) - found) > 0.5, "the start view has its own pivot"
+    assert np.linalg.norm(pivot(wall) - found) > 0.5, "the start view restores its pivot"
 
 
-def test_one_click_or_two_far_apart_set_nothing(wall):
+def test_one_click_or_two_distant_clicks_do_not_set_the_pivot(wall):
     before = pivot(wall)
     wall.tab.mouse.click(450, 250)
     wall.tab.mouse.click(300, 250)
@@ -451,7 +455,7 @@ def test_two_fingers_pan_and_pinch(tour):
     assert (before.R @ (panned.eye - before.eye))[1] < -0.1
 
     pinched = touch(tour, [(-20, 0), (20, 0)], [(-40, 0), (40, 0)])
-    # The fingers are twice as far apart, so what is between them looks twice as large.
+    # the fingers are twice as far apart, so the scene between them appears twice as large
     assert np.linalg.norm(pinched.eye - pivot(tour)) == pytest.approx(distance / 2, rel=0.15)
 
 

@@ -1,4 +1,4 @@
-"""A page's drawing in a real browser, compared with the renderer."""
+"""Drawings of a page in a browser equal the renderer's."""
 
 import base64
 import gzip
@@ -26,9 +26,9 @@ from gsplat_edu.viewer import page
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 ALIKE = 60.0
-"""Required PSNR, dB. The page blends into half floats: at worst 2^-12 of a value up to 1 per splat, most of it hidden
-by the splats in front. Errors of 1e-3 everywhere would be 60 dB; 71 to 77 are measured. A wrong convention costs 20 to
-40 dB."""
+"""Required PSNR, dB. The page blends half floats, which round by at most 2^-12 per splat for values up to 1, mostly
+hidden by splats in front. Errors of 1e-3 everywhere are 60 dB; 71 to 77 dB were measured. A wrong convention costs 20
+to 40 dB."""
 
 PLAIN = RenderSettings()
 
@@ -52,13 +52,15 @@ def likeness(seen, visit, gaussians, camera, settings):
     ],
     ids=["plain", "antialiased", "limit", "all"],
 )
-def test_the_page_draws_what_the_renderer_draws(show, random_gaussians, camera, settings, record_property):
+def test_the_page_draws_the_same_picture_as_the_renderer(
+    show, random_gaussians, camera, settings, record_property
+):
     gaussians = random_gaussians(5000)
     visit = show(gaussians, [("first", camera)], settings)
     found = likeness(drawn, visit, gaussians, camera, settings)
     record_property("psnr", found)
     assert found >= ALIKE
-    # The same from within the scene, with splats beside, behind and around the camera.
+    # the same from within the scene, with splats beside, behind and around the camera
     inside = Camera(
         look_at((0.1, 0.0, -0.3), (0.4, 0.2, 1.0)), (0.1, 0.0, -0.3), 150.0, 130.0, 61.7, 52.2, 90, 130
     )
@@ -83,7 +85,7 @@ def test_a_lower_degree_is_chosen(show, random_gaussians, camera):
 
 
 def test_extreme_splats(show, random_gaussians, camera):
-    """Needles, sheets, dust, giants, opaque and faint splats, and one without a rotation, which is left out."""
+    """The splats are needles, sheets, dust, giants, opaque and faint, and one has no rotation and is not drawn."""
     gaussians = random_gaussians(400)
     gaussians.log_scales[:40, 0] = -30.0
     gaussians.log_scales[40:80, :2] = -12.0
@@ -117,7 +119,8 @@ def test_splats_are_sorted_by_float32_depth(show, random_gaussians, camera):
     gaussians = random_gaussians(20_000, 0)
     means = gaussians.means.numpy()
     means[:] = np.round(means * 8) / 8  # many equal depths
-    means[:5000] = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32) * 1e-3  # and close ones
+    # and nearly equal ones
+    means[:5000] = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32) * 1e-3
     straight = Camera(np.eye(3), (0.0, 0.0, -0.5), 100.0, 100.0, 50.0, 40.0, 80, 100)
     visit = show(gaussians, [("first", straight)], PLAIN)
     encoded = visit.tab.evaluate(
@@ -147,7 +150,7 @@ def test_no_splat_or_one_splat(show, random_gaussians, camera, count):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("size", [(0.0, 0.0, 0.0), (-12.0, -12.0, -12.0), (-5.0, -30.0, -30.0)])
 def test_one_black_splat_on_white(show, random_gaussians, camera, size, antialiased):
-    """A single splat shows every constant: the maximum alpha, the dilation, the cut-off at 1/255."""
+    """A single splat reveals all constants: the maximum alpha, the dilation, the cut-off at 1/255."""
     gaussians = random_gaussians(1, 0)
     gaussians.means[0] = torch.tensor([0.1, 0.05, 0.0])
     gaussians.log_scales[0] = torch.tensor(size)
@@ -187,24 +190,24 @@ def test_a_trained_scene(show):
 @pytest.mark.parametrize(
     ("width", "height", "scale"),
     [
-        (160, 500, 2.5),  # narrow: the height fits, the sides are cropped
+        (160, 500, 2.5),  # a narrow window shows the whole height and crops the sides
         (320, 200, 1.0),
-        (400, 200, 1.25),  # wide: the width fits, a fifth of the height is cropped
-        (800, 200, 1.25),  # no more is cropped; the rest shows what is beside the image
+        (400, 200, 1.25),  # a wide window shows the whole width and crops a fifth of the height
+        (800, 200, 1.25),  # a wider window crops no more, and shows the surroundings of the image
     ],
 )
 def test_a_window_crops_the_sides_but_little_of_the_height(
     show, random_gaussians, camera, width, height, scale
 ):
     assert (camera.W, camera.H) == (320, 200)
-    few = random_gaussians(12)  # too few to be a subject, which a narrow window would show
+    few = random_gaussians(12)  # too few splats for a subject, which a narrow window would show
     visit = show(few, [("first", camera)], width=width, height=height)
     assert visit.camera().fy == pytest.approx(camera.fy * scale)
 
 
 @pytest.mark.parametrize("dense", [1, 2])
 def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
-    """In a window of another shape, the camera's image covers the window and is cropped."""
+    """In a window of another shape, the camera's image fills the window and is cropped."""
     gaussians = random_gaussians(2000)
     visit = show(gaussians, [("first", camera)], PLAIN, width=360, height=180, device_scale_factor=dense)
     visit.tab.evaluate("document.getElementById('panel').hidden = true")
@@ -218,7 +221,7 @@ def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
     visit.tab.evaluate("viewer.settled()")
     screen = np.asarray(Image.open(BytesIO(visit.tab.screenshot())).convert("RGB"))
     truth = np.round(255 * drawn(gaussians, window, PLAIN).clip(0, 1))
-    # The canvas rounds to bytes, so a half float may land one step away.
+    # The canvas rounds half floats to bytes, which may differ by one step.
     assert np.abs(screen - truth).max() <= 2
     assert (screen == truth).mean() > 0.9
 
@@ -269,7 +272,7 @@ def test_a_graphics_processor_with_small_textures_gets_a_message(visit, tmp_path
         return name === this.MAX_TEXTURE_SIZE ? LARGEST : real.call(this, name);
       };
     """
-    for size, fits in ((5, True), (4, False)):  # 20 splats are 4 rows of 5, or 5 of 4
+    for size, fits in ((5, True), (4, False)):  # 20 splats take 4 rows of 5, or 5 rows of 4
         one = visit(fresh=True)
         one.tab.add_init_script(limited.replace("LARGEST", str(size)))
         one.open(tmp_path / "a.html")

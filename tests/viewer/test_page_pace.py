@@ -1,4 +1,4 @@
-"""What a page draws on a computer that draws slowly: less while the view moves, then everything, in parts."""
+"""On a slow computer, a page draws fewer splats while the view moves, and then the whole picture in parts."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ SAMPLE = """async (most) => {
 
 @pytest.fixture
 def slow(show, random_gaussians, camera):
-    """Show a page of 15,000 splats in front of the camera."""
+    """Open a page of 15,000 splats in front of the camera."""
     gaussians = random_gaussians(15_000, 0)
     gaussians.means.mul_(0.3)
     visit = show(gaussians, [("first", camera)], RenderSettings(), width=320, height=200)
@@ -82,10 +82,14 @@ def test_the_whole_picture_in_parts_is_the_same_to_the_bit(slow, interrupt):
     assert found["isWhole"] and found["equal"] and found["shown"] and found["words"] == ""
     coarse = [size for size in found["sizes"] if size[2]]
     whole = [size for size in found["sizes"] if not size[2]]
-    assert len(coarse) == (2 if interrupt else 1), "coarse first, once for each movement"
-    assert all(width == 80 and count == 12_000 for width, count, _ in coarse), "a quarter of the width"
+    assert len(coarse) == (2 if interrupt else 1), "a coarse picture comes first, once for each movement"
+    assert all(width == 80 and count == 12_000 for width, count, _ in coarse), (
+        "the coarse picture has a quarter of the width"
+    )
     assert all(width == found["width"] == 320 for width, _, _ in whole)
-    assert whole[-1][1] < 15_000 and sum(count for _, count, _ in whole) >= 15_000, "several parts"
+    assert whole[-1][1] < 15_000 and sum(count for _, count, _ in whole) >= 15_000, (
+        "the whole picture has several parts"
+    )
 
 
 def test_a_sample_is_the_same_each_time_and_covers_as_much(slow):
@@ -97,15 +101,15 @@ def test_a_sample_is_the_same_each_time_and_covers_as_much(slow):
     weight = np.sqrt(area / (1 + np.exp(-gaussians.logit_opacities.numpy().astype(float))))
     chance = np.minimum(1, found["thinning"] * weight)
     chosen = np.asarray(found["first"])
-    # Their number is Poisson-like, so its mean is 2000 within 4 sqrt(2000) = 180.
+    # the number of sampled splats is within 4 sqrt(2000) = 180 of its mean of 2000
     assert chance.sum() == pytest.approx(2000, abs=180)
-    # An unbiased estimate of the total: its variance is the sum of area² (1 / chance - 1).
+    # the estimate of the total is unbiased, with variance the sum of area² (1 / chance - 1)
     spread = np.sqrt((area**2 * (1 / chance - 1)).sum())
     assert (area[chosen] / chance[chosen]).sum() == pytest.approx(area.sum(), abs=4 * spread)
-    assert spread < 0.1 * area.sum(), "and a sharp one"
+    assert spread < 0.1 * area.sum(), "a sharp picture follows"
 
 
-def test_while_a_training_runs_a_slow_page_draws_sparingly(slow):
+def test_a_slow_page_draws_rarely_while_a_training_runs(slow):
     visit, _ = slow
     found = visit.tab.evaluate(
         """async () => {

@@ -1,4 +1,4 @@
-"""The camera path of a page, in a real browser: the same motion as in Python, saved views, and the downloaded file."""
+"""The camera path of a page in a browser: the same motion as in Python, saved views, and the downloaded file."""
 
 import json
 
@@ -32,7 +32,7 @@ def turned(rotvec, eye=(0.0, 0.0, 0.0), time=None):
 
 
 def around(*times, count=5):
-    """Keyframes around zero at uneven distances, with a changing zoom."""
+    """Return keyframes around zero at uneven distances, with a changing zoom."""
     eyes = [(0, 0, -4), (0.3, -0.2, -3.8), (2.5, -0.5, -2), (3, 0, 1), (0.5, 0.4, 3.5)]
     times = times or (None,) * count
     return tuple(
@@ -63,7 +63,7 @@ PATHS = {
 
 @pytest.fixture
 def opened(visit, tmp_path, random_gaussians, three_views):
-    """A page of a scene with an origin, opened, with or without a path."""
+    """Return a function that opens the page of a scene with an origin, with or without a path."""
 
     def make(path=None, **options):
         page.write(
@@ -78,7 +78,7 @@ def test_the_page_moves_as_python_does(opened):
     shown = opened()
     for name, path in PATHS.items():
         curve = PathCurve(path)
-        # also before the beginning and after the end, and exactly at keyframes
+        # including times before the beginning, after the end, and exactly at keyframes
         times = np.r_[
             np.linspace(-1.0, curve.seconds + 1.0, 53), [float(k.time or 0) for k in path.keyframes]
         ]
@@ -90,7 +90,7 @@ def test_the_page_moves_as_python_does(opened):
 
 
 def stands_at(shown, expected):
-    """Whether the view is a keyframe's."""
+    """Return whether the view is that of a keyframe."""
     here = shown.tab.evaluate("viewer.view.camera")
     np.testing.assert_allclose(here["eye"], expected.eye, atol=1e-6)
     np.testing.assert_allclose(here["R"], expected.R, atol=1e-6)
@@ -132,7 +132,7 @@ def test_saved_views_become_the_file_that_render_reads(opened, tmp_path):
     assert shown.tab.inner_text("#path summary") == "camera path (0)"
     shown.tab.click("#path summary")
     assert [shown.tab.is_disabled(name) for name in BUTTONS] == [False, True, True]
-    shown.tab.keyboard.press("p")  # nothing to play, and no complaint
+    shown.tab.keyboard.press("p")  # an empty path cannot be played, without a complaint
     views = []
     for press in ("k", "ArrowRight", "k", "ArrowRight"):
         shown.tab.keyboard.press(press)
@@ -169,7 +169,9 @@ def test_an_embedded_path_is_written_as_it_came_and_keeps_its_times_when_it_grow
     shown.tab.click("#save-view")
     grown = read_path(downloaded(shown, tmp_path), ORIGIN)
     assert [k.time for k in grown.keyframes] == pytest.approx([1.0, 1.5, 4.0, 5.0, 5.0 + 4 / 3])
-    assert grown.duration == pytest.approx(5 / 4 * (4 + 4 / 3)), "the way back takes the mean time"
+    assert grown.duration == pytest.approx(5 / 4 * (4 + 4 / 3)), (
+        "the segment back to the start takes the mean time"
+    )
     shown.tab.uncheck("#loop")
     assert read_path(downloaded(shown, tmp_path), ORIGIN).duration is None
     shown.tab.focus('button[aria-label="remove view 1"]')
@@ -177,4 +179,4 @@ def test_an_embedded_path_is_written_as_it_came_and_keeps_its_times_when_it_grow
         shown.tab.keyboard.press("Enter")  # the next button has the focus
         assert shown.tab.inner_text("#path summary") == f"camera path ({left})"
     shown.tab.click("#save-view")
-    assert not read_path(downloaded(shown, tmp_path), ORIGIN).timed, "one time says nothing about speed"
+    assert not read_path(downloaded(shown, tmp_path), ORIGIN).timed, "a single time determines no speed"

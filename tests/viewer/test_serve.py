@@ -1,4 +1,4 @@
-"""The page's server, tested with real sockets: it serves one page, nothing else, and only to allowed host names."""
+"""The page's server, tested over sockets, serves one page and nothing else, and only to allowed host names."""
 
 import contextlib
 import http.client
@@ -24,7 +24,7 @@ from gsplat_edu.viewer.serve import (
     url_of,
 )
 
-PAGE = b"<!doctype html><title>page</title>" + bytes(range(256)) * 8192  # two MB: more than one write
+PAGE = b"<!doctype html><title>page</title>" + bytes(range(256)) * 8192  # two MB take more than one write
 NAMES = ("--host", "--port")
 ORANGE = (1.0, 0.5, 0.0)
 PATIENCE = 180.0
@@ -56,7 +56,7 @@ def ask(server, method="GET", path="/", **headers):
 
 
 def ask_raw(server, request):
-    """Send bytes that need not be HTTP; return the whole answer."""
+    """Send bytes, HTTP or not; return the whole answer."""
     with socket.create_connection(server.server_address[:2], timeout=10) as connection:
         connection.sendall(request)
         connection.shutdown(socket.SHUT_WR)
@@ -142,7 +142,7 @@ def test_names_of_this_computer_are_answered(server, host):
     ],
 )
 def test_other_host_names_are_refused(server, host):
-    """A foreign page may let its own host name resolve to 127.0.0.1."""
+    """A foreign page may make its own host name resolve to 127.0.0.1."""
     status, _, body = ask(server, Host=host)
     assert (status, body) == (403, b"403 Forbidden\n")
     assert ask(server, "HEAD", Host=host)[0] == 403
@@ -157,14 +157,14 @@ def test_two_host_headers_are_refused(server):
     "request_", [b"", b"\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x00\xa5\x01\x00", b"GET /", b"\0" * 70_000]
 )
 def test_an_invalid_request_does_no_harm(server, capsys, request_):
-    with contextlib.suppress(OSError):  # the server may hang up before all of a long line is sent
+    with contextlib.suppress(OSError):  # the server may close the connection before a long line is sent
         ask_raw(server, request_)
     assert ask(server)[2] == PAGE
     assert capsys.readouterr() == ("", ""), "the terminal stays clean"
 
 
 def cut_off(server, first, more, pieces):
-    """Send a request in `pieces` pieces; return whether the server closed the connection before the end."""
+    """Send a request in pieces; return whether the server closed the connection before the end."""
     with socket.create_connection(server.server_address[:2], timeout=PATIENCE) as connection:
         try:
             connection.sendall(first)
@@ -178,7 +178,7 @@ def cut_off(server, first, more, pieces):
 
 @pytest.mark.parametrize("first", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: "])
 def test_a_request_that_trickles_in_is_cut_off(server, monkeypatch, capsys, first):
-    """A byte every 10 ms for 20 s, while 0.2 s are allowed; each single read is quick."""
+    """A byte every 10 ms takes 20 s, while 0.2 s are allowed, although each read is quick."""
     monkeypatch.setattr(serve, "REQUEST_SECONDS", 0.2)
     assert cut_off(server, first, b"a", 2000)
     monkeypatch.undo()
@@ -187,18 +187,19 @@ def test_a_request_that_trickles_in_is_cut_off(server, monkeypatch, capsys, firs
 
 
 def test_a_request_without_end_is_cut_off(server):
-    # http.server accepts 100 headers. These are 90 of 60 KB, about a hundred times what is allowed.
+    # http.server accepts 100 headers. These are 90 headers of 60 KB, about a hundred times the limit.
     assert cut_off(server, b"GET / HTTP/1.1\r\n", b"X: " + b"a" * 60_000 + b"\r\n", 90)
 
 
 def test_connections_beyond_the_limit_are_closed(server, monkeypatch):
-    """Waiting connections hold their threads, so the next one gets no answer. Once they close, there is room again."""
+    """Waiting connections occupy all threads, so the next one gets no answer. Once they close, the server answers
+    again."""
     server._room = threading.Semaphore(3)
     waiting = [socket.create_connection(server.server_address[:2], timeout=10) for _ in range(3)]
     try:
         deadline = time.monotonic() + PATIENCE
         while server._room._value:
-            assert time.monotonic() < deadline, "the connections never took their threads"
+            assert time.monotonic() < deadline, "the connections did not occupy the threads"
             time.sleep(0.01)
         assert ask_raw(server, b"") == b""
         with pytest.raises((http.client.BadStatusLine, ConnectionError)):
@@ -207,7 +208,7 @@ def test_connections_beyond_the_limit_are_closed(server, monkeypatch):
         for connection in waiting:
             connection.close()
     while server._room._value < 3:
-        assert time.monotonic() < deadline, "the threads were never released"
+        assert time.monotonic() < deadline, "the threads were not released"
         time.sleep(0.01)
     assert ask(server)[2] == PAGE
 
@@ -263,7 +264,7 @@ def test_a_browser_draws_the_page_without_complaint(server, browser, random_gaus
         orange = np.abs(picture - 255.0 * np.array(ORANGE)).max(axis=2) < 3
         if 0.1 < orange.mean() < 0.95 and picture[~orange].std() > 20:
             break
-        assert time.monotonic() < deadline, "the scene never appeared in front of its background"
+        assert time.monotonic() < deadline, "the scene did not appear"
     tab.close()
     assert complaints == []
     assert [one for one in urls if not one.startswith((server.url, "blob:", "data:"))] == []
@@ -305,7 +306,7 @@ def test_a_port_that_is_taken_is_named():
         ("no such host", 0, "--host: 'no such host' is not an address"),
         ("a" * 300, 0, "--host: '"),
         ("", 0, "--host: '' is not an address"),
-        ("203.0.113.1", 0, "--host: cannot listen on 203.0.113.1"),  # for documentation: nobody has it
+        ("203.0.113.1", 0, "--host: cannot listen on 203.0.113.1"),  # an address reserved for documentation
     ],
 )
 def test_an_unusable_address_is_a_one_line_error(host, port, says):

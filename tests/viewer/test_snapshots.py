@@ -1,4 +1,4 @@
-"""A training watched by files in the run's folder, as another process does."""
+"""A training is watched through files in the run's folder, as by another process."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def made_run(capture, out, *words):
 
 
 class Watched:
-    """A training in its own thread, watched by files."""
+    """A training in its own thread, watched through files."""
 
     def __init__(self, capture, out, *words):
         self.run, self.live, self.said = made_run(capture, out, *words), LiveFolder(out), []
@@ -66,7 +66,7 @@ class Watched:
 
 
 def scene_of(path):
-    """Read scene.bin as its description says; return its header and Gaussians."""
+    """Read scene.bin by its specification; return its header and Gaussians."""
     data = path.read_bytes()
     length = int.from_bytes(data[:4], "little")
     assert length % 4 == 0
@@ -74,13 +74,13 @@ def scene_of(path):
     return header, page_data.unpacked(path, data[4 + length :], header["count"], header["sh_degree"])
 
 
-def test_nothing_is_written_unless_somebody_asks(capture, tmp_path):
+def test_no_files_are_written_unless_somebody_watches(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "60") as made:
         made.thread.join(60)
         assert not made.live.path.exists()
 
 
-def test_who_asks_gets_the_state_and_the_scene_of_the_same_iteration(capture, tmp_path):
+def test_a_watcher_gets_state_and_scene_of_the_same_iteration(capture, tmp_path):
     run = tmp_path / "run"
     LiveFolder(run).ask()
     LiveFolder(run).set_paused(True)
@@ -109,7 +109,7 @@ def test_who_asks_gets_the_state_and_the_scene_of_the_same_iteration(capture, tm
     assert not live.scene.exists() and not live.state.exists() and live.wanted.exists()
 
 
-def test_a_watcher_who_leaves_gets_no_more(capture, tmp_path):
+def test_no_files_are_written_after_the_watcher_left(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "100000") as made:
         made.live.ask()
         until(made.live.scene.exists, "a scene")
@@ -141,7 +141,7 @@ def test_watching_and_pausing_by_files_does_not_change_the_bits(capture, tmp_pat
             made.live.ask()
             header = header_of(made.live.scene)
             scenes.add(None if header is None else header["iteration"])
-    assert len(scenes) > 2, "it was watched"
+    assert len(scenes) > 2, "the training was watched"
     assert bits(made.run) == bits(alone)
 
 
@@ -157,7 +157,7 @@ def test_stopping_the_program_ends_a_pause(capture, tmp_path):
 
 def test_a_folder_that_cannot_be_written_ends_the_watching_but_not_the_training(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "100000") as made:
-        made.live.page.mkdir(parents=True)  # no file can be renamed onto a folder
+        made.live.page.mkdir(parents=True)  # a folder of the file's name makes the renaming fail
         made.live.ask()
         until(lambda: made.said, "the failure")
         held = made.run.trainer.iteration
@@ -221,4 +221,4 @@ def test_the_curves_keep_few_points(capture, tmp_path, monkeypatch):
     run.train(callbacks=[measured])
     iterations = [point[0] for point in figures.points]
     assert len(iterations) <= 8 and iterations[0] == 1 and iterations[-1] > 40
-    assert len({b - a for a, b in pairwise(iterations)}) == 1, "evenly spaced"
+    assert len({b - a for a, b in pairwise(iterations)}) == 1, "the kept points are evenly spaced"
