@@ -1,4 +1,4 @@
-"""Checkpoints damaged on purpose: in their bytes, tensors and numbers."""
+"""Makes checkpoints with damage to their bytes, tensors and numbers."""
 
 import json
 import struct
@@ -25,7 +25,7 @@ CONFIGS = {
 
 
 class Maker:
-    """Makes identical tiny trainers with a given strategy.
+    """Makes equal tiny trainers with a given strategy.
 
     Args:
         strategy: The density strategy.
@@ -98,7 +98,7 @@ def changed_tensor(tensor: torch.Tensor, rng: np.random.Generator) -> torch.Tens
             return changed.reshape(tensor.shape)
         case _ if tensor.numel():
             raw = tensor.contiguous().flatten().view(torch.uint8).clone()
-            # The important fields of torch's generator states are at both ends.
+            # the important fields of torch's generator states are at both ends
             reach = len(raw) if rng.random() < 0.5 else min(len(raw), 24)
             raw[torch.from_numpy(rng.integers(0, reach, 2))] = int(rng.integers(0, 256))
             return raw.view(tensor.dtype).reshape(tensor.shape)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 # One thread, because several processes run tests at once, and threads that wait for one another waste CPU time. Tests
-# of several threads ask for them. This must precede the import of torch. Programs started by tests inherit it.
+# of several threads set their number. This has to precede the import of torch; programs that tests start inherit it.
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import jaxtyping
@@ -34,7 +34,7 @@ outside.forbid()
 # Programs started in the background of a shell ignore Ctrl-C, and every tested program would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The same examples in every run make failures reproducible. `make soak` tries more, and random ones.
+# Each run has the same examples, so failures are reproducible. `make soak` tries more, and random ones.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=100)
 EXAMPLES = slices.count("GSPLAT_EDU_EXAMPLES", 100, 5_000)
 settings.register_profile("soak", deadline=None, max_examples=EXAMPLES, print_blob=True)
@@ -43,7 +43,7 @@ settings.load_profile("soak" if slices.SOAK else "repeatable")
 
 @pytest.fixture
 def as_shipped() -> Iterator[None]:
-    """Switch the shape-checking hook off, so that tests see the errors that users get."""
+    """Switch off the shape-checking hook, so that tests see the errors that users get."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -51,7 +51,7 @@ def as_shipped() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def photographed_once(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Share the photos that many tests need."""
+    """Share photos among tests."""
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent

@@ -11,7 +11,7 @@ def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
     """Damage some bytes: flip bits, change numbers, or delete, repeat, randomise or truncate pieces."""
     damaged = bytearray(data)
     for _ in range(int(rng.integers(1, 5))):
-        # Half of the damage goes to the region of the headers.
+        # half of the damage is in the region of the headers
         reach = len(damaged) if rng.random() < 0.5 else min(len(damaged), 400)
         if reach < 2:
             break

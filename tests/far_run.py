@@ -17,10 +17,10 @@ BLUE = (0.0, 0.0, 1.0)
 
 
 def write_far_run(root: Path) -> tuple[RunFolder, Path, Path, Sequence[View]]:
-    """Write a run whose scene lies at `ORIGIN`, over blue.
+    """Write a run whose scene lies at `ORIGIN`, with a blue background.
 
     Returns:
-        The run; its capture; its scene near zero, `bare.ply`; and the views, near zero too: four for training, two held
+        The run; its capture; its scene near zero, `bare.ply`; and the views near zero, four for training and two held
         out.
     """
     views, points, colors = procedural_capture(size=32, count=6)

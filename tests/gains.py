@@ -7,7 +7,7 @@ from gsplat_edu.train.view_model import Identity
 
 
 class Gains(Identity):
-    """A small but real view model: one brightness per view."""
+    """A small view model: a brightness per view."""
 
     def __init__(self, count):
         self.gains = torch.ones(count).requires_grad_()

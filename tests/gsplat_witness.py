@@ -1,8 +1,7 @@
-"""gsplat's own projection and harmonics in torch, and its compositing evaluated at every pixel, as a witness.
-
-gsplat composites in CUDA only. Its rules are few: alpha = min(0.999, o exp(-d' Sigma^-1 d / 2)), nothing below 1/255,
-and a pixel ends before the Gaussian that would take its transmittance to 1e-4 or below. Here they are applied one
-Gaussian after the other.
+"""A witness of gsplat: its own projection and harmonics in torch, and its compositing, evaluated at every pixel.
+gsplat composites in CUDA only. Its rules are few: alpha = min(0.999, o exp(-d' Sigma^-1 d / 2)), alpha below 1/255 is
+zero, and a pixel stops before the Gaussian that would take its transmittance to 1e-4 or below. This module applies
+them to one Gaussian after the other.
 """
 
 import pytest
@@ -12,7 +11,7 @@ torch_impl = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is no
 
 
 def scene(count=40, cameras=2, dtype=torch.float64, seed=0):
-    """Gaussians before, beside and behind cameras at the origin, with every tensor a leaf."""
+    """Return Gaussians in front of, beside and behind cameras at the origin; every tensor is a leaf."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
@@ -22,8 +21,8 @@ def scene(count=40, cameras=2, dtype=torch.float64, seed=0):
         return torch.rand(*shape, generator=g, dtype=torch.float64)
 
     means = normal(count, 3) * torch.tensor([1.0, 0.8, 0.6]) + torch.tensor([0.0, 0.0, 2.2])
-    means[-1] = torch.tensor([0.1, 0.2, -1.0])  # behind
-    means[-2] = torch.tensor([3.0, 0.2, 1.0])  # beside: the Jacobian's clamp acts
+    means[-1] = torch.tensor([0.1, 0.2, -1.0])  # behind the cameras
+    means[-2] = torch.tensor([3.0, 0.2, 1.0])  # beside the image, where the Jacobian is clamped
     viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
     for k in range(cameras):
         angle = torch.tensor(0.15 * k)
@@ -45,7 +44,7 @@ def scene(count=40, cameras=2, dtype=torch.float64, seed=0):
 
 
 def smooth():
-    """Few wide Gaussians, above 1/255 and below the clamps in every pixel: finite differences meet no step."""
+    """Return few wide Gaussians, above 1/255 and below the clamps in every pixel, for finite differences."""
     tensors = scene(count=4, cameras=2)
     tensors["means"] = torch.tensor([[0.1, 0.2, 2.0], [-0.2, 0.1, 2.5], [0.3, -0.2, 3.0], [0.0, 0.1, 3.5]])
     tensors["scales"] = torch.tensor([[1.5, 1.7, 1.6]]).repeat(4, 1) + 0.1 * torch.arange(4)[:, None]
@@ -55,7 +54,7 @@ def smooth():
 
 
 def rendered(tensors, width, height, sh_degree=None, antialiased=False, mode="RGB", **limits):
-    """Render with gsplat's torch functions; return images, alphas, means2d of each camera and of each pixel."""
+    """Render with gsplat's torch functions; return images, alphas, and means2d of each camera and of each pixel."""
     t, C = tensors, len(tensors["viewmats"])
     covars = t.get("covars")
     if covars is None:

@@ -1,4 +1,4 @@
-"""Helpers for tests of the live view: trainings that have one, and a client of its server."""
+"""Helpers for tests of the live view: trainings with a live view, and a client of its server."""
 
 import http.client
 import json
@@ -19,7 +19,7 @@ from gsplat_edu.viewer.live import LiveView
 from gsplat_edu.viewer.snapshots import Broadcast
 
 PATIENCE = 60.0
-"""Seconds after which a wait fails."""
+"""Longest time that a test waits, seconds."""
 
 GROWING = ["--max-gaussians", "600", "--set", "densify_start=5", "densify_every=10"]
 STRATEGIES = {
@@ -39,7 +39,7 @@ STRATEGIES = {
 
 
 def until(true, what):
-    """Wait until a function returns something true, and return that."""
+    """Wait until a function returns a true value, and return it."""
     deadline = time.monotonic() + PATIENCE
     while not (found := true()):
         assert time.monotonic() < deadline, f"timed out waiting for: {what}"
@@ -48,7 +48,7 @@ def until(true, what):
 
 
 def made_run(capture, out, *words):
-    """Make the run of a command line."""
+    """Make a run from options of the command line."""
     words = ["train", str(capture), "--out", str(out), "--seed", "3", *GROWING, *words]
     return CaptureRun(plan(options_from(build_parser(["train"]).parse_args(words)), Limits()).options)
 
@@ -94,7 +94,7 @@ def training(capture, out, *words):
 
 
 class Client:
-    """A page's requests, without a browser."""
+    """Sends the requests of a page, without a browser."""
 
     def __init__(self, url):
         parts = urllib.parse.urlsplit(url)
@@ -106,7 +106,7 @@ class Client:
         }
 
     def ask(self, method, path, body=None, headers=None):
-        """Return status, headers and body of one request; with the page's own headers unless others are given."""
+        """Return status, headers and body of a request, which has the page's headers unless others are given."""
         connection = http.client.HTTPConnection(self.host, self.port, timeout=PATIENCE)
         try:
             connection.request(method, path, body, self.own if headers is None else headers)
@@ -138,7 +138,7 @@ class Client:
 
 
 def unframed(data):
-    """Return header and Gaussians of the bytes of scene.bin, read as their description says."""
+    """Return header and Gaussians of the bytes of scene.bin, read by its specification."""
     length = int.from_bytes(data[:4], "little")
     assert length % 4 == 0
     header = json.loads(data[4 : 4 + length])
@@ -149,6 +149,6 @@ def unframed(data):
 
 
 def camera_json(camera):
-    """Return a camera as the page sends it."""
+    """Return a camera in the form that the page sends."""
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
     return json.dumps({"R": np.asarray(camera.R).tolist(), "eye": np.asarray(camera.eye).tolist(), **numbers})

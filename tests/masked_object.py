@@ -1,4 +1,4 @@
-"""A capture of the procedural object before a cluttered room, with masks that keep the object."""
+"""A capture of the procedural object in a cluttered room, with masks that keep the object."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from gsplat_edu.data import procedural
 from gsplat_edu.scene.views import View
 
 ROOM = 6.0
-"""Radius of the sphere that is painted as the room."""
+"""Radius of the painted sphere that is the room."""
 
 
 class MaskedObject(NamedTuple):
@@ -38,7 +38,7 @@ def wall_behind(camera):
 
 
 def masked_object(width, count, splats=300, seed=0):
-    """Photograph the object before the room; its masks keep pixels of which the object covers half or more."""
+    """Photograph the object in the room; masks keep pixels of which the object covers half or more."""
     rng = np.random.default_rng(seed)
     height = round(0.75 * width)
     means, cov3ds, colors, opacities = procedural._scene(rng, splats)
@@ -52,7 +52,7 @@ def masked_object(width, count, splats=300, seed=0):
     on_object = means[rng.permutation(len(means))[: 2 * len(means) // 3]]
     wall = rng.normal(size=(len(on_object), 3))
     wall *= ROOM / np.linalg.norm(wall, axis=1, keepdims=True)
-    between = rng.normal(size=(len(on_object) // 4, 3)) * 1.5  # what structure from motion gets wrong
+    between = rng.normal(size=(len(on_object) // 4, 3)) * 1.5  # errors of structure from motion
     points = np.concatenate([on_object + 0.03 * rng.normal(size=on_object.shape), wall, between])
     painted = np.concatenate(
         [np.clip(colors[: len(on_object)], 0, 1), room(wall), np.full(between.shape, 0.5)]

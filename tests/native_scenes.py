@@ -1,4 +1,4 @@
-"""Hard scenes for kernels, and their true images from the NumPy reference with exact extents and tile stops."""
+"""Hard scenes for kernels, and their images by the NumPy reference with exact extents and tile stops."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def assert_smooth(scene: Scene, settings: RenderSettings) -> None:
     for i in range(len(gaussians)):
         alone = gaussians.map(lambda t, i=i: t[i : i + 1])
         alpha = 1 - render(alone, scene.camera, settings=settings, backend="cpu").transmittance
-        assert alpha.min() > 1.5 / 255 and alpha.max() < 0.95, "alphas stay away from the floor and the clamp"
+        assert alpha.min() > 1.5 / 255 and alpha.max() < 0.95, "no alpha is near the floor or the clamp"
         assert render(alone, scene.camera, settings=RenderSettings(), backend="cpu").image.min() > 0.0
     assert len(render(gaussians, scene.camera, backend="cpu").visible) == len(gaussians)
 
@@ -141,7 +141,7 @@ SCENES = {
     "one Gaussian": random(1, seed=10),
     "partly behind": random(80, seed=11, means=np.random.default_rng(11).uniform(-4, 4, (80, 3))),
 }
-"""Scenes by what is hard about them. In the scene with ties, a camera axis is along z, so that depths tie exactly."""
+"""Scenes by their difficulty. In the scene with ties, a camera axis is along z, so that depths tie exactly."""
 
 SCENES["ties in depth"] = Scene(
     **{

@@ -1,4 +1,4 @@
-"""Forbids the process of the tests to contact other computers, so that every test shows that a command does not."""
+"""Forbids the tests' process to contact other computers, so every test checks that commands do not."""
 
 import ipaddress
 import sys
@@ -24,11 +24,11 @@ def is_here(address: object) -> bool:
         found = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
         return False
-    return found.is_loopback or found.is_unspecified  # 0.0.0.0 as a target is this computer
+    return found.is_loopback or found.is_unspecified  # the target 0.0.0.0 is this computer
 
 
 def forbid() -> None:
-    """Raise an error at every connection to another computer from now on; it cannot be undone."""
+    """Raise an error at every connection to another computer from now on; this cannot be undone."""
 
     def heard(event: str, arguments: tuple[object, ...]) -> None:
         if event in EVENTS and not is_here(arguments[1]):

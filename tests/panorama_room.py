@@ -1,7 +1,6 @@
-"""A textured room, drawn ray by ray: photos and 360-degree panoramas of it with known cameras.
-
-The room is a box seen from inside, with two boxes on its floor. Rays are intersected with all rectangles and the
-nearest one's texture is looked up, so a panorama is drawn without any projection of this package.
+"""Photos and 360-degree panoramas of a textured room with known cameras, drawn ray by ray. The room is a box seen
+from inside, with two boxes on its floor. Each ray takes the texture of the nearest rectangle that it hits, so
+panoramas are drawn without a projection of this package.
 """
 
 import functools
@@ -12,7 +11,7 @@ import numpy as np
 from gsplat_edu.scene.camera import Camera, look_at
 
 ROOM = np.array([[-3.0, -2.2, -2.5], [3.0, 0.6, 2.5]])
-"""Lowest and highest corner, world units; y points down, so the floor is y = 0.6."""
+"""Lowest and highest corner of the room, world units; y points down, so the floor is y = 0.6."""
 
 BOXES = np.array([[[-1.9, -0.3, 0.8], [-1.2, 0.6, 1.6]], [[1.0, -0.7, -1.6], [1.8, 0.6, -0.9]]])
 """Two boxes on the floor."""
@@ -23,7 +22,7 @@ SHARPER = 2
 
 @functools.cache
 def texture_of(number):
-    """Return coloured noise of scales that photos of 163 px resolve, (128, 128, 3)."""
+    """Return coloured noise, coarse enough for photos of 163 px, (128, 128, 3)."""
     rng, image = np.random.default_rng(number), np.zeros((128, 128, 3), np.float32)
     for cells in (4, 8, 16, 32):
         noise = rng.normal(size=(cells, cells, 3)).astype(np.float32)
@@ -32,7 +31,7 @@ def texture_of(number):
 
 
 def rectangles():
-    """Return the corners, edges and inward normals' axes of all rectangles: (corner, edge, edge) each."""
+    """Return all rectangles, each as (corner, edge, edge)."""
     found = []
     for low, high in (ROOM, *BOXES):
         size = high - low
@@ -48,7 +47,7 @@ def rectangles():
 
 
 def colours_of(eye, rays):
-    """Return what rays from a point see, (..., 3), 0 to 255.
+    """Return the colours that rays from a point hit, (..., 3), 0 to 255.
 
     Args:
         eye: (3,) the point.
@@ -62,7 +61,7 @@ def colours_of(eye, rays):
         slope = flat @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             t = ((corner - eye) @ normal) / slope
-            # far along a ray that runs parallel, NaN and infinity compare as false
+            # rays parallel to a rectangle give NaN and infinity, which compare as false
             at = eye + t[:, None] * flat - corner
             s, q = at @ a / (a @ a), at @ b / (b @ b)
             hit = (t > 1e-6) & (t < nearest) & (s >= 0) & (s <= 1) & (q >= 0) & (q <= 1)

@@ -1,4 +1,4 @@
-"""Photos with pasted things, and the pixels that these cover."""
+"""Photos with pasted objects, and the pixels that the objects cover."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from gsplat_edu.scene.views import View
 
 
 def pasted(views, share=0.3, seed=3, area=0.05):
-    """Paste a textured rectangle near the middle of some views; return all views, and where each is covered."""
+    """Paste a textured rectangle near the middle of some views; return all views and their covered pixels."""
     rng = np.random.default_rng(seed)
     struck = rng.permutation(len(views))[: round(share * len(views))]
     changed, truth = list(views), [np.zeros(view.image.shape[:2], bool) for view in views]

@@ -1,25 +1,25 @@
-"""Photos as phones write them: a picture of four flat quarters, in any orientation, format and colour space."""
+"""A picture of four flat quarters in all orientations, formats and colour spaces of phones."""
 
 import numpy as np
 from PIL import Image, ImageOps
 
 QUARTERS = ((190, 60, 50), (60, 170, 70), (50, 70, 180), (150, 150, 150))
-"""Values of the four quarters; as Display P3 they are colours inside of sRGB."""
+"""Values of the four quarters; as Display P3, they are colours within sRGB's gamut."""
 
 ORIENTATIONS = range(1, 9)
 """EXIF orientations."""
 
 P3 = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))
-"""xy of Display P3's primaries."""
+"""Primaries of Display P3, xy."""
 
 P3_TO_SRGB = np.array(
     [[1.2249401, -0.2249404, 0.0], [-0.0420569, 1.0420571, 0.0], [-0.0196376, -0.0786361, 1.0982735]]
 )
-"""Linear Display P3 to linear sRGB (CSS Color 4, through XYZ at D65)."""
+"""Matrix from linear Display P3 to linear sRGB (CSS Color 4, through XYZ at D65)."""
 
 
 def quarters(W=64, H=48):
-    """Return the picture as it is to be seen."""
+    """Return the picture, upright."""
     pixels = np.empty((H, W, 3), np.uint8)
     for i, color in enumerate(QUARTERS):
         pixels[i // 2 * H // 2 :, i % 2 * W // 2 :] = color
@@ -27,7 +27,7 @@ def quarters(W=64, H=48):
 
 
 def as_stored(upright, orientation):
-    """Return the pixels that become a picture when Pillow turns them by an EXIF orientation."""
+    """Return the stored pixels, which Pillow rotates by an EXIF orientation to the picture."""
     back = {6: 8, 8: 6}.get(orientation, orientation)
     image = Image.fromarray(upright)
     image.getexif()[0x0112] = back
@@ -35,20 +35,20 @@ def as_stored(upright, orientation):
 
 
 def exif_bytes(orientation):
-    """Return EXIF that consists of an orientation."""
+    """Return EXIF data with only an orientation."""
     exif = Image.Exif()
     exif[0x0112] = orientation
     return exif.tobytes()
 
 
 def save(path, upright, orientation=1, **options):
-    """Write a picture as a camera does: the sensor's pixels, and the orientation beside them."""
+    """Write a picture like a camera, as the sensor's pixels and an orientation."""
     pixels, exif = as_stored(upright, orientation), exif_bytes(orientation)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() != ".heic":
         Image.fromarray(pixels).save(path, exif=exif, **options)
         return path
-    import pillow_heif  # here, so that other tests run without it
+    import pillow_heif  # imported here, so that other tests do not need it
 
     H, W = pixels.shape[:2]
     heif = {"quality": 100, "chroma": 444, "exif": exif} | options
@@ -59,7 +59,7 @@ def save(path, upright, orientation=1, **options):
 
 
 def p3_as_srgb(values):
-    """Return what Display P3 values are in sRGB, 0 to 255, not rounded."""
+    """Convert Display P3 values to sRGB, 0 to 255, not rounded."""
     v = np.asarray(values, np.float64) / 255.0
     light = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     light = np.clip(light @ P3_TO_SRGB.T, 0.0, 1.0)
@@ -67,7 +67,7 @@ def p3_as_srgb(values):
 
 
 def p3_range(values, error):
-    """Return the smallest and largest sRGB values that Display P3 values become if each is off by so much."""
+    """Return the smallest and largest sRGB values of Display P3 values that are off by up to `error`."""
     steps = np.stack(np.meshgrid(*[(-error, 0, error)] * 3), axis=-1).reshape(-1, 3)
     found = np.stack([p3_as_srgb(np.clip(values.astype(int) + step, 0, 255)) for step in steps])
     return found.min(axis=0), found.max(axis=0)

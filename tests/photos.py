@@ -1,7 +1,6 @@
-"""Photos of the course's sphere and of the procedural scene, taken once.
-
-The reference renderer takes seconds for them, and dozens of tests need the same ones. The processes of a test run, and
-the programs that `processes.Program` starts, share them in a folder.
+"""Photos of the course's sphere and of the procedural scene, rendered once. The reference renderer takes seconds for
+them, and dozens of tests need the same photos. The processes of a test run, and the programs that `processes.Program`
+starts, share them in a folder.
 """
 
 import hashlib
@@ -16,11 +15,11 @@ from gsplat_edu import Camera
 from gsplat_edu.data import procedural, synthetic
 
 VARIABLE = "GSPLAT_TEST_PHOTOS"
-"""The environment's variable that names the folder."""
+"""Environment variable with the folder's name."""
 
 
 def keep() -> None:
-    """From now on, read photos that are in the folder, and add those that are not."""
+    """From now on, read photos from the folder, and add missing ones to it."""
     original, folder = synthetic.render_gaussians, Path(os.environ[VARIABLE])
     folder.mkdir(exist_ok=True)
 
@@ -39,7 +38,7 @@ def keep() -> None:
 
 
 def blank_png(W: int, H: int) -> bytes:
-    """Return a small gray PNG whose header claims a size; it does not hold as many pixels."""
+    """Return a small gray PNG whose header declares a larger size than its contents have."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,8 +1,8 @@
-"""Processes that start fast, because they are forked from one that has imported the package.
+"""Processes that start fast, because they are forked from a process that has imported the package.
 
 Importing torch and the commands takes several seconds of CPU time, and a test that kills a run thirteen times would
-import them thirteen times. multiprocessing's fork server imports them once per process that runs tests. It is a
-separate process without the shape-checking hook, and its children end or are killed like any other program.
+import them thirteen times. multiprocessing's fork server imports them once per process that runs tests. The fork
+server runs without the shape-checking hook, and its children end or are killed like any other program.
 """
 
 import multiprocessing
@@ -60,5 +60,5 @@ class Program:
     def ended(self, patience: float = 120.0) -> tuple[int, str, str]:
         """Wait for the end; return the exit code (negative for a signal), stdout and stderr."""
         self.process.join(patience)
-        assert not self.process.is_alive(), "the program hangs"
+        assert not self.process.is_alive(), "the program did not end in time"
         return self.process.exitcode, self._out.read_text(), self._err.read_text()

@@ -1,7 +1,6 @@
-"""Several ranks in one process: threads that exchange real gloo messages over loopback.
-
-Starting Python and torch takes seconds of CPU time per process; a thread takes none. Torch runs on one thread
-meanwhile, because its number of threads belongs to the process.
+"""Several ranks in one process: threads that exchange gloo messages over loopback. Starting Python and torch takes
+seconds of CPU time per process, starting a thread none. Torch runs on one thread meanwhile, because its number of
+threads is the process's.
 """
 
 from collections.abc import Callable
@@ -18,14 +17,14 @@ MEETING = timedelta(seconds=60)
 
 
 def together(size: int, work: Callable, patience: float = 30.0) -> list:
-    """Call `work(team)` for every rank at once; return the results by rank.
-
-    If some fail, the error of the first that did not only miss another is raised.
+    """Call `work(team)` for all ranks at the same time; return the results by rank. If ranks fail, raise the error of
+    the first one that did not fail because another rank was missing.
 
     Args:
         size: Number of ranks.
-        work: What each does.
-        patience: Seconds for which a rank waits for a message. A thread that fails does not close its connections.
+        work: Called for each rank.
+        patience: Seconds for which a rank waits for a message, because a thread that fails does not close its
+        connections.
     """
     store, before = dist.HashStore(), torch.get_num_threads()
 

@@ -52,7 +52,7 @@ def small_folder(folder: Path) -> Path:
 
 
 def small_levels(folder: Path) -> Path:
-    """Write the same scene at two levels of detail, in three files; return its lod-meta.json."""
+    """Write the same scene as two levels of detail in three files; return its lod-meta.json."""
     path = folder / "levels" / LOD_META
     lod.write(path, random_scene(40, 3), LodOptions(smallest=20, chunk=20, leaf=10))
     return path

@@ -1,7 +1,6 @@
-"""The type checker behind the shape-checking hook: beartype, which accepts an int where a float is annotated.
-
-Only the first calls of a function in each test are checked: a training calls some functions a hundred thousand times,
-and checking all of those calls doubles the time of the suite. conftest.py takes the hook from here.
+"""The type checker of the shape-checking hook: beartype, which accepts an int where a float is annotated. Only the
+first calls of a function in each test are checked, because a training calls some functions a hundred thousand times,
+and checking all calls doubles the time of the suite. conftest.py imports the hook from here.
 """
 
 import functools
@@ -14,7 +13,7 @@ import pytest
 from beartype import BeartypeConf, beartype
 
 CHECKS = 10
-"""Checks of a function in each test. Arguments and result are checked apart, so these are its first 5 calls."""
+"""Number of checks of a function in each test. Arguments and result are separate checks, so these are 5 calls."""
 
 _beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True))
 _counts: dict[tuple[str, str], int] = {}
@@ -22,7 +21,7 @@ _unchecked: list[Callable[..., Any]] = []
 
 
 def checked(stub: Callable[..., Any]) -> Callable[..., Any]:
-    """Check a function's arguments or its result; jaxtyping calls this for each, with a stub of the same signature.
+    """Check a function's arguments or its result. jaxtyping calls this for both, with a stub of the same signature.
 
     beartype writes the check at the first call, because most processes call only some of the functions they import.
     """
@@ -35,7 +34,7 @@ def checked(stub: Callable[..., Any]) -> Callable[..., Any]:
         check = check or _beartyped(stub)
         _counts[name] = count = _counts.get(name, 0) + 1
         if count == CHECKS and (function := _find(*name)) is not None:
-            function.__no_type_check__ = True  # jaxtyping then calls the function directly
+            function.__no_type_check__ = True  # jaxtyping then calls the function without checks
             _unchecked.append(function)
         return check(*arguments, **keywords)
 
@@ -43,7 +42,7 @@ def checked(stub: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _find(module: str, qualname: str) -> Any:
-    """Return a function or a method of a module; None if its name leads elsewhere, as a local function's does."""
+    """Return a function or a method of a module by name; None for others, such as local functions."""
     found: Any = sys.modules.get(module)
     for part in qualname.split("."):
         found = inspect.getattr_static(found, part, None)

@@ -1,7 +1,7 @@
 """A renderer written from conformance/SPECIFICATION.md alone, each convention of which can be broken on purpose.
 
-It imports nothing of the package. Unbroken, it is a third witness of the conformance kit; broken, it shows that the kit
-can fail.
+It imports nothing from the package. Unbroken, it is a third implementation that passes the conformance kit; broken,
+it shows that the kit can fail.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ SIGNS = np.array((1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1))
 
 @dataclass(frozen=True)
 class Conventions:
-    """Every convention, as specified; a test replaces one."""
+    """The conventions of the specification, of which a test replaces one."""
 
     pixel_offset: float = 0.0
     dilation: float = 0.3
-    alpha_max: float | None = None  # None: the setting
+    alpha_max: float | None = None  # None takes the setting
     alpha_min: float = 1 / 255
     largest_distance: float = np.inf  # standard deviations beyond which an ellipse is cut
     largest_deviation: float = np.inf  # px; larger Gaussians are dropped
@@ -39,17 +39,17 @@ class Conventions:
     sh_offset: float = 0.5
     sh_floor: bool = True
     sh_ceiling: float = np.inf
-    sh_degree: int | None = None  # None: the setting
+    sh_degree: int | None = None  # None takes the setting
     toward_camera: bool = False
     quaternion: tuple[int, ...] = (0, 1, 2, 3)
     normalised: bool = True
     transposed: bool = False
     clamps_jacobian: bool = True
-    limit: float | None = None  # None: the setting
+    limit: float | None = None  # None takes the setting
     clamp_centre: str = "image"  # or "principal point"
     order: str = "z"  # or "distance", "input"
     ties: str = "first"  # or "last"
-    z_near: float | None = None  # None: the setting
+    z_near: float | None = None  # None takes the setting
     near_included: bool = False
     compensates: bool = True
     compensation_power: float = 0.5
@@ -60,7 +60,7 @@ class Conventions:
     stop: str = "never"  # or "before" the Gaussian that takes T of a pixel below stop_at
     stop_at: float = 1e-4
     refuses_empty: bool = False
-    # Gradients only; the outputs stay as they are.
+    # these change gradients, but no outputs
     clamp_passes: bool = False
     floor_passes: bool = False
     cut_passes: bool = False
@@ -230,7 +230,7 @@ def _leaves(gaussians: Arrays, camera: Arrays, settings: Arrays, *, tracked: boo
 
 
 def _rotation(q: Tensor) -> Tensor:
-    """Return the matrices of v -> q v q*, column by column: the images of the three axes."""
+    """Return the matrices of v -> q v q*, whose columns are the images of the three axes."""
     w, v = q[:, :1], q[:, 1:]
     axes = torch.eye(3, dtype=q.dtype)
     columns = []

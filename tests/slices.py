@@ -43,7 +43,7 @@ if CHOSEN not in ("", "none", *NAMES):
 EVERY_TEST = CHOSEN in NAMES and os.environ.get("GSPLAT_EDU_SPLIT", "") == "all"
 
 HISTORY = touched.history(ROOT)
-# Stored in the environment, so that the workers of pytest-xdist choose the same cases, whatever changes meanwhile.
+# Stored in the environment, so that the workers of pytest-xdist choose the same cases even if files change meanwhile.
 COUNT = int(os.environ.setdefault("GSPLAT_EDU_SLICE", str(HISTORY.count)))
 os.environ.setdefault("GSPLAT_EDU_TOUCHED", "\n".join(sorted(touched.tests_of(ROOT, HISTORY.changed))))
 TOUCHED = frozenset(os.environ["GSPLAT_EDU_TOUCHED"].split("\n")) - {""}
@@ -101,9 +101,9 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/gpu/test_compile.py::test_every_kernel_compiles_with_few_spills": (4, 12),
     "tests/runs/test_transients.py::test_a_killed_and_resumed_run_writes_the_same_bytes": (4, 1),
 }
-"""Processor time of a case in seconds, and the number of cases, of the longest tests. A file that runs together is one.
-
-The first cases of these tests are spread over the shards by this time. Other tests begin at a shard by their name.
+"""Processor time of a case in seconds, and the number of cases, of the longest tests. A file that runs together
+counts as a case. These tests are spread over the shards by this time; the shards of other tests follow from their
+names.
 """
 
 FIRST = (
@@ -143,7 +143,8 @@ FIRST = (
     "tests/runs/test_extension.py",
     "tests/cli/test_view.py",
 )
-"""The slowest files. Each runs in one process, so the slow ones start first, while others remain to be shared out."""
+"""The slowest files. A file runs in one process, so slow files start first, while others are left for the other
+processes."""
 
 
 def count(name: str, sliced: int, soak: int) -> int:
@@ -159,7 +160,7 @@ def count(name: str, sliced: int, soak: int) -> int:
 
 
 def balanced(seconds: Mapping[str, tuple[float, int]]) -> dict[str, int]:
-    """Choose the shard of the first case of each test, so that the shards take about as long.
+    """Choose the shard of the first case of each test so that the shards take nearly equal times.
 
     Args:
         seconds: By test, the processor time of a case and the number of cases.
@@ -178,7 +179,8 @@ STARTS = balanced(SECONDS)
 
 
 def numbered(items: Iterable[pytest.Item]) -> dict[pytest.Item, int]:
-    """Return the shard of each test that has one: its cases follow one another, from the first's."""
+    """Return the shard of each test that has one. The cases of a test take consecutive shards, from that of the first
+    case."""
     shards, sizes, together = {}, defaultdict(int), {}
     for item in items:
         marker = item.get_closest_marker("sliced")
@@ -247,7 +249,7 @@ def pytest_report_header() -> str:
 
 
 def wanted(config: pytest.Config, item: pytest.Item) -> bool:
-    """Return whether the change touches a test, or the command line names it."""
+    """Return whether the change touches a test or the command line names it."""
     path, _, name = item.nodeid.partition("::")
     if path in TOUCHED or f"[{name.partition('[')[2]}" in TOUCHED:
         return True
@@ -259,7 +261,8 @@ def wanted(config: pytest.Config, item: pytest.Item) -> bool:
     return False
 
 
-@pytest.hookimpl(wrapper=True, tryfirst=True)  # numbers before -k and -m choose, leaves out afterwards
+# assigns shards before -k and -m select tests, and leaves cases out afterwards
+@pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_collection_modifyitems(
     config: pytest.Config, items: list[pytest.Item]
 ) -> Generator[None, object, object]:

@@ -2,7 +2,7 @@
 
     python soak.py CASE FOLDER
 
-It runs in its own process, because other tests' remains in the heap could hide or imitate growth.
+It runs in its own process, because memory that other tests left in the heap could hide or imitate growth.
 """
 
 import json
@@ -27,7 +27,7 @@ SIZES = {"one": [(320, 240)], "mixed": [(320, 240), (240, 320), (304, 304), (360
 """(W, H) of the photos, in rotation."""
 
 CASES = {
-    # Photos, their sizes, masks, kept in memory, random background, strategy.
+    # name: sizes of the photos, masks, kept in memory, random background, strategy
     "RGBA on white, adc": ("one", False, True, False, "adc"),
     "RGBA and masks of mixed sizes, read again, mcmc": ("mixed", True, False, False, "mcmc"),
     "RGBA over random colours, read again, adc": ("mixed", False, False, True, "adc"),

@@ -7,7 +7,7 @@ from gsplat_edu.scene.gaussians import Gaussians
 
 
 def splats_on(points, colors) -> Gaussians:
-    """Return a ball of fixed size on every point, in the point's colour."""
+    """Return a ball of fixed size at every point, in the point's colour."""
     count = len(points)
     return Gaussians(
         means=torch.tensor(points, dtype=torch.float32),

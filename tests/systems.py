@@ -1,4 +1,4 @@
-"""The mark of tests that only make sense on POSIX: they set its permissions or locks, or make its links or pipes."""
+"""The mark of tests that need POSIX: they set its permissions or locks, or make its links or pipes."""
 
 import os
 

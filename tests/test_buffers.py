@@ -1,4 +1,4 @@
-"""Buffers are reused once nothing refers to them, and not before."""
+"""Buffers are reused once no tensor refers to them, and not before."""
 
 import subprocess
 import sys
@@ -54,7 +54,9 @@ def test_an_unreferenced_buffer_is_reused():
         lambda tensor: tensor[5:6, 1],
         lambda tensor: tensor.detach(),
         lambda tensor: tensor.numpy(),
-        lambda tensor: (torch.ones_like(tensor, requires_grad=True) * tensor).sum(),  # saved by autograd
+        lambda tensor: (
+            torch.ones_like(tensor, requires_grad=True) * tensor
+        ).sum(),  # autograd saves the tensor
     ],
 )
 def test_a_referenced_buffer_is_not_reused(hold):
@@ -79,7 +81,7 @@ def test_a_tensor_outlives_the_block():
 
 
 def test_buffers_that_outlive_the_block_are_freed_individually(monkeypatch):
-    """A kept tensor, for example a render on display, does not keep the memory of others."""
+    """A tensor that is kept, such as a displayed render, does not keep the memory of others."""
     made, mapped = [], buffers._mapped
     monkeypatch.setattr(buffers, "_mapped", lambda nbytes: made.append(mapped(nbytes)) or made[-1])
     with reused_buffers():
@@ -125,7 +127,7 @@ def test_nested_blocks_share_buffers_and_threads_do_not():
 
 
 def test_the_pool_holds_no_more_than_the_peak_in_use():
-    """Two buffers at a time, of sizes that never recur: none can be reused, so unused ones must be freed."""
+    """Two buffers at a time have sizes that never recur, so none can be reused, and unused ones are freed."""
     pool = buffers._Pool()
     largest = 0
     for i in range(300):
@@ -133,7 +135,7 @@ def test_the_pool_holds_no_more_than_the_peak_in_use():
         pair = [pool.take(size), pool.take(2 * size)]
         largest = max(largest, sum(-(-a.nbytes // 4096) * 4096 for a in pair))
         del pair
-        # A reused buffer may be up to SLACK times as large as the request.
+        # a reused buffer may be up to SLACK times as large as requested
         assert pool.nbytes <= buffers.SLACK * largest
 
 

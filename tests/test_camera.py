@@ -29,13 +29,13 @@ def test_looking_at_centres_the_target_with_up_at_the_top():
     np.testing.assert_allclose(z[0], np.linalg.norm([-0.5, 2, 4]))
 
 
-def test_up_decides_the_orientation_of_the_image():
+def test_up_determines_the_roll_of_the_image():
     upright = Camera.looking_at((0, 0, -3), (0, 0, 0), 10, 10, 8, 8)
     turned = Camera.looking_at((0, 0, -3), (0, 0, 0), 10, 10, 8, 8, up=(1, 0, 0))
     u, v, _ = upright.project(upright.world_to_cam((1, 0, 0)))
     assert (u > 4) and v == 4
     u, v, _ = turned.project(turned.world_to_cam((1, 0, 0)))
-    assert abs(u - 4) < 1e-12 and v < 4, "right has become up"
+    assert abs(u - 4) < 1e-12 and v < 4, "the old right is now up"
 
 
 def test_project_is_a_pinhole_and_keeps_leading_axes():

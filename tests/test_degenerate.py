@@ -1,4 +1,4 @@
-"""Degenerate input to every public function gives the documented result or an error that names the argument."""
+"""Degenerate input to a public function gives the documented result, or an error that names the argument."""
 
 import inspect
 import re
@@ -48,7 +48,7 @@ def camera(**changes):
     return {"R": I3, "eye": (0, 0, 0), "fx": 1, "fy": 1, "cx": 0, "cy": 0, "H": 2, "W": 2} | changes
 
 
-# function, arguments, the error, the argument that it names
+# function, arguments, error, and the argument that the error names
 REJECTED = [
     (look_at, {"eye": (0, 0), "target": (0, 0, 1)}, ShapeError, "eye"),
     (look_at, {"eye": (0, 0, 1), "target": (0, 0, 1)}, ArgumentError, "target"),
@@ -155,7 +155,7 @@ def test_bad_arguments_are_rejected_by_name(function, arguments, error, names):
 def test_every_public_function_is_covered():
     functions = {
         name
-        for name in set(gsplat_edu.__all__) - set(gsplat_edu.LAZY)  # tests/test_library.py has torch's part
+        for name in set(gsplat_edu.__all__) - set(gsplat_edu.LAZY)  # tests/test_library.py tests those
         if inspect.isfunction(getattr(gsplat_edu, name)) or name == "Camera"
     }
     assert functions <= {function.__name__ for function, *_ in REJECTED}
@@ -192,7 +192,7 @@ def test_a_gaussian_behind_the_camera_is_not_drawn():
 def test_a_gaussian_without_extent_is_drawn():
     assert (build_cov3d((0, 0, 0), I3) == 0).all()
     _, T = render_gaussians(**splat(cov3ds=[np.zeros((3, 3))]))
-    assert T[4, 4] == 0.5, "only the dilation is drawn"
+    assert T[4, 4] == 0.5, "only the dilation remains"
 
 
 def test_a_gaussian_far_outside_the_image_does_not_overflow():
@@ -206,7 +206,7 @@ FIRST = {"means": [[0, 0, 1.0]] * 2, "colors": np.ones((2, 3)), "opacities": [0.
 
 @pytest.mark.parametrize("length", [1e12, 1e20, 1e60, 1e200, 1e300])
 def test_a_covariance_beyond_float64_is_named(length):
-    """NumPy's LinAlgError would name neither the Gaussian nor the problem."""
+    """NumPy's LinAlgError would name neither the Gaussian nor the cause."""
     along = np.array([0.6, 0.8, 0.0])
     needle = length * np.outer(along, along)
     with pytest.raises(ArgumentError, match=r"cov3ds\[1\]: "):
@@ -250,7 +250,7 @@ def test_a_gaussian_wider_than_the_image_covers_it():
     np.testing.assert_allclose(T, 0.5, rtol=1e-4)  # exponent at the corner: 20 px² / (2 x 1e8 px²) = 1e-7
 
 
-# Functions of torch tensors.
+# functions of torch tensors
 
 DIRS = torch.ones(1, 3)
 T1 = {
@@ -320,7 +320,7 @@ def test_gaussians_of_inconsistent_shapes_are_refused(name, shape):
 
 @pytest.mark.parametrize("case", ["empty", "culled"])
 def test_nothing_visible_gives_the_background_and_zero_gradients(case):
-    scene = gaussians(0 if case == "empty" else 3).trainable()  # means at the origin, like the camera
+    scene = gaussians(0 if case == "empty" else 3).trainable()  # means at the camera
     out = render(scene, CAM, settings=RenderSettings(background=(0.1, 0.2, 0.3)))
     torch.testing.assert_close(out.image, torch.tensor([0.1, 0.2, 0.3]).expand(8, 9, 3))
     assert (out.transmittance == 1).all() and len(out.visible) == 0
@@ -350,7 +350,7 @@ def test_the_length_and_sign_of_a_quaternion_do_not_matter():
 
 
 def test_a_needle_is_drawn():
-    """Its 2D determinant suffers cancellation, but it is symmetric and positive semi-definite, so it is drawn."""
+    """The 2D determinant has cancellation, but the covariance is symmetric and positive semi-definite."""
     direction = np.array([0.6, 0.8, 0.0])
     _, T = render_gaussians(**splat(cov3ds=[1e4 * np.outer(direction, direction)]))
     assert T.min() < 0.6

@@ -1,4 +1,4 @@
-"""One gain per channel: exact for a scale of linear light, and measured from an image and a photo."""
+"""A gain per channel is exact for a scale of linear light, and is measured from an image and a photo."""
 
 import math
 
@@ -19,7 +19,7 @@ def encoded(light):
 
 
 def photographed(image, scales):
-    """Scale an image's linear light and round it to bytes, as a camera does."""
+    """Scale an image's linear light and round to bytes, like a camera."""
     return np.round(255 * np.clip(encoded(decoded(image) * scales), 0, 1)).astype(np.uint8)
 
 
@@ -28,7 +28,7 @@ def texture(size=(90, 120), seed=3):
 
 
 def test_a_scale_of_linear_light_is_the_line_of_its_gain():
-    """Exactly, above the linear start of the sRGB curve: 0.04045 before and after the scale."""
+    """This is exact above the linear part of the sRGB curve, 0.04045 before and after the scale."""
     image, scales = np.linspace(0.07, 0.8, 99).reshape(11, 3, 3), np.array([0.6, 1.0, 1.5])
     logs = torch.from_numpy(np.log(scales) / 2.4)
     found = recolored(torch.from_numpy(image), color_matrix(logs)).numpy()
@@ -38,12 +38,12 @@ def test_a_scale_of_linear_light_is_the_line_of_its_gain():
 
 @pytest.mark.parametrize("scales", [(1.0, 1.0, 1.0), (0.5, 0.6, 0.55), (1.6, 1.4, 1.5)])
 def test_gains_are_measured_to_a_hundredth_of_a_stop(scales):
-    """The photo is rounded to bytes and clipped; the render is off by noise, and a fifth of it may be black."""
+    """The photo is rounded to bytes and clipped; the render has noise, and a fifth of it may be black."""
     image, rng = texture(), np.random.default_rng(0)
     render = np.clip(image + 0.02 * rng.normal(size=image.shape), 0, 1)
     render[:, :24] = 0.0
     logs = measured_gains(torch.from_numpy(render), torch.from_numpy(photographed(image, np.array(scales))))
-    # The black fifth shifts the median to the 37.5th percentile of the rest, whose ratios scatter by a few per cent.
+    # A black fifth shifts the median to the 37.5th percentile of the other ratios, which scatter by a few per cent.
     np.testing.assert_allclose(stops(logs).numpy(), np.log2(scales), atol=0.1)
     render[:, :24] = image[:, :24]
     logs = measured_gains(torch.from_numpy(render), torch.from_numpy(photographed(image, np.array(scales))))
@@ -59,7 +59,7 @@ def test_masked_and_clipped_pixels_do_not_count():
     photo[:, 80:] = 255
     render = torch.from_numpy(image)
     assert stops(measured_gains(render, photo, mask)).abs().max() < 0.01
-    assert stops(measured_gains(render, photo)).abs().max() > 0.1, "the mask matters"
+    assert stops(measured_gains(render, photo)).abs().max() > 0.1, "the mask has an effect"
 
 
 @pytest.mark.parametrize("value", [0, 255])
@@ -86,7 +86,7 @@ def test_the_bits_do_not_depend_on_the_threads():
 
 @pytest.mark.parametrize("size", [(90, 120), (121, 80), (1, 1), (1, 50)])
 def test_vignetting_has_no_mean_and_is_radial(size):
-    """Its logarithm is k times the squared distance from the centre, less the mean over the pixels."""
+    """The logarithm is k times the squared distance from the centre, minus the mean over the pixels."""
     H, W = size
     logs = torch.log(falloff(torch.tensor(-0.4, dtype=torch.float64), H, W)).numpy()
     y, x = np.mgrid[:H, :W]
@@ -97,14 +97,14 @@ def test_vignetting_has_no_mean_and_is_radial(size):
 @pytest.mark.parametrize(
     ("k", "scales"), [(0.0, (1.0, 1.0, 1.0)), (-0.4, (1.2, 1.0, 0.9)), (0.2, (0.7, 0.8, 0.8))]
 )
-def test_vignetting_is_measured_beside_the_gains(k, scales):
-    """The photo is rounded to bytes and clipped; the render is off by noise, and a masked part of it is black."""
+def test_vignetting_and_gains_are_measured_together(k, scales):
+    """The photo is rounded to bytes and clipped; the render has noise, and a masked part of it is black."""
     image, rng = 0.7 * texture() + 0.05, np.random.default_rng(0)
     q = 2.4 * np.log(falloff(torch.tensor(k, dtype=torch.float64), 90, 120).numpy())[..., None]
     photo = torch.from_numpy(photographed(image, np.array(scales) * np.exp(q)))
     render = np.clip(image + 0.02 * rng.normal(size=image.shape), 0, 1)
     found = measured_vignetting(torch.from_numpy(render), photo).numpy()
-    # 2,700 pixels whose ratios scatter by a tenth: medians of a third of them are good to 0.005, over 0.6 in q.
+    # Ratios of 2,700 pixels scatter by a tenth, so medians of a third of them are accurate to 0.005, over 0.6 in q.
     np.testing.assert_allclose(stops(torch.from_numpy(found[:3])).numpy(), np.log2(scales), atol=0.02)
     assert abs(found[3] - k) < 0.02
     render[:, 48:72] = 0.0

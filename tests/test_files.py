@@ -113,6 +113,6 @@ def test_unreadable_files_have_one_wording(number, advice):
         (7, False),
     ],
 )
-def test_a_path_that_a_file_names_is_one_that_a_file_can_have(value, names):
-    """A byte of a name that is not UTF-8 is a lone surrogate from U+DC80 on; others name no file."""
+def test_paths_in_files_have_only_characters_that_names_can_have(value, names):
+    """A byte that is not UTF-8 is a lone surrogate from U+DC80 on in a name; no file has other surrogates."""
     assert (stored_path(value) is not None) == names

@@ -1,4 +1,4 @@
-"""Cameras of a foreign class, as written in a chapter, whose members are lists and NumPy scalars."""
+"""Cameras of another class, like one that a chapter defines, whose members are lists and NumPy scalars."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_t
 from gsplat_edu.scene.gaussians import Gaussians
 
-pytestmark = pytest.mark.usefixtures("as_shipped")  # otherwise annotations are checked before the arguments
+pytestmark = pytest.mark.usefixtures("as_shipped")  # otherwise the hook checks annotations first
 
 OURS = Camera(
     [[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]], (0.1, -0.05, -3.0), 50.0, 45.5, 20.25, 16.75, 35, 41
@@ -46,7 +46,7 @@ def splats(seed=0, n=12):
 def test_the_oracle_renders_the_same(limit):
     expected = render_gaussians(OURS, *splats(), jacobian_limit=limit)
     found = render_gaussians(ChapterCamera(), *splats(), jacobian_limit=limit)
-    assert expected[1].min() < 0.9, "something is drawn"
+    assert expected[1].min() < 0.9, "the scene is visible"
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -84,7 +84,7 @@ def test_the_backends_render_the_same(backend):
         sh_rest=draw(9, 3, 3),
         logit_opacities=draw(9),
     )
-    # Settings accept NumPy scalars too.
+    # settings accept NumPy scalars as well
     plain = RenderSettings(sh_degree=1, antialiased=True, jacobian_limit=1.3)
     numpy = RenderSettings(sh_degree=np.int64(1), antialiased=np.True_, jacobian_limit=np.float64(1.3))
     assert numpy == plain and hash(numpy) == hash(plain)
@@ -94,7 +94,7 @@ def test_the_backends_render_the_same(backend):
     assert torch.equal(several.image[1], expected)
 
 
-def test_both_are_cameras():
+def test_both_classes_are_accepted_as_cameras():
     assert isinstance(OURS, CameraLike)
     assert isinstance(ChapterCamera(), CameraLike)
 

@@ -1,4 +1,4 @@
-"""Intrinsics as a value: scaling, turning and undistorting a pinhole, and the intrinsics of each camera class."""
+"""Intrinsics as a value: scaling, rotating and undistorting a pinhole, and the intrinsics of each camera class."""
 
 import dataclasses
 
@@ -24,12 +24,12 @@ def test_a_camera_is_a_pose_and_intrinsics():
     x, y, z = 0.1, -0.2, 2.0
     column, row, one = PINHOLE.K @ np.array([x / z, y / z, 1.0])
     u, v, _ = camera.project((x, y, z))
-    # Both are a product and a sum of the same float64 numbers, grouped differently: two roundings of about 20.
+    # Both are a product and a sum of the same float64 numbers in another order, with two roundings of about 20.
     assert one == 1.0 and abs(column - u) < 1e-14 and abs(row - v) < 1e-14
 
 
 def test_scaling_keeps_the_edges_of_the_image_in_place():
-    """The directions through the outer edges, half a pixel beyond the outermost centres, stay the same."""
+    """The directions through the edges, half a pixel beyond the outermost centres, do not change."""
     small = PINHOLE.scaled(20, 10)
     for side, other in ((0.0, 0.0), (1.0, 1.0)):
         assert (side * 40 - 0.5 - PINHOLE.cx) / PINHOLE.fx == pytest.approx(
@@ -38,7 +38,7 @@ def test_scaling_keeps_the_edges_of_the_image_in_place():
         assert (side * 30 - 0.5 - PINHOLE.cy) / PINHOLE.fy == pytest.approx(
             (other * 10 - 0.5 - small.cy) / small.fy, rel=1e-14
         )
-    assert small.scaled(40, 30) == PINHOLE, "powers of two and their inverse are exact here"
+    assert small.scaled(40, 30) == PINHOLE, "scaling by powers of two is exact"
 
 
 def test_a_lens_is_intrinsics_with_distortion():
@@ -58,7 +58,7 @@ def test_turning_four_times_changes_nothing():
 
 
 @pytest.mark.parametrize(("fy", "uneven"), [(50.0, False), (46.0, False), (45.0, True), (56.0, True)])
-def test_pixels_are_not_square_beyond_one_bound(fy, uneven):
+def test_pixels_are_square_up_to_a_bound(fy, uneven):
     assert UNEVEN == 1.1
     assert Intrinsics(40, 30, 50.0, fy, 20.0, 15.0).uneven is uneven
     assert Lens(40, 30, 50.0, fy, 20.0, 15.0).uneven is uneven
@@ -82,7 +82,7 @@ class OtherCamera:
     fx, fy, cx, cy, H, W = 50.0, 45.5, 18.25, 16.5, 30, 40
 
 
-@pytest.mark.usefixtures("as_shipped")  # otherwise annotations are checked
+@pytest.mark.usefixtures("as_shipped")  # otherwise the hook checks annotations
 def test_cameras_of_other_classes_are_resized_and_moved():
     assert resized(OtherCamera(), 20).intrinsics == PINHOLE.scaled(20, 15)
     moved = Similarity(np.eye(3), 2.0, np.array([1.0, 0.0, 0.0])).camera(OtherCamera())

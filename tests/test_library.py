@@ -1,4 +1,4 @@
-"""The library as an engineer meets it: wrong use is told by the argument's name, before anything runs."""
+"""The Python interface: wrong use raises an error that names the argument, before any computation."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def views():
     return [View(CAMERA, image, name="a")]
 
 
-def test_a_scene_in_one_line():
+def test_the_repr_of_a_scene_is_one_line():
     assert repr(ball(1_234)) == "Gaussians(1,234, SH degree 0, float32 on cpu)"
     assert repr(Scene(ball(3))).count("\n") == 0
 
@@ -44,7 +44,7 @@ def test_a_scene_in_one_line():
     ],
     ids=["mask", "NumPy mask", "list mask", "slice", "range", "list", "indices"],
 )
-def test_some_of_the_gaussians(index):
+def test_gaussians_are_indexed_by_masks_and_indices(index):
     scene = ball()
     some = scene[index]
     assert isinstance(some, Gaussians)
@@ -160,6 +160,6 @@ CONFIG = recipe(2, strategy="none")
     ],
 )
 @pytest.mark.usefixtures("as_shipped")
-def test_wrong_use_is_told_by_the_arguments_name(views, use, message):
+def test_wrong_use_names_the_argument(views, use, message):
     with pytest.raises((ArgumentError, ShapeError), match=message):
         use(views)

@@ -1,4 +1,4 @@
-"""A folder has one writer: a second one learns who holds the lock, and no lock outlives its process."""
+"""A folder has one writer. A second writer is told who holds the lock, and no lock outlives its process."""
 
 import errno
 import os
@@ -47,13 +47,13 @@ def lock(folder):
 
 
 @pytest.mark.own_process
-def test_the_second_writer_learns_the_holder_and_kill_9_frees_the_lock(tmp_path):
+def test_a_second_writer_is_told_the_holder_and_kill_9_frees_the_lock(tmp_path):
     process, _ = holder(tmp_path / "run")
     message = rf"^--out: .*run is in use by `gsplat-edu train`, process {process.pid} on .+, since 2\d{{3}}-.*; wait"
     with pytest.raises(ArgumentError, match=message):
         lock(tmp_path / "run")
     kill(process)
-    assert (tmp_path / "run" / LOCK).exists(), "a killed process cannot remove its file"
+    assert (tmp_path / "run" / LOCK).exists(), "a killed process does not remove its file"
     assert lock(tmp_path / "run")
     assert not (tmp_path / "run" / LOCK).exists()
 
@@ -66,7 +66,7 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path):
             lock(tmp_path / "run")
         process.kill()
         process.wait()
-        os.kill(child, 0)  # the child is alive, and stays so: it reads from a pipe that is open
+        os.kill(child, 0)  # the child keeps running, because it reads from an open pipe
         assert lock(tmp_path / "run")
     finally:
         os.kill(child, signal.SIGKILL)
@@ -122,7 +122,7 @@ def test_a_file_system_without_locks_gives_one_message(tmp_path, monkeypatch, nu
     assert len(said) == 1 and "has no locks" in said[0]
 
 
-def test_a_lock_that_is_a_link_is_refused_and_what_it_leads_to_stays(tmp_path):
+def test_a_lock_that_is_a_link_is_refused_and_its_target_is_unchanged(tmp_path):
     target = tmp_path / "target.txt"
     target.write_text("kept")
     (tmp_path / "folder").mkdir()

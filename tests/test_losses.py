@@ -36,7 +36,7 @@ def by_convolution(x, y, weight):
 )
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_l1_ssim_matches_the_definition_in_value_and_gradient(size, weight):
-    """float64, with sizes below the window and above one strip of rows and columns."""
+    """In float64, with sizes below the window and above a strip of rows and columns."""
     generator = torch.Generator().manual_seed(0)
     x, y = (torch.rand(*size, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
@@ -48,7 +48,7 @@ def test_l1_ssim_matches_the_definition_in_value_and_gradient(size, weight):
 
 
 def test_l1_ssim_gradcheck():
-    """The loss is smooth here: no pixel is so near its target that a step crosses the corner of |x - y|."""
+    """The loss is smooth, because no pixel is so near its target that a step crosses the corner of |x - y|."""
     generator = torch.Generator().manual_seed(1)
     x, y = (torch.rand(7, 9, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     assert (x - y).abs().min() > 1e-4
@@ -56,7 +56,8 @@ def test_l1_ssim_gradcheck():
 
 
 def test_bytes_are_scaled_to_1_and_float32_is_near_float64():
-    """float32 variances are differences of numbers up to 1 with 11 + 11 roundings each: 22 eps over C2 = 9e-4."""
+    """Variances in float32 are differences of numbers up to 1 with 11 + 11 roundings each, an error of 22 eps over C2
+    = 9e-4."""
     generator = torch.Generator().manual_seed(2)
     x = torch.rand(40, 30, 3, generator=generator)
     photo = torch.randint(0, 256, (40, 30, 3), generator=generator, dtype=torch.uint8)

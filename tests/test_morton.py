@@ -1,4 +1,4 @@
-"""The order along a Morton curve: of codes, of points with strays, and of points that are no numbers."""
+"""The order along a Morton curve: codes, points with outliers, and points that are not finite."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def test_codes_interleave_the_bits():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 20_000])
 def test_the_order_is_a_permutation_for_any_points(count, dtype):
-    """NaN, infinities, the largest and the smallest numbers, and equal points."""
+    """The points have NaN, infinities, the largest and the smallest numbers, and some are equal."""
     draw = np.random.default_rng(1)
     points = draw.normal(size=(count, 3)).astype(dtype)
     for value in (np.nan, np.inf, -np.inf, np.finfo(dtype).max, np.finfo(dtype).min, 1e-40, 0.0):
@@ -38,13 +38,13 @@ def path_length(points):
 
 
 def test_neighbours_in_the_order_are_neighbours_in_space():
-    """4,096 points in a unit cube are about 1/16 apart; a random order makes steps of 0.66."""
+    """4,096 points in a unit cube are about 1/16 apart, while a random order has steps of 0.66."""
     points = np.random.default_rng(2).random((4096, 3))
     assert path_length(points) < 4096 * 0.12
 
 
 @pytest.mark.parametrize("far", [1e3, 1e30, np.inf])
-def test_strays_do_not_coarsen_the_grid(far):
+def test_outliers_do_not_coarsen_the_grid(far):
     draw = np.random.default_rng(3)
     points = draw.random((4096, 3))
     strays = draw.permutation(4096)[:20]

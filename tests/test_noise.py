@@ -1,4 +1,4 @@
-"""Noise: published words of Philox, moments of the draws, and the native step against torch and the formula."""
+"""Noise: published words of Philox, moments of the random numbers, and the native step equals torch and the formula."""
 
 import math
 
@@ -50,13 +50,14 @@ def moved(gaussians, numbers=NUMBERS, step=add_noise_natively):
     ],
 )
 def test_philox_gives_the_published_words(counter, key, words):
-    """The known answers that Salmon et al. publish with their code: zeros, ones, and digits of pi."""
+    """Salmon et al. publish the answers for zeros, ones, and digits of pi with their code."""
     found = philox(tuple(torch.tensor([word]) for word in counter), key)
     assert tuple(int(word) for word in found) == words
 
 
 def test_normals_have_the_moments_of_the_normal_distribution():
-    """Allow five standard errors: 1 / sqrt(N) for means, covariances and correlations, sqrt(96 / N) for E n^4 = 3."""
+    """Five standard errors are allowed: 1 / sqrt(N) for means, covariances and correlations, sqrt(96 / N) for E n^4 =
+    3."""
     count = 200_000
     n = standard_normals(5, count, LIKE).numpy()
     error = 5 / math.sqrt(count)
@@ -66,7 +67,7 @@ def test_normals_have_the_moments_of_the_normal_distribution():
     assert np.abs((n**4).mean(axis=0) - 3).max() < math.sqrt(96) * error
     for lag in (1, 2, 64):
         assert np.abs(n[lag:].T @ n[:-lag] / (count - lag)).max() < error
-    # The shares within 1 and 2 standard deviations.
+    # the fractions within 1 and 2 standard deviations
     for limit in (1, 2):
         share = math.erf(limit / math.sqrt(2))
         assert abs((np.abs(n) < limit).mean() - share) < 5 * math.sqrt(share * (1 - share) / n.size)
@@ -80,8 +81,8 @@ def test_other_seeds_give_independent_numbers(other):
 
 @pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 4097, 10_001])
 @pytest.mark.parametrize("seed", [0, 2**32, 2**63 - 1])
-def test_the_native_step_is_that_of_torch(count, seed):
-    """float64: both round a few dozen operations, on steps up to amount x 5.8 x the largest variance."""
+def test_the_native_step_equals_torchs(count, seed):
+    """In float64, both round a few dozen operations, on steps up to amount x 5.8 x the largest variance."""
     gaussians, numbers = scene(count), NUMBERS._replace(seed=seed)
     found, truth = moved(gaussians, numbers), moved(gaussians, numbers, add_noise_in_torch)
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-14)
@@ -89,7 +90,7 @@ def test_the_native_step_is_that_of_torch(count, seed):
 
 
 def test_float32_is_near_float64():
-    """The opacity's rounding, 1e-7, is multiplied by the sharpness 100 in the gate's exponent: 1e-5 of the step."""
+    """The gate's exponent multiplies the opacity's rounding, 1e-7, by the sharpness 100, which is 1e-5 of the step."""
     exact = scene(20_000)
     exact = exact.map(lambda tensor: tensor.float().double())
     rounded = exact.map(lambda tensor: tensor.float())
@@ -102,7 +103,7 @@ def test_float32_is_near_float64():
     assert ((in_torch - truth).abs() / size).max() < 1e-5
 
 
-def test_the_step_is_the_formula():
+def test_the_step_follows_the_formula():
     gaussians = scene(50)
     gate = 1 / (1 + torch.exp(-100 * (0.005 - torch.sigmoid(gaussians.logit_opacities))))
     sigma = cov3d_t(gaussians.log_scales, gaussians.quats)
@@ -138,7 +139,7 @@ def test_native_threads_are_those_outside_one_thread():
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities"])
 def test_an_odd_parameter_moves_only_its_own_gaussian(name, value, dtype):
-    """Natively as in torch: the same rows are finite afterwards."""
+    """The native step and torch's leave the same rows finite."""
     gaussians = scene(130, dtype)
     changed = gaussians.map(lambda tensor: tensor.clone())
     row = changed.tensors()[name][70]

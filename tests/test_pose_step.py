@@ -1,4 +1,4 @@
-"""Steps of a pose end at the true pose, whatever the exposure, and hold the given one where a photo says nothing."""
+"""Steps of a pose reach the true pose with any exposure, and keep the given pose if a photo has no information."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ NOWHERE = torch.zeros(6, dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def scene():
-    """An opaque cloud of splats, one of its cameras, and the photo taken there, as floats."""
+    """An opaque cloud of splats, one of its cameras, and the photo of that camera, as floats."""
     views, points, colors = procedural_capture(96, 3, splats=300)
     gaussians = from_points(points, 0.2 + 0.5 * colors, recipe(1, start_opacity=0.9, start_scale=1.5))
     camera = views[0].camera
@@ -35,7 +35,7 @@ def shown(gaussians, camera):
 
 
 def aligned(scene, photo, steps=12, moved=None):
-    """Take steps from a camera that is off; return the image motion left, px rms, and the camera."""
+    """Take steps from a wrong camera; return the remaining motion in the image, px rms, and the camera."""
     gaussians, camera, _ = scene
     now = CameraTensors.of(camera).moved(OFF).value()
     for _ in range(steps):
@@ -48,27 +48,27 @@ def aligned(scene, photo, steps=12, moved=None):
 
 
 def motion(gaussians, camera, other):
-    """How far the scene's points lie apart in the images of two cameras, px rms."""
+    """Return the distance of the scene's points between the images of two cameras, px rms."""
     points = gaussians.means.detach().double().numpy()
     places = [(points - c.eye) @ c.R.T for c in (camera, other)]
     u, v = (p[:, :2] / p[:, 2:] * (c.fx, c.fy) for p, c in zip(places, (camera, other), strict=True))
     return float(np.sqrt(np.square(u - v).sum(axis=1).mean()))
 
 
-def test_a_pose_that_is_off_comes_back(scene):
+def test_a_wrong_pose_is_corrected(scene):
     before = motion(scene[0], scene[1], CameraTensors.of(scene[1]).moved(OFF).value())
     after, _ = aligned(scene, scene[2])
     assert before > 0.5 and after < 0.1 * before
 
 
-def test_a_photo_of_another_exposure_moves_the_camera_no_other_way(scene):
-    """The gains of the model are exact: y = g x + 0.055 (g - 1)."""
+def test_the_exposure_of_a_photo_does_not_change_the_steps(scene):
+    """The model of gains is exact: y = g x + 0.055 (g - 1)."""
     darker = 0.7 * scene[2] + 0.055 * (0.7 - 1)
     before = motion(scene[0], scene[1], CameraTensors.of(scene[1]).moved(OFF).value())
     assert aligned(scene, darker)[0] < 0.1 * before
 
 
-def test_at_the_true_pose_nothing_moves(scene):
+def test_the_true_pose_does_not_move(scene):
     gaussians, camera, photo = scene
     seen = shown(gaussians, camera)
     step = pose_step(seen.image, seen.median_depth, camera, photo, NOWHERE, SPREAD)
@@ -93,8 +93,8 @@ def test_bytes_and_a_mask_count(scene):
     assert torch.allclose(coarse, whole, atol=0.05 * float(whole.abs().max()))
 
 
-def test_where_the_photo_says_nothing_the_given_pose_holds(scene):
-    """A flat photo of a flat render: only the distance from the given pose is left, and the step goes all the way."""
+def test_a_photo_without_information_keeps_the_given_pose(scene):
+    """Photo and render are flat, so only the distance from the given pose matters, and the step returns to it."""
     _, camera, photo = scene
     flat, depth = torch.full_like(photo, 0.5), torch.ones(camera.H, camera.W)
     step = pose_step(flat, depth, camera, flat, OFF, SPREAD)

@@ -7,7 +7,7 @@ from hypothesis.extra.numpy import arrays
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R, quat_to_R_batch, render_gaussians
 
-pytestmark = pytest.mark.sliced  # a soak tries many more examples
+pytestmark = pytest.mark.sliced  # a soak tries more examples
 
 CAM = Camera(np.eye(3), (0, 0, 0), fx=20, fy=22, cx=9.3, cy=6.8, H=14, W=19)
 
@@ -17,13 +17,13 @@ def floats(shape, low, high):
 
 
 def unit_quats(shape):
-    """Generate quaternions that are never near zero, where they would have no direction."""
+    """Generate quaternions that are not near zero."""
     return floats(shape, 0.1, 1.0)
 
 
 @st.composite
 def scenes(draw):
-    """Generate up to six splats in front of CAM, at depths that differ by at least 0.1 and so cannot tie."""
+    """Generate up to six splats in front of CAM; their depths differ by at least 0.1, so none tie."""
     n = draw(st.integers(1, 6))
     depths = 1.0 + 0.2 * np.arange(n) + draw(floats(n, 0.0, 0.1))
     means = np.concatenate([draw(floats((n, 2), -1.0, 1.0)), depths[:, None]], axis=1)
@@ -39,7 +39,7 @@ def splats(scene):
 SUBNORMAL = tuple(
     np.array(each) for each in ([[0, 0, 1.0]], [[1.04e-161, 0, 0]], [[0.5, 1, 1, 1]], [[0.0, 0, 0]], [0.0])
 )
-"""A splat whose covariance is subnormal, so that rounding makes it skew."""
+"""A splat whose covariance is subnormal, so that rounding makes it asymmetric."""
 
 
 @given(scenes(), unit_quats(4), floats(3, -10.0, 10.0))
@@ -50,7 +50,7 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(scene, quat, s
     extent="exact" and stop="none" are used because the chapter's boxes consist of whole pixels and may grow by one
     when a mean moves by a rounding error. Rounding: coordinates up to 12 have errors of 12 eps, which fx / z = 22 turns
     into 6e-14 px. The slope of alpha is at most 1 / sqrt(0.3 e) = 1.1 per px. Relative errors of Sigma2d (up to 2e2
-    px²) enter the exponent as 16 eps x 2e2 / 0.3. All of this stays below 1e-10. An alpha exactly at the floor may be
+    px²) enter the exponent as 16 eps x 2e2 / 0.3. Together, these are below 1e-10. An alpha exactly at the floor may be
     dropped on one side only, so such a pixel may differ by 1/255.
     """
     means, cov3ds, colors, opacities = splats(scene)
@@ -75,7 +75,9 @@ def test_transmittance_and_colours_stay_in_range(scene, extent, stop, bg):
     image, T = render_gaussians(CAM, *scene, bg=bg, extent=extent, stop=stop)
     assert (T >= 0).all() and (T <= 1).all()
     low, high = np.minimum(colors.min(0), bg), np.maximum(colors.max(0), bg)
-    assert (image >= low - 1e-12).all() and (image <= high + 1e-12).all(), "a convex mix, up to rounding"
+    assert (image >= low - 1e-12).all() and (image <= high + 1e-12).all(), (
+        "a convex combination, up to rounding"
+    )
 
 
 @given(scenes(), st.randoms(use_true_random=False))

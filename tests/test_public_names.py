@@ -53,7 +53,7 @@ def test_all_lists_every_public_name_once_and_nothing_else():
     )
 
 
-def test_the_names_of_torchs_part_are_imported_on_first_use():
+def test_names_that_need_torch_are_imported_on_first_use():
     for name in gsplat_edu.LAZY:
         assert getattr(gsplat_edu, name).__name__ == name
         assert name in dir(gsplat_edu)

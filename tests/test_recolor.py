@@ -1,4 +1,4 @@
-"""Colours through a matrix: the native kernel against torch, gradients in float64, saturated photos, backgrounds."""
+"""Colours times a matrix: the native kernel equals torch; gradients in float64, saturated photos, backgrounds."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ BACKGROUND = (0.3, 0.9, 0.6)
 
 
 def scene(dtype, size=(9, 15), seed=0):
-    """An image around 0 to 1, a matrix near the identity, and a photo of which a tenth is saturated."""
+    """Return an image of values about 0 to 1, a matrix near the identity, and a photo of which a tenth is saturated."""
     generator = torch.Generator().manual_seed(seed)
     image = 1.4 * torch.rand(*size, 3, generator=generator, dtype=torch.float64) - 0.1
     matrix = torch.eye(3, 4, dtype=torch.float64) + 0.2 * torch.randn(
@@ -25,13 +25,13 @@ def scene(dtype, size=(9, 15), seed=0):
 
 
 def backdrop(dtype, size=(9, 15)):
-    """What shows through: anything from nothing to all of the background."""
+    """Return transmittances from 0 to 1, and a background."""
     generator = torch.Generator().manual_seed(9)
     return Backdrop(torch.rand(*size, generator=generator, dtype=torch.float64).to(dtype), BACKGROUND)
 
 
 def corners(dtype, size=(9, 15)):
-    """A falloff from 0.5 to 1.3."""
+    """Return a falloff from 0.5 to 1.3."""
     generator = torch.Generator().manual_seed(11)
     return (0.5 + 0.8 * torch.rand(*size, generator=generator, dtype=torch.float64)).to(dtype)
 
@@ -40,8 +40,10 @@ def corners(dtype, size=(9, 15)):
 @pytest.mark.parametrize("with_photo", [False, True])
 @pytest.mark.parametrize("with_background", [False, True])
 @pytest.mark.parametrize("with_falloff", [False, True])
-def test_the_kernel_is_torchs_formula_in_value_and_gradients(size, with_photo, with_background, with_falloff):
-    """float64; a sum of 27,300 products of up to 2 rounds by less than 1e-11."""
+def test_the_kernel_equals_torchs_formula_in_value_and_gradients(
+    size, with_photo, with_background, with_falloff
+):
+    """In float64, a sum of 27,300 products of up to 2 rounds by less than 1e-11."""
     image, matrix, photo = scene(torch.float64, size)
     weights, results = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(image.shape), []
     for native in (True, False):
@@ -59,18 +61,20 @@ def test_the_kernel_is_torchs_formula_in_value_and_gradients(size, with_photo, w
 
 
 def test_gradients_are_proven_by_finite_differences():
-    """The function is linear except where a saturated photo cuts it at 1; no such value is within 1e-3 of 1."""
+    """The function is linear except where a saturated photo clips it at 1, and no such value is within 1e-3 of 1."""
     image, matrix, photo = scene(torch.float64, (8, 11))
     cut = recolored(image, matrix)[photo == 255]
     assert (cut > 1).any() and (cut < 1).any() and ((cut - 1).abs() > 1e-3).all()
     x, m = image.requires_grad_(), matrix.requires_grad_()
     assert torch.autograd.gradcheck(lambda a, b: recolored(a, b, photo), (x, m))
-    assert torch.autograd.gradcheck(lambda a: recolored(a, m.detach(), photo), (x,)), "without the matrix's"
+    assert torch.autograd.gradcheck(lambda a: recolored(a, m.detach(), photo), (x,)), (
+        "without the gradient of the matrix"
+    )
 
 
 @pytest.mark.parametrize("with_falloff", [False, True])
 def test_gradients_before_a_background_are_proven_by_finite_differences(with_falloff):
-    """As above; linear in image and transmittance, bilinear with the matrix."""
+    """The function is linear in image and transmittance, and bilinear with the matrix."""
     image, matrix, photo = scene(torch.float64, (8, 11))
     given, plane = backdrop(torch.float64, (8, 11)), corners(torch.float64, (8, 11)) if with_falloff else None
     cut = recolored(image, matrix, None, given, plane)[photo == 255]
@@ -84,7 +88,7 @@ def test_gradients_before_a_background_are_proven_by_finite_differences(with_fal
 
 
 def test_the_object_is_recoloured_and_the_background_stays():
-    """NumPy, float64: premultiplied colours and opacities, corrected, then composited; a few roundings."""
+    """The test corrects premultiplied colours and composites them in float64 NumPy, which differs by a few roundings."""
     rng = np.random.default_rng(4)
     colors, opacity = rng.uniform(size=(7, 9, 3)), rng.uniform(size=(7, 9))
     opacity[0], opacity[1] = 0.0, 1.0
@@ -102,7 +106,7 @@ def test_the_object_is_recoloured_and_the_background_stays():
         np.testing.assert_allclose(found[0].numpy(), np.broadcast_to(background, (9, 3)), rtol=0, atol=1e-12)
 
 
-def test_a_saturated_photo_asks_for_no_less_light():
+def test_a_saturated_photo_has_no_gradient_where_the_render_is_brighter():
     image = torch.tensor([[[0.9, 0.9, 0.9]], [[0.2, 0.9, 0.9]]], requires_grad=True)
     matrix = torch.eye(3, 4) * 1.25
     photo = torch.tensor([[[255, 254, 255]], [[255, 255, 0]]], dtype=torch.uint8)
@@ -133,7 +137,7 @@ def test_the_bits_do_not_depend_on_the_threads(with_background):
         assert all(torch.equal(a, b) for a, b in zip(found[0], others, strict=True))
 
 
-@pytest.mark.usefixtures("as_shipped")  # otherwise annotations are checked before the arguments
+@pytest.mark.usefixtures("as_shipped")  # otherwise the hook checks annotations first
 def test_wrong_arguments_are_named():
     image, matrix, photo = scene(torch.float32)
     with pytest.raises(ShapeError, match="^matrix"):
@@ -152,7 +156,7 @@ def test_wrong_arguments_are_named():
         recolored(image, matrix, falloff=corners(torch.float64))
 
 
-def test_the_native_border_refuses_what_does_not_fit():
+def test_the_native_function_refuses_arguments_that_do_not_fit():
     image, matrix, photo = scene(torch.float32)
     given = {"image": image, "matrix": matrix, "photo": photo, "threads": 1}
     given |= {"transmittance": image[..., 0].contiguous(), "background": BACKGROUND, "falloff": None}

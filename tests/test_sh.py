@@ -16,15 +16,13 @@ def directions(n, seed=0):
 
 
 def test_the_basis_is_orthonormal_over_the_sphere():
-    """Monte Carlo: 4 pi E[b_i b_j] = delta_ij.
-
-    E[(b_i b_j)²] <= max E[b_i^4] by Cauchy and Schwarz, and the fourth moments are computed here from the samples.
-    So the standard deviation of the estimate is at most 4 pi sqrt(max E[b^4] / SAMPLES), near 2.5e-3. Allow five of
-    those.
+    """Monte Carlo estimates 4 pi E[b_i b_j] = delta_ij. E[(b_i b_j)²] <= max E[b_i^4] by Cauchy and Schwarz, and the
+    test computes the fourth moments from the samples. So the standard deviation of the estimate is at most 4 pi
+    sqrt(max E[b^4] / SAMPLES), near 2.5e-3, of which five are allowed.
     """
     basis = sh_basis(directions(SAMPLES))
     deviation = 4 * np.pi * np.sqrt((basis**4).mean(axis=0).max() / SAMPLES)
-    assert deviation < 3e-3, "there are enough samples"
+    assert deviation < 3e-3, "the bound is small enough"
     gram = 4 * np.pi * basis.T @ basis / SAMPLES
     np.testing.assert_allclose(gram, np.eye(16), rtol=0, atol=5 * deviation)
 
@@ -47,7 +45,8 @@ def test_order_and_signs_follow_the_convention():
     dirs = directions(200)
     orders = [(degree, m) for degree in range(4) for m in range(-degree, degree + 1)]
     expected = np.stack([real_harmonic(degree, m, dirs) for degree, m in orders], axis=-1)
-    np.testing.assert_allclose(sh_basis(dirs), expected, rtol=0, atol=1e-13)  # sums of a few terms of order 1
+    # rounding of sums of a few terms of order 1
+    np.testing.assert_allclose(sh_basis(dirs), expected, rtol=0, atol=1e-13)
     assert (sh_basis(dirs)[:, 0] == C0).all()
 
 
@@ -68,7 +67,7 @@ def test_colours_are_the_sum_floored_at_zero(degree):
     for n in range(50):
         total = sum(basis[n, i] * sh[n, i] for i in range((degree + 1) ** 2)) + 0.5
         np.testing.assert_allclose(colors[n], np.maximum(total, 0), rtol=0, atol=1e-14)
-    assert (colors == 0).any(), "some colours reach the floor"
+    assert (colors == 0).any(), "some colours are below the floor"
     just_enough = eval_sh(degree, sh[:, : (degree + 1) ** 2], dirs)
     np.testing.assert_allclose(just_enough, colors, rtol=0, atol=1e-15)
 

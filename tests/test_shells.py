@@ -1,4 +1,4 @@
-"""A shell far behind all others is found; scenes without one are left alone."""
+"""A far shell behind all other splats is found; other scenes have none."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ def scene(count=5_000):
     return rng.normal(size=(count, 3)) * rng.lognormal(sigma=0.7, size=(count, 1)) + (3.0, 1.0, -2.0)
 
 
-def test_a_shell_is_found_among_strays():
+def test_a_shell_is_found_beside_outliers():
     shell = 300.0 * fibonacci(2_000)
     shell = shell[shell[:, 1] < 0]
     strays = 40.0 * fibonacci(10)
@@ -23,14 +23,14 @@ def test_a_shell_is_found_among_strays():
     )
 
 
-def test_scenes_without_one_have_none():
+def test_scenes_without_a_shell_have_none():
     rng = np.random.default_rng(1)
     background = rng.normal(size=(1_000, 3)) * rng.uniform(5, 60, (1_000, 1))
     for points in (
         scene(),
         np.concatenate([scene(), background]),  # distances without a gap
-        np.concatenate([scene(), [[1e4, 0, 0]]]),  # one stray
-        fibonacci(1_000),  # a shell and nothing inside
+        np.concatenate([scene(), [[1e4, 0, 0]]]),  # one outlier
+        fibonacci(1_000),  # a shell without a scene inside
         np.zeros((5, 3)),
         np.full((5, 3), np.nan),
         np.zeros((0, 3)),

@@ -1,4 +1,4 @@
-"""Windows: every module imports, and every command answers, in a Python without POSIX's modules and functions."""
+"""As on Windows, every module is imported, and every command answers, without POSIX's modules and functions."""
 
 import subprocess
 import sys

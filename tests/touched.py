@@ -1,4 +1,4 @@
-"""What a change touches: the test files whose sliced cases all run (slices.py).
+"""The test files that a change touches, all of whose sliced cases run (slices.py).
 
 The change is every path in which the working tree (staged, unstaged and untracked files included) differs from a base.
 The base is the merge base of HEAD with the main branch (origin/main, else main) if HEAD is ahead of that branch. On the
@@ -11,8 +11,8 @@ GSPLAT_EDU_BASE names another base.
 - src/gsplat_edu/PACKAGE touches tests/PACKAGE, tests/test_PACKAGE.py and what ELSEWHERE names.
 - A module of a package without a folder of tests (base, scene, ops, photos) touches tests/test_MODULE.py and the test
   files that import it. If at most FEW packages import it, or no test does, the tests of these packages are touched as
-  well. With more users (errors.py), the other tests wait their turn.
-- A chapter or a benchmark touches the cases that carry its name; other files touch what ELSEWHERE names.
+  well. A module with more users (errors.py) touches no further tests.
+- A chapter or a benchmark touches the cases with its name; for other files, ELSEWHERE lists the tests.
 """
 
 import ast
@@ -44,7 +44,7 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class History:
-    """What git knows of a working tree.
+    """History and changes of a working tree, from git.
 
     Attributes:
         count: Number of commits up to HEAD; 0 if unknown.
@@ -58,7 +58,7 @@ class History:
 
 
 def git(root: Path, *words: str) -> str | None:
-    """Return what a git command prints, or None if it fails. A hook's GIT_DIR is not followed."""
+    """Return the output of a git command, or None if it fails. GIT_DIR, which hooks set, is ignored."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
         done = subprocess.run(
@@ -82,7 +82,7 @@ def base_of(root: Path) -> str | None:
 
 
 def history(root: Path) -> History:
-    """Return the number of commits and what changed; outside git and in a shallow clone, why they are unknown."""
+    """Return the number of commits and the changed paths; outside git and in a shallow clone, why they are unknown."""
     top = git(root, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != root.resolve():
         return History(0, frozenset(), "no git repository, so the change is unknown")
@@ -102,7 +102,7 @@ def imported(path: Path) -> frozenset[str]:
     found: set[str] = set()
     try:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-    except (SyntaxError, UnicodeDecodeError):  # the tests that import it will say so
+    except (SyntaxError, UnicodeDecodeError):  # tests that import the file report its error
         return frozenset()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -129,8 +129,7 @@ def module_name(root: Path, path: Path) -> str:
 
 def users(root: Path, module: str, seen: frozenset[str] = frozenset()) -> set[Path]:
     """Return the test files that import a module, also through helpers and through the conftest.py of their folder.
-
-    Of a helper of tests, also the benchmarks that import it.
+    For a helper of tests, return the benchmarks that import it as well.
     """
     found: set[Path] = set()
     if not module.startswith("gsplat_edu"):
@@ -148,7 +147,8 @@ def users(root: Path, module: str, seen: frozenset[str] = frozenset()) -> set[Pa
 
 
 def of_package(root: Path, parts: tuple[str, ...]) -> set[Path]:
-    """Return the tests of a package; or, for a module of one without tests, its own and those of the few that need it.
+    """Return the tests of a package. For a module of a package without tests, return its tests and those of its few
+    users.
 
     Args:
         root: The repository.
@@ -172,7 +172,7 @@ def of_package(root: Path, parts: tuple[str, ...]) -> set[Path]:
 
 
 def of_test_folder(root: Path, path: Path) -> set[Path]:
-    """Return what a changed file below tests touches."""
+    """Return the tests that a changed file below tests touches."""
     tests = root / "tests"
     if path.name.startswith("test_") and path.suffix == ".py":
         return {path}
@@ -184,14 +184,15 @@ def of_test_folder(root: Path, path: Path) -> set[Path]:
 
 
 def tests_of(root: Path, changed: Iterable[str]) -> set[str]:
-    """Return what a change touches.
+    """Return the tests that a change touches.
 
     Args:
         root: The repository.
         changed: Paths relative to it.
 
     Returns:
-        Test files relative to the root, and names in brackets, "[09_train_in_3d]", of the cases that carry them.
+        Test files relative to the root, and names in brackets, "[09_train_in_3d]", that stand for the cases with this
+        name.
     """
     found: set[Path] = set()
     names: set[str] = set()

@@ -1,10 +1,10 @@
-"""Short trainings with known results to the bit, run by tests/golden/test_training_bits.py, recorded by this file.
+"""Short trainings whose bits are known, run by tests/golden/test_training_bits.py and recorded by this file.
 
     python tests/training_bits.py --record
 
 writes the hashes for every instruction set of this machine into tests/golden/training_bits.json. A change of the
-trainer that is meant to keep the numbers must keep the hashes. A change that alters them records them again, and its
-commit explains why.
+trainer that should not change results keeps the hashes. A commit that changes results records the hashes again and
+explains why.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from gsplat_edu.train.trainer import Trainer, TrainResult
 RECORDS = Path(__file__).parent / "golden" / "training_bits.json"
 
 CAPABILITIES = {"v2": "default", "v3": "avx2", "v4": "avx512"}
-"""Torch's capability on a machine whose best instruction set is this one of ours."""
+"""Torch's capability on a machine, by the best of our instruction sets that the machine has."""
 
 SCHEDULE = {"densify_start": 5, "densify_every": 10, "densify_stop": 100, "mcmc_stop": 100, "sh_every": 20}
 
@@ -89,7 +89,7 @@ CASES: dict[str, Callable] = {
 
 
 def took_part(name: str, events: list) -> bool:
-    """Return whether the density control that a case is meant to cover really happened."""
+    """Return whether the training had the density control that the case is meant to test."""
     if name == "mcmc":
         moved = [event for event in events if isinstance(event, RelocateEvent)]
         return any(event.num_relocated for event in moved) and any(event.num_added for event in moved)
@@ -118,17 +118,16 @@ def digest(name: str) -> str:
 
 
 def compiler() -> str:
-    """Return the compiler named in the native module's file. Another compiler may fuse other products and sums."""
+    """Return the compiler named in the native module's file. Other compilers may fuse other products and sums."""
     data = Path(kernels.native().__file__).read_bytes()
     found = re.search(rb"GCC: \([^)]*\) [\d.]+|clang version [\d.]+", data)
     return found[0].decode() if found else sys.platform
 
 
 def arithmetic() -> str:
-    """Name what a training's bits depend on besides our own code. A new name means another machine, not a bug.
-
-    The libraries' exponentials, roots, matrix products and generators differ between CPUs. Their results are part of
-    the name, so a CPU that computes like a known one has the same name.
+    """Return a name for everything besides our code that a training's bits depend on. A new name means another
+    machine, not a bug. The libraries' exponentials, roots, matrix products and generators differ between CPUs. Their
+    results are part of the name, so CPUs with equal results have the same name.
     """
     probe, rng = hashlib.sha256(), np.random.default_rng(0)
     numbers = rng.normal(size=4099)
