@@ -1,11 +1,11 @@
-"""What do batches cost in quality, and what do several processes send?
+"""How do batches change the quality, and how many bytes do several processes send?
 
     python benchmarks/batches.py [CAPTURE] [--resolution R] [--iterations N] [--smoke] [--out FILE.json]
 
 Trains CAPTURE (anything that `gsplat-edu train` accepts with poses) with batches of 1, 2 and 4 views and the same
-number of images, and scores the held-out photos. Then torchrun trains with a batch of 4 on one and on two processes of
-one thread each, and counts bytes and time. The processes share this machine, so the speed-up of several machines is a
-model, not a measurement:
+number of images, and scores the held-out photos. Then torchrun trains with a batch of 4 on one and on two processes
+of one thread each, and bytes and time are counted. The processes share this machine, so the speed-up of several
+machines is modelled, not measured:
 
     step(N) = shared / N + repeated + messages(N) + bytes(N) / bandwidth
 
@@ -44,22 +44,22 @@ MACHINES = (2, 4, 8)
 MODELLED = (8, 32)
 """Batches of the model."""
 NETWORKS = {"1 Gbit/s": 1e9 / 8, "10 Gbit/s": 10e9 / 8}
-"""Bytes per second that a machine sends while it receives as many: all of the nominal rate, in both directions."""
+"""Bytes per second that a machine sends and receives at the same time: the nominal rate in both directions."""
 LATENCY = 1e-4
-"""Assumed seconds of a message between two machines."""
+"""Assumed latency of a message between two machines, s."""
 MESSAGES = 6
-"""Messages that a process waits for in a step: lengths and contents of gradients, Gaussians and the flag to stop."""
+"""Number of messages that a process waits for in a step: lengths and contents of gradients, Gaussians, stop flag."""
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Means over the steps of the second half of a training, in one process.
+    """Means over the steps in the second half of a training, in one process.
 
     Args:
         gaussians: Number of Gaussians.
         sent: Bytes sent.
         wall: Seconds.
-        waited: Seconds from the begin to the end of exchanges.
+        waited: Seconds in exchanges.
         compute: Processor seconds outside of exchanges.
         exchange: Processor seconds of exchanges: packing, copying and the kernel's part of sending.
     """
@@ -73,7 +73,7 @@ class Steps:
 
 
 def options(folder: Path, out: Path, resolution: float | None, iterations: int, batch: int) -> RunOptions:
-    """Return the options of a training of the recipe fast, its number of Gaussians planned."""
+    """Return the options of a training by the recipe fast with a planned number of Gaussians."""
     config = recipe(iterations, strategy="fast", batch=batch)
     settings = DataSettings(resolution=resolution)
     given = RunOptions(folder, out, config, settings, eval_every=0, save_every=0)
@@ -124,7 +124,7 @@ def quality(folder: Path, arguments: Any) -> dict[str, Any]:  # noqa: ANN401
 
 
 def on_two(folder: Path, arguments: Any) -> dict[str, Steps]:  # noqa: ANN401
-    """Train on one and on two processes of one thread each; return what their steps took."""
+    """Train on one and on two processes of one thread each; return the means of their steps."""
     found = {}
     for size in (1, 2):
         with TemporaryDirectory() as scratch:
@@ -143,7 +143,7 @@ def on_two(folder: Path, arguments: Any) -> dict[str, Steps]:  # noqa: ANN401
 
 
 def rank(arguments: Any) -> None:  # noqa: ANN401
-    """Train as one of torchrun's processes; the first one writes what its steps took."""
+    """Train as one of torchrun's processes; the first one writes the means of its steps."""
     with joined(num_processes()) as team, TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
         given = options(arguments.capture, out, arguments.resolution, arguments.iterations, SHARED)
@@ -162,7 +162,8 @@ def model(one: Steps, two: Steps) -> list[dict[str, Any]]:
         for name, rate in NETWORKS.items():
             found = {}
             for machines in MACHINES:
-                sent = two.sent * 2 * (machines - 1) / machines  # of two processes each sends half, twice
+                # each of two processes sends half of the bytes twice
+                sent = two.sent * 2 * (machines - 1) / machines
                 talk = sent / rate + MESSAGES * LATENCY + two.exchange * sent / two.sent
                 found[machines] = (views + repeated) / (views / machines + repeated + talk)
             rows.append({"batch": batch, "network": name, "speedups": found})

@@ -1,14 +1,15 @@
-"""What do blocks cost in quality, memory and time, compared with one training of the whole capture?
+"""How do blocks change quality, memory and time, compared with one training of the whole capture?
 
     python benchmarks/blocks.py [CAPTURE] [--photos N] [--width PX] [--blocks N] [--iterations N] [--gaussians N]
                                 [--keep FOLDER] [--smoke] [--out FILE.json]
 
-Without CAPTURE, writes a procedural city (tests/fixtures/city.py) from the air. The capture is trained as a whole, and
-in blocks: a coarse model takes a quarter of the iterations, and the blocks share the rest: both ways take as many in
-total. Every eighth photo is held out. The strips lie along the cuts; the depth of the merged scene says which pixels
-show them, for both scenes. PSNR of strips is that of all their pixels together. Other options go to all trainings.
+Without CAPTURE, writes a procedural city (tests/fixtures/city.py) from the air. The capture is trained as a whole,
+and in blocks, of which the coarse model takes a quarter of the iterations and the blocks share the rest, so both
+trainings have equally many in total. Every eighth photo is held out. The strips lie along the cuts. The depth of the
+merged scene determines their pixels, for both scenes, and their PSNR is that of all these pixels together. Other
+options go to all trainings.
 
-Each command runs in a process of its own, which tells its processor time and its largest memory. The overhead is the
+Each command runs in a process of its own, whose processor time and peak memory are measured. The overhead is the
 processor time of splitting (without the coarse training), of merging and writing, and of a local Dask cluster of two
 workers whose tasks find their blocks finished, as a fraction of that of the coarse training and the blocks.
 """
@@ -51,11 +52,11 @@ COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 CLUSTER = "import sys; sys.path.insert(0, sys.argv[1]); import blocks; blocks.schedule(sys.argv[2], int(sys.argv[3]))"
 
 COARSE = 0.25
-"""Share of all iterations that the coarse model takes."""
+"""Fraction of all iterations for the coarse model."""
 
 
 def measured(*words: object, code: str = COMMAND) -> tuple[float, float]:
-    """Run a command in a process of its own; return its processor time, s, and its largest memory, MiB.
+    """Run a command in a process of its own; return its processor time, s, and its peak memory, MiB.
 
     Raises:
         ArgumentError: it failed.

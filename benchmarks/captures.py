@@ -29,7 +29,7 @@ def capture(named: Path | None, smoke: bool) -> Iterator[Path]:
     if named is not None or (default.exists() and not smoke):
         yield named or default
         return
-    # Imported late: these take memory, which limits.py would count as its children's.
+    # imported late, because limits.py would count their memory as its children's
     from gsplat_edu.data.procedural import procedural_capture
     from gsplat_edu.data.writers import write_colmap
 

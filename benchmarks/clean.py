@@ -1,15 +1,15 @@
-"""How many planted floaters does cleaning find, what else does it remove, what does it cost, and how long does it take?
+"""How many planted floaters does cleaning find, what else does it remove, and how much PSNR and time does it cost?
 
     python benchmarks/clean.py [RUN] [--count N] [--seed S] [--million] [--smoke] [--out FILE.json]
 
-Floaters are planted in the scene of a run (tests/fixtures/plant.py): between its training cameras and what they see.
-Then the scene is cleaned with the run's photos. Recall is the share of the planted floaters that is removed. Precision
-is the share of planted ones among all that is removed as floaters, so that splats of the scene itself count against it,
-whether the scene needs them or not; splats that no view sees are listed apart. A scene has floaters of its own, which
-cleaning is for. So the scene is also cleaned as it is, and a second precision counts against cleaning only the own
-splats that went because of the planted ones. The loss is the held-out PSNR of the
-scene before planting minus that of the planted and cleaned one. The own splats removed are also taken out of the scene
-alone, which tells whether it needed them.
+Floaters are planted in the scene of a run (tests/fixtures/plant.py), between its training cameras and the surfaces
+that they see. Then the scene is cleaned with the run's photos. Recall is the fraction of planted floaters that are
+removed. Precision is the fraction of planted floaters among all splats that are removed as floaters, so removing a
+splat of the scene lowers it, whether or not the scene needs this splat. Splats that no view sees are listed
+separately. A scene has floaters of its own, which cleaning should remove. Therefore the scene is also cleaned without
+planting, and a second precision counts only splats of the scene that are removed in addition. The loss is the
+held-out PSNR of the scene before planting minus that of the planted and cleaned one. The removed splats of the scene
+are also removed from the scene without floaters, which shows whether it needed them.
 
 --million instead splits the scene's splats until it has a million, and measures the time of a whole cleaning.
 
@@ -76,7 +76,7 @@ def held_out(subject: Subject, gaussians: Gaussians) -> float:
 
 
 def timed(subject: Subject, gaussians: Gaussians) -> tuple[Cleaning, float]:
-    """Clean, and return the result and the seconds; photos are decoded before."""
+    """Clean; return the result and the seconds. Photos are decoded before."""
     subject.dataset.preload()
     began = time.perf_counter()
     found = clean(gaussians, subject.dataset.train, subject.dataset.test, subject.source.settings)
@@ -117,7 +117,7 @@ def planted(subject: Subject, count: int, seed: int) -> dict[str, Any]:
 
 
 def split(gaussians: Gaussians, count: int) -> Gaussians:
-    """Replace every splat by several smaller ones within it, `count` in all."""
+    """Replace every splat by several smaller ones inside it, `count` in total."""
     generator = torch.Generator().manual_seed(0)
     parts, times = [], -(-count // len(gaussians))
     for _ in range(times):

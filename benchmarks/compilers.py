@@ -2,11 +2,11 @@
 
     python benchmarks/compilers.py FOLDER [FOLDER] [--capture CAPTURE] [--smoke] [--out FILE.json]
 
-A FOLDER holds a compiled module: that of an unpacked wheel is WHEEL/gsplat_edu. The installed module is the default.
-Each module has a process of its own with one thread. They take turns with the same training iterations of a capture (as
-train_step.py: render, 0.8 L1 + 0.2 (1 - SSIM), backward with Adam inside), and the processor time of a turn counts, so
-that other work on the machine hardly matters. Printed: the median and the extremes over the turns of the first module's
-time over the second's, and the hashes of an image and of its gradients.
+A FOLDER has a compiled module; for an unpacked wheel, it is WHEEL/gsplat_edu. The installed module is the default.
+Each module runs in a process of its own with one thread. The processes take turns with the same training iterations
+of a capture (as in train_step.py: render, 0.8 L1 + 0.2 (1 - SSIM), backward with Adam inside). The processor time of
+a turn is measured, so other work on the machine hardly matters. The benchmark prints the median and the extremes over
+the turns of the ratio of the two times, and the hashes of an image and of its gradients.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def load(folder: Path) -> None:
 
 
 def serve(module: Path, capture: Path, views: int) -> None:
-    """Print the hashes; then, for every line of input, train on some views and print the seconds of processor time."""
+    """Print the hashes; then, for each line of input, train on some views and print the processor time, s."""
     load(module)
     import torch
 
@@ -73,7 +73,7 @@ def serve(module: Path, capture: Path, views: int) -> None:
         hashes = {k: hashlib.sha256(v.numpy().tobytes()).hexdigest()[:16] for k, v in kept.items()}
         for tensor in gaussians.tensors().values():
             tensor.grad = None
-        iteration(1, fused=True)  # buffers are allocated and pages touched
+        iteration(1, fused=True)  # allocates buffers and touches their pages
         print(json.dumps(hashes), flush=True)
         for number, _ in enumerate(sys.stdin):
             start = time.process_time()
@@ -83,7 +83,7 @@ def serve(module: Path, capture: Path, views: int) -> None:
 
 
 def compare(folders: list[Path], capture: Path, turns: int, views: int) -> dict[str, object]:
-    """Let two modules take turns; return their hashes, seconds per iteration and the ratio."""
+    """Run two modules in turns; return their hashes, seconds per iteration and the ratio."""
     env = os.environ | {"OMP_NUM_THREADS": "1"}
     programs = []
     for folder in folders:

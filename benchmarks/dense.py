@@ -3,8 +3,8 @@
     python benchmarks/dense.py [--smoke] [--out FILE.json]
 
 Renders and differentiates a cloud of the course's size (1,600 splats, 128 px, float32) with several chunk sizes
-in turn. Prints the median time of each and its ratio to the chapter's chunk of 512 within the same round. Compare
-the ratios: the machine's speed drifts between runs, but little within a round.
+in turn. Prints the median time of each and its ratio to the chapter's chunk of 512 within the same round. Ratios are
+comparable, because the machine's speed drifts between runs, but little within a round.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""What do a camera's gradient, features, median depth and statistics add to an iteration?
+"""How much time do the camera's gradient, features, median depth and statistics add to an iteration?
 
     python benchmarks/extras.py [CAPTURE] [--scene FILE] [--smoke] [--out FILE.json]
 
 CAPTURE is anything that `gsplat-edu train` accepts (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else
-a procedural capture). Gaussians start at its points, or come from FILE. An iteration: render at full size, 0.8 L1
-+ 0.2 (1 - SSIM) against the photo, and the backward pass with stored gradients. The gradient of the features' image is
-given: a loss of its own would add its own time. In every round each way takes one iteration at the same view, so that
-a machine whose speed drifts slows them alike; the figures are medians of the rounds, and medians of the ratio to the
-plain way of the same round.
+a procedural capture). Gaussians start at its points, or come from FILE. An iteration renders at full size, computes
+0.8 L1 + 0.2 (1 - SSIM) with the photo, and takes the backward pass with stored gradients. The gradient of the
+features' image is given, because a loss would add its own time. In every round, each variant takes one iteration at
+the same view, so a drift of the machine's speed affects all equally. The figures are medians over the rounds, of
+milliseconds and of the ratio to the plain variant of the same round.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def finish(image: torch.Tensor, shot: Shot) -> None:
 
 
 def with_camera(scene: Gaussians, shot: Shot, settings: RenderSettings) -> None:
-    """The same, with the gradient of the pose and the intrinsics."""
+    """Take an iteration with the gradient of pose and intrinsics."""
     camera = CameraTensors.of(shot.camera)
     for tensor in camera.tensors():
         tensor.requires_grad_()
@@ -74,7 +74,7 @@ def with_features(channels: int) -> Callable[[Gaussians, Shot, RenderSettings], 
         output = render(scene, shot.camera, settings=settings, features=features, backend="cpu")
         assert output.features is not None
         size = output.features.shape
-        if size not in gradients:  # in the rounds that are not counted
+        if size not in gradients:  # first called in rounds that are not counted
             gradients[size] = torch.full(size, 1e-6)
         loss = photo_loss(output.image, shot.photo)
         torch.autograd.backward([loss, output.features], [None, gradients[size]])
@@ -83,13 +83,13 @@ def with_features(channels: int) -> Callable[[Gaussians, Shot, RenderSettings], 
 
 
 def with_median(scene: Gaussians, shot: Shot, settings: RenderSettings) -> None:
-    """The plain iteration, and the median depth."""
+    """Take an iteration with the median depth."""
     settings = replace(settings, median_depth=True)
     finish(render(scene, shot.camera, settings=settings, backend="cpu").image, shot)
 
 
 def with_statistics(scene: Gaussians, shot: Shot, settings: RenderSettings) -> None:
-    """The plain iteration, which collects every statistic."""
+    """Take an iteration that collects all statistics."""
     output = render(scene, shot.camera, settings=settings, backend="cpu")
     errors = torch.ones(shot.camera.H, shot.camera.W)
     found = output.collect("absgrad", "weight_sum", "weight_max", "pixels", "error_sum", errors=errors)
@@ -107,7 +107,7 @@ WAYS = {
 
 
 def measure(scene: Gaussians, views: Sequence[View], rounds: int) -> dict[str, dict[str, float]]:
-    """Return, by way, the median milliseconds, and the median ratio to the plain way of the same round."""
+    """Return the median milliseconds by variant, and the median ratio to the plain variant of the same round."""
     settings = RenderSettings(depth=False, jacobian_limit=TrainConfig().jacobian_limit)
     seconds: dict[str, list[float]] = {name: [] for name in WAYS}
     for k in range(rounds + WARM_UP):

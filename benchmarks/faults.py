@@ -1,28 +1,28 @@
-"""How much of what a fault of the photos costs does its remedy bring back?
+"""How much of the quality that a fault of the photos costs does its remedy recover?
 
     python benchmarks/faults.py [CAPTURE] [--fault exposure|vignetting|poses|transients] [--resolution R]
         [--iterations N] [--seeds N] [--every N] [--test-every N] [--out FILE]
 
-Plants a fault with known truth into a copy of a capture, and trains with the fast recipe: the capture and the copy,
-each without and with the remedy. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given;
+Plants a fault of known truth into a copy of a capture, and trains capture and copy by the fast recipe, each without
+and with the remedy. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given;
 the word "traced" stands for 60 photos of 400 x 400 px, traced here, whose own exposure does not vary.
 
 exposure: linear light times 2^u for u from -0.7 to 0.7, and its red and blue times 0.85 to 1.15 in addition, rounded
-to bytes and clipped. Held-out photos have it too, so scenes are compared by the PSNR of the photos' right half after a
-fit on the left half. Gains are compared with the truth beyond those found in the capture itself.
+to bytes and clipped. Held-out photos have the fault as well, so scenes are compared by the PSNR of the photos' right
+half after a fit on the left half. The true gains are relative to the gains found in the capture itself.
 
 vignetting: linear light times 1 / (1 + t r^2)^2, the law of cos^4, with r = 1 in the corners, which lose 0 to 1.5
 stops, around a centre that is off by up to 5 % of a side. Held-out photos are clean; scenes are compared by the PSNR of
 their right half after a fit of exposure on the left half, and with a training that corrects exposure only.
 
-poses: every camera turned by 0.5 degrees and shifted by 1 % of the extent, in random directions. Held-out cameras have
-it too, so scenes are compared by the PSNR of half of each photo after its pose is aligned on the other half. Errors are
-measured after the move of all cameras together (shift, turn, scale) that brings them closest to the truth.
+poses: every camera turned by 0.5 degrees and shifted by 1 % of the extent, in random directions. Held-out cameras
+have the fault as well, so scenes are compared by the PSNR of half of each photo after its pose is aligned on the
+other half. Errors are measured after the best common move of all cameras (shift, rotation, scale).
 
 transients: one or two blobs in 30 % of the training photos, 5 % of the pixels of each, cut from other photos, mirrored
-and tinted. Held-out photos are clean. A fifth run gets the true masks; what the remedy regains is a share of what these
-regain. With few photos a fault costs more: --every 2 takes every second photo, --test-every 3 holds out every third of
-these.
+and tinted. Held-out photos are clean. A fifth run gets the true masks, and the recovery by the remedy is a fraction
+of theirs. With few photos, a fault costs more; --every 2 takes every second photo, --test-every 3 holds out every
+third of these.
 """
 
 from __future__ import annotations
@@ -62,25 +62,25 @@ from gsplat_edu.train.poses import Refinement, gauge
 from gsplat_edu.train.transients import resized_mask
 
 TRACED = "traced"
-"""Name of the capture that is traced here."""
+"""Name of the ray-traced capture."""
 
 GREY = 0.4
-"""Background of the traced photos, which have to be opaque."""
+"""Background of the traced photos, which are made opaque."""
 
 STOPS, TINT = 0.7, 0.15
 """Largest planted exposure, stops, and largest planted change of red and blue."""
 
 CORNER, OFF_CENTRE = 1.5, 0.05
-"""Largest planted vignetting, stops lost in the corners, and how far its centre is off, sides of the photo."""
+"""Largest planted vignetting, stops in the corners, and largest error of its centre, fraction of a side."""
 
 DEGREES, SHIFT = 0.5, 0.01
 """Planted errors of the poses: degrees, and fraction of the extent."""
 
 SHARE, AREA = 0.3, 0.05
-"""Planted passers-by: share of the training photos, and share of the pixels of each."""
+"""Planted passers-by: fraction of the training photos, and fraction of the pixels of each."""
 
 SEED = 7
-"""Seed of the faults; it is counted up with the seed of the training."""
+"""Seed of the faults for the first seed of the training; both are counted up together."""
 
 
 def linear(encoded: ArrayLike) -> Float64[np.ndarray, "..."]:
@@ -98,7 +98,7 @@ def encoded(light: ArrayLike) -> Float64[np.ndarray, "..."]:
 def uneven(
     views: Sequence[View], held_out: Sequence[bool], seed: int
 ) -> tuple[list[View], Float64[np.ndarray, "V 3"]]:
-    """Return the views with other exposures, and the factors on their linear light."""
+    """Change the exposures of views; return the views and the factors on their linear light."""
     rng = np.random.default_rng(seed)
     scales = 2.0 ** rng.uniform(-STOPS, STOPS, (len(views), 1)) * np.ones(3)
     scales[:, ::2] *= rng.uniform(1 - TINT, 1 + TINT, (len(views), 2))
@@ -114,7 +114,7 @@ def uneven(
 def vignetted(
     views: Sequence[View], held_out: Sequence[bool], seed: int
 ) -> tuple[list[View], Float64[np.ndarray, " V"]]:
-    """Return the views with dark corners, but for those held out, and the logarithm of the corners' gain on bytes."""
+    """Darken the corners of views that are not held out; return all views and the corners' log gains on bytes."""
     rng, changed, truths = np.random.default_rng(seed), [], []
     for view, clean in zip(views, held_out, strict=True):
         stops_lost, (cy, cx) = rng.uniform(0, CORNER), rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)
@@ -135,12 +135,12 @@ def relit(view: View, photo: Photo, gain: Float64[np.ndarray, "H W"]) -> View:
 
 
 def opaque(views: Sequence[View]) -> list[View]:
-    """Return the views before grey."""
+    """Return the views composited over grey."""
     return [View(view.camera, view.read().over((GREY,) * 3), name=view.name) for view in views]
 
 
 def stored(folder: Path, views: Sequence[View], points: ArrayLike, colors: ArrayLike) -> Path:
-    """Write a capture; names end in .png."""
+    """Write a capture, with names that end in .png."""
     write_colmap(
         folder, [View.stored(view.camera, view.read, png_name(view.name)) for view in views], points, colors
     )
@@ -148,7 +148,7 @@ def stored(folder: Path, views: Sequence[View], points: ArrayLike, colors: Array
 
 
 def png_name(name: str) -> str:
-    """Return a view's name with the ending .png."""
+    """Return a view's name with the suffix .png."""
     return str(Path(name).with_suffix(".png"))
 
 
@@ -182,7 +182,7 @@ def blob(rng: np.random.Generator, H: int, W: int, area: float) -> Bool[np.ndarr
 def with_passers_by(
     views: Sequence[View], held_out: Sequence[bool], seed: int
 ) -> tuple[list[View], list[Any]]:
-    """Return the views with pasted blobs in a share of those that are not held out, and the blobs' pixels."""
+    """Paste blobs into a fraction of the views that are not held out; return all views and the blobs' pixels."""
     rng = np.random.default_rng(seed)
     free = rng.permutation(np.flatnonzero(~np.asarray(held_out)))
     struck = set(free[: round(SHARE * len(free))].tolist())
@@ -215,11 +215,11 @@ def without_pixels(views: Sequence[View], covered: Sequence[Any]) -> list[View]:
 
 
 def mask_errors(clean: CaptureRun, faulty: CaptureRun, truth: dict[str, Any]) -> dict[str, float]:
-    """Return precision and recall of the masks, in pixels, and the share of the clean run's pixels that is masked."""
+    """Return precision and recall of the masks, in pixels, and the fraction of masked pixels in the clean run."""
     hits = masked = covered = total = excluded = 0
     for run in (clean, faulty):
         found = run.trainer.transients
-        assert found is not None, "the remedy finds masks"
+        assert found is not None, "a run with the remedy has masks"
         for view, mask in zip(run.dataset.train, found.masks, strict=True):
             size = view.camera.H, view.camera.W
             total += size[0] * size[1] if run is clean else 0
@@ -348,8 +348,8 @@ class Fault:
         without: Options of `gsplat-edu train` without the remedy.
         remedy: Options with it.
         score: The score of the held-out views that the fault itself does not change.
-        errors: Returns how well the remedy found the truth.
-        cured: Returns the views without what the truth says is wrong; None if the clean views are the measure.
+        errors: Returns the errors of what the remedy found.
+        cured: Returns the views without the true fault; None to compare with the clean views.
         reduced: Whether --resolution reduces the photos before the fault is planted, instead of in the training.
     """
 
@@ -386,7 +386,7 @@ FAULTS = {
 
 
 def compare(folder: Path, arguments: argparse.Namespace, seed: int) -> dict[str, Any]:
-    """Train the runs of one seed; return their scores, what was regained, and how well the truth was found."""
+    """Train the runs of one seed; return their scores, the recovered fraction, and the remedy's errors."""
     fault = FAULTS[arguments.fault]
     dataset = load_dataset(folder, DataSettings(resolution=arguments.resolution if fault.reduced else None))
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.name)[:: arguments.every]
@@ -416,7 +416,7 @@ def compare(folder: Path, arguments: argparse.Namespace, seed: int) -> dict[str,
 
 
 def summary(results: Sequence[dict[str, Any]], fault: Fault) -> dict[str, Any]:
-    """Return means over the seeds: scores, the share that is regained, and the errors."""
+    """Return means over the seeds of scores, recovered fraction and errors."""
 
     def mean(name: str) -> float:
         return float(np.mean([result["runs"][name][fault.score] for result in results]))
@@ -435,7 +435,7 @@ def summary(results: Sequence[dict[str, Any]], fault: Fault) -> dict[str, Any]:
 
 
 def line(found: dict[str, Any]) -> str:
-    """Return one run's scores."""
+    """Return the scores of a run as a line."""
     return (
         f"PSNR {found['psnr']:.2f} dB, exposure fitted {found['psnr_fitted']:.2f}, pose aligned"
         f" {found['psnr_aligned']:.2f}; {found['gaussians']} Gaussians,"

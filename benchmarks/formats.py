@@ -3,8 +3,8 @@
     python benchmarks/formats.py [SCENE|RUN] [--count N] [--formats .ply .spz ...] [--smoke]
         [--out FILE.json]
 
-Without a scene, N random Gaussians of SH degree 3 (default: a million) are written and read but not rendered; their
-file sizes differ from those of real scenes. For a scene, PSNR is that of `gsplat-edu convert --verify`. Each time is
+Without a scene, N random Gaussians of SH degree 3 (default: a million) are written and read, but not rendered. Their
+file sizes differ from those of trained scenes. For a scene, PSNR is that of `gsplat-edu convert --verify`. Each time is
 the best of three in one process, with the file in the operating system's cache.
 """
 

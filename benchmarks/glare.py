@@ -1,15 +1,16 @@
-"""How much of a glare on a flat, glossy plate does a training show in photos that it has not seen?
+"""How well does a training show the glare of a flat, glossy plate in held-out photos?
 
     python benchmarks/glare.py [--recipes NAME ...] [--shininess E] [--count N] [--size PX] [--iterations N]
         [--seeds N] [--out FILE]
 
-Traces blocks on a plate with Phong's highlight of one light (exponent E), RGBA, and trains them by several recipes.
-Training cameras lie on the upper hemisphere, test cameras on a ring that crosses the glare. A test photo is one with
+Traces RGBA photos of blocks on a plate with Phong's highlight of one light (exponent E), and trains them by several
+recipes. Training cameras lie on the upper hemisphere, test cameras on a ring that crosses the glare. A test photo has
 glare if the highlight adds 0.1 or more to 5 % of the object's pixels. Scores are means of PSNRs over white.
 
-Before the trainings it prints what harmonics can do, whatever the recipe: for points of the plate, their colours in
-the training photos are fitted by least squares for each degree, and compared with those in the test photos with glare.
-"all directions" fits 2,000 directions of the hemisphere instead, which leaves what the degree cannot represent.
+Before the trainings it prints the limits of the harmonics, which hold for any recipe: the colours of points of the
+plate in the training photos are fitted by least squares for each degree, and compared with those in the test photos
+with glare. "all directions" fits 2,000 directions of the hemisphere instead, whose error is what the degree cannot
+represent.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ TESTS = 24
 """Number of test cameras."""
 
 GLARE, SHARE = 0.1, 0.05
-"""What the highlight adds to a pixel with glare, and the share of the object's pixels in a photo with glare."""
+"""Least brightness that the highlight adds to a pixel with glare, and least fraction of these pixels in a photo with
+glare."""
 
 RIDGE = 1e-3
 """Weight on the squares of the higher harmonics, per sample, in the fit of colours."""
@@ -108,19 +110,19 @@ class Judge:
 
     @property
     def has_glare(self) -> bool:
-        """Whether enough of the object's pixels have glare."""
+        """Whether the photo has glare."""
         alpha = self.view.read().alpha
         assert alpha is not None, "traced photos have alpha"
         return bool(self.glare.sum() >= SHARE * (alpha > 0).sum())
 
 
 def train_camera(index: int, count: int, size: int) -> Camera:
-    """Return a camera of a spiral over the upper hemisphere, each with an equal share of its area."""
+    """Return a camera of a spiral that covers the upper hemisphere evenly."""
     return camera_at(0.98 - 0.96 * index / max(count - 1, 1), index * math.pi * (3 - math.sqrt(5)), size)
 
 
 def test_camera(index: int, size: int) -> Camera:
-    """Return a camera of a ring whose height oscillates around that at which the plate mirrors the light."""
+    """Return a camera of a ring whose height oscillates around the one at which the plate mirrors the light."""
     turn = 2 * math.pi * index / TESTS
     return camera_at(-float(LIGHT[1, 0]) + 0.1 * math.sin(2 * turn), turn, size)
 
@@ -163,7 +165,7 @@ def towards(
 
 
 def harmonics(train: list[View], judges: list[Judge], shininess: float) -> dict[str, dict[str, float]]:
-    """Return the PSNR of the fitted highlight where it is a glare, dB, by degree."""
+    """Return the PSNR of the fitted highlight at places with glare, dB, by degree."""
     points = plate_points()
     tests = np.array([judge.view.camera.eye for judge in judges if judge.has_glare])
     shown = towards(points, tests)
@@ -216,7 +218,9 @@ def scores(run: CaptureRun, judges: list[Judge]) -> dict[str, float]:
     background = run.options.config.background
     with torch.no_grad():
         for judge, view in zip(judges, run.dataset.test, strict=True):
-            assert Path(view.name).stem == Path(judge.view.name).stem, "in the order of their names"
+            assert Path(view.name).stem == Path(judge.view.name).stem, (
+                "the photos are in the order of their names"
+            )
             image = run.options.renderer(
                 run.trainer.gaussians, view.camera, background=torch.tensor(background)
             ).image

@@ -1,4 +1,4 @@
-"""What does a training iteration cost on a GPU, stage by stage, and how close is it to the hardware's limits?
+"""How long does each stage of a training iteration take on a GPU, and how close is it to the hardware's limits?
 
     python benchmarks/gpu.py [--smoke] [--out FILE.json]
 
@@ -146,8 +146,8 @@ def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]
 def achieved(found: dict[str, float], count: int, pairs: int) -> dict[str, float]:
     """Return bandwidths and FLOP rates of stages, for comparison with the ceilings.
 
-    Bytes are the minimum traffic: Adam reads four numbers and writes three per parameter. Operations are counted in the
-    kernels' source: about 25 per pixel and pair forward, 45 backward, an exponential as one.
+    Bytes are the least traffic possible; Adam reads four numbers and writes three per parameter. Operations are
+    counted in the kernels' source, about 25 per pixel and pair forward and 45 backward; an exponential counts as one.
     """
     pixels = 256 * pairs
     return {

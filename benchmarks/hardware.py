@@ -1,6 +1,6 @@
 """Describe the machine of a measurement and store the result.
 
-Importing this module lets benchmarks import what tests/fixtures makes.
+Importing this module puts tests/ on the path, so that benchmarks can import its fixtures.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How much memory and time does a step of a scene of millions of Gaussians take?
+"""How much memory and time does a training step of millions of Gaussians take?
 
     python benchmarks/large.py [--count N] [--smoke] [--out FILE.json]
 
 Takes two training steps (render without depth, L1 + SSIM, backward, Adam) of N random Gaussians of SH degree 3 in a
-cube, ten million unless given, in Morton order as the trainer keeps them: at a view of half of them from outside the
-cube, or at one from its middle, which sees a twentieth. Each view runs in a process of its own, whose peak RSS is
+cube (default: ten million), in Morton order as in the trainer. One view, from outside the cube, sees half of them;
+another, from the middle, sees a twentieth. Each view runs in a process of its own, whose peak RSS is
 counted by the system. Needs Linux, where ru_maxrss is in KiB.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 import hardware
 
 VIEWS = {"from outside": -6.0, "from the middle": 0.0}
-"""Where the camera stands on the z axis; the cube reaches from -5 to 5."""
+"""Positions of the camera on the z axis; the cube extends from -5 to 5."""
 
 W, H, FOCAL = 1297, 840, 1000.0
 

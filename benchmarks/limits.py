@@ -1,12 +1,11 @@
-"""Do --max-memory and --time-limit hold, and how far off was the forecast?
+"""Are --max-memory and --time-limit kept, and how accurate is the forecast?
 
     python benchmarks/limits.py [CAPTURE] [--memory SIZE ...] [--time TIME ...] [--smoke] [--out FILE.json]
 
 Runs `gsplat-edu train CAPTURE` (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else a procedural
-capture) in its own process, once for each limit (default: 1GiB, 2GiB, 2m, 4m), and measures it from outside: its
-peak RSS by wait4, its wall time, and the forecast it printed. Runs with a memory limit get options that split every
-Gaussian as often as possible, so that they reach the chosen cap and use the memory. Needs Linux, where ru_maxrss is in
-KiB.
+capture) in its own process, once for each limit (default: 1GiB, 2GiB, 2m, 4m), and measures its peak RSS by wait4,
+its wall time, and the forecast it printed. Runs with a memory limit get options that split every Gaussian as often as
+possible, so that they reach the chosen cap and use the memory. Needs Linux, where ru_maxrss is in KiB.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ FILLING = "--strategy adc --iterations 300 --no-rescale --set sh_every=20 --set 
 FILLING += (
     " --set densify_stop=250 --set reset_every=0 --set grad_threshold=2e-6 --eval-every 200 --save-every 100"
 )
-"""Options that grow a scene to its cap in a few hundred iterations. The scene itself is useless."""
+"""Options that grow a scene to its cap in a few hundred iterations, without regard to its quality."""
 
 UNITS = {"h": 3600.0, "min": 60.0, "s": 1.0}
 SIZES = {"MiB": 2.0**20, "GiB": 2.0**30}
 
 
 def train(folder: Path, limit: list[str]) -> dict[str, Any]:
-    """Train under one limit; return the measurements and the forecast."""
+    """Train with one limit; return the measurements and the forecast."""
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
         words = [sys.executable, "-c", COMMAND, "train", str(folder), "--out", str(out), *limit]
@@ -115,7 +114,7 @@ def main() -> None:
             rows.append(train(folder, limit) | {"load": [before, os.getloadavg()[0]]})
             load = rows[-1]["load"]
             print(line(rows[-1]) + f", load {load[0]:.1f} to {load[1]:.1f}", flush=True)
-    import hardware  # imports torch, whose memory would be counted as the children's
+    import hardware  # imported late, because torch's memory would count as the children's
 
     hardware.report({"capture": folder.name, "runs": rows}, arguments.out)
 

@@ -1,13 +1,13 @@
-"""By how much does a watching page slow a training?
+"""By how much does a page that watches a training slow it down?
 
     python benchmarks/live.py [CAPTURE] [--from SCENE] [--resolution R] [--turns N] [--seconds S] [--smoke]
                               [--out FILE.json]
 
-Trains with a live view. In turns, a headless Chromium shows an empty page, or opens that of the training anew, for some
-seconds each; a watched turn begins with the opening. Prints the iterations per second of each turn, and the median over
-pairs of neighbours of the share that is lost. Without a graphics processor, the page draws on the same cores as the
-training. What other programs take from these disturbs the rates. So iterations per processor second of the training are
-printed beside them, and the processor time of the browser, on Linux, as a share of the training's.
+Trains with a live view. Alternately, for some seconds each, a headless Chromium shows an empty page or opens the
+training's page again. Prints the iterations per second of each turn, and the median over neighbouring turns of the
+lost fraction. Without a graphics processor, the page draws on the cores of the training, and other programs disturb
+the rates. Therefore iterations per processor second of the training are printed as well, and on Linux the processor
+time of the browser as a fraction of the training's.
 
 --smoke requests states and snapshots without a browser.
 """
@@ -37,16 +37,16 @@ from gsplat_edu.viewer.snapshots import Broadcast
 
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SETTLING = GRACE + 3.0
-"""Seconds before a turn without the page, in which it is forgotten."""
+"""Seconds before a turn without the page, after which the training forgets it."""
 
 
 def browser_seconds() -> float:
-    """Return the processor time of all processes below this one, s; 0 where there is no /proc."""
+    """Return the processor time of all descendants of this process, s; 0 without /proc."""
     parents, seconds = {}, {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:  # it has ended
+        except OSError:  # the process has ended
             continue
         parents[int(stat.parent.name)] = int(fields[1])
         seconds[int(stat.parent.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -76,7 +76,7 @@ def training(words: list[str], stop: threading.Event) -> Iterator[tuple[CaptureR
 
 @contextmanager
 def page(smoke: bool) -> Iterator[Callable[[str], object]]:
-    """Yield what opens an address in a headless Chromium; with `smoke`, what requests the page."""
+    """Yield a function that opens an address in a headless Chromium, or with `smoke` only requests the page."""
     if smoke:
         yield lambda url: url.startswith("http") and urllib.request.urlopen(url, timeout=60).read()
         return

@@ -4,9 +4,9 @@
                                 [-- options of gsplat-edu train]
 
 Makes a capture in Blender's layout: RGBA photos of a patterned ball. Runs `gsplat-edu train` on it in its own process,
-with few Gaussians so that images dominate the memory. Reads the resident set size (RSS) of that process from outside
-while the log grows; wait4 reports the peak. Prints a table of iterations and RSS. The default is 5,000 iterations with
-100 photos of 800 x 800 on white. Needs Linux, for /proc.
+with few Gaussians so that images dominate the memory. Reads the resident set size (RSS) of that process from /proc
+while the log grows; wait4 reports the peak. Prints a table of iterations and RSS. The default is 5,000 iterations
+with 100 photos of 800 x 800 on white. Needs Linux, for /proc.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def main() -> None:
         capture, run = folder / "capture", folder / "run"
         if (
             not capture.exists()
-        ):  # made in another process: a child's peak includes its parent's memory at the start
+        ):  # made in another process, because a child's peak includes its parent's memory at the start
             maker = multiprocessing.get_context("spawn").Process(
                 target=make_capture, args=(capture, given.size, given.photos)
             )
@@ -177,7 +177,7 @@ def main() -> None:
         raise SystemExit(
             f"memory.py: the training failed with exit code {found['code']}: {found['said'].strip()[-500:]}"
         )
-    import hardware  # imports torch, whose memory would be counted as the child's
+    import hardware  # imported late, because torch's memory would count as the child's
 
     parts = ("curve", "peak_rss", "seconds")
     hardware.report(

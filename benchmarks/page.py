@@ -2,9 +2,9 @@
 
     python benchmarks/page.py [SCENE ...] [--seconds S] [--pictures FOLDER] [--smoke] [--out FILE.json]
 
-Without scenes, makes two of 200,000 and 1,000,000 splats with harmonics of degree 3: an object on a floor. Serves each
-by `gsplat-edu view` and opens the page in a headless Chromium that draws in software, in a window of a laptop and in
-one of a phone. Prints, for each,
+Without scenes, makes two of 200,000 and 1,000,000 splats with harmonics of degree 3: an object on a floor. Serves
+each by `gsplat-edu view` and opens the page in a headless Chromium that draws in software, in windows of a laptop's
+and of a phone's size. Prints, for each,
 
 - the seconds from opening the page to its first picture, and to the first complete one;
 - the seconds from the command to the address, once per scene;
@@ -57,7 +57,7 @@ SHOWN = """() => {
     viewer.renderer.drawn().then(() => shown.push(performance.now()));
   };
 }"""
-"""Records when each picture is on the screen."""
+"""Script that records when each picture is on the screen."""
 
 
 def room(count: int, seed: int = 0) -> Gaussians:
@@ -65,7 +65,7 @@ def room(count: int, seed: int = 0) -> Gaussians:
 
     Args:
         count: Number of splats.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -125,7 +125,7 @@ def browser(smoke: bool) -> Iterator[Any]:
 
 
 def until(tab: Any, words: str, limit: float = PATIENCE) -> None:  # noqa: ANN401
-    """Wait until a condition holds in a page; its policy forbids the waiting by strings that Playwright has."""
+    """Wait until a condition holds in a page, whose policy forbids Playwright's own function, which evaluates strings."""
     end = time.perf_counter() + limit / 1e3
     while not tab.evaluate(words):
         if time.perf_counter() > end:
@@ -134,7 +134,7 @@ def until(tab: Any, words: str, limit: float = PATIENCE) -> None:  # noqa: ANN40
 
 
 def turned(tab: Any, seconds: float, picture: Path | None) -> None:  # noqa: ANN401
-    """Drag the view to and fro; take a screenshot meanwhile."""
+    """Drag the view back and forth, and take a screenshot meanwhile."""
     size = tab.viewport_size
     across, down = size["width"] // 2, size["height"] // 2
     tab.mouse.move(across, down)
@@ -150,7 +150,7 @@ def turned(tab: Any, seconds: float, picture: Path | None) -> None:  # noqa: ANN
 
 
 def measured(opened: Any, url: str, window: tuple[int, int], seconds: float, pictures: Path | None) -> Any:  # noqa: ANN401
-    """Open a page and turn it; return the figures."""
+    """Open a page and rotate the view; return the figures."""
     tab = opened.new_page(viewport={"width": window[0], "height": window[1]})
     tab.set_default_timeout(PATIENCE)
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What does float32 cost on extreme scenes, and why?
+"""How large are the errors of float32 on extreme scenes, and what causes them?
 
     python benchmarks/precision.py [--scenes 2000] [--seed 24] [--smoke] [--out FILE.json]
 
@@ -29,7 +29,7 @@ EPS = 2.0**-24
 """Relative error of one float32 rounding."""
 
 STEEPEST = np.sqrt(np.log2(np.e) / 2 / DILATION)
-"""Largest factor of dx and dy in the exponent's squares, per px: the dilation limits how thin an ellipse is."""
+"""Largest factor of dx and dy in the exponent's squares, per px. It is finite because of the dilation."""
 
 
 def extreme_scene(seed: int, index: int) -> tuple[Camera, Gaussians]:
@@ -116,7 +116,8 @@ def layers(camera: Camera, gaussians: Gaussians) -> Layers:
     toward = arrays["means"][order] - camera.eye
     sh = np.concatenate([arrays["sh0"], arrays["sh_rest"]], axis=1)[order]
     colors = eval_sh(1, sh, toward / np.linalg.norm(toward, axis=1, keepdims=True))
-    # The relative error of a multiplied-out inverse is its condition number times eps, for terms of this size.
+    # The inverse of a computed covariance has a relative error of its condition number times eps, for terms of this
+    # size.
     terms = (shape[2] * dx**2 + shape[0] * dy**2).max(axis=(1, 2)) / det
     noise = 64 * np.finfo(np.float64).eps * (a + c) ** 2 / det * (11 + terms)
     return Layers(order, z, opacities[:, None, None] * np.exp(power), colors, noise)
@@ -139,7 +140,7 @@ class Verdict:
 
     error: float  # largest difference from float64, any pixel and channel
     bound: float  # largest error that rounding explains
-    causes: tuple[str, ...]  # discontinuities that a rounding error can cross, whether or not it did
+    causes: tuple[str, ...]  # discontinuities that a rounding error can cross, whether or not one did
     allowed: float  # bound including these
 
 
@@ -157,8 +158,8 @@ def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
     bright = float(max(1.0, np.abs(drawn.colors).max(initial=0.0)))
     relative = relative_bound(camera)
     alphas = drawn.drawn()
-    # An error in alpha changes the image by that error, times T, times the colour difference to the layers behind. The
-    # weights T alpha of a pixel add up to at most 1. Sums round once per layer.
+    # An error of alpha changes the image by that error times T times the colour difference to the layers behind. The
+    # weights T alpha of a pixel add up to at most 1, and sums round once per layer.
     bound = 2 * bright * (relative + (len(alphas) + 16) * EPS)
     floor_ties = (np.abs(drawn.alphas / ALPHA_MIN - 1) < relative).sum(axis=0).max(initial=0)
     causes, allowed = [], bound
@@ -168,7 +169,7 @@ def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
     if _stop_is_tied(alphas, relative * (len(alphas) + 1)):
         causes.append("tile at the stop 1e-4")
         allowed += 2 * bright * T_STOP
-    # The float32 depth is the rounded float64 depth, so neighbours tie if their rounded depths do.
+    # The float32 depth is the rounded float64 depth, so neighbours tie if their rounded depths are equal.
     near = np.diff(drawn.depths.astype(np.float32)) <= 0
     if np.any(near & (np.diff(drawn.depths) > 0)):
         causes.append("equal depths in float32")
@@ -177,7 +178,7 @@ def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
 
 
 def _stop_is_tied(alphas: np.ndarray, relative: float) -> bool:
-    """Return whether a tile's largest transmittance comes within `relative` of the stop."""
+    """Return whether a tile's largest transmittance is within `relative` of the stop."""
     T = np.cumprod(1 - alphas, axis=0)
     padded = np.pad(T, ((0, 0), (0, -T.shape[1] % TILE), (0, -T.shape[2] % TILE)))
     count, H, W = padded.shape
@@ -195,7 +196,7 @@ def is_stopped(camera: Camera, gaussians: Gaussians) -> bool:
 
 
 def oracle_error(camera: Camera, gaussians: Gaussians) -> tuple[float, float] | str:
-    """Return the difference of the float64 kernels from the NumPy oracle and a bound, or why the oracle refuses."""
+    """Return the difference of float64 kernels and NumPy reference, and a bound; or why the reference refuses."""
     arrays = {name: tensor.double().numpy() for name, tensor in gaussians.tensors().items()}
     covs = build_cov3d_batch(np.exp(arrays["log_scales"]), quat_to_R_batch(arrays["quats"]))
     toward = arrays["means"] - camera.eye
@@ -235,7 +236,7 @@ def gradient_error(camera: Camera, gaussians: Gaussians) -> tuple[float, str]:
 
 
 def images_table(seed: int, count: int) -> list[Verdict]:
-    """Print how many scenes are in each class; return every verdict."""
+    """Print the number of scenes by class; return all verdicts."""
     verdicts = [judge(*extreme_scene(seed, k)) for k in range(count)]
     print(f"float32 against float64, {count} scenes (seed {seed})")
     limits = (1e-5, 1e-4, 1e-3, 0.02)

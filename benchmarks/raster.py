@@ -1,11 +1,11 @@
-"""What does a pair of Gaussian and tile cost, forward and backward?
+"""How much time does a pair of Gaussian and tile take, forward and backward?
 
     python benchmarks/raster.py [--smoke] [--out FILE.json]
 
 200,000 and 500,000 round Gaussians of 2 px at 1024 x 1024, float32, every instruction set of the machine, one and
-two threads. Times are medians of 7 rounds. A pair is one Gaussian in one 16 x 16 tile that its ellipse alpha >=
-1/255 meets. Costs are also given in vector FMAs of the native width, measured in the same run on one thread, since
-their speed drifts with the machine's.
+two threads. Times are medians of 7 rounds. A pair is one Gaussian in one 16 x 16 tile that its ellipse alpha >= 1/255
+meets. Times are also given in vector FMAs of the native width, measured in the same run on one thread, because both
+drift with the machine's speed.
 """
 
 from __future__ import annotations
@@ -38,9 +38,8 @@ def round_gaussians(count: int, size: int) -> dict[str, torch.Tensor]:
         "opacities": rng.uniform(0.1, 0.99, count),
     }
     parameters = {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
-    return parameters | {
-        "cov3ds": torch.tensor(arrays["cov3ds"])
-    }  # the kernels take covariances in double only
+    # the kernels take covariances in double precision only
+    return parameters | {"cov3ds": torch.tensor(arrays["cov3ds"])}
 
 
 class Room(NamedTuple):

@@ -1,17 +1,16 @@
-"""Which recipe gives the best held-out picture per minute and per Gaussian?
+"""Which recipe gives the best held-out quality per minute and per Gaussian?
 
     python benchmarks/recipes.py [CAPTURE] --out FILE.json [--recipes NAME ...] [--seeds N] [--resolution R]
         [--length FACTOR] [--smoke]
 
 Trains one capture by several recipes, one after another in this process, and scores the held-out views twenty times
-during each run with the clock stopped: PSNR, SSIM, and at the end FLIP (Andersson et al. 2020), the perceptual score,
-since the weights of LPIPS would have to be downloaded. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data
-unless given; the word "rgba" stands for 100 photos of 800 x 800 px with alpha, traced here.
+during each run with the clock stopped: PSNR, SSIM, and at the end FLIP (Andersson et al. 2020), a perceptual score
+without weights to download. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given; the word "rgba"
+stands for 100 photos of 800 x 800 px with alpha, traced here.
 
-Every finished run is stored in FILE.json, so that an interrupted benchmark continues where it stopped, and a further
-capture goes to a further file. Beside it, FILE.png shows the scores over time and over Gaussians.
-
-Seeds change a result by several tenths of a dB: the table shows the mean over the seeds and half their range.
+Finished runs are stored in FILE.json, a file per capture, so an interrupted benchmark resumes. FILE.png beside it
+shows the scores over time and over Gaussians. Seeds change a result by several tenths of a dB, so the table shows the
+mean over the seeds and half their range.
 """
 
 from __future__ import annotations
@@ -58,17 +57,17 @@ except ModuleNotFoundError as missing:
     raise SystemExit(f"{missing}; pip install -c constraints.txt '.[benchmarks]'") from None
 
 MOMENTS = 20
-"""How often the held-out views are scored, at equal numbers of iterations."""
+"""Number of times that the held-out views are scored, at equal distances in iterations."""
 
 RGBA = "rgba"
 """Name of the traced capture."""
 
 CAP = 100_000
-"""Cap of mcmc where no run of adc has said how many Gaussians the capture takes."""
+"""Cap of mcmc if no run of adc has determined the number of Gaussians."""
 
 
 class Uniform(PlannedDensity):
-    """The fast recipe without its score: every visible Gaussian is equally likely to be split."""
+    """Density control of the fast recipe without its score: all visible Gaussians are equally likely to be split."""
 
     def _score(self) -> torch.Tensor:
         generator = torch.Generator().manual_seed(len(self.norm_sums))
@@ -99,7 +98,7 @@ STANDARD = QUALITIES["standard"] * UNIT
 
 @dataclass(frozen=True)
 class Piece:
-    """A piece of the fast recipe, and what leaves it out.
+    """The settings that omit a piece of the fast recipe.
 
     Args:
         options: Options of `gsplat-edu train`.
@@ -121,7 +120,7 @@ PIECES = {
     "doubled-rates": Piece(HALF_RATES),
     "late-means": Piece(("--set", "means_rate_final=1.6e-6")),
 }
-"""The pieces of the fast recipe by name."""
+"""Pieces of the fast recipe by name."""
 
 
 def without(*names: str) -> Recipe:
@@ -145,7 +144,7 @@ RECIPES = {
     "adc-3k": Recipe("adc", STANDARD),
     "mcmc-3k": Recipe("mcmc", STANDARD),
 }
-"""The recipes by name: the references, the qualities of the fast recipe, and that recipe without one piece, with only
+"""Recipes by name: adc and mcmc, the qualities of the fast recipe, and the fast recipe without a piece, with only
 one, and with none."""
 
 DEFAULT = ("adc-7k", "mcmc-7k", *(f"fast-{name}" for name in QUALITIES))
@@ -153,11 +152,11 @@ DEFAULT = ("adc-7k", "mcmc-7k", *(f"fast-{name}" for name in QUALITIES))
 
 @dataclass
 class Results:
-    """The finished runs, in a file that grows.
+    """The finished runs, and the file that stores them.
 
     Args:
         path: JSON file; None to keep them in memory.
-        setting: What all runs have in common. A file with another setting is refused.
+        setting: Settings that all runs share. A file with other settings is refused.
     """
 
     path: Path | None
@@ -180,7 +179,7 @@ class Results:
         return [run for run in self.runs if run["recipe"] == recipe]
 
     def recipes(self) -> list[str]:
-        """Return the names of the recipes with at least one run, in the order of the first ones."""
+        """Return the names of the recipes with at least one run, ordered by their first run."""
         return list(dict.fromkeys(run["recipe"] for run in self.runs))
 
     def check(self, recipe: str, config: dict[str, Any]) -> None:
@@ -206,7 +205,7 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
     Args:
         name: Name of the recipe.
         seed: Seed of the run.
-        arguments: The benchmark's: data, resolution, length.
+        arguments: Arguments of the benchmark: data, resolution, length.
         results: Earlier runs; mcmc takes its cap from those of adc.
     """
     recipe = RECIPES[name]
@@ -237,7 +236,7 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
 
 
 def settings_of(run: CaptureRun) -> dict[str, Any]:
-    """Return what the runs of a recipe have in common, as JSON gives it back: all but the seed and the cap."""
+    """Return the settings that all runs of a recipe share, as read from JSON: all except seed and cap."""
     settings = dataclasses.asdict(run.options.config)
     settings = {key: value for key, value in settings.items() if key not in ("seed", "max_gaussians")}
     found: dict[str, Any] = json.loads(json.dumps(settings))
@@ -245,7 +244,7 @@ def settings_of(run: CaptureRun) -> dict[str, Any]:
 
 
 class Clock:
-    """Wall and processor time of a training, without the time in which it is stopped."""
+    """Wall and processor time of a training, without the time while it is stopped."""
 
     def __init__(self) -> None:
         self._began = np.array([time.perf_counter(), time.process_time()])
@@ -257,14 +256,14 @@ class Clock:
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """Exclude the block."""
+        """Exclude the time of the block."""
         before = np.array([time.perf_counter(), time.process_time()])
         yield
         self._began += np.array([time.perf_counter(), time.process_time()]) - before
 
 
 def measured(run: CaptureRun) -> dict[str, Any]:
-    """Train, score the held-out views at `MOMENTS`, and return what was found."""
+    """Train, score the held-out views `MOMENTS` times, and return the scores."""
     total = run.options.config.iterations
     due = {math.ceil(total * k / MOMENTS) for k in range(1, MOMENTS + 1)}
     curve: list[dict[str, float]] = []
@@ -306,14 +305,11 @@ def flip(run: CaptureRun) -> float:
 
 
 TIME = "processor_seconds"
-"""Where recipes are compared: other programs on the machine change it little."""
+"""Time by which recipes are compared; other programs on the machine hardly change it."""
 
 
 def seconds_to(curve: Sequence[dict[str, float]], psnr: float) -> float | None:
-    """Return when a run's held-out PSNR first reaches a value, in processor seconds.
-
-    Linear between its moments; None if it never does.
-    """
+    """Return when a run's held-out PSNR first reaches a value, processor seconds, interpolated; None if it never does."""
     for before, point in zip((None, *curve), curve, strict=False):
         if point["psnr"] >= psnr:
             if before is None:
@@ -351,7 +347,7 @@ def spread(runs: Sequence[dict[str, Any]], key: str, digits: int) -> str:
 
 
 def races(results: Results) -> list[str]:
-    """Say when each recipe reaches the final PSNR of adc and mcmc: shares of their processor time, means over seeds."""
+    """Return when recipes reach the final PSNR of adc and mcmc, as fractions of their processor time (mean over seeds)."""
     said = []
     for other in (name for name in results.recipes() if RECIPES[name].strategy != "fast"):
         target, whole = mean(results.of(other), "psnr"), mean(results.of(other), TIME)
@@ -373,7 +369,7 @@ SCORES = (
     ("ssim", "held-out SSIM", 0.05),
     ("flip", "held-out FLIP (lower is better)", None),
 )
-"""What the figure draws: key, label, and how far below the worst final score a run's curve is shown."""
+"""Curves of the figure: key, label, and how far the axis extends below the worst final score."""
 
 
 def figure(results: Results, title: str) -> Figure:
@@ -410,7 +406,7 @@ def columns(curve: Sequence[dict[str, float]], *keys: str) -> list[list[float]]:
 
 @contextmanager
 def chosen_capture(arguments: argparse.Namespace) -> Iterator[Path]:
-    """Yield the folder of the capture that the arguments name. The traced one is kept beside the results."""
+    """Yield the folder of the capture that the arguments name. The traced capture is kept beside the results."""
     if str(arguments.capture) != RGBA:
         with capture(arguments.capture, arguments.smoke) as folder:
             yield folder
@@ -418,14 +414,14 @@ def chosen_capture(arguments: argparse.Namespace) -> Iterator[Path]:
     size, count = (24, 8) if arguments.smoke else (800, 100)
     with tempfile.TemporaryDirectory() as scratch:
         folder = (arguments.out.parent if arguments.out else Path(scratch)) / RGBA
-        if not (folder / "transforms_test.json").exists():  # it is written last
+        if not (folder / "transforms_test.json").exists():  # the file that is written last
             print(f"tracing {count} photos of {size} x {size} px into {folder}", flush=True)
             write_blender(folder, *traced_capture(size, count))
         yield folder
 
 
 def compare(arguments: argparse.Namespace) -> None:
-    """Train by every recipe and seed that has no result yet; print the table and draw the figure."""
+    """Train by the recipes and seeds that have no result yet; print the table and draw the figure."""
     whole_number("--seeds", arguments.seeds, 1)
     in_range("--length", arguments.length, 0.0, open_low=True)
     with chosen_capture(arguments) as folder:

@@ -1,11 +1,11 @@
-"""Which part of a training iteration cannot be shared by more cores, and what follows for many of them?
+"""Which part of a training iteration is serial, and how much faster do more cores make it?
 
     python benchmarks/serial.py [CAPTURE] [--scene FILE] [--smoke] [--out FILE.json]
 
 One thread trains FILE (default: 160,000 Gaussians around the capture's points) on CAPTURE, anything that
-`gsplat-edu train` accepts. Native stages count as parallel where they run in the pool's tasks; everything else, torch's
-operations and Python among it, counts as serial. The model for more cores is Amdahl's law by stage, with the number of
-tasks and the memory bandwidth as further bounds; docs/KERNELS.md has its assumptions.
+`gsplat-edu train` accepts. Native stages count as parallel where they run in the pool's tasks. Everything else,
+including torch's operations and Python, counts as serial. The model for more cores is Amdahl's law by stage, with the
+number of tasks and the memory bandwidth as further bounds; docs/KERNELS.md has its assumptions.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ COUNT = 160_000
 WARM_UP = 3
 CORES = (8, 16, 64)
 BUS = {8: 40e9, 16: 60e9, 64: 180e9}
-"""Assumed bytes per second that all cores together read and write: two channels of DDR4 and of DDR5, eight of DDR4."""
+"""Assumed memory bandwidth of all cores together, bytes/s: two channels of DDR4, two of DDR5, eight of DDR4."""
 CALL = 5e-6
-"""Assumed seconds to start the threads and to wait for the last, per call of `parallel`."""
+"""Assumed seconds to start the threads and to wait for the last one, per call of `parallel`."""
 LONGEST_TILE = 4.0
-"""Assumed time of the longest tile, in average ones."""
+"""Assumed time of the slowest tile, as a multiple of the mean."""
 
 
 @dataclass
@@ -56,9 +56,9 @@ class Stage:
     """One stage of an iteration on one thread, in processor time.
 
     Args:
-        seconds: All of it.
-        parallel: The part of it inside the pool's tasks.
-        calls: How often work was handed to the pool.
+        seconds: Total.
+        parallel: Part of it in the pool's tasks.
+        calls: Number of times that work was handed to the pool.
     """
 
     seconds: float
@@ -67,14 +67,14 @@ class Stage:
 
 
 class Clock:
-    """Collects the times of the stages, a list of rounds for each."""
+    """Collects the times of the stages, a list over the rounds for each."""
 
     def __init__(self) -> None:
         self.found: dict[str, list[Stage]] = defaultdict(list)
 
     @contextmanager
     def stage(self, name: str, within: Sequence[Stage] = ()) -> Iterator[None]:
-        """Time a block; less the stages that are timed within it, if the list has them at the end."""
+        """Time a block, minus the stages that are timed within it and named in the list."""
         (parallel, calls), start = native().parallel_time(), time.thread_time()
         yield
         seconds, (after, calls_after) = time.thread_time() - start, native().parallel_time()
@@ -93,7 +93,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Size:
-    """What the costs of an iteration depend on."""
+    """Sizes that determine the cost of an iteration."""
 
     gaussians: int
     visible: float
@@ -115,7 +115,7 @@ class Size:
 
 @dataclass
 class Loop:
-    """What the iterations of a training share."""
+    """State that the iterations of a training share."""
 
     gaussians: Gaussians
     feed: ViewFeed
@@ -126,7 +126,7 @@ class Loop:
     def iterate(self, clock: Clock) -> tuple[int, int, int, int]:
         """Time one iteration; return its visible Gaussians and pairs, and the image's height and width.
 
-        Nothing of it is alive afterwards, as in the trainer, so that the next one reuses its memory.
+        As in the trainer, its tensors are released at the end, so that the next iteration reuses their memory.
         """
         config, gaussians = self.config, self.gaussians
         settings = RenderSettings(depth=False, jacobian_limit=config.jacobian_limit)
@@ -142,7 +142,7 @@ class Loop:
             loss = photo_loss(output.image, target.image, target.mask, config.ssim_weight)
         in_backward = output.defer()
         with clock.stage("autograd"):
-            loss.backward()  # to the image: the step runs the kernels
+            loss.backward()  # up to the image; the step runs the kernels
         backward: list[Stage] = []
         with clock.stage("step, Python", backward):
             self.optimizer.step(gaussians.tensors(), in_backward)
@@ -151,7 +151,7 @@ class Loop:
             clock.found[name].append(stage)
         with clock.stage(f"{config.strategy}, observe"):
             self.strategy.observe(gaussians, output)
-        with clock.stage(f"{config.strategy}, update"):  # of a step that adds and removes nothing
+        with clock.stage(f"{config.strategy}, update"):  # of a step that neither adds nor removes Gaussians
             self.strategy.update(1, gaussians, self.optimizer)
         return len(output.visible), output.num_pairs, draw.view.camera.H, draw.view.camera.W
 
@@ -171,7 +171,7 @@ def train(scene: Gaussians, views: Sequence[View], config: TrainConfig, rounds: 
 
 
 def measure(scene: Gaussians, views: Sequence[View], rounds: int) -> tuple[dict[str, Stage], Size]:
-    """Return the stages of an iteration with either strategy, and what they depend on."""
+    """Return the stages of an iteration by strategy, and the sizes that they depend on."""
     stages: dict[str, Stage] = {}
     for strategy in ("adc", "mcmc"):
         config = TrainConfig(strategy=strategy, max_gaussians=len(scene))
@@ -181,7 +181,7 @@ def measure(scene: Gaussians, views: Sequence[View], rounds: int) -> tuple[dict[
 
 
 def traffic(size: Size) -> dict[str, float]:
-    """Return the bytes that the stages read and write in memory at least; a written line is read first."""
+    """Return the least number of bytes that the stages read and write in memory; a written line is read first."""
     n, visible, pairs, pixels = size.gaussians, size.visible, size.pairs, size.pixels
     return {
         "project": 44 * n + (192 + 2 * 64) * visible,
@@ -196,7 +196,7 @@ def traffic(size: Size) -> dict[str, float]:
 
 
 def tasks(size: Size) -> dict[str, int]:
-    """Return how many tasks share the work of the stages; those not named have as many as they need."""
+    """Return the number of tasks of the stages; stages that are not listed have enough tasks."""
     return {
         "project": -(-size.gaussians // 256),
         "project_backward, Adam": -(-size.gaussians // 256),
@@ -206,7 +206,7 @@ def tasks(size: Size) -> dict[str, int]:
 
 
 def model(stages: dict[str, Stage], size: Size, cores: int, bandwidth: float) -> dict[str, tuple[float, str]]:
-    """Return the seconds of every stage on so many cores, and what bounds it: work, tasks, memory or serial."""
+    """Return the seconds of every stage on a number of cores, and its limit: work, tasks, memory or serial."""
     moved, split, found = traffic(size), tasks(size), {}
     rate = min(cores * bandwidth, BUS[cores])
     for name, stage in stages.items():
@@ -235,7 +235,7 @@ def copy_rate(megabytes: int) -> float:
 
 
 def load(arguments: object, smoke: bool) -> tuple[Gaussians, Dataset]:
-    """Read the capture and the scene, or put Gaussians around the capture's points."""
+    """Read the capture and the scene, or make Gaussians around the capture's points."""
     with capture(arguments.capture, smoke) as folder:  # type: ignore[attr-defined]
         dataset = load_dataset(folder)
         dataset.preload()

@@ -1,13 +1,12 @@
-"""What does a sky of far splats bring, and does a capture without a sky lose by the choice?
+"""How much does a sky of far splats improve, and does `--sky auto` harm a capture without a sky?
 
     python benchmarks/sky.py [CAPTURE] [--strategy NAME] [--iterations N] [--resolution R] [--radius R] [--out FILE]
 
 Without CAPTURE, traces 64 photos of boxes on the ground under a sky with clouds, from a ring of cameras with exact
 poses, and trains them without a sky and with one. Every eighth photo is held out. Further views from outside the ring
-are compared with traced ones. Scores are means of PSNRs: over whole images, and over the pixels of the sky. "in front"
-is the share of these pixels' weight that comes from splats of the scene, not of the sky.
-
-With CAPTURE, trains it in both ways and prints what the photos decide.
+are compared with traced ones. Scores are means of PSNRs: over whole images, and over the pixels of the sky. "in
+front" is the fraction of these pixels' weight that belongs to splats of the scene. With CAPTURE, trains it without
+and with a sky, and prints the choice of auto.
 """
 
 from __future__ import annotations
@@ -43,10 +42,11 @@ from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import View
 
 Judges = Sequence[tuple[View, Bool[np.ndarray, "_ _"]]]
-"""Views and where they show the sky."""
+"""Views, and their pixels of sky."""
 
 OUTSIDE, RADIUS, HEIGHTS = 12, 6.5, (1.0, 2.2, 3.0)
-"""Cameras outside the ring, whose radius is 3.4 to 4.6: their number, distance from the centre and heights in turn."""
+"""Cameras outside the ring, whose radius is 3.4 to 4.6: number, distance from the centre, and heights, taken in turn.
+"""
 
 
 def outside(width: int, height: int) -> list[tuple[View, Bool[np.ndarray, "H W"]]]:
@@ -96,7 +96,7 @@ def scores(run: CaptureRun, views: Judges) -> dict[str, float]:
 
 
 def sky_marked(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians with a sky in white and all others in black."""
+    """Return the Gaussians with those of the sky in white and all others in black."""
     far = torch.from_numpy(far_shell(gaussians.means.numpy(force=True)))
     color = torch.where(far, (1 - SH_OFFSET) / C0, -SH_OFFSET / C0)
     tensors = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}
@@ -108,7 +108,7 @@ def sky_marked(gaussians: Gaussians) -> Gaussians:
 def compare(
     folder: Path, arguments: argparse.Namespace, groups: dict[str, Judges], skies_of: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Train with each choice of `--sky` and score every group of views."""
+    """Train with each value of `--sky` and score all groups of views."""
     found: dict[str, Any] = {}
     for sky in skies_of:
         run, seconds = trained(folder, sky, arguments)
@@ -135,7 +135,7 @@ def psnr_of(run: CaptureRun, view: View) -> float:
 
 
 def measure(arguments: argparse.Namespace) -> None:
-    """Make or take the capture, compare, and report."""
+    """Read or make the capture, compare, and report."""
     if arguments.radius is not None:
         skies.RADIUS = arguments.radius
     with tempfile.TemporaryDirectory() as scratch:

@@ -2,9 +2,9 @@
 
     python benchmarks/sphere.py [--smoke] [--out FILE.json]
 
-The chapter's run ends with 1,600 Gaussians at 128 px. From that scene, with a fixed number of Gaussians, the benchmark
-times the kernels and the dense renderer in turn, the latter with the chapter's chunk of 512 splats and with the 16 used
-for training. The kernels also train all 800 iterations.
+The chapter's run ends with 1,600 Gaussians at 128 px. From that scene, with a fixed number of Gaussians, the
+benchmark times alternately the kernels, and the dense renderer with the chapter's chunks of 512 splats and with the
+16 used for training. The kernels also train all 800 iterations.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
-"""What is a start worth where a capture has poses but no points?
+"""How does the start affect the quality if a capture has poses but no points?
 
     python benchmarks/start_points.py [--seeds N] [--smoke] [--out FILE.json]
 
 Trains a traced room whose walls lie beyond its cameras, `fox` and `snowmiku97` from four starts: random points in a
-cube around what the cameras look at (the usual start of the field), random points where two training photos look,
-triangulated points, and the capture's own points (for snowmiku97 those of its COLMAP model, for the room points on its
-walls, for fox points of another reconstruction that are 2 to 5 px off). Mean PSNR on held-out photos, dB; one thread.
+cube around the cameras' subject (the usual start in the field), random points that two training photos see,
+triangulated points, and the capture's own points (for snowmiku97 those of its COLMAP model, for the room points on
+its walls, for fox points of another reconstruction that are 2 to 5 px off). Mean PSNR on held-out photos, dB; one
+thread.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def starts(dataset: Dataset, full: Dataset, own: Cloud, scratch: Path) -> dict[s
     Args:
         dataset: The capture at training size.
         full: The capture at the size of its files.
-        own: Its own points.
+        own: The capture's own points.
         scratch: A work folder.
     """
     began = time.perf_counter()

@@ -1,6 +1,6 @@
 """An object with textures, hard edges, shadows and highlights, ray-traced with alpha.
 
-Unlike the package's procedural capture it is not made of Gaussians, so that no recipe can represent it exactly.
+Unlike the package's procedural capture, the object is not made of Gaussians, so no recipe can represent it exactly.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.views import View
 
 Points = Float64[np.ndarray, "3 N"]
-"""Points, directions or colours; components first, since NumPy reduces a short last axis slowly."""
+"""Points, directions or colours; components are the first axis, because NumPy reduces a short last axis slowly."""
 
 Texture = Callable[[Points], Points]
 
@@ -31,7 +31,7 @@ SHININESS = 30.0
 """Phong's exponent of the highlights."""
 
 HELD_OUT = 8
-"""Every n-th view is a test view."""
+"""Every view of this number is a test view."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def camera_at(height: float, azimuth: float, size: int) -> Camera:
 
 
 def photographed(scene: Scene, name: str, camera: Camera) -> View:
-    """Trace a photo with alpha, a row of pixels at a time: that many rays fit in cache."""
+    """Trace a photo with alpha, a row of pixels at a time, whose rays fit in cache."""
     rows = [_row(scene, camera, y) for y in range(camera.H)]
     color, alpha = (np.stack(part) for part in zip(*rows, strict=True))
     return View(camera, _bytes(color), alpha=_bytes(alpha), name=name)
@@ -133,7 +133,7 @@ def photographed(scene: Scene, name: str, camera: Camera) -> View:
 def _row(
     scene: Scene, camera: Camera, y: int
 ) -> tuple[Float64[np.ndarray, "W 3"], Float64[np.ndarray, " W"]]:
-    """Return straight colour and alpha of a row of pixels: means over the rays of each."""
+    """Return straight colour and alpha of a row of pixels, as means over the rays of each pixel."""
     inside = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
     across = (np.arange(camera.W)[:, None] + inside).ravel()
     x, v = np.meshgrid((across - camera.cx) / camera.fx, (y + inside - camera.cy) / camera.fy)
@@ -178,7 +178,7 @@ def _shaded(scene: Scene, shape: Shape, points: Points, directions: Points) -> P
 
 
 def checks(scale: float, dark: tuple[float, ...], bright: tuple[float, ...]) -> Texture:
-    """Return cubes of two colours, `scale` of them in a unit of length."""
+    """Return a texture of cubes of two colours, `scale` of them per unit of length."""
 
     def texture(points: Points) -> Points:
         even = np.floor(scale * points).sum(axis=0) % 2 == 0
@@ -188,7 +188,7 @@ def checks(scale: float, dark: tuple[float, ...], bright: tuple[float, ...]) -> 
 
 
 def _waves(points: Points) -> Points:
-    """Return smooth colours with fine ripples."""
+    """Return a texture of smooth colours with fine ripples."""
     x, y, z = points
     ripple = 0.15 * np.sin(40 * x + 9 * np.sin(5 * y)) * np.sin(35 * z + 3 * x)
     base = [0.6 + 0.3 * np.sin(3 * x + z), 0.4 + 0.3 * np.cos(4 * y), 0.5 - 0.3 * np.sin(5 * z)]
@@ -196,7 +196,7 @@ def _waves(points: Points) -> Points:
 
 
 def _stripes(points: Points) -> Points:
-    """Return stripes that wind around the vertical axis."""
+    """Return a texture of stripes that wind around the vertical axis."""
     turn = np.arctan2(points[2], points[0]) / (2 * math.pi)
     bright = np.sin(2 * math.pi * (9 * turn + 6 * points[1])) > 0
     return np.where(bright, _column((0.95, 0.9, 0.8)), _column((0.1, 0.25, 0.5)))
@@ -209,7 +209,7 @@ def _column(color: tuple[float, ...]) -> Float64[np.ndarray, "3 1"]:
 def placed(
     center: tuple[float, ...], halves: tuple[float, ...], turn: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and axes of a shape that is turned about the vertical axis, radians."""
+    """Return centre and axes of a shape that is rotated about the vertical axis, radians."""
     c, s = math.cos(turn), math.sin(turn)
     return np.array(center), np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) / np.array(halves)[:, None]
 

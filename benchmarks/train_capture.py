@@ -1,4 +1,4 @@
-"""What does a whole training of a capture cost, and how is its time spent as the scene grows?
+"""How long does a training of a capture take, and how do the stages of an iteration change as the scene grows?
 
     python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--smoke] [--out FILE.json] [options of train]
 

@@ -1,11 +1,12 @@
-"""What does a training iteration of a real capture cost, stage by stage?
+"""How long does each stage of a training iteration of a capture take?
 
     python benchmarks/train_step.py [CAPTURE] [--smoke] [--out FILE.json]
 
 CAPTURE is anything that `gsplat-edu train` accepts (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else
-a procedural capture). Gaussians start at its points, as in the recipe. One iteration: render at full size, 0.8 L1
-+ 0.2 (1 - SSIM) against the uint8 photo, backward, Adam. Medians over 20 views: first with stored gradients, so that
-every stage has its own time, then with Adam in the backward pass, as the trainer does it.
+a procedural capture). Gaussians start at its points, as in the recipe. An iteration renders at full size, computes
+0.8 L1 + 0.2 (1 - SSIM) with the uint8 photo, and takes the backward pass and Adam. Times are medians over 20 views,
+first with stored gradients, so that every stage has its own time, then with Adam in the backward pass, as in the
+trainer.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def main() -> None:
         dataset = load_dataset(folder)
         dataset.preload()
     scene = from_points(dataset.points, dataset.colors, TrainConfig())
-    with reused_buffers():  # as the trainer does
+    with reused_buffers():  # as in the trainer
         views, rounds = (*dataset.train, *dataset.test), 1 if arguments.smoke else 20
         medians, fused = (measure(scene, views, rounds, way) for way in (False, True))
     hardware.report({"capture": folder.name, "medians": medians, "fused": fused}, arguments.out)

@@ -88,7 +88,7 @@ def test_gradients_before_a_background_are_proven_by_finite_differences(with_fal
 
 
 def test_the_object_is_recoloured_and_the_background_stays():
-    """The test corrects premultiplied colours and composites them in float64 NumPy, which differs by a few roundings."""
+    """The test corrects premultiplied colours and composites them in float64 NumPy, equal up to a few roundings."""
     rng = np.random.default_rng(4)
     colors, opacity = rng.uniform(size=(7, 9, 3)), rng.uniform(size=(7, 9))
     opacity[0], opacity[1] = 0.0, 1.0
