@@ -41,6 +41,7 @@ from gsplat_edu.clean.judge import Reason
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import Subject, open_subject
 from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
 
@@ -157,7 +158,7 @@ def main() -> int:
 
     def measure() -> None:
         with trained(None if options.smoke else options.run) as run:
-            subject = open_subject(run, None)
+            subject = open_subject(run, None, load_backend("cpu"))
             if options.million:
                 result = million(subject, 1_000 if options.smoke else MILLION)
             else:

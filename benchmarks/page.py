@@ -125,7 +125,7 @@ def browser(smoke: bool) -> Iterator[Any]:
 
 
 def until(tab: Any, words: str, limit: float = PATIENCE) -> None:  # noqa: ANN401
-    """Wait until a condition holds in a page, whose policy forbids Playwright's own function, which evaluates strings."""
+    """Wait until a condition holds in a page, whose policy forbids the evaluated strings of Playwright's function."""
     end = time.perf_counter() + limit / 1e3
     while not tab.evaluate(words):
         if time.perf_counter() > end:

@@ -309,7 +309,7 @@ TIME = "processor_seconds"
 
 
 def seconds_to(curve: Sequence[dict[str, float]], psnr: float) -> float | None:
-    """Return when a run's held-out PSNR first reaches a value, processor seconds, interpolated; None if it never does."""
+    """Return the processor seconds at which a run's held-out PSNR reaches a value, interpolated; None if never."""
     for before, point in zip((None, *curve), curve, strict=False):
         if point["psnr"] >= psnr:
             if before is None:
@@ -347,7 +347,7 @@ def spread(runs: Sequence[dict[str, Any]], key: str, digits: int) -> str:
 
 
 def races(results: Results) -> list[str]:
-    """Return when recipes reach the final PSNR of adc and mcmc, as fractions of their processor time (mean over seeds)."""
+    """Return when recipes reach the final PSNR of adc and mcmc, as fractions of their processor time."""
     said = []
     for other in (name for name in results.recipes() if RECIPES[name].strategy != "fast"):
         target, whole = mean(results.of(other), "psnr"), mean(results.of(other), TIME)
