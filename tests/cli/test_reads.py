@@ -1,6 +1,7 @@
 """A command reads its capture once, also if it chooses settings, measures the machine and trains."""
 
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -74,10 +75,28 @@ def test_doctor_before_and_after_a_training(capture, tmp_path, reads, capsys):
         assert reads == {("read_capture", capture): 1} | photo_headers(capture), command
 
 
-def test_split(tmp_path, reads):
-    folder = tmp_path / "city"
-    write_city(folder, City(photos=36, width=32, points=40))
-    words = ["--blocks", "2", "--iterations", "12", "--coarse-iterations", "12"]
-    assert main(["train", str(folder), "--out", str(tmp_path / "run"), "--until", "split", *words]) == 0
-    assert [count for (name, _), count in reads.items() if name == "read_capture"] == [1]
-    assert set(reads.values()) == {1}
+def test_blocks(tmp_path, reads, monkeypatch):
+    """Splitting, all blocks and merging share what was read once, also if the path is relative."""
+    monkeypatch.chdir(tmp_path)
+    write_city(tmp_path / "city", City(photos=36, width=32, points=40))
+    words = [
+        "train",
+        "city",
+        "--out",
+        "run",
+        "--blocks",
+        "2",
+        "--iterations",
+        "12",
+        "--coarse-iterations",
+        "12",
+    ]
+    assert main([*words, "--until", "split"]) == 0
+    assert reads == {("read_capture", Path("city")): 1} | photo_headers(Path("city"))
+    reads.clear()
+    assert main([*words, "--resume"]) == 0
+    assert reads == {("read_capture", tmp_path / "city"): 1} | photo_headers(tmp_path / "city")
+    reads.clear()
+    words[words.index("run")] = "at_once"
+    assert main(words) == 0
+    assert reads == {("read_capture", Path("city")): 1} | photo_headers(Path("city"))

@@ -17,9 +17,11 @@ from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
 from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
 from gsplat_edu.blocks.task import block_options
-from gsplat_edu.data.dataset import Dataset, load_dataset
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
+from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import fingerprint
 from gsplat_edu.runs.options import RunOptions
@@ -102,7 +104,7 @@ def _within_cap(parts: list[Gaussians], cap: int) -> list[Gaussians]:
 def merge_blocks(
     path: Path,
     say: Say = lambda sentence: None,
-    data: Path | None = None,
+    reader: CaptureReader | None = None,
     progress: Progress | None = None,
     export: Export | None = None,
 ) -> Evaluation:
@@ -111,7 +113,7 @@ def merge_blocks(
     Args:
         path: Folder of the run in blocks.
         say: Receives sentences for the user.
-        data: Where the capture is on this machine; None for the path in the plan.
+        reader: Reads the capture, from where it is on this machine; None to read it from the path in the plan.
         progress: Called for every scored view.
         export: As for `CaptureRun.finish`.
 
@@ -126,8 +128,8 @@ def merge_blocks(
         named = ", ".join(" with version ".join(kind) for kind in kinds)
         say(f"blocks were trained by different kernels ({named}): other machines may round to other bytes")
     gaussians, counts = merged(folder, plan, records)
-    options = _whole(folder, plan, data)
-    dataset = load_dataset(options.data, options.data_settings)
+    options = _whole(folder, plan, None if reader is None else reader.path)
+    dataset = Dataset.of(reader_for(options.data, reader), options.data_settings)
     steps = max(done.iterations for done in records)
     run = folder.merged
     check_views(folder, plan, dataset)

@@ -17,6 +17,7 @@ from gsplat_edu.base.reading import stored_path
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.ops.kernels import REASON, native
 from gsplat_edu.render.settings import BACKENDS
@@ -73,7 +74,7 @@ def block_options(folder: BlocksFolder, plan: BlockPlan, number: int, data: Path
 def train_block(
     path: Path,
     number: int,
-    data: Path | None = None,
+    reader: CaptureReader | None = None,
     say: Say = lambda sentence: None,
     stop: Callable[[], bool] = lambda: False,
     callbacks: Sequence[Callback] = (),
@@ -84,7 +85,7 @@ def train_block(
     Args:
         path: Folder of the run in blocks.
         number: The block.
-        data: Where the capture is on this machine; None for the path in the plan.
+        reader: Reads the capture, from where it is on this machine; None to read it from the path in the plan.
         say: Receives sentences for the user.
         stop: Called after every iteration; if it returns true, the block is saved and can be resumed.
         callbacks: Receive every step.
@@ -101,7 +102,7 @@ def train_block(
     """
     folder = BlocksFolder(path)
     plan = BlockPlan.read(path)
-    options = block_options(folder, plan, number, data)
+    options = block_options(folder, plan, number, None if reader is None else reader.path)
     if (done := folder.read_done(number, plan.digest())) is not None:
         return done
     with locked(f"block {number}", options.out, "a training of this block", say, patience):
@@ -110,7 +111,7 @@ def train_block(
         start = folder.start(number)
         if not start.is_file() or file_digest(start) != plan.blocks[number].start:
             raise CheckpointError(f"{start}: is missing or not as it was split; restore it, or split again")
-        capture = CaptureRun(options, say, check=functools.partial(check_views, folder, plan))
+        capture = CaptureRun(options, say, check=functools.partial(check_views, folder, plan), reader=reader)
         if capture.train(stop, callbacks):
             return None
         capture.finish()

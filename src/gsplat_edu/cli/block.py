@@ -10,6 +10,7 @@ from gsplat_edu.blocks.task import train_block
 from gsplat_edu.cli.block_table import BlockTable
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train import interruptible
+from gsplat_edu.data.reader import CaptureReader
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -24,8 +25,9 @@ def run(arguments: argparse.Namespace) -> None:
     if number < len(planned.blocks) and folder.read_done(number, planned.digest()) is not None:
         say(f"block {number}: is finished; nothing to do")
         return
+    reader = None if arguments.data is None else CaptureReader(arguments.data)
     with interruptible() as interrupted, BlockTable(console, folder, planned):
-        done = train_block(path, number, arguments.data, say, interrupted)
+        done = train_block(path, number, reader, say, interrupted)
     if done is None:
         raise KeyboardInterrupt(
             f"interrupted in block {number}; the same command resumes from its checkpoint"

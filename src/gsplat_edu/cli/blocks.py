@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.locks import locked
+from gsplat_edu.base.reading import stored_path
 from gsplat_edu.blocks.cluster import AGAIN, ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import merge_blocks
@@ -58,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.scheduler is not None or (arguments.workers or 1) > 1:
         cluster = ClusterOptions(arguments.scheduler, arguments.workers or 1)
     with locked("--out", arguments.out, "gsplat-edu train --blocks", say):
-        planned = _prepared(arguments, console, say)
+        planned, reader = _prepared(arguments, console, say)
         folder = BlocksFolder(arguments.out)
         if arguments.until == SPLIT:
             last = len(planned.blocks) - 1
@@ -69,17 +70,21 @@ def run(arguments: argparse.Namespace) -> None:
             return
         with BlockTable(console, folder, planned) as table:
             if cluster is None:
-                _train_here(folder, planned, table)
+                _train_here(folder, planned, reader, table)
             else:
                 _train_there(folder, planned, cluster, table, say)
         if is_merged(folder):
             say(f"{folder.path}: is finished, {len(planned.blocks)} blocks; nothing to do")
             return
-        merge_and_report(arguments.out, arguments.export, console, say)
+        merge_and_report(arguments.out, arguments.export, console, say, reader)
 
 
-def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> BlockPlan:
+def _prepared(
+    arguments: argparse.Namespace, console: Console, say: Say
+) -> tuple[BlockPlan, CaptureReader | None]:
     """Return the plan of a run in blocks; train the coarse model and split the capture if there is none yet.
+
+    The second value reads the capture; it is None if the plan names none on this computer.
 
     Raises:
         CheckpointError: the folder holds another run, or the options differ from its plan.
@@ -97,7 +102,8 @@ def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> Bloc
         chosen = stored.recipe.get("train", {})
         still_open = {n: chosen[n] for n in OPEN if getattr(of_block, n) in (None, "auto") and n in chosen}
         check_recipe(folder.path, stored, replace(options, config=options.config.changed(**still_open)))
-        return stored
+        capture = stored_path(stored.capture)
+        return stored, None if capture is None else CaptureReader(capture)
     if folder.merged.exists():
         raise CheckpointError(f"--out: {folder.path} holds a run that is not in blocks; give another folder")
     options = with_poses(options, arguments, console, say)
@@ -115,7 +121,7 @@ def _prepared(arguments: argparse.Namespace, console: Console, say: Say) -> Bloc
         _train_coarse(coarse, reader, console, say)
     split = SplitOptions(block_count(arguments), arguments.min_views or LEAST_VIEWS, quality_of(arguments))
     scene = coarse_scene(replace(options, scene=arguments.scene))
-    return split_capture(replace(options, scene=None), scene, split, say, reader)
+    return split_capture(replace(options, scene=None), scene, split, say, reader), reader
 
 
 def _chosen_before(coarse: RunOptions, of_block: argparse.Namespace) -> dict[str, object]:
@@ -142,11 +148,13 @@ def _train_coarse(options: RunOptions, reader: CaptureReader, console: Console, 
         capture.finish()
 
 
-def _train_here(folder: BlocksFolder, planned: BlockPlan, table: BlockTable) -> None:
+def _train_here(
+    folder: BlocksFolder, planned: BlockPlan, reader: CaptureReader | None, table: BlockTable
+) -> None:
     """Train the blocks in this process, one after the other."""
     with interruptible() as interrupted:
         for number in range(len(planned.blocks)):
-            if train_block(folder.path, number, stop=interrupted) is None:
+            if train_block(folder.path, number, reader, stop=interrupted) is None:
                 raise KeyboardInterrupt(f"interrupted in block {number}; {AGAIN}")
             table.look()
 
@@ -172,7 +180,7 @@ def is_merged(folder: BlocksFolder) -> bool:
 
 
 def merge_and_report(
-    path: Path, exports: list[Path], console: Console, say: Say, data: Path | None = None
+    path: Path, exports: list[Path], console: Console, say: Say, reader: CaptureReader | None = None
 ) -> None:
     """Merge the blocks of a run and print the scores.
 
@@ -181,7 +189,7 @@ def merge_and_report(
         exports: Files to write in other formats.
         console: The terminal.
         say: Receives sentences for the user.
-        data: Where the capture is on this machine; None for the path in the plan.
+        reader: Reads the capture, from where it is on this machine; None to read it from the path in the plan.
     """
     recipe = BlockPlan.read(path).recipe
     with progress_bar(console, "") as bar:
@@ -193,7 +201,7 @@ def merge_and_report(
         export = (
             functools.partial(export_all, exports, bar, str(recipe.get("backend")), say) if exports else None
         )
-        result = merge_blocks(path, say, data, scored, export)
+        result = merge_blocks(path, say, reader, scored, export)
     for line in score_lines(result.test, result.train):
         say(line)
     seams = result.metrics["seams"]

@@ -7,6 +7,7 @@ import argparse
 from gsplat_edu.base.locks import locked
 from gsplat_edu.cli.blocks import merge_and_report
 from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.viewer.export import check_target
 
 
@@ -20,4 +21,5 @@ def run(arguments: argparse.Namespace) -> None:
     for path in arguments.export:
         check_target("--export", path)
     with locked("RUN", arguments.run_folder, "gsplat-edu merge", say):
-        merge_and_report(arguments.run_folder, arguments.export, console, say, arguments.data)
+        reader = None if arguments.data is None else CaptureReader(arguments.data)
+        merge_and_report(arguments.run_folder, arguments.export, console, say, reader)
