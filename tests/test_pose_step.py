@@ -101,7 +101,7 @@ def test_a_photo_without_information_keeps_the_given_pose(scene):
     torch.testing.assert_close(step, -OFF)
 
 
-def test_too_few_pixels_move_nothing(scene):
+def test_too_few_pixels_do_not_move_the_pose(scene):
     gaussians, camera, photo = scene
     seen = shown(gaussians, camera)
     mask = torch.zeros(camera.H, camera.W, dtype=torch.bool)

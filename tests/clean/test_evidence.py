@@ -106,7 +106,7 @@ def test_the_gain_is_the_change_of_the_error_without_the_splat(scene, photo):
         assert found.gain[i] / REPEATS == pytest.approx(change, abs=5 * 0.1415 * square + 1e-6)
 
 
-def test_a_splat_that_is_removed_is_judged_by_what_it_would_add(scene, photo):
+def test_the_gain_of_a_removed_splat_is_that_of_adding_it(scene, photo):
     """Drawn at 0.02, a splat ends where alpha is 1/255. That core holds 80 % of the linear and 96 % of the square
     term."""
     removed = np.zeros(COUNT, dtype=bool)

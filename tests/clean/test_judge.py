@@ -54,7 +54,7 @@ def test_unseen_splats_change_no_pixel_by_more_than_a_byte(room, planted, cleani
         assert float((whole - rest).abs().max()) <= 1 / 255
 
 
-def test_a_clean_scene_keeps_what_is_seen(room, rings):
+def test_a_clean_scene_loses_at_most_one_visible_splat(room, rings):
     """At most one splat is removed: hardly visible, in front of an edge by chance, and not missed by any photo."""
     found = clean(room, photographed(room, rings[0]), photographed(room, rings[1]), SETTINGS)
     assert (found.reasons > Reason.UNSEEN).sum() <= 1

@@ -68,7 +68,7 @@ def test_every_format_is_written_and_verified_from_the_runs_cameras(convert, tmp
         assert float(figures[1]) == 100.0
 
 
-def test_what_a_format_cannot_store_is_reported(convert, tmp_path):
+def test_values_that_a_format_cannot_store_are_reported(convert, tmp_path):
     folder, *_ = make_run(tmp_path / "run")
     said = convert(folder.path, tmp_path / "a.splat")
     assert "30 splats, SH degree 0" in said

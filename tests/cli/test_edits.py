@@ -205,7 +205,7 @@ def test_the_file_of_the_editor_is_beside_the_scene(tmp_path, plain):
         assert str(_edits_file(build_parser(given).parse_args(given))) == str(file)
 
 
-def test_what_cannot_be_edited_is_one_line(run, plain, tmp_path):
+def test_sources_that_cannot_be_edited_are_refused_in_one_line(run, plain, tmp_path):
     (tmp_path / "bad.json").write_text('{"format": "gsplat_edu edits", "version": 7}')
     words = ["view", plain, "--port", 0, "--no-open", "--edit", tmp_path / "bad.json"]
     assert "bad.json: version: is 7, but 1 is supported" in run(*words, code=2)
@@ -214,6 +214,6 @@ def test_what_cannot_be_edited_is_one_line(run, plain, tmp_path):
     assert "--edit: levels of detail cannot be edited" in said
 
 
-def test_a_written_page_is_read_back_with_what_is_left(run, edits, plain, tmp_path):
+def test_a_page_of_edits_has_the_remaining_splats(run, edits, plain, tmp_path):
     run("convert", plain, "--edits", edits(plain, *DELETE, *TILT), tmp_path / "out.html")
     assert len(read_back(tmp_path / "out.html").gaussians) == len(outside(read_scene(plain).gaussians))

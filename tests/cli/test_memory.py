@@ -175,7 +175,7 @@ def test_free_memory_is_the_minimum_over_the_machine_and_its_cgroups(tmp_path, m
     require_memory("little work", 2**20, "nothing to say")
 
 
-def test_small_photos_are_decoded_whatever_is_free(tmp_path, monkeypatch):
+def test_small_photos_are_decoded_without_checking_free_memory(tmp_path, monkeypatch):
     write_transforms(tmp_path, *procedural_capture(24, 3, splats=20))
     monkeypatch.setattr(headroom, "available_memory", lambda: 0)
     assert decode(next((tmp_path / "images").iterdir()))[0].shape == (18, 24, 3)

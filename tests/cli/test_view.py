@@ -201,7 +201,7 @@ def test_the_browser_opens_only_on_a_terminal_with_a_screen(made, tmp_path):
     ],
 )
 @pytest.mark.usefixtures("as_shipped")
-def test_what_cannot_be_shown_costs_one_line(tmp_path, monkeypatch, capsys, words, says):
+def test_sources_that_cannot_be_viewed_are_refused_in_one_line(tmp_path, monkeypatch, capsys, words, says):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.txt").write_text("notes")

@@ -142,7 +142,7 @@ TAKEN = {
 
 
 @pytest.mark.parametrize(("function", "name"), CASES)
-def test_only_our_errors_come_out(function, name):
+def test_wrong_types_raise_only_our_errors(function, name):
     call, given = CALLS[function]
     call(**given)
     for what, value in WRONG.items():

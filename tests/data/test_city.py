@@ -53,7 +53,7 @@ def test_several_processes_write_the_same_bytes(written, tmp_path):
         assert len(digests) == 1, file
 
 
-def test_the_tool_writes_it(tmp_path, monkeypatch, capsys):
+def test_the_tool_writes_a_city(tmp_path, monkeypatch, capsys):
     words = [
         "make_city.py",
         str(tmp_path / "city"),

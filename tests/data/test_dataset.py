@@ -105,7 +105,7 @@ def test_one_photo_is_trained_on(tmp_path, small):
         load_dataset(tmp_path, DataSettings(test_every=8))
 
 
-def test_the_captures_own_split(tmp_path, small):
+def test_the_split_of_the_capture_is_used(tmp_path, small):
     views = small[0]
     names = [f"images/{view.name}" for view in views]
     write_transforms(tmp_path, views, extra={"train_filenames": names[:4], "test_filenames": names[6:]})

@@ -28,7 +28,7 @@ def by_stem(views):
 
 
 @pytest.mark.parametrize("layout", ["colmap", "text", "transforms", "blender"])
-def test_what_is_written_is_read(written, small, layout):
+def test_written_captures_are_read_unchanged(written, small, layout):
     views, points, colors = small
     dataset = load_dataset(written(layout), EVERYTHING)
     found = by_stem(dataset.train)

@@ -236,7 +236,7 @@ def test_a_tiff_with_16_bits_is_rounded(tmp_path, order):
     np.testing.assert_array_equal(rgb, np.repeat(ROUNDED[..., :1], 3, axis=2))
 
 
-def test_colours_that_were_multiplied_with_alpha_are_divided_by_it(tmp_path):
+def test_premultiplied_colours_are_divided_by_alpha(tmp_path):
     alpha = np.maximum(DEEP[..., 3], 3000)
     colors = DEEP[..., :3] / 65535.0
     stored = np.dstack([np.rint(colors * alpha[..., None]), alpha]).astype(np.uint16)

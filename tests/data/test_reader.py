@@ -29,7 +29,7 @@ def capture(tmp_path_factory):
 
 
 @pytest.mark.parametrize("with_points", [False, True])
-def test_a_derived_dataset_is_that_of_a_capture_read_anew(capture, tmp_path, with_points):
+def test_a_derived_dataset_equals_that_of_a_new_reader(capture, tmp_path, with_points):
     points = tmp_path / "points.ply" if with_points else None
     if points is not None:
         write_points_ply(points, Cloud(np.eye(3), np.full((3, 3), 0.5)))

@@ -54,7 +54,7 @@ def test_one_photo_and_photos_that_share_nothing():
     assert cloud_in_view([back, front]) is None
 
 
-def test_a_cube_loses_what_no_two_photos_see():
+def test_points_of_a_cube_that_no_two_photos_see_are_dropped():
     cameras = [camera for camera in orbit() if camera.eye[0] > 0]
     cloud = cloud_in_cube(cameras, np.zeros(3), 5.0)
     assert 0 < len(cloud.points) < RANDOM_POINTS and seen_by(cloud.points, cameras, 2).all()
@@ -91,7 +91,7 @@ def test_photos_that_share_nothing_start_around_the_cameras(tmp_path):
     assert len(dataset.points) == RANDOM_POINTS
 
 
-def test_cameras_close_together_start_where_they_look():
+def test_cameras_close_together_get_points_at_their_subject():
     """The distance between the cameras is a twentieth of the distance to the subject."""
     eyes = [np.array([0.2 * i, 0.1 * (i % 2), -8.0]) for i in range(-2, 3)]
     cameras = [Camera(look_at(eye, np.zeros(3)), eye, 60.0, 60.0, 31.5, 31.5, 64, 64) for eye in eyes]

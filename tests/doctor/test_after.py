@@ -112,7 +112,7 @@ def test_a_photo_the_scene_cannot_explain(scene, sigma, is_named):
 
 
 @pytest.mark.parametrize(("sigma", "is_named"), [(0.01, False), (0.05, True), (0.15, True)])
-def test_test_views_far_below_those_of_training(scene, sigma, is_named):
+def test_test_views_that_score_far_below_training_views(scene, sigma, is_named):
     gaussians, views = scene
     spoiled = views
     for i in range(4):
@@ -371,7 +371,7 @@ def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     assert not any("not between" in line for line in diagnosis_lines(examine_run(trained(gaussians, views))))
 
 
-def test_photos_that_show_what_others_do_not_are_named_with_the_option(scene):
+def test_photos_with_objects_that_others_lack_are_named_with_the_option(scene):
     assert "moved" not in warnings(trained(*scene))
     found = warnings(trained(*scene, moved=(("b.png", 0.123), ("a.png", 0.02))))["moved"]
     assert found.labels == ("b.png (12.3 %)", "a.png (2.0 %)") and "2 photos" in found.sentence

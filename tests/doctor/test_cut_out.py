@@ -63,7 +63,7 @@ def test_the_shape_of_the_masks_decides(mask, choice):
     assert found.value == choice and found.reason
 
 
-def test_photos_without_a_mask_show_what_surrounds_the_object():
+def test_masks_of_too_few_photos_do_not_cut_out_an_object():
     masks = [objects(i) for i in range(N)]
     assert outside_masks_for(masks, N + 1).value == "empty"
     assert outside_masks_for(masks, N + 3).value == "ignore"

@@ -70,7 +70,7 @@ def test_8_bits_round_to_the_nearest_byte():
     np.testing.assert_array_equal(to_bytes(np.full((1, 1, 3), 100.5 / 255)), 101)
 
 
-def test_tensors_are_images_too():
+def test_tensors_are_accepted_as_images():
     image, truth = noise(6, 7, 3), noise(6, 7, 3, seed=1)
     given = torch.tensor(image, requires_grad=True), torch.tensor(truth)
     assert psnr(*given) == psnr(image, truth)

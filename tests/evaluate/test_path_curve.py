@@ -115,7 +115,7 @@ def test_keyframes_are_met_at_their_times(loop):
         np.testing.assert_allclose(rotations[i], keyframe.R, atol=1e-9)
         assert fovs[i] == pytest.approx(keyframe.fov)
     first, again = (np.concatenate([x.ravel() for x in curve.poses([t])]) for t in (0.25, 0.25 + 9.5))
-    assert np.allclose(first, again) == loop, "a loop repeats its first camera, an open path does not"
+    assert np.allclose(first, again) == loop, "a loop repeats its motion, an open path does not"
 
 
 def test_the_times_change_the_speed_and_not_the_curve():

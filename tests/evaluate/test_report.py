@@ -257,7 +257,7 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
         browser.close()
 
 
-def test_a_report_without_content_is_a_page_too(tmp_path):
+def test_a_report_without_content_is_a_valid_page(tmp_path):
     write_report(tmp_path / "r.html", Report("empty", {"test": summarize([])}))
     page = Page(tmp_path / "r.html")
     assert "No view was held out for testing" in page.text and "svg" not in page.tags
@@ -284,7 +284,7 @@ def test_every_kind_of_number_has_its_own_curve():
     assert [axes.lines[0].get_ydata()[0] for axes in panels] == [2.0, 21.0, 301.0, 5.0]
 
 
-def test_the_size_of_the_photos_and_the_cap_are_drawn_where_a_run_has_them():
+def test_the_size_of_the_photos_and_the_cap_are_drawn_if_a_run_has_them():
     log = [{"iteration": i, "num_gaussians": 100 * i, "photo_factor": 4.0 / i} for i in (1, 2)]
     count, size = (figure.axes[0] for figure in run_curve_figures(log, cap=900))
     assert size.get_title() == "size of the photos" and size.lines[0].get_ydata().tolist() == [4.0, 2.0]

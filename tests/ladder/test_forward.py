@@ -129,7 +129,7 @@ def test_the_naive_kernel_in_triton():
     assert seconds > 0 and ("interpreter" in where() or "compiled" in where())
 
 
-def test_timing_returns_what_was_drawn():
+def test_timing_returns_the_drawn_image():
     splats = odd(20, seed=0, stretch=1.0)
     seconds, rendered = forward.seconds("tight", splats, enough=0.0)
     assert seconds > 0

@@ -98,7 +98,7 @@ def test_the_same_bits_with_any_number_of_threads(random_splats, random_camera, 
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
-def test_other_backends_refuse_it(random_camera):
+def test_other_backends_refuse_to_stop_pixels(random_camera):
     shapes = {
         "means": (2, 3),
         "quats": (2, 4),

@@ -45,7 +45,7 @@ ELSEWHERE = {
     "sanitize.sh": "Makefile",
     "set_up.sh": "Makefile",
 }
-"""Tools by the test file that runs them, or the make target."""
+"""By tool, the file that runs it."""
 
 
 SCRIPT = """

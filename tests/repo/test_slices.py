@@ -120,7 +120,7 @@ def test_a_shard_may_take_an_eighth_of_every_test(monkeypatch):
     assert all(len(kept) == 2 + 1 for kept in runs(items, soak=True))
 
 
-def test_no_shard_leaves_only_what_the_change_touches():
+def test_shard_none_runs_only_what_the_change_touches():
     items = cases("long", pytest.mark.sliced(3), range(12)) + cases("short", None, range(4))
     shards = slices.numbered(items)
     kept, _ = slices.split(items, {item: shards[item] for item in items[2:12]}, None)

@@ -180,7 +180,7 @@ def test_a_wheel_has_every_file_of_the_package(wheel):
     }
 
 
-def test_no_wheel_has_what_only_tests_and_benchmarks_use(wheel):
+def test_wheels_have_no_modules_that_only_tests_and_benchmarks_use(wheel):
     names = {Path(name).name for name in zipfile.ZipFile(wheel).namelist()}
     fixtures = {path.name for path in (ROOT / "tests" / "fixtures").glob("*.py")} - {"__init__.py"}
     assert {"city.py", "outdoors.py", "plant.py"} <= fixtures
@@ -188,7 +188,7 @@ def test_no_wheel_has_what_only_tests_and_benchmarks_use(wheel):
 
 
 @pytest.mark.parametrize("room", ["data", "clean"])
-def test_users_need_every_module_of_a_room_that_once_held_fixtures(room):
+def test_packages_that_had_fixtures_have_only_modules_for_users(room):
     """Each module of these packages is imported by the package, or used in the course or the documents."""
     package = ROOT / "src" / "gsplat_edu"
     sources = list(package.rglob("*.py"))
@@ -236,7 +236,7 @@ def test_the_compiler_gives_the_same_bytes_in_every_folder(tmp_path):
     assert [name for name in first if first[name] != second[name]] == []
 
 
-def test_what_differs_between_two_wheels_is_named(module, pure, tmp_path):
+def test_differences_between_two_wheels_are_named(module, pure, tmp_path):
     tag = "cp311-cp311-linux_x86_64"
     wheel, same = (pack(pure, module, tag, [], tmp_path / name) for name in ("one", "two"))
     assert repeat.differences(wheel, same) == []

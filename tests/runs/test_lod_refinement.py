@@ -75,7 +75,7 @@ def test_a_scene_without_photos_is_compared_with_its_renders(tmp_path, capsys):
     assert codec.read_index(out).counts() == [120, 60, 30]
 
 
-def test_a_level_that_training_makes_worse_stays_as_merged(run, monkeypatch):
+def test_a_level_that_training_makes_worse_is_not_refined(run, monkeypatch):
     def spoilt(source, gaussians, views, steps, backend):
         return gaussians.map(lambda tensor: tensor + 1.0)
 

@@ -236,7 +236,7 @@ def test_gps_reaches_the_faces(tmp_path):
 
 
 @pytest.mark.sliced(1, group="captures from photos", together=True)
-def test_the_work_folder_records_what_was_cut(room):
+def test_the_work_folder_lists_the_cut_panoramas(room):
     facts = json.loads((room.capture / "sfm" / "stages.json").read_text())["stages"]["faces"]["facts"]
     assert [one["name"] for one in facts["panoramas"]] == [f"p{i}.jpg" for i in range(COUNT)]
     data = (room.capture / "images" / "p0_0.jpg").read_bytes()

@@ -312,7 +312,7 @@ def test_a_record_names_no_other_place_than_a_request_could(library, work, purpo
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 
 
-def test_a_training_and_what_reads_its_run_wait_for_each_other(page, studio):
+def test_a_training_and_jobs_that_read_its_run_wait_for_each_other(page, studio):
     (studio.library.root / "captures" / "a").mkdir()
     (studio.library.root / "runs" / "r").mkdir()
     (studio.library.root / "runs" / "r" / "config.json").touch()

@@ -40,7 +40,7 @@ def test_a_watcher_resumes_after_the_last_event_it_has():
     assert found[-1][0] == f"{stream.boot}-5"
 
 
-def test_unknown_ids_start_anew(monkeypatch):
+def test_unknown_ids_start_from_the_beginning(monkeypatch):
     monkeypatch.setattr(stream_module, "KEPT", 3)
     stream = Stream()
     for number in range(6):

@@ -110,7 +110,7 @@ def test_a_sum_with_missing_terms_is_refused():
         _ = found.total
 
 
-def test_the_gradient_of_a_batch_is_the_mean_of_those_of_its_views():
+def test_the_gradient_of_a_batch_is_the_mean_over_its_views():
     """In float64, a sum of four rounds three times by at most 2^-53 of the sum of magnitudes, and the mean is exact."""
     settings = config(random_background=False, densify_start=40)
     views, points, colors = procedural_capture(24, 6, splats=60)
@@ -274,7 +274,7 @@ def test_moments_are_divided_among_ranks():
     assert together(2, held) == [(256, 256), (344, 344)]
 
 
-def test_what_a_view_model_measures_is_the_same_for_every_view_of_a_batch():
+def test_views_of_a_batch_do_not_see_each_others_measurements():
     settings = config("adc", appearance="exposure", random_background=False)
     run = trainer(settings)
     views = step_views(run, 4)

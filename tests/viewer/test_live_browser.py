@@ -69,7 +69,9 @@ class Tab:
         return np.asarray(shown.convert("RGB"), dtype=float)
 
 
-def test_a_page_shows_a_training_pauses_it_and_may_vanish(capture, tmp_path, browser, picture, monkeypatch):
+def test_a_page_shows_and_pauses_a_training_and_may_be_closed(
+    capture, tmp_path, browser, picture, monkeypatch
+):
     monkeypatch.setattr(live, "GRACE", 1.0)
     with training(capture, tmp_path / "run", "--iterations", "100000") as made:
         with Tab(browser, made.view.url) as tab:

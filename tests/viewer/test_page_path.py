@@ -155,7 +155,7 @@ def test_saved_views_become_the_file_that_render_reads(opened, tmp_path):
     np.testing.assert_array_equal(again.keyframes[1].eye, found.keyframes[2].eye)
 
 
-def test_an_embedded_path_is_written_as_it_came_and_keeps_its_times_when_it_grows(opened, tmp_path):
+def test_an_embedded_path_is_written_unchanged_and_keeps_its_times_when_it_grows(opened, tmp_path):
     path = KeyframePath(around(1.0, 1.5, 4.0, 5.0), True, 7.5)
     shown = opened(path, fresh=True)
     shown.tab.click("#path summary")

@@ -125,7 +125,7 @@ def test_a_tile_declares_splats_as_cesium_expects(written):
     ]
 
 
-def test_version_2_holds_what_version_4_holds(tmp_path):
+def test_spz_versions_2_and_4_have_the_same_values(tmp_path):
     """Only rotations are stored differently, with 8 bits per component."""
     scene = random_scene(200, 8)
     scene = Scene(scene.gaussians, antialiased=True)
