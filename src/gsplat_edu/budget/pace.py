@@ -13,7 +13,7 @@ from gsplat_edu.budget.costs import Facts
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import ending_seconds, saving_seconds
 from gsplat_edu.budget.planned import flags
-from gsplat_edu.budget.probe import judging_seconds
+from gsplat_edu.budget.probe import scoring_seconds
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.config import RECIPE_ITERATIONS
 from gsplat_edu.train.events import Event, StepEvent
@@ -76,15 +76,15 @@ class Pace:
         self._next_decision = 0.0
         self._costs = deque[tuple[float, float, float]](maxlen=3)
         # After each step: seconds by the model, seconds of the steps, and seconds since the command began.
-        self._marks = deque([(0.0, 0.0, deadline.spent)])
+        self._history = deque([(0.0, 0.0, deadline.spent)])
         self._last = deadline.spent
-        self._aside = 0.0  # seconds between steps: density, evaluations, checkpoints
-        self._planned = self._told = run.options.config.iterations
+        self._between_steps = 0.0  # seconds between steps: density, evaluations, checkpoints
+        self._planned = self._reported = run.options.config.iterations
 
     def over(self) -> bool:
         """Return whether training has to stop now."""
         now = self._deadline.spent
-        self._aside, self._last = self._aside + now - self._last, now
+        self._between_steps, self._last = self._between_steps + now - self._last, now
         late = self._deadline.seconds - now <= self._reserve
         if late and self._profile is not None:
             # The schedule follows the time, so the run is complete at this iteration.
@@ -123,17 +123,17 @@ class Pace:
         if self._profile is not None:
             position = trainer.tempo.position(trainer.iteration - trainer.config.batch)
             expected = float(self._profile[min(position, len(self._profile) - 1)])
-        modelled, stepped, _ = self._marks[-1]
+        modelled, stepped, _ = self._history[-1]
         batch = trainer.config.batch
-        self._marks.append((modelled + expected * batch, stepped + now - self._last, now))
+        self._history.append((modelled + expected * batch, stepped + now - self._last, now))
         window = WINDOW * self._deadline.seconds
-        while len(self._marks) > LEAST_STEPS + 1 and self._marks[1][2] < now - window:
-            self._marks.popleft()
+        while len(self._history) > LEAST_STEPS + 1 and self._history[1][2] < now - window:
+            self._history.popleft()
 
     @property
     def _slowness(self) -> float:
         """Ratio of the measured to the expected time of the steps in the window; 1 before the first step."""
-        (modelled, stepped, _), (last, now, _) = self._marks[0], self._marks[-1]
+        (modelled, stepped, _), (last, now, _) = self._history[0], self._history[-1]
         return (now - stepped) / (last - modelled) if last > modelled and now > stepped else 1.0
 
     @property
@@ -154,16 +154,16 @@ class Pace:
         dataset, options = self._run.dataset, self._run.options
         view = (dataset.test or dataset.train)[0]
         clock = self._deadline.clock
-        found = judging_seconds(trainer.gaussians, [view], options.config, options.backend, clock)
+        found = scoring_seconds(trainer.gaussians, [view], options.config, options.backend, clock)
         self._costs.append((*found, self._slowness))
 
     def _decide(self, trainer: Trainer, profile: Float64[np.ndarray, " iterations"]) -> None:
         """Change the number of iterations to the one that fits, if the difference exceeds `DEAD_BAND`."""
         done, config, tempo = trainer.iteration, trainer.config, trainer.tempo
-        if len(self._marks) <= LEAST_STEPS:
+        if len(self._history) <= LEAST_STEPS:
             return
         rest = profile[min(tempo.position(done), len(profile) - 1) :]
-        share_of_steps = self._marks[-1][1] / (self._marks[-1][1] + self._aside)
+        share_of_steps = self._history[-1][1] / (self._history[-1][1] + self._between_steps)
         left = PLANNED_FRACTION * (self._deadline.left - self._reserve) * share_of_steps
         fitting = min(int(left / (self._slowness * float(rest.mean()))), RECIPE_ITERATIONS - done)
         fitting -= fitting % config.batch
@@ -172,9 +172,11 @@ class Pace:
             return
         total = done + fitting
         self._settle(total, str(tempo.changed(done, total)))
-        if abs(total - self._told) > REPORTED_CHANGE * self._told:
-            self._say(f"iteration {done}: the time is enough for {total} iterations, instead of {self._told}")
-            self._told = total
+        if abs(total - self._reported) > REPORTED_CHANGE * self._reported:
+            self._say(
+                f"iteration {done}: the time is enough for {total} iterations, instead of {self._reported}"
+            )
+            self._reported = total
 
     def _settle(self, iterations: int, tempo: str) -> None:
         """Set the number of iterations and the tempo here and in config.json."""

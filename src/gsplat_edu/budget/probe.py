@@ -74,7 +74,7 @@ def resident_bytes() -> int:
     return most if sys.platform == "darwin" else 1024 * most
 
 
-def give_back() -> None:
+def return_freed_memory() -> None:
     """Return freed memory to the system if the C library supports it; by default it keeps memory for reuse."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # not the GNU C library
         ctypes.CDLL(None).malloc_trim(0)
@@ -123,10 +123,10 @@ def probe(
     trials = [trial(start, photos), trial(grown, photos)]
     if min(min(view.camera.W, view.camera.H) for view in small) >= SMALLEST_HALVED_SIDE:
         trials.append(trial(start, small))
-    score, picture = judging_seconds(grown, photos[:2], config, backend)
+    score, picture = scoring_seconds(grown, photos[:2], config, backend)
     pairs = _pairs_at_first(config, trials[0].pairs * len(usual) / len(start), len(usual))
     del start, usual, grown, small, photos
-    give_back()
+    return_freed_memory()
     return Measurements(
         backend=backend,
         speed=Speed.fitted([(t.gaussians, t.pixels, _median(t.seconds)) for t in trials]),
@@ -243,7 +243,7 @@ def _halved(view: View) -> View:
     return View(small, image, alpha=alpha, mask=mask)
 
 
-def judging_seconds(
+def scoring_seconds(
     gaussians: Gaussians,
     views: Sequence[View],
     config: TrainConfig,
