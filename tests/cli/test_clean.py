@@ -15,7 +15,6 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import save_ply
-from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.cleaning import default_target
 from gsplat_edu.runs.folder import RunFolder
@@ -89,40 +88,6 @@ def test_a_scene_file_is_judged_by_a_capture(made, cli, tmp_path):
     assert results[0] == results[1]
     assert cli(["clean", str(scene), "--dataset", str(capture)]) == 0
     assert len(read_scene(tmp_path / "scene.clean.ply").gaussians) < len(read_scene(scene).gaussians)
-
-
-def test_the_named_backend_renders(made, cli, tmp_path, monkeypatch):
-    folder, _, _ = made
-    rendered = []
-
-    def loaded(name):
-        backend = load_backend("cpu")
-
-        def noted(*arguments):
-            rendered.append(name)
-            return backend.rasterize(*arguments)
-
-        return dataclasses.replace(backend, rasterize=noted)
-
-    scenes = []
-    for words in ([], ["--backend", "auto"]):
-        assert cli(["clean", str(folder.path), "--out", str(tmp_path / "out.ply"), *words]) == 0
-        scenes.append((tmp_path / "out.ply").read_bytes())
-        monkeypatch.setattr("gsplat_edu.cli.clean.load_backend", loaded)
-    assert scenes[0] == scenes[1]
-    assert len(rendered) > 16 and set(rendered) == {"auto"}, "each view judges or guards at least once"
-
-
-def test_a_backend_without_statistics_is_refused_before_the_capture_is_read(made, cli, capsys, monkeypatch):
-    folder, _, _ = made
-    monkeypatch.setattr("gsplat_edu.cli.clean.open_subject", lambda *_: pytest.fail("the capture was read"))
-    for name, said in {
-        "torch": "clean: needs a backend that collects statistics",
-        "gpu": "backend 'gpu': not in this version of gsplat_edu; use auto or one of: cuda, cpu, torch",
-    }.items():
-        assert cli(["clean", str(folder.path), "--backend", name]) == 2
-        complaint = capsys.readouterr().err
-        assert said in complaint and complaint.count("\n") == 1
 
 
 def test_a_dry_run_writes_nothing(made, cli, capsys):

@@ -165,7 +165,7 @@ SAMPLES = {
         "clean": True,
     },
     "sfm": {"frames": 30, "matcher": "exhaustive", "camera_model": "auto", "scale": "none"},
-    "clean": {"max_loss": 0.1, "backend": "cpu"},
+    "clean": {"max_loss": 0.1},
 }
 SUBJECTS = {
     "train": "captures/a",

@@ -126,17 +126,12 @@ class _HelpAll(argparse.Action):
         parser.exit()
 
 
-def add_backend(parser: argparse._ActionsContainer, default: str = AUTO) -> None:
-    """Add the option --backend.
-
-    Args:
-        parser: Receives the option.
-        default: The default backend.
-    """
+def add_backend(parser: argparse._ActionsContainer) -> None:
+    """Add the option --backend."""
     names = ", ".join((AUTO, *BACKENDS))
     parser.add_argument(
         "--backend",
-        default=default,
+        default=AUTO,
         metavar="NAME",
         help=f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu"
         " (default: %(default)s)",

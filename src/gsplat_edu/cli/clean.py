@@ -9,7 +9,6 @@ from pathlib import Path
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.clean.evidence import judging_backend
 from gsplat_edu.clean.guard import clean
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.io.formats import format_of
@@ -32,7 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
             raise ArgumentError(f"--out: {out} is the scene itself; give another file")
     if arguments.preview is not None:
         export.check_target("--preview", arguments.preview)
-    backend = judging_backend(load_backend(arguments.backend))
+    backend = load_backend("cpu")  # no other one collects the statistics of each splat
     subject = open_subject(arguments.source, arguments.dataset, backend)
     for note in subject.dataset.notes:
         console.print(str(note), soft_wrap=True)

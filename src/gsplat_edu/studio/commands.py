@@ -13,7 +13,6 @@ from typing import Any
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import legible, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
-from gsplat_edu.render.settings import BACKENDS
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import Library, files_within, scene_file
@@ -167,7 +166,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
 
 DOCTOR_OPTIONS: Mapping[str, Option] = {"resolution": _number(0.1, 100_000.0)}
 
-CLEAN_OPTIONS: Mapping[str, Option] = {"max_loss": _number(0.0, 100.0), "backend": _choice(AUTO, *BACKENDS)}
+CLEAN_OPTIONS: Mapping[str, Option] = {"max_loss": _number(0.0, 100.0)}
 
 CONVERT_OPTIONS: Mapping[str, Option] = {
     "sh_degree": _whole(0, 3),

@@ -7,15 +7,11 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.cli.arguments import add_backend
 
 EXAMPLE = "example: gsplat-edu clean runs/plush --preview removed.html"
 
 MAX_LOSS = 0.05
 """dB: default of --max-loss."""
-
-BACKEND = "cpu"
-"""Default of --backend: auto may choose a GPU, whose kernels do not collect the statistics of each splat."""
 
 PREVIEW = ".html"
 """Suffix of the preview."""
@@ -50,7 +46,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also write a page of the scene in grey, with the removed splats in a colour for each reason",
     )
     parser.add_argument("--dry-run", action="store_true", help="report what would be removed; write no scene")
-    add_backend(parser, default=BACKEND)
 
 
 def check(arguments: argparse.Namespace) -> None:
