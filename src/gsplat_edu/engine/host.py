@@ -29,6 +29,9 @@ INSTALL = 'pip install "gsplat-edu[gpu]"'
 SLICE = 256
 """Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
 
+LEAST = 4
+"""Words of the smallest buffer: one row of four numbers, which is the largest type of an array."""
+
 VIEW_BYTES = 512
 """Bytes of the uniform block that all passes of a part share: camera and settings."""
 
@@ -213,7 +216,7 @@ class Memory:
         self.device, self.program, self.counts = device, program, dict(counts)
         usage = wgpu.BufferUsage
         storage = usage.STORAGE | usage.COPY_SRC | usage.COPY_DST
-        self._words = {buffer.name: max(1, buffer.size.of(counts)) for buffer in program.buffers}
+        self._words = {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in program.buffers}
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
         with _one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):

@@ -4,7 +4,7 @@ struct Job {
     count: u32,    // items of the pass, its capacity where the device knows how many there are
     live: u32,     // place of the number of items in the buffer `live`
     blocks: u32,   // workgroups that have items
-    shift: u32,    // lowest bit of the sort's digit
+    shift: u32,    // lowest bit of the sort's digit; 1 for a composite without background
 }
 
 @group(0) @binding(0) var<uniform> job: Job;

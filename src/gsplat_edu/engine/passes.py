@@ -17,6 +17,13 @@ FOLDER = Path(__file__).parent
 MODULES: dict[str, tuple[str, ...]] = {
     "scan": ("job", "scan"),
     "sort": ("job", "sort"),
+    "project": ("job", "view", "constants", "gaussian", "harmonics", "ellipse", "project"),
+    "order": ("job", "order"),
+    "intersect": ("job", "view", "constants", "ellipse", "intersect"),
+    "composite": ("job", "view", "constants", "splat", "composite"),
+    "composite_backward": ("job", "view", "constants", "splat", "composite_backward"),
+    "features": ("job", "features"),
+    "project_backward": ("job", "view", "constants", "gaussian", "harmonics", "project_backward"),
 }
 """Shader modules, and the WGSL files that are joined to each."""
 
@@ -87,7 +94,7 @@ class Pass:
         items: Its number of items.
         group: Items that a workgroup takes; 0 if one workgroup takes all blocks of `BLOCK`.
         live: Place in the buffer `live` of the number of items that there are, or of a total that the pass writes.
-        shift: Lowest bit of a sort's digit.
+        shift: Lowest bit of a sort's digit; 1 for a composite without background.
     """
 
     module: str

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
+from gsplat_edu.engine import host
 from gsplat_edu.ops import kernels
 from gsplat_edu.ops.adam import adam_in_torch, adam_natively
 from gsplat_edu.ops.losses import l1_ssim, l1_ssim_in_torch
@@ -25,6 +26,9 @@ from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
 CUDA_LACKS = frozenset({"stop", "processes", "statistics"})
 """What the Triton kernels do not offer."""
 
+WEBGPU_LACKS = frozenset({"stop", "processes", "statistics", "forecast"})
+"""What the WGSL kernels do not offer."""
+
 
 def resolve_backend(name: str, device: torch.device | None = None) -> str:
     """Resolve a backend's name, or "auto", to the backend that will run.
@@ -32,7 +36,8 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
     The first use of cuda in a process checks its kernels on the device (`gsplat_edu.render.self_check`).
 
     Args:
-        name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu; or a backend by name.
+        name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu, never webgpu; or a backend
+            by name.
         device: The device of the tensors to render, if they exist already: "auto" does not move them.
 
     Returns:
@@ -71,6 +76,8 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
     """
     if name == "cpu":
         return kernels.REASON
+    if name == "webgpu":
+        return host.missing()
     if name == "cuda":
         if importlib.util.find_spec("triton") is None:
             return "triton is not installed; pip install triton, or use the backend cpu"
@@ -138,6 +145,14 @@ def _dense() -> Backend:
 
 
 @functools.cache
+def _webgpu() -> Backend:
+    from gsplat_edu.render.webgpu import render_webgpu
+
+    others = _cpu() if kernels.REASON is None else _dense()  # its tensors are on the CPU
+    return dataclasses.replace(others, name="webgpu", rasterize=render_webgpu, lacks=WEBGPU_LACKS)
+
+
+@functools.cache
 def _cuda() -> Backend:
     from gsplat_edu.render.triton.adam import adam_triton
     from gsplat_edu.render.triton.loss import l1_ssim_triton
@@ -173,4 +188,4 @@ def _cuda() -> Backend:
     )
 
 
-_LOADERS = {"cpu": _cpu, "torch": _dense, "cuda": _cuda}
+_LOADERS = {"cpu": _cpu, "torch": _dense, "cuda": _cuda, "webgpu": _webgpu}
