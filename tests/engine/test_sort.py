@@ -99,14 +99,24 @@ def test_fewer_keys_than_there_is_room_for(device, count):
 
 @pytest.mark.parametrize("count", [*SIZES, 2**20 - 1, 2**20 + 1025])
 def test_scan_is_numpy_s_sum(device, count):
-    """Sums wrap around at 2^32, as NumPy's do."""
-    numbers = keys_of("random", count)
+    numbers = keys_of("random", count) >> 20
     memory = allocated(device, count)
     memory.write("numbers", numbers)
     found = memory.play("scan", read=("numbers", "live"))
-    sums = np.concatenate([[0], np.cumsum(numbers, dtype=np.uint32)]).astype(np.uint32)
+    sums = np.concatenate([[0], np.cumsum(numbers, dtype=np.uint64)])
+    assert sums[-1] < 2**32
     np.testing.assert_array_equal(found["numbers"][:count], sums[:-1])
     assert found["live"][TOTAL] == sums[-1]
+
+
+@pytest.mark.parametrize("count", [2, 1025, 3 * 2**20])
+def test_a_sum_that_does_not_fit_stays_at_the_largest_number(device, count):
+    numbers = np.full(count, 2**31 + 5, dtype=np.uint32)
+    memory = allocated(device, count)
+    memory.write("numbers", numbers)
+    found = memory.play("scan", read=("numbers", "live"))
+    assert found["numbers"][:2].tolist() == [0, 2**31 + 5]
+    assert (found["numbers"][2:count] == 2**32 - 1).all() and found["live"][TOTAL] == 2**32 - 1
 
 
 def test_workgroups_beyond_a_dimension_continue_in_the_next(device):

@@ -14,6 +14,7 @@ import functools
 import importlib.util
 import os
 import struct
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -125,6 +126,7 @@ class Device:
             self.device = chosen.request_device_sync(required_limits=wanted)
         self.limits: Mapping[str, int] = wanted
         self.most_groups = most_groups or wanted["max-compute-workgroups-per-dimension"]
+        self.lock = threading.RLock()
         self._modules: dict[str, Any] = {}
         self._pipelines: dict[tuple[str, str, int, int], Any] = {}
 
@@ -161,14 +163,14 @@ class Device:
             BackendUnavailableError: one is; the message names it.
         """
         most = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
-        for buffer in program.buffers:
-            size = WORD * buffer.size.of(counts)
-            if size > most:
-                raise BackendUnavailableError(
-                    f"backend 'webgpu': {counts[buffer.size.count]} {buffer.size.count} need a buffer of "
-                    f"{size / 2**20:.0f} MiB for {buffer.name}, but {self.name.name} allows {most / 2**20:.0f}; use "
-                    "the backend cpu"
-                )
+        largest = max(program.buffers, key=lambda buffer: buffer.size.of(counts))
+        size = WORD * largest.size.of(counts)
+        if size > most:
+            raise BackendUnavailableError(
+                f"backend 'webgpu': the buffer {largest.name} needs {size / 2**20:.0f} MiB for "
+                f"{', '.join(f'{count} {name}' for name, count in counts.items())}, but {self.name.name} allows "
+                f"{most / 2**20:.0f}; use the backend cpu"
+            )
 
     def pipeline(self, one: Pass) -> tuple[Any, Any]:
         """Return the compiled pipeline of a pass, and the layout of its storage buffers."""
@@ -284,7 +286,7 @@ class Memory:
             BackendUnavailableError: the device fails.
         """
         names = tuple(read)
-        with _one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, _one_line(f"{self.device.name.name} fails in {part}"):
             queue = self.device.device.queue
             if view:
                 queue.write_buffer(self._view, 0, view)

@@ -8,7 +8,7 @@ dimension.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
@@ -137,6 +137,22 @@ class Program:
 def source(module: str) -> str:
     """Return the WGSL of a module."""
     return "\n".join((FOLDER / f"{name}.wgsl").read_text(encoding="utf-8") for name in MODULES[module])
+
+
+def manifest(program: Program) -> dict[str, object]:
+    """Return a program as JSON for a host in another language: the shaders' text, buffers and passes.
+
+    A size is {count, words, per}, as in `Size`; a pass has the fields of `Pass`.
+    """
+    parts = {part: [asdict(one) for one in passes] for part, passes in program.parts.items()}
+    modules = sorted({one.module for one in program.passes()})
+    return {
+        "modules": {name: source(name) for name in modules},
+        "buffers": [asdict(buffer) for buffer in program.buffers],
+        "parts": parts,
+        "block": BLOCK,
+        "limits": LIMITS,
+    }
 
 
 def scan_scratch(items: Size) -> Size:

@@ -2,6 +2,7 @@
 //
 //     out[i] = in[0] + ... + in[i - 1]
 //
+// Sums that do not fit stay at 2^32 - 1, so that a total that is too large can be told from a small one.
 // Three passes: `reduce` sums blocks of 1024, `scan_sums` scans the sums in one workgroup, `scan_blocks` scans each block
 // from its sum. No workgroup waits for another one.
 
@@ -20,6 +21,11 @@ const SCAN_BLOCK = 1024u;
 
 var<workgroup> partial: array<u32, SCAN_THREADS>;
 
+fn plus(a: u32, b: u32) -> u32 {
+    let sum = a + b;
+    return select(sum, 0xffffffffu, sum < a);
+}
+
 // Returns the sum of `mine` over the threads before this one. All threads of the workgroup call it together; `partial`
 // then has the sums up to and with each thread.
 fn scan_threads(mine: u32, thread: u32) -> u32 {
@@ -31,10 +37,10 @@ fn scan_threads(mine: u32, thread: u32) -> u32 {
             before = partial[thread - reach];
         }
         workgroupBarrier();
-        partial[thread] += before;
+        partial[thread] = plus(partial[thread], before);
         workgroupBarrier();
     }
-    return partial[thread] - mine;
+    return select(partial[max(thread, 1u) - 1u], 0u, thread == 0u);
 }
 
 @compute @workgroup_size(SCAN_THREADS)
@@ -45,7 +51,7 @@ fn reduce(@builtin(workgroup_id) id: vec3<u32>, @builtin(num_workgroups) groups:
     var mine = 0u;
     for (var k = 0u; k < SCAN_ITEMS; k++) {
         if (first + k < job.count) {
-            mine += scan_in[first + k];
+            mine = plus(mine, scan_in[first + k]);
         }
     }
     scan_threads(mine, thread);
@@ -66,16 +72,16 @@ fn scan_sums(@builtin(local_invocation_index) thread: u32) {
             if (first + k < job.blocks) {
                 items[k] = sums_to_scan[first + k];
             }
-            mine += items[k];
+            mine = plus(mine, items[k]);
         }
-        var start = before + scan_threads(mine, thread);
+        var start = plus(before, scan_threads(mine, thread));
         for (var k = 0u; k < SCAN_ITEMS; k++) {
             if (first + k < job.blocks) {
                 sums_to_scan[first + k] = start;
             }
-            start += items[k];
+            start = plus(start, items[k]);
         }
-        before += partial[SCAN_THREADS - 1u];
+        before = plus(before, partial[SCAN_THREADS - 1u]);
         workgroupBarrier();          // the next chunk overwrites `partial`
     }
     if (thread == 0u) {
@@ -95,16 +101,16 @@ fn scan_blocks(@builtin(workgroup_id) id: vec3<u32>, @builtin(num_workgroups) gr
         if (first + k < job.count) {
             items[k] = scanned[first + k];
         }
-        mine += items[k];
+        mine = plus(mine, items[k]);
     }
     var start = scan_threads(mine, thread);
     if (block < job.blocks) {
-        start += block_starts[block];
+        start = plus(start, block_starts[block]);
     }
     for (var k = 0u; k < SCAN_ITEMS; k++) {
         if (first + k < job.count) {
             scanned[first + k] = start;
         }
-        start += items[k];
+        start = plus(start, items[k]);
     }
 }
