@@ -29,14 +29,15 @@ struct Pixel {
 fn blended(start: Pixel, pixel: vec2<f32>, count: u32, fell: ptr<function, u32>) -> Pixel {
     var state = start;
     for (var j = 0u; j < count; j++) {
-        let splat = batch[j];
-        let alpha = alpha_of(power_at(splat, pixel - splat.a.xy));
-        if (alpha > 0.0) {
-            let w = state.T * alpha;
-            state.mixed += w * splat.paint;
+        let a = batch[j].a;
+        let power = power_at(a, batch[j].b, pixel - a.xy);
+        if (power >= LOG2_ALPHA_MIN) {
+            let paint = batch[j].paint;
+            let w = state.T * alpha_of(power);
+            state.mixed += w * paint;
             let after = state.T - w;
             if (state.T >= 0.5 && after < 0.5) {
-                state.median = splat.paint.w;
+                state.median = paint.w;
             }
             if (state.T >= T_STOP && after < T_STOP) {
                 *fell = j + 1u;

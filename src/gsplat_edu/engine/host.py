@@ -90,6 +90,12 @@ def adapters() -> tuple[AdapterName, ...]:
     return tuple(name for name, _ in _adapters())
 
 
+def chosen() -> AdapterName:
+    """Return the best adapter, or the first one whose name contains `GSPLAT_EDU_ADAPTER`; call `missing` first."""
+    wanted = os.environ.get(ADAPTER_VARIABLE, "").lower()
+    return next(name for name in adapters() if wanted in name.name.lower())
+
+
 @functools.cache
 def _adapters() -> tuple[tuple[AdapterName, Any], ...]:
     import wgpu
@@ -133,15 +139,14 @@ class Device:
     @staticmethod
     @functools.cache
     def default() -> Device:
-        """Return the best adapter, or the first one whose name contains `GSPLAT_EDU_ADAPTER`.
+        """Return the device of `chosen`.
 
         Raises:
-            BackendUnavailableError: there is none; the message says why.
+            BackendUnavailableError: there is none, or it does not start; the message says why.
         """
         if reason := missing():
             raise BackendUnavailableError(f"backend 'webgpu': {reason}")
-        wanted = os.environ.get(ADAPTER_VARIABLE, "").lower()
-        return Device(next(i for i, name in enumerate(adapters()) if wanted in name.name.lower()))
+        return Device(adapters().index(chosen()))
 
     def allocate(self, program: Program, counts: Mapping[str, int], poison: bool = False) -> Memory:
         """Allocate a program's buffers.

@@ -10,14 +10,15 @@ struct Splat {
     paint: vec4<f32>,        // colour and depth, or four features
 }
 
-fn power_at(splat: Splat, d: vec2<f32>) -> f32 {
-    let s = splat.b.y + splat.a.z * d.x + splat.a.w * d.y;
-    let t = splat.b.z + splat.b.x * d.y;
-    return splat.b.w - s * s - t * t;
+fn power_at(a: vec4<f32>, b: vec4<f32>, d: vec2<f32>) -> f32 {
+    let s = b.y + a.z * d.x + a.w * d.y;
+    let t = b.z + b.x * d.y;
+    return b.w - s * s - t * t;
 }
 
+// Of a splat that is drawn, power >= LOG2_ALPHA_MIN.
 fn alpha_of(power: f32) -> f32 {
-    return select(0.0, min(exp2(min(power, 0.0)), view.alpha_max), power >= LOG2_ALPHA_MIN);
+    return min(exp2(min(power, 0.0)), view.alpha_max);
 }
 
 fn pixel_of(tile: u32, lane: u32) -> vec2<u32> {

@@ -20,7 +20,7 @@ from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import add_noise_in_torch, add_noise_natively
 from gsplat_edu.ops.recolor import recolored_in_torch, recolored_natively
 from gsplat_edu.render.backend import Backend
-from gsplat_edu.render.self_check import cuda_failure
+from gsplat_edu.render.self_check import cuda_failure, webgpu_failure
 from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
 
 CUDA_LACKS = frozenset({"stop", "processes", "statistics"})
@@ -33,7 +33,7 @@ WEBGPU_LACKS = frozenset({"stop", "processes", "statistics", "forecast"})
 def resolve_backend(name: str, device: torch.device | None = None) -> str:
     """Resolve a backend's name, or "auto", to the backend that will run.
 
-    The first use of cuda in a process checks its kernels on the device (`gsplat_edu.render.self_check`).
+    The first use of cuda or webgpu checks its kernels on the device (`gsplat_edu.render.self_check`).
 
     Args:
         name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu, never webgpu; or a backend
@@ -77,7 +77,7 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
     if name == "cpu":
         return kernels.REASON
     if name == "webgpu":
-        return host.missing()
+        return host.missing() or _webgpu_failure()
     if name == "cuda":
         if importlib.util.find_spec("triton") is None:
             return "triton is not installed; pip install triton, or use the backend cpu"
@@ -87,6 +87,12 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
             return "torch sees no GPU; use the backend cpu (TRITON_INTERPRET=1 runs the kernels, slowly, without one)"
         if failure := cuda_failure(device if device is not None and device.type == "cuda" else None):
             return f"its kernels failed their check on this GPU: {failure}; the backend cpu needs no GPU"
+    return None
+
+
+def _webgpu_failure() -> str | None:
+    if failure := webgpu_failure():
+        return f"its kernels failed their check on {host.chosen().name}: {failure}; use the backend cpu"
     return None
 
 

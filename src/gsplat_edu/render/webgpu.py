@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.engine.frame import GRADS, Pool, Scene, differentiate, draw
-from gsplat_edu.engine.host import Device
+from gsplat_edu.engine.host import AdapterName, Device
 from gsplat_edu.engine.view import View
 from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
@@ -161,6 +161,15 @@ class _Rasterize(torch.autograd.Function):
 @functools.cache
 def _pool() -> Pool:
     return Pool(Device.default())
+
+
+def adapter_name() -> AdapterName:
+    """Return the adapter that renders.
+
+    Raises:
+        BackendUnavailableError: there is none, or it does not start.
+    """
+    return _pool().device.name
 
 
 def _scene(parameters: tuple[Tensor, ...] | list[Tensor], features: Tensor | None) -> Scene:
