@@ -1,7 +1,7 @@
-"""A browser plays the same description: Tint compiles every shader, and image and gradients are those of the native host.
+"""A browser plays the same description: Tint compiles every shader, image and gradients are those of the native host.
 
-Chromium computes WebGPU on the CPU with SwiftShader. It has its own compiler and its own exp2, so bits differ; the bounds are
-those of two float32 kernels, twice those of one against float64.
+Chromium computes WebGPU on the CPU with SwiftShader. It has its own compiler and its own exp2, so bits differ; the
+bounds are those of two float32 kernels, twice those of one against float64.
 """
 
 import base64
@@ -26,7 +26,10 @@ READS = ("live", "image", "core_grads", "rest_grads", "camera_sums")
 def page():
     with chromium(FLAGS) as browser:
         one = browser.new_page()
-        one.route("http://localhost/**", lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"))
+        one.route(
+            "http://localhost/**",
+            lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"),
+        )
         one.goto("http://localhost/")  # WebGPU needs a secure context
         one.add_script_tag(content=SCRIPT)
         yield one
@@ -38,7 +41,13 @@ def text_of(array):
 
 def played(page, scene, view, grads, room):
     n, H, W = len(scene.core), view.camera.H, view.camera.W
-    counts = {"gaussians": n, "rest": scene.rest.size, "pixels": H * W, "edges": view.tiles + 2, "live": frame.LIVE}
+    counts = {
+        "gaussians": n,
+        "rest": scene.rest.size,
+        "pixels": H * W,
+        "edges": view.tiles + 2,
+        "live": frame.LIVE,
+    }
     writes = {"core": text_of(scene.core), "rest": text_of(scene.rest), "grads": text_of(grads)}
     result = page.evaluate(
         "given => play(...given)",
@@ -54,9 +63,12 @@ def played(page, scene, view, grads, room):
     if not result["adapter"]:
         pytest.skip("this Chromium has no WebGPU adapter")
     assert result["notes"] == []
-    return {name: np.frombuffer(base64.b64decode(text), dtype=np.uint32) for name, text in result["found"].items()}
+    return {
+        name: np.frombuffer(base64.b64decode(text), dtype=np.uint32) for name, text in result["found"].items()
+    }
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("name", ["random", "opaque, tiles stop", "needles 100:1"])
 def test_image_and_gradients_in_a_browser(page, pool, name):
     scene, view = packed(SMALLER[name]), view_of(SMALLER[name])

@@ -71,7 +71,9 @@ def test_no_float_atomics_and_no_test_that_a_compiler_may_assume_away():
 
 def test_a_buffer_that_is_too_large_is_named(device):
     counts = {"gaussians": 10**6, "rest": 45 * 10**6, "pairs": 1, "pixels": 1, "edges": 2, "live": 4}
-    with pytest.raises(BackendUnavailableError, match=r"^backend 'webgpu': the buffer rest needs 172 MiB for 1000000"):
+    with pytest.raises(
+        BackendUnavailableError, match=r"^backend 'webgpu': the buffer rest needs 172 MiB for 1000000"
+    ):
         device.allocate(PROGRAM, counts)
 
 

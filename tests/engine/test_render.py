@@ -1,7 +1,8 @@
-"""The backend webgpu: gradients against the native kernels in float64, in everything that a render is differentiable in.
+"""The backend webgpu: gradients of everything that a render is differentiable in, against native ones in float64.
 
-Bounds are those of the other float32 kernels (tests/native, tests/gpu): 3e-4 of the largest entry of a gradient, or 4e-3 for
-ill-conditioned conics. They allow for the cancellation in sums of moments; PRECISION.md has what is measured.
+Bounds are those of the other float32 kernels (tests/native, tests/gpu): 3e-4 of the largest entry of a gradient, or
+4e-3 for ill-conditioned conics. They allow for the cancellation in sums of moments; PRECISION.md has what is
+measured.
 """
 
 import dataclasses

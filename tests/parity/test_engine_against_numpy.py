@@ -1,12 +1,13 @@
 """The engine's frames against the NumPy reference.
 
-Every step is backward stable, as in the native float32 kernels: up to a rounding, its result is exact for parameters that
-differ by a few eps. WGSL promises less than IEEE for some operations: division errs by 2.5 ULP, exp2(p) by 3 + 2 |p|, at most
-19 where alpha is above 1/255, log2 by 2^-21 near 1. The relative error of an alpha is then at most 19 eps from exp2,
-ln 2 x 2^-21 = 3 eps from log2, and what the errors of s and t give, which is the change of the pixel when the parameters
-move by 4 eps (times 4, because only eight random moves are tried). A pixel is a sum of w c with weights that sum to at
-most 1, so 22 eps of the brightest colour bound the first two, in front of 100 eps for the rounding of the sum. A pixel with
-an alpha that close to 1/255 may gain or lose 1/255 of a colour: two such pixels per scene are allowed.
+Every step is backward stable, as in the native float32 kernels: up to a rounding, its result is exact for parameters
+that differ by a few eps. WGSL promises less than IEEE for some operations: division errs by 2.5 ULP, exp2(p) by 3 + 2
+|p|, at most 19 where alpha is above 1/255, log2 by 2^-21 near 1. The relative error of an alpha is then at most 19
+eps from exp2, ln 2 x 2^-21 = 3 eps from log2, and what the errors of s and t give, which is the change of the pixel
+when the parameters move by 4 eps (times 4, because only eight random moves are tried). A pixel is a sum of w c with
+weights that sum to at most 1, so 22 eps of the brightest colour bound the first two, in front of 100 eps for the
+rounding of the sum. A pixel with an alpha that close to 1/255 may gain or lose 1/255 of a colour: two such pixels per
+scene are allowed.
 """
 
 import numpy as np
@@ -36,7 +37,8 @@ def test_image_transmittance_and_depth(pool, name):
 def test_counts_around_a_batch(pool, count):
     """Small Gaussians, so that the reference, which loops over them, takes seconds at most.
 
-    With thousands of them, several alphas may be within rounding of 1/255; the mean error tells these from a wrong formula.
+    With thousands of them, several alphas may be within rounding of 1/255; the mean error tells these from a wrong
+    formula.
     """
     scene = random(count, (90, 61), seed=count, log_scales=np.full((count, 3), -3.5))
     found = drawn(pool, scene)
