@@ -13,7 +13,7 @@ from gsplat_edu.engine.passes import LIMITS
 
 @pytest.fixture(scope="session")
 def device() -> host.Device:
-    if reason := host.missing():
+    if reason := host.why_unavailable():
         pytest.skip(reason)
     return host.Device(limits=LIMITS)
 

@@ -27,4 +27,4 @@ def view_of(scene, **changes):
 
 
 def drawn(pool, scene, **changes):
-    return frame.draw(pool, packed(scene), view_of(scene, **changes))
+    return frame.draw_frame(pool, packed(scene), view_of(scene, **changes))

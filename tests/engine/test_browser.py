@@ -72,9 +72,9 @@ def played(page, scene, view, grads, room):
 @pytest.mark.parametrize("name", ["random", "opaque, tiles stop", "needles 100:1"])
 def test_image_and_gradients_in_a_browser(page, pool, name):
     scene, view = packed(SMALLER[name]), view_of(SMALLER[name])
-    ours = frame.draw(pool, scene, view)
+    ours = frame.draw_frame(pool, scene, view)
     grads = np.random.default_rng(1).normal(size=(*ours.transmittance.shape, frame.GRADS)).astype(np.float32)
-    expected = frame.differentiate(ours, scene, grads, None)
+    expected = frame.differentiate_frame(ours, scene, grads, None)
     found = played(page, scene, view, grads, ours.memory.counts["pairs"])
     assert found["live"][: frame.SPARE].tolist() == [len(ours.visible), ours.num_pairs]
     image = found["image"].view(np.float32).reshape(*ours.transmittance.shape, frame.PIXEL)
@@ -87,7 +87,9 @@ def test_image_and_gradients_in_a_browser(page, pool, name):
         assert np.abs(core[:, part] - truth).max() <= 6e-4 * np.abs(truth).max()
     rest = found["rest_grads"].view(np.float32).reshape(expected.rest.shape)
     assert np.abs(rest - expected.rest).max() <= 6e-4 * np.abs(expected.rest).max()
-    camera = found["camera_sums"].view(np.float32).reshape(-1, frame.CAMERA).sum(axis=0, dtype=np.float64)
+    camera = (
+        found["camera_sums"].view(np.float32).reshape(-1, frame.CAMERA_NUMBERS).sum(axis=0, dtype=np.float64)
+    )
     for part in (slice(0, 9), slice(9, 12), slice(12, 16)):
         bound = 6e-4 * len(scene.core) * np.abs(expected.camera[part]).max()
         assert np.abs(camera[part] - expected.camera[part]).max() <= bound

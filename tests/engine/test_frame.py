@@ -31,7 +31,7 @@ def test_noise_in_the_buffers_changes_nothing(device, monkeypatch):
     for pool in (clean, noisy):
         found = drawn(pool, scene)
         grads = np.random.default_rng(0).normal(size=(*found.transmittance.shape, 5)).astype(np.float32)
-        gradients = frame.differentiate(found, packed(scene), grads, None)
+        gradients = frame.differentiate_frame(found, packed(scene), grads, None)
         results.append((found.image, found.depth, found.visible, found.radii, gradients.core, gradients.rest))
     for ours, other in zip(*results, strict=True):
         np.testing.assert_array_equal(ours, other)
@@ -49,9 +49,9 @@ def test_a_frame_keeps_its_buffers_while_others_are_drawn(pool):
     scene, other = random(50, seed=1), random(50, seed=2)
     first = drawn(pool, scene)
     grads = np.random.default_rng(0).normal(size=(*first.transmittance.shape, 5)).astype(np.float32)
-    expected = frame.differentiate(first, packed(scene), grads, None).core.copy()
+    expected = frame.differentiate_frame(first, packed(scene), grads, None).core.copy()
     drawn(pool, other)
     kept = drawn(pool, other)
-    found = frame.differentiate(first, packed(scene), grads, None).core
+    found = frame.differentiate_frame(first, packed(scene), grads, None).core
     np.testing.assert_array_equal(found, expected)
     assert kept.memory is not first.memory

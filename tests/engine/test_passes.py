@@ -7,7 +7,7 @@ import pytest
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine import host
 from gsplat_edu.engine.frame import program
-from gsplat_edu.engine.passes import FOLDER, LIMITS, MODULES, Buffer, Pass, Program, Size, source
+from gsplat_edu.engine.passes import FOLDER, LIMITS, MODULES, Buffer, Pass, Program, Size, module_source
 
 PROGRAM = program(16, True)
 PASSES = {(one.module, one.entry): one for one in PROGRAM.passes()}
@@ -16,7 +16,7 @@ BYTES = {"u32": 4, "f32": 4, "vec2<f32>": 8, "vec4<f32>": 16, "Splat": 48}
 
 def bindings(module, entry):
     """Return kind and name of the storage buffers that an entry point uses, itself or through functions, by binding."""
-    text = re.sub(r"//.*", "", source(module))
+    text = re.sub(r"//.*", "", module_source(module))
     declared = re.findall(r"@group\(1\) @binding\((\d)\) var<storage, (\w+)> (\w+)", text)
     functions = dict(re.findall(r"fn (\w+)\([^{]*\{(.*?)^\}", text, re.DOTALL | re.MULTILINE))
     waiting, reached = [entry], set()
@@ -43,7 +43,7 @@ def test_a_pass_binds_what_its_entry_point_declares(key):
 
 @pytest.mark.parametrize("module", MODULES)
 def test_workgroup_memory_and_size_are_within_the_limits(module):
-    text = source(module)
+    text = module_source(module)
     constants = dict(re.findall(r"const (\w+) = (\d+)u?;", text))
     used = 0
     for kind, count in re.findall(r"var<workgroup> \w+: array<(.+), (\w+)>;", text):
@@ -89,19 +89,22 @@ def test_a_shader_that_does_not_compile_is_one_line(device, monkeypatch):
 
 def test_without_wgpu_or_an_adapter_the_reason_says_what_to_install(monkeypatch):
     monkeypatch.setattr(host.importlib.util, "find_spec", lambda name: None)
-    assert host.missing() == 'wgpu is not installed; pip install "gsplat-edu[gpu]", or use the backend cpu'
+    assert (
+        host.why_unavailable()
+        == 'wgpu is not installed; pip install "gsplat-edu[gpu]", or use the backend cpu'
+    )
     monkeypatch.undo()
     pytest.importorskip("wgpu")
     monkeypatch.setattr(host, "_adapters", lambda: ())
-    assert host.missing().startswith(
+    assert host.why_unavailable().startswith(
         "wgpu finds no adapter for Vulkan, Metal or DirectX 12; install the driver"
     )
 
 
 def test_the_adapter_can_be_named(device, monkeypatch):
     monkeypatch.setenv("GSPLAT_EDU_ADAPTER", device.name.name[:4].upper())
-    assert host.missing() is None
+    assert host.why_unavailable() is None
     monkeypatch.setenv("GSPLAT_EDU_ADAPTER", "Voodoo 2")
-    assert host.missing().startswith(
+    assert host.why_unavailable().startswith(
         "GSPLAT_EDU_ADAPTER: is 'Voodoo 2', which no adapter's name contains; there are: "
     )

@@ -16,6 +16,8 @@ from float32_backends import ILL_CONDITIONED, POISON, POSE, SETTINGS, SMALLER, i
 from gsplat_edu import Camera
 from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError
 from gsplat_edu.cli.main import main
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.engine import host
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
@@ -264,6 +266,21 @@ def test_the_command_line_renders_with_it(tmp_path):
     command = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--backend", "webgpu"]
     assert main([*command, "--out", str(tmp_path / "frames")]) == 0
     assert len(list((tmp_path / "frames").iterdir())) == 1
+
+
+@pytest.mark.parametrize("backend", ["webgpu", "torch"])
+def test_what_needs_a_forecast_is_refused(tmp_path, capsys, backend):
+    write_colmap(tmp_path / "egg", *procedural_capture(24, 6))
+    capture = str(tmp_path / "egg")
+    assert main(["doctor", capture, "--backend", backend]) == 2
+    line = (
+        f"gsplat-edu doctor: --backend {backend}: has no forecast; choose cpu or cuda, or add --no-forecast"
+    )
+    assert capsys.readouterr().err.splitlines()[-1] == line
+    run = ["--out", str(tmp_path / "run"), "--backend", backend, "--iterations", "5"]
+    assert main(["train", capture, *run, "--max-memory", "4GiB"]) == 2
+    line = f"--max-memory 4 GiB: cannot be planned for --backend {backend}; choose cpu or cuda"
+    assert line in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_without_an_adapter_the_command_is_one_line(tmp_path, monkeypatch, capsys):

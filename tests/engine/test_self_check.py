@@ -30,14 +30,14 @@ def test_correct_kernels_are_checked_once(empty_cache, monkeypatch):
 
 def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkeypatch):
     """As if a driver had compiled a shader wrongly."""
-    right = webgpu.differentiate
+    right = webgpu.differentiate_frame
 
     def wrong(*given):
         found = right(*given)
         found.core[:, 5] *= 1.01
         return found
 
-    monkeypatch.setattr(webgpu, "differentiate", wrong)
+    monkeypatch.setattr(webgpu, "differentiate_frame", wrong)
     with pytest.raises(BackendUnavailableError) as raised:
         resolve_backend("webgpu")
     assert "its kernels failed their check on" in str(raised.value)

@@ -31,7 +31,7 @@ from gsplat_edu.engine.passes import (
 )
 from gsplat_edu.engine.view import View
 
-CORE, OUT, RECORD, SLOT, PIXEL, GRADS, CAMERA = 14, 16, 16, 10, 6, 5, 16
+CORE, OUT, RECORD, SLOT, PIXEL, GRADS, CAMERA_NUMBERS = 14, 16, 16, 10, 6, 5, 16
 """Numbers of a Gaussian without its higher harmonics, of their gradient, a record, a slot, a pixel, its gradient, and
 of the camera's gradient."""
 
@@ -71,7 +71,7 @@ def program(tile_bits: int, with_features: bool) -> Program:
         *(Buffer("image", Size("pixels", PIXEL)), Buffer("grads", Size("pixels", GRADS))),
         Buffer("slots", Size("pairs", SLOT)),
         *(Buffer("core_grads", Size("gaussians", OUT)), Buffer("rest_grads", Size("rest"))),
-        *(Buffer("camera_sums", Size("gaussians", CAMERA, 64)), Buffer("live", Size("live"))),
+        *(Buffer("camera_sums", Size("gaussians", CAMERA_NUMBERS, 64)), Buffer("live", Size("live"))),
     )
     parts = {
         "render": _forward(tile_bits),
@@ -263,7 +263,7 @@ def _rounded(pairs: int) -> int:
     return max(-(-pairs // step) * step, FEWEST_PAIRS)
 
 
-def draw(pool: Pool, scene: Scene, view: View) -> Frame:
+def draw_frame(pool: Pool, scene: Scene, view: View) -> Frame:
     """Render a scene.
 
     Args:
@@ -320,7 +320,7 @@ def _drawn_features(memory: Memory, scene: Scene, H: int, W: int) -> np.ndarray 
     return np.concatenate(groups, axis=2)[..., : scene.features.shape[1]]
 
 
-def differentiate(
+def differentiate_frame(
     frame: Frame, scene: Scene, grads: np.ndarray, of_features: np.ndarray | None
 ) -> FrameGradients:
     """Propagate gradients of a frame's images to the Gaussians and the camera.
@@ -340,7 +340,7 @@ def differentiate(
     to_features = None if of_features is None else _features_backward(memory, scene, of_features)
     found = memory.play("project_backward", read=("core_grads", "rest_grads", "camera_sums"))
     core = found["core_grads"].view(np.float32)[: n * OUT].reshape(n, OUT)
-    sums = found["camera_sums"].view(np.float32)[: -(-n // 64) * CAMERA].reshape(-1, CAMERA)
+    sums = found["camera_sums"].view(np.float32)[: -(-n // 64) * CAMERA_NUMBERS].reshape(-1, CAMERA_NUMBERS)
     return FrameGradients(
         core[:, :CORE],
         found["rest_grads"].view(np.float32)[: scene.rest.size].reshape(scene.rest.shape),

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
-from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, source
+from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
 
 INSTALL = 'pip install "gsplat-edu[gpu]"'
 """Installs wgpu."""
@@ -65,7 +65,7 @@ class AdapterName:
         return self.kind == "CPU"
 
 
-def missing() -> str | None:
+def why_unavailable() -> str | None:
     """Return why no adapter can be used here; None if one can."""
     if importlib.util.find_spec("wgpu") is None:
         return f"wgpu is not installed; {INSTALL}, or use the backend cpu"
@@ -90,8 +90,8 @@ def adapters() -> tuple[AdapterName, ...]:
     return tuple(name for name, _ in _adapters())
 
 
-def chosen() -> AdapterName:
-    """Return the best adapter, or the first one whose name contains `GSPLAT_EDU_ADAPTER`; call `missing` first."""
+def chosen_adapter() -> AdapterName:
+    """Return the best adapter, or the first whose name contains `GSPLAT_EDU_ADAPTER`; call `why_unavailable` before."""
     wanted = os.environ.get(ADAPTER_VARIABLE, "").lower()
     return next(name for name in adapters() if wanted in name.name.lower())
 
@@ -139,14 +139,14 @@ class Device:
     @staticmethod
     @functools.cache
     def default() -> Device:
-        """Return the device of `chosen`.
+        """Return the device of `chosen_adapter`.
 
         Raises:
             BackendUnavailableError: there is none, or it does not start; the message says why.
         """
-        if reason := missing():
+        if reason := why_unavailable():
             raise BackendUnavailableError(f"backend 'webgpu': {reason}")
-        return Device(adapters().index(chosen()))
+        return Device(adapters().index(chosen_adapter()))
 
     def allocate(self, program: Program, counts: Mapping[str, int], poison: bool = False) -> Memory:
         """Allocate a program's buffers.
@@ -187,7 +187,7 @@ class Device:
     def _compiled(self, one: Pass) -> tuple[Any, Any]:
         if one.module not in self._modules:
             with _one_line(f"{self.name.name} refuses the shader {one.module}"):
-                self._modules[one.module] = self.device.create_shader_module(code=source(one.module))
+                self._modules[one.module] = self.device.create_shader_module(code=module_source(one.module))
         kinds = ["read-only-storage"] * len(one.reads) + ["storage"] * len(one.writes)
         storage = self.device.create_bind_group_layout(
             entries=[_entry(binding, {"type": kind}) for binding, kind in enumerate(kinds)]

@@ -134,7 +134,7 @@ class Program:
             yield from part
 
 
-def source(module: str) -> str:
+def module_source(module: str) -> str:
     """Return the WGSL of a module."""
     return "\n".join((FOLDER / f"{name}.wgsl").read_text(encoding="utf-8") for name in MODULES[module])
 
@@ -147,7 +147,7 @@ def manifest(program: Program) -> dict[str, object]:
     parts = {part: [asdict(one) for one in passes] for part, passes in program.parts.items()}
     modules = sorted({one.module for one in program.passes()})
     return {
-        "modules": {name: source(name) for name in modules},
+        "modules": {name: module_source(name) for name in modules},
         "buffers": [asdict(buffer) for buffer in program.buffers],
         "parts": parts,
         "block": BLOCK,

@@ -77,7 +77,7 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
     if name == "cpu":
         return kernels.REASON
     if name == "webgpu":
-        return host.missing() or _webgpu_failure()
+        return host.why_unavailable() or _webgpu_failure()
     if name == "cuda":
         if importlib.util.find_spec("triton") is None:
             return "triton is not installed; pip install triton, or use the backend cpu"
@@ -92,7 +92,9 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
 
 def _webgpu_failure() -> str | None:
     if failure := webgpu_failure():
-        return f"its kernels failed their check on {host.chosen().name}: {failure}; use the backend cpu"
+        return (
+            f"its kernels failed their check on {host.chosen_adapter().name}: {failure}; use the backend cpu"
+        )
     return None
 
 

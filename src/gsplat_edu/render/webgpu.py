@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.engine.frame import GRADS, Pool, Scene, differentiate, draw
+from gsplat_edu.engine.frame import GRADS, Pool, Scene, differentiate_frame, draw_frame
 from gsplat_edu.engine.host import AdapterName, Device
 from gsplat_edu.engine.view import View
 from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
@@ -114,7 +114,7 @@ class _Rasterize(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         scene = _scene(parameters, features)
-        frame = draw(_pool(), scene, call.view)
+        frame = draw_frame(_pool(), scene, call.view)
         call.visible, call.radii = torch.from_numpy(frame.visible), torch.from_numpy(frame.radii)
         call.num_pairs = frame.num_pairs
         planes = (frame.image, frame.transmittance, frame.depth, frame.features, frame.median_depth)
@@ -142,7 +142,7 @@ class _Rasterize(torch.autograd.Function):
         if of_depth is not None and call.depth:
             upstream[..., 4] = of_depth
         feature_grads = None if of_features is None else of_features.contiguous().numpy()
-        found = differentiate(ctx.frame, _scene(parameters, features), upstream.numpy(), feature_grads)
+        found = differentiate_frame(ctx.frame, _scene(parameters, features), upstream.numpy(), feature_grads)
         norms = torch.from_numpy(found.norms)
         call.norms = norms if call.norms is None else call.norms + norms
         behind = (
