@@ -8,26 +8,18 @@ import numpy as np
 import pytest
 
 from gsplat_edu.engine import host
-from gsplat_edu.engine.passes import LIMITS, Buffer, Program, Size, scan, scan_scratch, sort, sort_scratch
+from gsplat_edu.engine.check import sort_and_scan
+from gsplat_edu.engine.passes import LIMITS, Program, sort
 
-NUMBERS = Size("keys")
 LIVE, SPARE, TOTAL = 0, 1, 2
 SIZES = (0, 1, 7, 8, 9, 1023, 1024, 1025, 8191, 8193, 2**16 - 1, 2**16, 2**16 + 1, 10**5)
 
 
-def program(bits=32):
-    return Program(
-        (
-            Buffer("live", Size("live")),
-            *(Buffer(name, NUMBERS) for name in ("keys", "values", "numbers")),
-            Buffer("sums", scan_scratch(NUMBERS)),
-            *sort_scratch("spare", "keys"),
-        ),
-        {
-            "sort": sort("keys", "values", "spare", "keys", LIVE, bits, SPARE),
-            "scan": scan("numbers", "sums", NUMBERS, TOTAL),
-        },
-    )
+def program(bits):
+    parts = sort_and_scan()
+    if bits == 32:
+        return parts
+    return Program(parts.buffers, {"sort": sort("keys", "values", "spare", "keys", LIVE, bits, SPARE)})
 
 
 def allocated(device, capacity, bits=32):

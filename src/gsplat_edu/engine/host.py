@@ -39,6 +39,12 @@ VIEW_BYTES = 512
 ADAPTER_VARIABLE = "GSPLAT_EDU_ADAPTER"
 """Environment variable with a part of the name of the adapter to use."""
 
+TIMESTAMPS = "timestamp-query"
+"""The optional feature of measuring passes."""
+
+Call = tuple[Any, Any, Any, int, int, int]
+"""Pipeline, uniforms, storage, offset of the job, workgroups in two dimensions."""
+
 KINDS = ("DiscreteGPU", "IntegratedGPU", "VirtualGPU", "Unknown", "CPU")
 """Kinds of adapters, best first."""
 
@@ -128,8 +134,11 @@ class Device:
     ) -> None:
         self.name, chosen = _adapters()[adapter]
         wanted = {key: chosen.limits[key] for key in LIMITS} if limits is None else dict(limits)
+        self.measures = TIMESTAMPS in chosen.features
         with _one_line(f"the adapter {self.name.name} does not start"):
-            self.device = chosen.request_device_sync(required_limits=wanted)
+            self.device = chosen.request_device_sync(
+                required_limits=wanted, required_features=[TIMESTAMPS] if self.measures else []
+            )
         self.limits: Mapping[str, int] = wanted
         self.most_groups = most_groups or wanted["max-compute-workgroups-per-dimension"]
         self.lock = threading.RLock()
@@ -238,8 +247,8 @@ class Memory:
         self._staging: Any = None
         self._recorded = {part: self._bind(passes) for part, passes in program.parts.items()}
 
-    def _bind(self, passes: Sequence[Pass]) -> list[tuple[Any, Any, Any, int, int, int]]:
-        """Return pipeline, uniforms, storage, offset of the job and workgroups of each pass that has any."""
+    def _bind(self, passes: Sequence[Pass]) -> list[Call]:
+        """Return the call of each pass that has any workgroups."""
         import wgpu
 
         make = self.device.device.create_bind_group
@@ -297,11 +306,8 @@ class Memory:
                 queue.write_buffer(self._view, 0, view)
             encoder = self.device.device.create_command_encoder()
             computing = encoder.begin_compute_pass()
-            for pipeline, uniforms, storage, offset, x, y in self._recorded[part]:
-                computing.set_pipeline(pipeline)
-                computing.set_bind_group(0, uniforms, [offset])
-                computing.set_bind_group(1, storage)
-                computing.dispatch_workgroups(x, y)
+            for call in self._recorded[part]:
+                _dispatch(computing, call)
             computing.end()
             offset = 0
             staging = self._staging_for(names)
@@ -312,6 +318,36 @@ class Memory:
                 offset += WORD * self._words[name]
             queue.submit([encoder.finish()])
             return self._collected(names, staging)
+
+    def times(self, part: str) -> dict[str, float]:
+        """Play a part once more, pass by pass, and return the milliseconds that the device took for each entry point.
+
+        Raises:
+            BackendUnavailableError: the device has no timestamps, or fails.
+        """
+        import wgpu
+
+        if not self.device.measures:
+            raise BackendUnavailableError(f"backend 'webgpu': {self.device.name.name} has no timestamps")
+        make, recorded = self.device.device, self._recorded[part]
+        passes = [one for one in self.program.parts[part] if one.groups(self.counts)]
+        with self.device.lock, _one_line(f"{self.device.name.name} fails in {part}"):
+            queries = make.create_query_set(type="timestamp", count=2 * len(passes))
+            usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
+            resolved = make.create_buffer(size=16 * len(passes), usage=usage)
+            encoder = make.create_command_encoder()
+            for place, call in enumerate(recorded):
+                marks = {"beginning_of_pass_write_index": 2 * place, "end_of_pass_write_index": 2 * place + 1}
+                computing = encoder.begin_compute_pass(timestamp_writes={"query_set": queries, **marks})
+                _dispatch(computing, call)
+                computing.end()
+            encoder.resolve_query_set(queries, 0, 2 * len(passes), resolved, 0)
+            make.queue.submit([encoder.finish()])
+            stamps = np.frombuffer(make.queue.read_buffer(resolved), dtype=np.uint64).reshape(-1, 2)
+        found: dict[str, float] = {}
+        for one, (begin, end) in zip(passes, stamps, strict=True):
+            found[one.entry] = found.get(one.entry, 0.0) + (int(end) - int(begin)) / 1e6
+        return found
 
     def _staging_for(self, names: tuple[str, ...]) -> Any:  # noqa: ANN401
         """Return a buffer that holds these buffers and can be mapped; it is kept for the next read."""
@@ -353,6 +389,14 @@ class _one_line:  # noqa: N801  used like a function
             raise BackendUnavailableError(
                 f"backend 'webgpu': {self.what} ({_first_line(error)}); use the backend cpu"
             ) from error
+
+
+def _dispatch(computing: Any, call: Call) -> None:  # noqa: ANN401
+    pipeline, uniforms, storage, offset, x, y = call
+    computing.set_pipeline(pipeline)
+    computing.set_bind_group(0, uniforms, [offset])
+    computing.set_bind_group(1, storage)
+    computing.dispatch_workgroups(x, y)
 
 
 def _is_of_wgpu(error: BaseException) -> bool:
