@@ -4,6 +4,8 @@
     python conformance/run.py ours:render_cpu_float32 ours:gradients_cpu_float32 --precision float32
     python conformance/run.py ours:render_torch ours:gradients_torch
 
+    python conformance/run.py ours:render_webgpu ours:gradients_webgpu --precision float32
+
 Backend cuda, without a GPU: `TRITON_INTERPRET=1`, `ours:render_cuda ours:gradients_cuda --precision float32`.
 """
 
@@ -29,7 +31,7 @@ class Renderer:
     """One backend in one precision, as the two functions that the runner takes.
 
     Args:
-        backend: "cpu", "torch" or "cuda".
+        backend: "cpu", "torch", "cuda" or "webgpu".
         dtype: Of the Gaussians; cameras are float64.
     """
 
@@ -106,5 +108,7 @@ _float64, _float32 = Renderer("cpu"), Renderer("cpu", torch.float32)
 render_cpu, gradients_cpu = _float64.render, _float64.gradients
 render_cpu_float32, gradients_cpu_float32 = _float32.render, _float32.gradients
 _dense, _triton = Renderer("torch"), Renderer("cuda", torch.float32)
+_webgpu = Renderer("webgpu", torch.float32)
 render_torch, gradients_torch = _dense.render, _dense.gradients
 render_cuda, gradients_cuda = _triton.render, _triton.gradients
+render_webgpu, gradients_webgpu = _webgpu.render, _webgpu.gradients

@@ -64,6 +64,7 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     ),
     "tests/cli/test_train_3d.py::test_the_default_budget_trains_end_to_end": (51, 1),
     "tests/repo/test_site.py": (38, 1),
+    "tests/engine/test_training.py::test_the_sphere_reaches_the_course_s_quality": (35, 1),
     "tests/sfm/test_panoramas.py": (37, 1),
     "tests/studio/test_page.py::test_from_dropped_photos_to_a_downloaded_scene": (26, 1),
     "tests/studio/test_page_intake.py::test_a_dropped_video_becomes_a_capture": (22, 1),

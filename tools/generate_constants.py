@@ -1,8 +1,9 @@
-"""Write native/constants.h from src/gsplat_edu/base/constants.py, so that each constant is defined once.
+"""Write the kernels' constants from src/gsplat_edu/base/constants.py, so that each is defined once.
 
     python tools/generate_constants.py
 
-A test compares the file with this script's output.
+It writes native/constants.h and src/gsplat_edu/engine/constants.wgsl. A test compares the files with this script's
+output.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from pathlib import Path
 
 from gsplat_edu.base import constants as c
 
-HEADER = Path(__file__).resolve().parent.parent / "native" / "constants.h"
+ROOT = Path(__file__).resolve().parent.parent
+HEADER = ROOT / "native" / "constants.h"
+WGSL = ROOT / "src" / "gsplat_edu" / "engine" / "constants.wgsl"
 NAMES = (
     "DILATION_MAX",
     "THINNEST",
@@ -31,6 +34,10 @@ NAMES = (
     "SSIM_C1",
     "SSIM_C2",
     "SRGB_OFFSET",
+)
+WGSL_NAMES = (
+    *("THINNEST", "ALPHA_MIN", "T_STOP", "DET_FLOOR", "SPLAT_LIMIT_F32", "COLOR_LIMIT", "RIM_SLACK"),
+    *("C0", "C1", "C2", "C3", "SH_OFFSET"),
 )
 SSIM_TAPS = 6
 """Taps of one half of SSIM's window: the central one and five on one side."""
@@ -58,5 +65,31 @@ def _line(name: str, value: float | tuple[float, ...]) -> str:
     return f"constexpr double {name} = {value!r};"
 
 
+def shader() -> str:
+    """Return the text of the WGSL file; entries of a tuple are numbered from 0."""
+    lines = [
+        "// Made by tools/generate_constants.py from src/gsplat_edu/base/constants.py. Do not edit.",
+        "",
+        f"const TILE = {c.TILE};",
+    ]
+    for name in WGSL_NAMES:
+        value = getattr(c, name)
+        entries = (
+            {f"{name}_{k}": v for k, v in enumerate(value)} if isinstance(value, tuple) else {name: value}
+        )
+        lines += [_wgsl_line(*entry) for entry in entries.items()]
+    logarithms = {
+        "LOG2_ALPHA_MIN": math.log2(c.ALPHA_MIN),
+        "LN2": math.log(2),
+        "SQRT_HALF_LOG2E": math.sqrt(math.log2(math.e) / 2),
+    }
+    return "\n".join([*lines, *(_wgsl_line(*entry) for entry in logarithms.items()), ""])
+
+
+def _wgsl_line(name: str, value: float) -> str:
+    return f"const {name} = {value!r}f;"
+
+
 if __name__ == "__main__":
     HEADER.write_text(header(), encoding="ascii")
+    WGSL.write_text(shader(), encoding="ascii")

@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "LICENCES.md"
-EXTRAS = ("sfm", "studio", "heic", "cluster")
+EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {
@@ -49,9 +49,13 @@ EXCEPTIONS = {"pillow-heif"}
 NOTES = {
     "opencv-python-headless": "its wheels also contain FFmpeg, a library under LGPL-2.1",
     "pillow-heif": "only with the extra heic: its wheels also contain x265, and are GPL-2.0 as a whole",
+    "wgpu": "its wheels also contain wgpu-native, under MIT OR Apache-2.0",
     "torch": "pip's default build for Linux adds NVIDIA's libraries under NVIDIA's terms; the CPU build does not",
 }
 """What the metadata of a package do not say about its wheels."""
+
+TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause"}
+"""Packages whose metadata contain the text of their licence, but not its SPDX name."""
 
 CLASSIFIERS = {
     "Apache Software License": "Apache-2.0",
@@ -117,7 +121,7 @@ def licence(package: Distribution) -> str:
         for line in package.metadata.get_all("Classifier") or ()
         if line.startswith("License :: OSI Approved ::") and line.count("::") > 1
     ]
-    return " OR ".join(named) if named else "unknown"
+    return " OR ".join(named) if named else TEXTS.get(package.metadata["Name"], "unknown")
 
 
 def compatible(expression: str) -> bool:

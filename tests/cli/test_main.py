@@ -71,7 +71,7 @@ def test_the_backend_determines_the_budget_that_is_not_given(tmp_path, capsys):
         (["--iter", "3"], "unrecognized argument --iter: did you mean --iters? see gsplat-edu demo --help"),
         (
             ["--backend", "abacus"],
-            "backend 'abacus': not in this version of gsplat_edu; use auto or one of: cuda, cpu, torch",
+            "backend 'abacus': not in this version of gsplat_edu; use auto or one of: cuda, webgpu, cpu, torch",
         ),
         (["--out", "sphere.jpg"], "--out: 'sphere.jpg' must end in .png"),
         (["--out", "taken/sphere.png"], "--out: cannot write taken/sphere.png"),

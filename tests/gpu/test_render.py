@@ -11,65 +11,21 @@ import numpy as np
 import pytest
 import torch
 
+from float32_backends import (
+    ILL_CONDITIONED,
+    POISON,
+    POSE,
+    SETTINGS,
+    SMALLER,
+    images_and_gradients,
+    sensitivity,
+)
 from gsplat_edu import Camera
 from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import resolve_backend
-from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
-from native_scenes import BACKGROUND, SCENES, random
-
-SETTINGS = RenderSettings(background=BACKGROUND)
-SMALLER = {name: scene for name, scene in SCENES.items() if name != "thousands of layers"}
-SMALLER["hundreds of layers"] = dataclasses.replace(
-    SCENES["thousands of layers"],
-    **{
-        key: getattr(SCENES["thousands of layers"], key)[::10]
-        for key in ("means", "quats", "log_scales", "sh", "logits")
-    },
-)
-POSE = ("R", "eye", "intrinsics")
-ILL_CONDITIONED = ("needles 100:1", "partly behind")
-
-
-def images_and_gradients(scene, backend, device, settings=SETTINGS):
-    """Return images, and gradients of a loss with random weights for all pixels of image, transmittance and depth."""
-    dtype = torch.float32 if backend == "cuda" else torch.float64
-    where = device if backend == "cuda" else "cpu"
-    gaussians = scene.gaussians(dtype).to(torch.device(where)).trainable()
-    background = torch.tensor(BACKGROUND, dtype=dtype, device=where, requires_grad=True)
-    camera = CameraTensors.of(scene.camera)
-    for tensor in camera.tensors():
-        tensor.requires_grad_()
-    out = render(gaussians, camera, settings=settings, background=background, backend=backend)
-    generator = torch.Generator().manual_seed(3)
-    draws = [
-        torch.randn(t.shape, generator=generator, dtype=torch.float64)
-        for t in (out.image, out.transmittance, out.depth)
-    ]
-    images = (out.image, out.transmittance, out.depth)
-    sum((t * draw.to(t)).sum() for t, draw in zip(images, draws, strict=True)).backward()
-    norms = torch.zeros(len(gaussians), dtype=dtype, device=where)
-    norms[out.visible] = out.means2d_grad_norms()
-    gradients = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
-    gradients |= {"background": background.grad, "means2d": norms}
-    gradients |= {name: getattr(camera, name).grad for name in POSE}
-    values = {"image": out.image, "T": out.transmittance, "depth": out.depth}
-    numpy = lambda found: {k: t.detach().double().cpu().numpy() for k, t in found.items()}  # noqa: E731
-    return numpy(values), numpy(gradients), out
-
-
-def sensitivity(scene) -> np.ndarray:
-    """Return the largest change of each pixel over eight perturbations of the parameters by 4 float32 eps."""
-    rng = np.random.default_rng(0)
-    exact = scene.gaussians()
-    base = render(exact, scene.camera, settings=SETTINGS, backend="cpu").image.numpy()
-    worst = np.zeros(base.shape[:2])
-    for _ in range(8):
-        noise = lambda t: t * (1 + 4 * 1.2e-7 * torch.tensor(rng.choice([-1.0, 1.0], t.shape)))  # noqa: E731
-        moved = render(exact.map(noise), scene.camera, settings=SETTINGS, backend="cpu").image.numpy()
-        worst = np.maximum(worst, np.abs(moved - base).max(axis=-1))
-    return worst
+from native_scenes import BACKGROUND, random
 
 
 @pytest.mark.sliced(2)
@@ -168,16 +124,6 @@ def test_almost_empty_scenes(device, kind):
         expected = torch.tensor(BACKGROUND, device=device).expand(33, 17, 3)
         torch.testing.assert_close(out.image.detach(), expected)
         assert all((t.grad == 0).all() for t in gaussians.tensors().values())
-
-
-POISON = (
-    ("means", np.nan),
-    ("quats", 0.0),
-    ("log_scales", np.inf),
-    ("sh0", np.inf),
-    ("sh_rest", np.nan),
-    ("logit_opacities", np.nan),
-)
 
 
 @pytest.mark.sliced(1)

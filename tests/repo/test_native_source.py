@@ -17,11 +17,12 @@ ISA_FREE = {
 """Files that are compiled once, for the oldest processor. All others are compiled once per instruction set."""
 
 
-def test_the_constants_header_is_generated_from_constants_py():
+def test_the_constants_are_generated_from_constants_py():
     spec = importlib.util.spec_from_file_location("generate", ROOT / "tools" / "generate_constants.py")
     generate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generate)
     assert (NATIVE / "constants.h").read_text() == generate.header()
+    assert generate.WGSL.read_text() == generate.shader()
 
 
 def test_only_the_bindings_include_python_and_nothing_includes_torch():

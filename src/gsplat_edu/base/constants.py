@@ -55,6 +55,10 @@ SPLAT_LIMIT: Final = 1e15
 """px: the native kernels skip a Gaussian whose standard deviation on the screen exceeds this. float32 can hold the
 squares of its inverse, a factor of the exponent. Source: ours."""
 
+SPLAT_LIMIT_F32: Final = 1e9
+"""px: the same for kernels that compute in float32, where the determinant of a longer one could overflow. Source:
+ours."""
+
 DET_FLOOR: Final = 1e-12
 """px⁴: lower bound of the determinant of a screen-space covariance before dilation, used where antialiasing takes the
 root of its ratio to the dilated one. A Gaussian that degenerates to a line has determinant 0, where the root has no

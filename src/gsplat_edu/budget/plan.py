@@ -34,6 +34,7 @@ from gsplat_edu.budget.planned import flags, taken_up
 from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.start import scene_start
 from gsplat_edu.runs.thin import ThinTrial
@@ -258,8 +259,10 @@ def _measured(
     options: RunOptions, limits: Limits, given: Collection[str], rescale: bool, reader: CaptureReader
 ) -> tuple[Request, Measurements]:
     """Return the input of a plan with limits, and measurements with the largest photos that fit into memory."""
-    if options.backend == "torch":
-        raise ArgumentError(f"{limits}: cannot be planned for --backend torch; choose cpu or cuda")
+    if "forecast" in load_backend(options.backend).lacks:
+        raise ArgumentError(
+            f"{limits}: cannot be planned for --backend {options.backend}; choose cpu or cuda"
+        )
     settings = options.data_settings
     chosen = {"resolution": settings.resolution, "max_gaussians": options.config.max_gaussians}
     fixed = frozenset(given) | {name for name, value in chosen.items() if value is not None}

@@ -96,11 +96,12 @@ def probe(
         scene: Gaussians that the run starts from; None to start from the points of the capture.
 
     Raises:
-        ArgumentError: the backend is the dense one, which takes minutes per iteration of a capture.
+        ArgumentError: the backend has no forecast: the dense one, which takes minutes per iteration of a capture, or
+            webgpu, whose memory is not in the model.
         DatasetError: a photo cannot be read.
     """
-    if backend == "torch":
-        raise ArgumentError("backend: torch is too slow to be measured on a capture; choose cpu or cuda")
+    if "forecast" in load_backend(backend).lacks:
+        raise ArgumentError(f"backend: {backend} has no forecast; choose cpu or cuda")
     resident, views = resident_bytes(), _spread(dataset.train, 4)
     reading, photos = [], []
     for view in views:

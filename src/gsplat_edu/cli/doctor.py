@@ -29,7 +29,7 @@ from gsplat_edu.io.ply import load_ply
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed, Found
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import device_of, resolve_backend
+from gsplat_edu.render.backends import device_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.train.config import DEFAULT_STRATEGY, TrainConfig, recipe
@@ -76,10 +76,8 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
     if arguments.iterations is not None:
         whole_number("--iterations", arguments.iterations, 1)
     backend = resolve_backend(arguments.backend)
-    if backend == "torch" and not arguments.no_forecast:
-        raise ArgumentError(
-            "--backend torch: is too slow for a forecast; choose cpu or cuda, or add --no-forecast"
-        )
+    if "forecast" in load_backend(backend).lacks and not arguments.no_forecast:
+        raise ArgumentError(f"--backend {backend}: has no forecast; choose cpu or cuda, or add --no-forecast")
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         survey = prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))

@@ -27,7 +27,7 @@ FEATURES = {
     "stop": "stops compositing pixel by pixel (RenderSettings.stop)",
     "processes": "shares a step among processes",
     "statistics": "collects statistics of each Gaussian (RenderOutput.collect)",
-    "forecast": "is fast enough to be measured on a capture before a training",
+    "forecast": "has a forecast of the time and memory of a training",
 }
 """Features that a backend may lack: name, and description for messages."""
 

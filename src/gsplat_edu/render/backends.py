@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
+from gsplat_edu.engine import host
 from gsplat_edu.ops import kernels
 from gsplat_edu.ops.adam import adam_in_torch, adam_natively
 from gsplat_edu.ops.losses import l1_ssim, l1_ssim_in_torch
@@ -19,20 +20,24 @@ from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import add_noise_in_torch, add_noise_natively
 from gsplat_edu.ops.recolor import recolored_in_torch, recolored_natively
 from gsplat_edu.render.backend import Backend
-from gsplat_edu.render.self_check import cuda_failure
+from gsplat_edu.render.self_check import cuda_failure, webgpu_failure
 from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
 
 CUDA_LACKS = frozenset({"stop", "processes", "statistics"})
 """What the Triton kernels do not offer."""
 
+WEBGPU_LACKS = frozenset({"stop", "processes", "statistics", "forecast"})
+"""What the WGSL kernels do not offer."""
+
 
 def resolve_backend(name: str, device: torch.device | None = None) -> str:
     """Resolve a backend's name, or "auto", to the backend that will run.
 
-    The first use of cuda in a process checks its kernels on the device (`gsplat_edu.render.self_check`).
+    The first use of cuda or webgpu checks its kernels on the device (`gsplat_edu.render.self_check`).
 
     Args:
-        name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu; or a backend by name.
+        name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu, never webgpu; or a backend
+            by name.
         device: The device of the tensors to render, if they exist already: "auto" does not move them.
 
     Returns:
@@ -71,6 +76,8 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
     """
     if name == "cpu":
         return kernels.REASON
+    if name == "webgpu":
+        return host.why_unavailable() or _webgpu_failure()
     if name == "cuda":
         if importlib.util.find_spec("triton") is None:
             return "triton is not installed; pip install triton, or use the backend cpu"
@@ -80,6 +87,14 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
             return "torch sees no GPU; use the backend cpu (TRITON_INTERPRET=1 runs the kernels, slowly, without one)"
         if failure := cuda_failure(device if device is not None and device.type == "cuda" else None):
             return f"its kernels failed their check on this GPU: {failure}; the backend cpu needs no GPU"
+    return None
+
+
+def _webgpu_failure() -> str | None:
+    if failure := webgpu_failure():
+        return (
+            f"its kernels failed their check on {host.chosen_adapter().name}: {failure}; use the backend cpu"
+        )
     return None
 
 
@@ -138,6 +153,14 @@ def _dense() -> Backend:
 
 
 @functools.cache
+def _webgpu() -> Backend:
+    from gsplat_edu.render.webgpu import render_webgpu
+
+    others = _cpu() if kernels.REASON is None else _dense()  # its tensors are on the CPU
+    return dataclasses.replace(others, name="webgpu", rasterize=render_webgpu, lacks=WEBGPU_LACKS)
+
+
+@functools.cache
 def _cuda() -> Backend:
     from gsplat_edu.render.triton.adam import adam_triton
     from gsplat_edu.render.triton.loss import l1_ssim_triton
@@ -173,4 +196,4 @@ def _cuda() -> Backend:
     )
 
 
-_LOADERS = {"cpu": _cpu, "torch": _dense, "cuda": _cuda}
+_LOADERS = {"cpu": _cpu, "torch": _dense, "cuda": _cuda, "webgpu": _webgpu}

@@ -1,4 +1,4 @@
-"""Check the backend cuda on a small scene before its first use.
+"""Check the backends cuda and webgpu on a small scene before their first use.
 
 A GPU, its driver and the installed compiler may differ from everything the kernels were tested on. The first use on a
 device therefore renders and differentiates a scene of 64 Gaussians, and compares both with float64 on the CPU. A
@@ -20,7 +20,9 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.constants import ALPHA_MIN
+from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.engine.passes import FOLDER
 from gsplat_edu.ops import kernels
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
@@ -42,6 +44,9 @@ GRADIENT_BOUND = 3e-4
 SETTINGS = RenderSettings(background=(0.2, 0.5, 0.9), jacobian_limit=1.3)
 
 
+Render = Callable[[Gaussians, Camera, RenderSettings, Extra], RenderOutput]
+
+
 def cuda_failure(device: torch.device | None = None) -> str | None:
     """Describe the failure of the kernels of the backend cuda on a device; None if they pass.
 
@@ -55,23 +60,54 @@ def cuda_failure(device: torch.device | None = None) -> str | None:
             device = torch.device("cuda", torch.cuda.current_device())
         return _failure(device)
     except Exception as error:  # compilers and drivers raise anything; the CPU renders instead
-        first = str(error).strip().splitlines()
-        return f"they do not run ({type(error).__name__}: {first[0] if first else 'no message'})"
+        return _does_not_run(error)
+
+
+def webgpu_failure() -> str | None:
+    """Describe the failure of the kernels of the backend webgpu on the adapter that it uses; None if they pass.
+
+    Cached and stored as for `cuda_failure`.
+    """
+    try:
+        return _adapter_failure()
+    except BackendUnavailableError:
+        raise  # it says what failed
+    except Exception as error:
+        return _does_not_run(error)
+
+
+def _does_not_run(error: Exception) -> str:
+    first = str(error).strip().splitlines()
+    return f"they do not run ({type(error).__name__}: {first[0] if first else 'no message'})"
 
 
 @functools.cache
 def _failure(device: torch.device) -> str | None:
-    identity, passed = _identity(device), _passed()
+    return _checked_once("cuda", _identity(device), lambda: kernel_error(device))
+
+
+@functools.cache
+def _adapter_failure() -> str | None:
+    from gsplat_edu.render.webgpu import adapter_name
+
+    name = adapter_name()
+    on = f"{name.name}, {name.interface}, {name.driver}, torch {torch.__version__}, wgpu {version('wgpu')}"
+    return _checked_once("webgpu", f"{on}, kernels {_hash_of_kernels()}", shader_error)
+
+
+def _checked_once(backend: str, identity: str, check: Callable[[], str | None]) -> str | None:
+    """Return what a check finds, without running it if it has passed with this identity before."""
+    passed = _passed(backend)
     if identity in passed:
         return None
-    failure = kernel_error(device)
+    failure = check()
     if failure is None:
-        _remember([*passed, identity])
+        _remember(backend, [*passed, identity])
     return failure
 
 
 def kernel_error(device: torch.device) -> str | None:
-    """Render and differentiate the scene on a device, and compare the results with float64 on the CPU.
+    """Render and differentiate the scene on a device with Triton's kernels, and compare with float64 on the CPU.
 
     Args:
         device: As for `cuda_failure`.
@@ -81,9 +117,20 @@ def kernel_error(device: torch.device) -> str | None:
     """
     from gsplat_edu.render.triton.rasterize import render_triton
 
+    return _error(render_triton, device)
+
+
+def shader_error() -> str | None:
+    """Do the same on the adapter of the backend webgpu."""
+    from gsplat_edu.render.webgpu import render_webgpu
+
+    return _error(render_webgpu, torch.device("cpu"))
+
+
+def _error(render: Render, device: torch.device) -> str | None:
     image, gradients = _differentiated(
         check_scene(torch.float32).to(device),
-        lambda g, bg: render_triton(g, CHECK_CAMERA, SETTINGS, Extra(bg)),
+        lambda g, bg: render(g, CHECK_CAMERA, SETTINGS, Extra(bg)),
     )
     truth, expected = _differentiated(check_scene(torch.float64), _exact)
     bright = max(1.0, float(truth.abs().max()))
@@ -165,10 +212,16 @@ def _identity(device: torch.device) -> str:
         on = f"{name}, {capability}, CUDA {torch.version.cuda}, driver {_driver()}"
     else:
         on = "interpreter"
+    return f"{on}, torch {torch.__version__}, triton {version('triton')}, kernels {_hash_of_kernels()}"
+
+
+def _hash_of_kernels() -> str:
+    """Return a hash of the modules and shaders that render."""
     source = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        source.update(path.read_bytes())
-    return f"{on}, torch {torch.__version__}, triton {version('triton')}, kernels {source.hexdigest()[:16]}"
+    for folder, pattern in ((Path(__file__).parent, "*.py"), (FOLDER, "*.py"), (FOLDER, "*.wgsl")):
+        for path in sorted(folder.rglob(pattern)):
+            source.update(path.read_bytes())
+    return source.hexdigest()[:16]
 
 
 def _driver() -> str:
@@ -179,23 +232,23 @@ def _driver() -> str:
         return "unknown"
 
 
-def _memory() -> Path:
-    """Return the file that stores passed checks."""
+def _memory(backend: str) -> Path:
+    """Return the file that stores a backend's passed checks."""
     folder = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(folder) / "gsplat_edu" / "cuda_passed.json"
+    return Path(folder) / "gsplat_edu" / f"{backend}_passed.json"
 
 
-def _passed() -> list[str]:
+def _passed(backend: str) -> list[str]:
     try:
-        found = json.loads(_memory().read_text())
+        found = json.loads(_memory(backend).read_text())
     except (OSError, ValueError, RecursionError):
         return []  # the check runs again
     return [entry for entry in found if isinstance(entry, str)] if isinstance(found, list) else []
 
 
-def _remember(identities: list[str]) -> None:
+def _remember(backend: str, identities: list[str]) -> None:
     try:
-        with written_aside(_memory()) as path:
+        with written_aside(_memory(backend)) as path:
             path.write_text(json.dumps(identities[-20:]))
     except OSError:
         pass  # the next process checks again

@@ -8,9 +8,9 @@ from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, DILATION, DILATION_M
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.base.validation import flag, float64_array, in_range, one_of, quoted, whole_number
 
-BACKENDS = ("cuda", "cpu", "torch")
-"""All backends, fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, which evaluates every
-splat at every pixel."""
+BACKENDS = ("cuda", "webgpu", "cpu", "torch")
+"""All backends: Triton kernels on a GPU; WGSL kernels on any GPU; native SIMD kernels; the dense reference, which
+evaluates every splat at every pixel."""
 
 MAPS = ("alpha", "depth", "expected-depth", "median-depth", "normal")
 """The maps of `gsplat_edu.render.maps`, by name. The command line lists them without importing torch."""

@@ -1,0 +1,366 @@
+"""A render and its gradients as programs of the engine, from NumPy arrays to NumPy arrays.
+
+    project -> scan, list -> sort by depth -> scan, emit pairs -> sort by tile -> ranges -> composite
+    composite_backward -> project_backward
+
+The device counts the visible Gaussians and the pairs. The host guesses how many pairs there are, and if there are more,
+renders again with more room; all it waits for is the result.
+"""
+
+from __future__ import annotations
+
+import functools
+import weakref
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsplat_edu.engine.host import Device, Memory
+from gsplat_edu.engine.passes import (
+    Buffer,
+    Pass,
+    Program,
+    Size,
+    scan,
+    scan_scratch,
+    sort,
+    sort_bits,
+    sort_scratch,
+)
+from gsplat_edu.engine.view import View
+
+CORE, OUT, RECORD, SLOT, PIXEL, GRADS, CAMERA_NUMBERS = 14, 16, 16, 10, 6, 5, 16
+"""Numbers of a Gaussian without its higher harmonics, of their gradient, a record, a slot, a pixel, its gradient, and
+of the camera's gradient."""
+
+VISIBLE, PAIRS, SPARE, LIVE = 0, 1, 2, 4
+"""Places in `live`, and its length."""
+
+GROUP = 4
+"""Features per pass: composite has room for three colours and a depth."""
+
+FEWEST_PAIRS = 1 << 12
+"""Room for pairs in the smallest buffers."""
+
+MOST_SIZES = 64
+"""Sizes of frames whose numbers of pairs are remembered."""
+
+GAUSSIANS, PAIR, EDGES = Size("gaussians"), Size("pairs"), Size("edges")
+
+
+@functools.cache
+def program(tile_bits: int, with_features: bool) -> Program:
+    """Return the program of a render.
+
+    Args:
+        tile_bits: Bits of the number of tiles, by which pairs are sorted.
+        with_features: Whether it also composites features, four at a time.
+    """
+    buffers = (
+        *(Buffer("core", Size("gaussians", CORE)), Buffer("rest", Size("rest"))),
+        *(Buffer("records", Size("gaussians", RECORD)), Buffer("seen", GAUSSIANS)),
+        *(Buffer("spans", Size("gaussians", 2)), Buffer("radii", Size("gaussians", 2))),
+        *(Buffer(name, GAUSSIANS) for name in ("depth_keys", "order", "starts")),
+        *sort_scratch("depth_sort", "gaussians"),
+        Buffer("gaussian_sums", scan_scratch(GAUSSIANS)),
+        *(Buffer(name, PAIR) for name in ("tile_keys", "slot_of", "owner")),
+        *sort_scratch("tile_sort", "pairs"),
+        *(Buffer("tiles", EDGES), Buffer("done", EDGES)),
+        *(Buffer("image", Size("pixels", PIXEL)), Buffer("grads", Size("pixels", GRADS))),
+        Buffer("slots", Size("pairs", SLOT)),
+        *(Buffer("core_grads", Size("gaussians", OUT)), Buffer("rest_grads", Size("rest"))),
+        *(Buffer("camera_sums", Size("gaussians", CAMERA_NUMBERS, 64)), Buffer("live", Size("live"))),
+    )
+    parts = {
+        "render": _forward(tile_bits),
+        "composite_backward": (_composite_backward("records", "image", "slots"),),
+        "project_backward": _project_backward(),
+    }
+    if with_features:
+        buffers += (
+            *(
+                Buffer("features", Size("gaussians", GROUP)),
+                Buffer("feature_grads", Size("gaussians", GROUP)),
+            ),
+            *(Buffer("painted", Size("gaussians", RECORD)), Buffer("feature_slots", Size("pairs", SLOT))),
+            Buffer("feature_image", Size("pixels", PIXEL)),
+        )
+        parts |= _feature_parts()
+    return Program(buffers, parts)
+
+
+def _forward(tile_bits: int) -> tuple[Pass, ...]:
+    sources, lists = ("live", "order", "spans", "records"), ("live", "records", "order", "starts")
+    return (
+        Pass("project", "project", ("core", "rest"), ("records", "seen", "spans"), GAUSSIANS, 64),
+        *scan("seen", "gaussian_sums", GAUSSIANS, VISIBLE),
+        Pass("order", "list_seen", ("records", "seen"), ("depth_keys", "order"), GAUSSIANS, 256),
+        *sort("depth_keys", "order", "depth_sort", "gaussians", VISIBLE, 32, SPARE),
+        Pass("order", "gather_spans", sources, ("starts", "radii"), GAUSSIANS, 256, VISIBLE),
+        *scan("starts", "gaussian_sums", GAUSSIANS, PAIRS),
+        Pass(
+            "intersect",
+            "emit_pairs",
+            lists,
+            ("spans", "tile_keys", "slot_of", "owner"),
+            GAUSSIANS,
+            64,
+            VISIBLE,
+        ),
+        *sort("tile_keys", "slot_of", "tile_sort", "pairs", PAIRS, tile_bits, SPARE),
+        Pass("intersect", "find_ranges", ("live", "tile_keys"), ("tiles",), EDGES, 256, PAIRS),
+        _composite("records", "image", 0),
+    )
+
+
+def _composite(records: str, image: str, without_background: int) -> Pass:
+    reads = (records, "owner", "slot_of", "tiles")
+    return Pass("composite", "composite", reads, ("done", image), EDGES, 1, shift=without_background)
+
+
+def _composite_backward(records: str, image: str, slots: str) -> Pass:
+    reads = (records, "owner", "slot_of", "tiles", "done", image, "grads")
+    return Pass("composite_backward", "composite_backward", reads, (slots,), EDGES, 1)
+
+
+def _project_backward() -> tuple[Pass, ...]:
+    reads, writes = ("core", "rest", "spans", "slots"), ("core_grads", "rest_grads", "camera_sums")
+    return (Pass("project_backward", "project_backward", reads, writes, GAUSSIANS, 64),)
+
+
+def _feature_parts() -> dict[str, tuple[Pass, ...]]:
+    sums = ("spans", "feature_slots")
+    return {
+        "features": (
+            Pass("features", "paint", ("records", "features"), ("painted",), GAUSSIANS, 256),
+            _composite("painted", "feature_image", 1),
+        ),
+        "features_backward": (
+            _composite_backward("painted", "feature_image", "feature_slots"),
+            Pass("features", "add_moments", ("live", "feature_slots"), ("slots",), PAIR, 256, PAIRS),
+            Pass("features", "sum_features", sums, ("feature_grads",), GAUSSIANS, 64),
+        ),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Raw parameters of N Gaussians.
+
+    Args:
+        core: (N, 14) float32: mean, quaternion (w, x, y, z), log scales, first harmonic, logit of the opacity.
+        rest: (N, K, 3) float32, the other harmonics.
+        features: (N, C) float32, composited over zero like colours; None for none.
+    """
+
+    core: np.ndarray
+    rest: np.ndarray
+    features: np.ndarray | None = None
+
+    def groups(self) -> Iterator[np.ndarray]:
+        """Yield the features four at a time, missing ones as 0."""
+        if self.features is not None:
+            channels = self.features.shape[1]
+            padded = np.zeros((len(self.core), -(-channels // GROUP) * GROUP), dtype=np.float32)
+            padded[:, :channels] = self.features
+            for first in range(0, channels, GROUP):
+                yield np.ascontiguousarray(padded[:, first : first + GROUP])
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A rendered view, whose buffers stay on the device for its gradients.
+
+    Args:
+        image: (H, W, 3) float32.
+        transmittance: (H, W).
+        depth: (H, W), expected depth, not normalised.
+        median_depth: (H, W).
+        visible: (M,) int64, the Gaussians that take part, near to far.
+        radii: (M, 2), half width and height of alpha >= 1/255, px.
+        num_pairs: Pairs of Gaussian and tile.
+        features: (H, W, C), or None.
+        memory: The buffers.
+    """
+
+    image: np.ndarray
+    transmittance: np.ndarray
+    depth: np.ndarray
+    median_depth: np.ndarray
+    visible: np.ndarray
+    radii: np.ndarray
+    num_pairs: int
+    features: np.ndarray | None
+    memory: Memory
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGradients:
+    """Gradients of a loss of one frame.
+
+    Args:
+        core: (N, 14) float32, as `Scene.core`.
+        rest: (N, K, 3).
+        norms: (N,), |(gu W/2, gv H/2)| with the gradient (gu, gv) of the position in the image.
+        camera: (16,) float64: R row by row, the eye, fx, fy, cx, cy.
+        features: (N, C), or None.
+    """
+
+    core: np.ndarray
+    rest: np.ndarray
+    norms: np.ndarray
+    camera: np.ndarray
+    features: np.ndarray | None
+
+
+class Pool:
+    """Buffers of frames that nothing refers to any more, to be used again.
+
+    Args:
+        device: Where they are.
+        most: Sets that wait at most; the oldest is given back to the device.
+    """
+
+    def __init__(self, device: Device, most: int = 2) -> None:
+        self.device = device
+        self._waiting: deque[Memory] = deque(maxlen=most)
+        self._pairs: dict[tuple[int, int], int] = {}
+
+    def take(self, wanted: Program, counts: Mapping[str, int]) -> Memory:
+        """Return buffers for these counts, with the results of earlier frames in them."""
+        for _ in range(len(self._waiting)):
+            try:
+                memory = self._waiting.popleft()
+            except IndexError:  # another thread took it
+                break
+            if memory.program is wanted and memory.counts == counts:
+                return memory
+            self._waiting.append(memory)
+        return self.device.allocate(wanted, counts)
+
+    def keep(self, memory: Memory) -> None:
+        """Take back the buffers of a frame. Finalizers call it from any thread, so it takes no lock."""
+        self._waiting.append(memory)
+
+    def room(self, gaussians: int, tiles: int) -> int:
+        """Return the number of pairs to make room for: what frames of this size needed, or two per Gaussian."""
+        return self._pairs.get((gaussians, tiles), _rounded(2 * gaussians))
+
+    def note(self, gaussians: int, tiles: int, pairs: int) -> int:
+        """Remember how many pairs a frame has, and return the room for as many."""
+        if len(self._pairs) > MOST_SIZES:
+            self._pairs.clear()
+        room = max(self._pairs.get((gaussians, tiles), 0), _rounded(pairs))
+        self._pairs[(gaussians, tiles)] = room
+        return room
+
+
+def _rounded(pairs: int) -> int:
+    """Round up by a quarter at most, so that frames of similar size share buffers."""
+    step = 1 << max(pairs.bit_length() - 3, 0)
+    return max(-(-pairs // step) * step, FEWEST_PAIRS)
+
+
+def draw_frame(pool: Pool, scene: Scene, view: View) -> Frame:
+    """Render a scene.
+
+    Args:
+        pool: Buffers of the device.
+        scene: The Gaussians.
+        view: Camera and settings.
+
+    Raises:
+        BackendUnavailableError: the device fails, or has no buffers that large.
+    """
+    n, H, W = len(scene.core), view.camera.H, view.camera.W
+    counts = {"gaussians": n, "rest": scene.rest.size, "pixels": H * W, "edges": view.tiles + 2, "live": LIVE}
+    wanted, room = (
+        program(sort_bits(view.tiles.bit_length()), scene.features is not None),
+        pool.room(n, view.tiles),
+    )
+    while True:
+        memory = pool.take(wanted, counts | {"pairs": room})
+        memory.write("core", scene.core)
+        memory.write("rest", scene.rest)
+        found = memory.play(
+            "render", view.packed(scene.rest.shape[1]), read=("live", "image", "order", "radii")
+        )
+        visible, pairs = int(found["live"][VISIBLE]), int(found["live"][PAIRS])
+        needed = pool.note(n, view.tiles, pairs)
+        if pairs <= room:
+            break
+        room = needed
+    image = _pixels(found["image"], H, W)
+    frame = Frame(
+        *(image[..., :3], image[..., 3], image[..., 4], image[..., 5]),
+        visible=found["order"][:visible].astype(np.int64),
+        radii=found["radii"].view(np.float32)[: 2 * visible].reshape(visible, 2).copy(),
+        num_pairs=pairs,
+        features=_drawn_features(memory, scene, H, W),
+        memory=memory,
+    )
+    weakref.finalize(frame, pool.keep, memory).atexit = False
+    return frame
+
+
+def _pixels(words: np.ndarray, H: int, W: int) -> np.ndarray:
+    return words.view(np.float32)[: H * W * PIXEL].reshape(H, W, PIXEL)
+
+
+def _drawn_features(memory: Memory, scene: Scene, H: int, W: int) -> np.ndarray | None:
+    if scene.features is None:
+        return None
+    groups = []
+    for group in scene.groups():
+        memory.write("features", group)
+        image = _pixels(memory.play("features", read=("feature_image",))["feature_image"], H, W)
+        groups.append(image[..., [0, 1, 2, 4]])
+    return np.concatenate(groups, axis=2)[..., : scene.features.shape[1]]
+
+
+def differentiate_frame(
+    frame: Frame, scene: Scene, grads: np.ndarray, of_features: np.ndarray | None
+) -> FrameGradients:
+    """Propagate gradients of a frame's images to the Gaussians and the camera.
+
+    Args:
+        frame: The frame.
+        scene: The Gaussians of the frame.
+        grads: (H, W, 5) float32, of image, transmittance and depth.
+        of_features: (H, W, C) float32, of the image of the features; None for zero.
+
+    Raises:
+        BackendUnavailableError: the device fails.
+    """
+    memory, n = frame.memory, len(scene.core)
+    memory.write("grads", grads)
+    memory.play("composite_backward")
+    to_features = None if of_features is None else _features_backward(memory, scene, of_features)
+    found = memory.play("project_backward", read=("core_grads", "rest_grads", "camera_sums"))
+    core = found["core_grads"].view(np.float32)[: n * OUT].reshape(n, OUT)
+    sums = found["camera_sums"].view(np.float32)[: -(-n // 64) * CAMERA_NUMBERS].reshape(-1, CAMERA_NUMBERS)
+    return FrameGradients(
+        core[:, :CORE],
+        found["rest_grads"].view(np.float32)[: scene.rest.size].reshape(scene.rest.shape),
+        core[:, CORE].copy(),
+        sums.sum(axis=0, dtype=np.float64),
+        to_features,
+    )
+
+
+def _features_backward(memory: Memory, scene: Scene, gradient: np.ndarray) -> np.ndarray:
+    """Return the gradient of the features, and add their share of the moments to the slots of all pairs."""
+    H, W, channels = gradient.shape
+    n, found = len(scene.core), []
+    for place, group in enumerate(scene.groups()):
+        own = gradient[..., GROUP * place : GROUP * (place + 1)]
+        grads = np.zeros((H, W, GRADS), dtype=np.float32)
+        grads[..., [0, 1, 2, 4][: own.shape[2]]] = own
+        memory.write("features", group)
+        memory.play("features")
+        memory.write("grads", grads)
+        words = memory.play("features_backward", read=("feature_grads",))["feature_grads"]
+        found.append(words.view(np.float32)[: n * GROUP].reshape(n, GROUP))
+    return np.concatenate(found, axis=1)[:, :channels]

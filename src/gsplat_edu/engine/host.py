@@ -1,0 +1,414 @@
+"""A host that plays the engine's programs from Python, over wgpu: Vulkan, Metal or DirectX 12.
+
+    device = Device.default()
+    memory = device.allocate(program, {"gaussians": 1000})
+    memory.write("keys", keys)
+    found = memory.play("sort", read=("keys",))
+
+A part of a program is one submission. Nothing is read back but what `read` names.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+import struct
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
+
+INSTALL = 'pip install "gsplat-edu[gpu]"'
+"""Installs wgpu."""
+
+SLICE = 256
+"""Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
+
+LEAST = 4
+"""Words of the smallest buffer: one row of four numbers, which is the largest type of an array."""
+
+VIEW_BYTES = 512
+"""Bytes of the uniform block that all passes of a part share: camera and settings."""
+
+ADAPTER_VARIABLE = "GSPLAT_EDU_ADAPTER"
+"""Environment variable with a part of the name of the adapter to use."""
+
+TIMESTAMPS = "timestamp-query"
+"""The optional feature of measuring passes."""
+
+Call = tuple[Any, Any, Any, int, int, int]
+"""Pipeline, uniforms, storage, offset of the job, workgroups in two dimensions."""
+
+KINDS = ("DiscreteGPU", "IntegratedGPU", "VirtualGPU", "Unknown", "CPU")
+"""Kinds of adapters, best first."""
+
+
+@dataclass(frozen=True)
+class AdapterName:
+    """An adapter as it is listed.
+
+    Args:
+        name: Its device's name.
+        kind: One of `KINDS`.
+        interface: "Vulkan", "Metal" or "D3D12".
+        driver: The driver's description of itself.
+    """
+
+    name: str
+    kind: str
+    interface: str
+    driver: str
+
+    @property
+    def software(self) -> bool:
+        """Whether it computes on the CPU."""
+        return self.kind == "CPU"
+
+
+def why_unavailable() -> str | None:
+    """Return why no adapter can be used here; None if one can."""
+    if importlib.util.find_spec("wgpu") is None:
+        return f"wgpu is not installed; {INSTALL}, or use the backend cpu"
+    try:
+        found = adapters()
+    except Exception as error:  # a driver's library that does not load raises anything
+        return f"wgpu does not start here ({_first_line(error)}); use the backend cpu"
+    wanted = os.environ.get(ADAPTER_VARIABLE, "")
+    if not found:
+        return (
+            "wgpu finds no adapter for Vulkan, Metal or DirectX 12; install the driver of the GPU, or on Debian and "
+            "Ubuntu mesa-vulkan-drivers, which computes on the CPU, or use the backend cpu"
+        )
+    if not any(wanted.lower() in name.name.lower() for name in found):
+        names = ", ".join(name.name for name in found)
+        return f"{ADAPTER_VARIABLE}: is {wanted!r}, which no adapter's name contains; there are: {names}"
+    return None
+
+
+def adapters() -> tuple[AdapterName, ...]:
+    """List the adapters, best first; OpenGL's, which repeat them, are left out."""
+    return tuple(name for name, _ in _adapters())
+
+
+def chosen_adapter() -> AdapterName:
+    """Return the best adapter, or the first whose name contains `GSPLAT_EDU_ADAPTER`; call `why_unavailable` before."""
+    wanted = os.environ.get(ADAPTER_VARIABLE, "").lower()
+    return next(name for name in adapters() if wanted in name.name.lower())
+
+
+@functools.cache
+def _adapters() -> tuple[tuple[AdapterName, Any], ...]:
+    import wgpu
+
+    found = []
+    for adapter in wgpu.gpu.enumerate_adapters_sync():
+        info = adapter.info
+        name = AdapterName(info["device"], info["adapter_type"], info["backend_type"], info["description"])
+        if name.interface != "OpenGL":
+            found.append((name, adapter))
+    return tuple(
+        sorted(found, key=lambda pair: KINDS.index(pair[0].kind) if pair[0].kind in KINDS else len(KINDS))
+    )
+
+
+class Device:
+    """An adapter that is ready to compute, with the pipelines that were made for it.
+
+    Args:
+        adapter: Its place in `adapters()`.
+        limits: What it is asked for, by the names of `LIMITS`; None for all that the adapter has.
+        most_groups: Workgroups in one dimension; more continue in the second.
+
+    Raises:
+        BackendUnavailableError: it does not start.
+    """
+
+    def __init__(
+        self, adapter: int = 0, limits: Mapping[str, int] | None = None, most_groups: int | None = None
+    ) -> None:
+        self.name, chosen = _adapters()[adapter]
+        wanted = {key: chosen.limits[key] for key in LIMITS} if limits is None else dict(limits)
+        self.measures = TIMESTAMPS in chosen.features
+        with _one_line(f"the adapter {self.name.name} does not start"):
+            self.device = chosen.request_device_sync(
+                required_limits=wanted, required_features=[TIMESTAMPS] if self.measures else []
+            )
+        self.limits: Mapping[str, int] = wanted
+        self.most_groups = most_groups or wanted["max-compute-workgroups-per-dimension"]
+        self.lock = threading.RLock()
+        self._modules: dict[str, Any] = {}
+        self._pipelines: dict[tuple[str, str, int, int], Any] = {}
+
+    @staticmethod
+    @functools.cache
+    def default() -> Device:
+        """Return the device of `chosen_adapter`.
+
+        Raises:
+            BackendUnavailableError: there is none, or it does not start; the message says why.
+        """
+        if reason := why_unavailable():
+            raise BackendUnavailableError(f"backend 'webgpu': {reason}")
+        return Device(adapters().index(chosen_adapter()))
+
+    def allocate(self, program: Program, counts: Mapping[str, int], poison: bool = False) -> Memory:
+        """Allocate a program's buffers.
+
+        Args:
+            program: The program.
+            counts: Its counts by name.
+            poison: Fill the buffers with noise instead of zeros, so that tests find what is read before it is written.
+
+        Raises:
+            BackendUnavailableError: the device has too little memory or too small buffers; the message says which.
+        """
+        return Memory(self, program, counts, poison)
+
+    def check_fits(self, program: Program, counts: Mapping[str, int]) -> None:
+        """Check that no buffer is larger than the device allows.
+
+        Raises:
+            BackendUnavailableError: one is; the message names it.
+        """
+        most = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
+        largest = max(program.buffers, key=lambda buffer: buffer.size.of(counts))
+        size = WORD * largest.size.of(counts)
+        if size > most:
+            raise BackendUnavailableError(
+                f"backend 'webgpu': the buffer {largest.name} needs {size / 2**20:.0f} MiB for "
+                f"{', '.join(f'{count} {name}' for name, count in counts.items())}, but {self.name.name} allows "
+                f"{most / 2**20:.0f}; use the backend cpu"
+            )
+
+    def pipeline(self, one: Pass) -> tuple[Any, Any]:
+        """Return the compiled pipeline of a pass, and the layout of its storage buffers."""
+        key = (one.module, one.entry, len(one.reads), len(one.writes))
+        if key not in self._pipelines:
+            self._pipelines[key] = self._compiled(one)
+        return self._pipelines[key]  # type: ignore[no-any-return]
+
+    def _compiled(self, one: Pass) -> tuple[Any, Any]:
+        if one.module not in self._modules:
+            with _one_line(f"{self.name.name} refuses the shader {one.module}"):
+                self._modules[one.module] = self.device.create_shader_module(code=module_source(one.module))
+        kinds = ["read-only-storage"] * len(one.reads) + ["storage"] * len(one.writes)
+        storage = self.device.create_bind_group_layout(
+            entries=[_entry(binding, {"type": kind}) for binding, kind in enumerate(kinds)]
+        )
+        layout = self.device.create_pipeline_layout(bind_group_layouts=[self.uniform_layout, storage])
+        stage = {"module": self._modules[one.module], "entry_point": one.entry}
+        with _one_line(f"{self.name.name} refuses the shader {one.module}.{one.entry}"):
+            return self.device.create_compute_pipeline(layout=layout, compute=stage), storage
+
+    @functools.cached_property
+    def uniform_layout(self) -> Any:  # noqa: ANN401
+        """The layout of group 0: the job of the pass, and the view."""
+        job = {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": 16}
+        return self.device.create_bind_group_layout(
+            entries=[_entry(0, job), _entry(1, {"type": "uniform", "min_binding_size": VIEW_BYTES})]
+        )
+
+
+class Memory:
+    """The buffers of a program for certain counts; `Device.allocate` makes it.
+
+    Args:
+        device: Where they are.
+        program: The program.
+        counts: Its counts by name.
+        poison: Whether they begin with noise.
+    """
+
+    def __init__(self, device: Device, program: Program, counts: Mapping[str, int], poison: bool) -> None:
+        import wgpu
+
+        device.check_fits(program, counts)
+        self.device, self.program, self.counts = device, program, dict(counts)
+        usage = wgpu.BufferUsage
+        storage = usage.STORAGE | usage.COPY_SRC | usage.COPY_DST
+        self._words = {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in program.buffers}
+        total = WORD * sum(self._words.values())
+        make = device.device.create_buffer
+        with _one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):
+            self._buffers = {
+                name: make(size=WORD * words, usage=storage) for name, words in self._words.items()
+            }
+            self._view = make(size=VIEW_BYTES, usage=usage.UNIFORM | usage.COPY_DST)
+        if poison:
+            noise = np.random.default_rng(0)
+            for name, words in self._words.items():
+                self.write(name, noise.integers(0, 2**32, words, dtype=np.uint32))
+        self._staging: Any = None
+        self._recorded = {part: self._bind(passes) for part, passes in program.parts.items()}
+
+    def _bind(self, passes: Sequence[Pass]) -> list[Call]:
+        """Return the call of each pass that has any workgroups."""
+        import wgpu
+
+        make = self.device.device.create_bind_group
+        jobs = self.device.device.create_buffer_with_data(
+            data=b"".join(struct.pack("<4I", *one.job(self.counts)).ljust(SLICE, b"\0") for one in passes),
+            usage=wgpu.BufferUsage.UNIFORM,
+        )
+        uniforms = make(
+            layout=self.device.uniform_layout,
+            entries=[
+                {"binding": 0, "resource": {"buffer": jobs, "offset": 0, "size": 16}},
+                {"binding": 1, "resource": {"buffer": self._view, "offset": 0, "size": VIEW_BYTES}},
+            ],
+        )
+        recorded = []
+        for place, one in enumerate(passes):
+            if groups := one.groups(self.counts):
+                pipeline, layout = self.device.pipeline(one)
+                bound = [{"buffer": self._buffers[name]} for name in (*one.reads, *one.writes)]
+                entries = [{"binding": k, "resource": each} for k, each in enumerate(bound)]
+                x = min(groups, self.device.most_groups)
+                storage = make(layout=layout, entries=entries)
+                recorded.append((pipeline, uniforms, storage, SLICE * place, x, -(-groups // x)))
+        return recorded
+
+    def write(self, name: str, array: np.ndarray) -> None:
+        """Write an array of four-byte numbers to the beginning of a buffer.
+
+        Raises:
+            ValueError: it is longer than the buffer, or its numbers have another size.
+        """
+        if array.itemsize != WORD or array.size > self._words[name]:
+            raise ValueError(
+                f"{name}: has {self._words[name]} words, not {array.size} of {array.itemsize} bytes"
+            )
+        if array.size:
+            with _one_line(f"{self.device.name.name} does not take {name}"):
+                self.device.device.queue.write_buffer(self._buffers[name], 0, np.ascontiguousarray(array))
+
+    def play(self, part: str, view: bytes = b"", read: Iterable[str] = ()) -> dict[str, np.ndarray]:
+        """Play a part of the program as one submission, and wait for it if something is read.
+
+        Args:
+            part: Its name.
+            view: Begin of the uniform block that its passes share; empty leaves it as it is.
+            read: Buffers whose contents are returned, as uint32.
+
+        Raises:
+            BackendUnavailableError: the device fails.
+        """
+        names = tuple(read)
+        with self.device.lock, _one_line(f"{self.device.name.name} fails in {part}"):
+            queue = self.device.device.queue
+            if view:
+                queue.write_buffer(self._view, 0, view)
+            encoder = self.device.device.create_command_encoder()
+            computing = encoder.begin_compute_pass()
+            for call in self._recorded[part]:
+                _dispatch(computing, call)
+            computing.end()
+            offset = 0
+            staging = self._staging_for(names)
+            for name in names:
+                encoder.copy_buffer_to_buffer(
+                    self._buffers[name], 0, staging, offset, WORD * self._words[name]
+                )
+                offset += WORD * self._words[name]
+            queue.submit([encoder.finish()])
+            return self._collected(names, staging)
+
+    def times(self, part: str) -> dict[str, float]:
+        """Play a part once more, pass by pass, and return the milliseconds that the device took for each entry point.
+
+        Raises:
+            BackendUnavailableError: the device has no timestamps, or fails.
+        """
+        import wgpu
+
+        if not self.device.measures:
+            raise BackendUnavailableError(f"backend 'webgpu': {self.device.name.name} has no timestamps")
+        make, recorded = self.device.device, self._recorded[part]
+        passes = [one for one in self.program.parts[part] if one.groups(self.counts)]
+        with self.device.lock, _one_line(f"{self.device.name.name} fails in {part}"):
+            queries = make.create_query_set(type="timestamp", count=2 * len(passes))
+            usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
+            resolved = make.create_buffer(size=16 * len(passes), usage=usage)
+            encoder = make.create_command_encoder()
+            for place, call in enumerate(recorded):
+                marks = {"beginning_of_pass_write_index": 2 * place, "end_of_pass_write_index": 2 * place + 1}
+                computing = encoder.begin_compute_pass(timestamp_writes={"query_set": queries, **marks})
+                _dispatch(computing, call)
+                computing.end()
+            encoder.resolve_query_set(queries, 0, 2 * len(passes), resolved, 0)
+            make.queue.submit([encoder.finish()])
+            stamps = np.frombuffer(make.queue.read_buffer(resolved), dtype=np.uint64).reshape(-1, 2)
+        found: dict[str, float] = {}
+        for one, (begin, end) in zip(passes, stamps, strict=True):
+            found[one.entry] = found.get(one.entry, 0.0) + (int(end) - int(begin)) / 1e6
+        return found
+
+    def _staging_for(self, names: tuple[str, ...]) -> Any:  # noqa: ANN401
+        """Return a buffer that holds these buffers and can be mapped; it is kept for the next read."""
+        import wgpu
+
+        size = self._bytes_of(names)
+        if size and (self._staging is None or self._staging.size < size):
+            usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
+            self._staging = self.device.device.create_buffer(size=size, usage=usage)
+        return self._staging
+
+    def _collected(self, names: tuple[str, ...], staging: Any) -> dict[str, np.ndarray]:  # noqa: ANN401
+        if not names:
+            return {}
+        size = self._bytes_of(names)
+        staging.map_sync("READ", 0, size)
+        words = np.frombuffer(staging.read_mapped(0, size), dtype=np.uint32)
+        staging.unmap()
+        lengths = [self._words[name] for name in names]
+        return dict(zip(names, np.split(words, np.cumsum(lengths)[:-1]), strict=False))
+
+    def _bytes_of(self, names: tuple[str, ...]) -> int:
+        """Return the bytes of these buffers; mapped ranges are multiples of 8."""
+        return -(-WORD * sum(self._words[name] for name in names) // 8) * 8
+
+
+class _one_line:  # noqa: N801  used like a function
+    """Turns what wgpu raises into one line."""
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+
+    def __enter__(self) -> None:
+        """Nothing to prepare."""
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        """Translate errors of wgpu."""
+        if error is not None and _is_of_wgpu(error):
+            raise BackendUnavailableError(
+                f"backend 'webgpu': {self.what} ({_first_line(error)}); use the backend cpu"
+            ) from error
+
+
+def _dispatch(computing: Any, call: Call) -> None:  # noqa: ANN401
+    pipeline, uniforms, storage, offset, x, y = call
+    computing.set_pipeline(pipeline)
+    computing.set_bind_group(0, uniforms, [offset])
+    computing.set_bind_group(1, storage)
+    computing.dispatch_workgroups(x, y)
+
+
+def _is_of_wgpu(error: BaseException) -> bool:
+    import wgpu
+
+    return isinstance(error, (wgpu.GPUError, RuntimeError))
+
+
+def _first_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0] if lines else 'no message'}"
+
+
+def _entry(binding: int, buffer: Mapping[str, object]) -> dict[str, object]:
+    return {"binding": binding, "visibility": 4, "buffer": dict(buffer)}  # 4: ShaderStage.COMPUTE

@@ -1,0 +1,239 @@
+// project_backward: add each Gaussian's slots in order, and propagate the sums to its raw parameters and to the camera.
+//
+//     moments of h -> J W M -> (J W, quaternion, log scale) -> mean;   colour -> (coefficients, direction -> mean)
+//
+// Sigma2d^-1 = L' L, y = L d: moments are taken in y, where they are of order 1; in d they grow with the ellipse and cancel.
+// With r = (J W) M, w = L r and N the matrix of moments: dL/dr = L' N w. As in native/project_backward.cpp.
+
+const OUT = 16u;             // as `core`, then |(gu W/2, gv H/2)|, and one unused
+const SLOT = 10u;
+const CAMERA = 16u;          // R row by row, eye, fx, fy, cx, cy
+
+@group(1) @binding(2) var<storage, read> spans: array<vec2<u32>>;
+@group(1) @binding(3) var<storage, read> slots: array<f32>;
+@group(1) @binding(4) var<storage, read_write> core_grads: array<f32>;
+@group(1) @binding(5) var<storage, read_write> rest_grads: array<f32>;
+@group(1) @binding(6) var<storage, read_write> camera_sums: array<f32>;
+
+var<workgroup> camera_parts: array<f32, 1024>;   // 64 threads x CAMERA
+
+struct Sums {
+    color: vec3<f32>,
+    depth: f32,
+    h: f32,
+    first: vec2<f32>,
+    second: vec3<f32>,       // hxx, hxy, hyy
+}
+
+struct Moments {
+    L: vec3<f32>,            // sx, sy, ty
+    m: vec2<f32>,            // sum h y
+    m00: f32,                // sum h y y', minus sum h on the diagonal with antialiasing
+    m01: f32,
+    m11: f32,
+}
+
+struct Through {             // gradients on their way
+    d0: vec3<f32>,           // of the rows of J W
+    d1: vec3<f32>,
+    total: f32,              // d0 . t0 + d1 . t1
+    uv: vec2<f32>,           // of the position in the image
+    p: vec3<f32>,            // of the mean in camera axes
+    mean: vec3<f32>,
+}
+
+fn sum_slots(span: vec2<u32>) -> Sums {
+    var sums = Sums(vec3<f32>(0.0), 0.0, 0.0, vec2<f32>(0.0), vec3<f32>(0.0));
+    for (var k = 0u; k < span.x; k++) {
+        let at = (span.y + k) * SLOT;
+        sums.color += vec3<f32>(slots[at], slots[at + 1u], slots[at + 2u]);
+        sums.depth += slots[at + 3u];
+        sums.h += slots[at + 4u];
+        sums.first += vec2<f32>(slots[at + 5u], slots[at + 6u]);
+        sums.second += vec3<f32>(slots[at + 7u], slots[at + 8u], slots[at + 9u]);
+    }
+    return sums;
+}
+
+// Turns moments about the reference point into moments of y about the mean.
+fn whiten(g: Projected, sums: Sums) -> Moments {
+    var w: Moments;
+    w.L = whitening(g);
+    let d = g.nearest - g.uv;
+    let s = w.L.x * d.x + w.L.y * d.y;           // y of the reference point
+    let t = w.L.z * d.y;
+    let along = w.L.x * sums.first.x + w.L.y * sums.first.y;
+    let down = w.L.z * sums.first.y;
+    w.m = vec2<f32>(s * sums.h + along, t * sums.h + down);
+    w.m00 = s * (s * sums.h + 2.0 * along)
+        + w.L.x * (w.L.x * sums.second.x + 2.0 * w.L.y * sums.second.y) + w.L.y * w.L.y * sums.second.z;
+    w.m01 = s * (t * sums.h + down) + t * along + w.L.z * (w.L.x * sums.second.y + w.L.y * sums.second.z);
+    w.m11 = t * (t * sums.h + 2.0 * down) + w.L.z * w.L.z * sums.second.z;
+    if (view.antialiased != 0u) {                // the opacity's factor contains det^(-1/2)
+        w.m00 -= sums.h;
+        w.m11 -= sums.h;
+    }
+    return w;
+}
+
+// dL/dq of a unit quaternion from G = dL/dR (columns), without its component along q.
+fn turn_gradient(q: vec4<f32>, G: mat3x3<f32>) -> vec4<f32> {
+    let w = q.x;
+    let x = q.y;
+    let y = q.z;
+    let z = q.w;
+    // G[column][row]
+    let dw = x * (G[1].z - G[2].y) + y * (G[2].x - G[0].z) + z * (G[0].y - G[1].x);
+    let dx = y * (G[1].x + G[0].y) + z * (G[2].x + G[0].z) + w * (G[1].z - G[2].y) - 2.0 * x * (G[1].y + G[2].z);
+    let dy = x * (G[1].x + G[0].y) + z * (G[2].y + G[1].z) + w * (G[2].x - G[0].z) - 2.0 * y * (G[0].x + G[2].z);
+    let dz = x * (G[2].x + G[0].z) + y * (G[2].y + G[1].z) + w * (G[0].y - G[1].x) - 2.0 * z * (G[0].x + G[1].y);
+    let d = 2.0 * vec4<f32>(dw, dx, dy, dz);
+    return d - dot(d, q) * q;
+}
+
+// Propagates the moments to scales and quaternion, which it stores, and to the rows of J W. `lit` is antialiasing's part:
+// the opacity's factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r with Sigma before the dilation.
+fn shape_gradient(i: u32, g: Projected, m: Moments, lit: f32, to: ptr<function, Through>) {
+    let across0 = cross(g.r1, g.n);              // c0 r0 - b0 r1
+    let across1 = cross(g.n, g.r0);              // a0 r1 - b0 r0
+    let w0 = m.L.x / g.c * (view.dilation * g.r0 + across0);      // sx r0 + sy r1 = sx (r0 - b/c r1)
+    let w1 = m.L.z * g.r1;
+    let dw0 = m.m00 * w0 + m.m01 * w1;
+    let dw1 = m.m01 * w0 + m.m11 * w1;
+    let extra0 = lit * across0;
+    let extra1 = lit * across1;
+    let scale = w0 * dw0 + w1 * dw1 + g.r0 * extra0 + g.r1 * extra1;
+    let dr0 = (m.L.x * dw0 + extra0) * g.s;
+    let dr1 = (m.L.y * dw0 + m.L.z * dw1 + extra1) * g.s;
+    (*to).d0 = g.R * dr0;
+    (*to).d1 = g.R * dr1;
+    (*to).total = scale.x + scale.y + scale.z;
+    let G = mat3x3<f32>(g.t0 * dr0.x + g.t1 * dr1.x, g.t0 * dr0.y + g.t1 * dr1.y, g.t0 * dr0.z + g.t1 * dr1.z);
+    let dq = turn_gradient(g.q, G) / g.q_length;
+    for (var k = 0u; k < 4u; k++) {
+        core_grads[i * OUT + 3u + k] = dq[k];
+    }
+    for (var k = 0u; k < 3u; k++) {
+        core_grads[i * OUT + 7u + k] = scale[k];
+    }
+}
+
+// Propagates to the mean in camera axes. J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³
+// W_2. A clamped x/z is a constant.
+fn mean_gradient(g: Projected, depth: f32, to: ptr<function, Through>) {
+    let plain = g.p.xy / g.p.z;
+    let along = vec2<f32>(dot((*to).d0, view.R2.xyz), dot((*to).d1, view.R2.xyz));
+    let w = select(along, vec2<f32>(0.0), g.clamped);
+    let f = view.focal / g.p.z;
+    let flat = f * (*to).uv - f / g.p.z * w;
+    let deep = (dot(f * plain, w) - (*to).total) / g.p.z - dot(plain * f, (*to).uv) + depth;
+    (*to).p = vec3<f32>(flat, deep);
+}
+
+// Propagates the colour's gradient to the coefficients, which it stores, and returns that of the direction to the mean.
+fn color_gradient(i: u32, g: Projected, painted: vec3<f32>) -> vec3<f32> {
+    let distance = sqrt(dot(g.offset, g.offset));
+    let d = g.offset / distance;
+    let dc = select(vec3<f32>(0.0), painted, color_along(i, d) > vec3<f32>(0.0));
+    for (var k = 0u; k < 3u; k++) {
+        core_grads[i * OUT + 10u + k] = C0 * dc[k];
+    }
+    var turned = vec3<f32>(0.0);
+    for (var j = 1u; j <= view.rest; j++) {
+        let at = 3u * (i * view.rest + j - 1u);
+        var basis = 0.0;
+        if (j < (view.degree + 1u) * (view.degree + 1u)) {
+            basis = harmonic(j, d);
+            turned += dot(vec3<f32>(rest[at], rest[at + 1u], rest[at + 2u]), dc) * harmonic_slope(j, d);
+        }
+        for (var k = 0u; k < 3u; k++) {
+            rest_grads[at + k] = basis * dc[k];
+        }
+    }
+    return (turned - dot(turned, d) * d) / distance;
+}
+
+// All formulas take R (mean - eye), so the eye's gradient is minus that of the mean. A clamped x/z is a bound of the image,
+// (constant - cx) / fx.
+fn camera_gradient(thread: u32, g: Projected, to: Through) {
+    let f = view.focal / g.p.z;
+    let along = vec2<f32>(dot(to.d0, view.R2.xyz), dot(to.d1, view.R2.xyz)) / g.p.z;
+    let w = select(vec2<f32>(0.0), along, g.clamped);
+    let row0 = to.p.x * g.offset + f.x * to.d0;
+    let row1 = to.p.y * g.offset + f.y * to.d1;
+    let row2 = to.p.z * g.offset - f.x * g.ratio.x * to.d0 - f.y * g.ratio.y * to.d1;
+    let focal = to.uv * g.p.xy / g.p.z + vec2<f32>(dot(to.d0, g.t0), dot(to.d1, g.t1)) / view.focal + w * g.ratio;
+    let middle = to.uv + w;
+    let at = thread * CAMERA;
+    for (var k = 0u; k < 3u; k++) {
+        camera_parts[at + k] = row0[k];
+        camera_parts[at + 3u + k] = row1[k];
+        camera_parts[at + 6u + k] = row2[k];
+        camera_parts[at + 9u + k] = -to.mean[k];
+    }
+    for (var k = 0u; k < 2u; k++) {
+        camera_parts[at + 12u + k] = focal[k];
+        camera_parts[at + 14u + k] = middle[k];
+    }
+}
+
+fn clear(i: u32) {
+    for (var k = 0u; k < OUT; k++) {
+        core_grads[i * OUT + k] = 0.0;
+    }
+    for (var k = 0u; k < 3u * view.rest; k++) {
+        rest_grads[3u * i * view.rest + k] = 0.0;
+    }
+}
+
+fn differentiate(i: u32, thread: u32) {
+    let g = project_shape(i);
+    if (!g.valid) {              // rounded to the other side of a bound than in project
+        clear(i);
+        return;
+    }
+    let sums = sum_slots(spans[i]);
+    let m = whiten(g, sums);
+    var to: Through;
+    to.uv = vec2<f32>(m.L.x * m.m.x, m.L.y * m.m.x + m.L.z * m.m.y);
+    var lit = 0.0;
+    if (view.antialiased != 0u && g.det0 > DET_FLOOR) {
+        lit = sums.h / g.det0;
+    }
+    shape_gradient(i, g, m, lit, &to);
+    mean_gradient(g, sums.depth, &to);
+    to.mean = to.p.x * view.R0.xyz + to.p.y * view.R1.xyz + to.p.z * view.R2.xyz + color_gradient(i, g, sums.color);
+    for (var k = 0u; k < 3u; k++) {
+        core_grads[i * OUT + k] = to.mean[k];
+    }
+    core_grads[i * OUT + 13u] = g.transparency * sums.h;
+    let screen = to.uv * 0.5 * vec2<f32>(view.size);
+    core_grads[i * OUT + 14u] = sqrt(dot(screen, screen));
+    core_grads[i * OUT + 15u] = 0.0;
+    camera_gradient(thread, g, to);
+}
+
+@compute @workgroup_size(64)
+fn project_backward(@builtin(workgroup_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+                    @builtin(local_invocation_index) thread: u32) {
+    let block = group_of(id, groups);
+    let i = block * 64u + thread;
+    for (var k = 0u; k < CAMERA; k++) {
+        camera_parts[thread * CAMERA + k] = 0.0;
+    }
+    if (i < job.count) {
+        if (spans[i].x > 0u) {
+            differentiate(i, thread);
+        } else {
+            clear(i);
+        }
+    }
+    workgroupBarrier();
+    if (thread < CAMERA && block < job.blocks) {
+        var sum = 0.0;
+        for (var k = 0u; k < 64u; k++) {
+            sum += camera_parts[k * CAMERA + thread];
+        }
+        camera_sums[block * CAMERA + thread] = sum;
+    }
+}

@@ -1,0 +1,183 @@
+"""The backend webgpu: the engine's WGSL kernels behind one autograd function, for tensors on the CPU.
+
+    project -> sort -> intersect -> composite, and back: composite_backward -> project_backward
+
+A render uploads the Gaussians and reads the images; its backward pass uploads their gradients and reads those of the
+Gaussians. What it drew stays on the device until autograd lets go of it. Every sum has a fixed order, so two runs on
+one device give the same bits.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.engine.frame import GRADS, Pool, Scene, differentiate_frame, draw_frame
+from gsplat_edu.engine.host import AdapterName, Device
+from gsplat_edu.engine.view import View
+from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
+from gsplat_edu.render.output import Extra, RenderOutput
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+
+CORE = {"means": 3, "quats": 4, "log_scales": 3, "sh0": 3, "logit_opacities": 1}
+"""Parameters in the order of `Scene.core`, and how many numbers each has."""
+
+
+@dataclass
+class _Call:
+    """State of one render: inputs that are no tensors, and outputs that are no images."""
+
+    view: View
+    depth: bool
+    visible: Tensor = field(init=False)
+    radii: Tensor = field(init=False)
+    num_pairs: int = field(init=False)
+    norms: Tensor | None = None
+
+
+def render_webgpu(
+    gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, extra: Extra
+) -> RenderOutput:
+    """Render raw parameters; `gsplat_edu.render.api.render` validates the arguments.
+
+    Args:
+        gaussians: N Gaussians, float32, on the CPU.
+        camera: The camera.
+        settings: The settings.
+        extra: Background and features, of the Gaussians' dtype and device.
+
+    Returns:
+        The view. Differentiable in every raw parameter, background, features and a camera of tensors.
+
+    Raises:
+        ArgumentError: the Gaussians are not float32 on the CPU.
+        BackendUnavailableError: there is no adapter, or it fails.
+    """
+    means = gaussians.means
+    if means.dtype != torch.float32 or means.device.type != "cpu":
+        raise ArgumentError(
+            f"means: are {means.dtype} on {means.device}, but the backend webgpu needs float32 on the CPU"
+        )
+    value, pose = split_camera(camera)
+    background = tuple(extra.background.detach().tolist())
+    degree = min(settings.sh_degree, gaussians.sh_degree)
+    view = View(
+        value, background, degree, settings.antialiased, settings.dilation, settings.jacobian_limit,
+        settings.alpha_max, settings.z_near,
+    )  # fmt: skip
+    call = _Call(view, settings.depth)
+    tensors = gaussians.tensors()
+    parameters = [tensors[name] for name in (*CORE, "sh_rest")]
+    image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        call, extra.background, *pose, extra.features, *parameters
+    )
+
+    def norms() -> Tensor:
+        if call.norms is None:
+            raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
+        return call.norms[call.visible]
+
+    return RenderOutput(
+        image,
+        transmittance,
+        depth if settings.depth else None,
+        call.visible,
+        call.radii,
+        call.num_pairs,
+        norms,
+        features=None if extra.features is None else mixed,
+        median_depth=median if settings.median_depth else None,
+    )
+
+
+class _Rasterize(torch.autograd.Function):
+    """The complete renderer as one differentiable operation."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401
+        call: _Call,
+        background: Tensor,
+        R: Tensor | None,
+        eye: Tensor | None,
+        intrinsics: Tensor | None,
+        features: Tensor | None,
+        *parameters: Tensor,
+    ) -> tuple[Tensor, ...]:
+        scene = _scene(parameters, features)
+        frame = draw_frame(_pool(), scene, call.view)
+        call.visible, call.radii = torch.from_numpy(frame.visible), torch.from_numpy(frame.radii)
+        call.num_pairs = frame.num_pairs
+        planes = (frame.image, frame.transmittance, frame.depth, frame.features, frame.median_depth)
+        image, transmittance, depth, mixed, median = (
+            background.new_empty(0) if plane is None else torch.from_numpy(plane.copy()) for plane in planes
+        )
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(median)
+        ctx.call, ctx.frame = call, frame
+        ctx.save_for_backward(features, transmittance, *parameters)
+        return image, transmittance, depth, mixed, median
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        features, transmittance, *parameters = ctx.saved_tensors
+        call: _Call = ctx.call
+        of_image, of_T, of_depth, of_features, _ = grads
+        H, W = transmittance.shape
+        upstream = torch.zeros(H, W, GRADS)
+        if of_image is not None:
+            upstream[..., :3] = of_image
+        if of_T is not None:
+            upstream[..., 3] = of_T
+        if of_depth is not None and call.depth:
+            upstream[..., 4] = of_depth
+        feature_grads = None if of_features is None else of_features.contiguous().numpy()
+        found = differentiate_frame(ctx.frame, _scene(parameters, features), upstream.numpy(), feature_grads)
+        norms = torch.from_numpy(found.norms)
+        call.norms = norms if call.norms is None else call.norms + norms
+        behind = (
+            (upstream[..., :3] * transmittance[..., None]).sum(dim=(0, 1))
+            if ctx.needs_input_grad[1]
+            else None
+        )
+        with_camera = any(ctx.needs_input_grad[2:5])
+        pose = camera_gradients(torch.from_numpy(found.camera) if with_camera else None)
+        to_features = None if found.features is None else torch.from_numpy(found.features)
+        core = torch.split(torch.from_numpy(found.core), list(CORE.values()), dim=1)
+        outgoing = [part.reshape(p.shape) for part, p in zip(core, parameters, strict=False)]
+        return None, behind, *pose, to_features, *outgoing, torch.from_numpy(found.rest)
+
+
+@functools.cache
+def _pool() -> Pool:
+    return Pool(Device.default())
+
+
+def adapter_name() -> AdapterName:
+    """Return the adapter that renders.
+
+    Raises:
+        BackendUnavailableError: there is none, or it does not start.
+    """
+    return _pool().device.name
+
+
+def _scene(parameters: tuple[Tensor, ...] | list[Tensor], features: Tensor | None) -> Scene:
+    """Return the parameters, those of `CORE` and sh_rest, as the engine takes them."""
+    *core, rest = (p.detach() for p in parameters)
+    columns = [part.reshape(len(part), width) for part, width in zip(core, CORE.values(), strict=True)]
+    return Scene(
+        torch.cat(columns, dim=1).numpy(),
+        np.ascontiguousarray(rest.numpy()),
+        None if features is None else features.detach().contiguous().numpy(),
+    )

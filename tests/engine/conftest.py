@@ -1,0 +1,31 @@
+"""The engine is tested on the first adapter, with no more than what a browser grants by default."""
+
+import os
+
+import pytest
+
+os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # Mesa complains without it
+
+from gsplat_edu.engine import host
+from gsplat_edu.engine.frame import Pool
+from gsplat_edu.engine.passes import LIMITS
+
+
+@pytest.fixture(scope="session")
+def device() -> host.Device:
+    if reason := host.why_unavailable():
+        pytest.skip(reason)
+    return host.Device(limits=LIMITS)
+
+
+@pytest.fixture(scope="session")
+def pool(device) -> Pool:
+    return Pool(device)
+
+
+@pytest.fixture
+def webgpu(pool, monkeypatch):
+    """Let the backend use that device."""
+    from gsplat_edu.render import webgpu
+
+    monkeypatch.setattr(webgpu, "_pool", lambda: pool)

@@ -1,0 +1,95 @@
+// A host of the engine's programs in a browser: it plays what `passes.manifest` describes, as host.py does from Python.
+
+const WORD = 4, SLICE = 256, VIEW_BYTES = 512, LEAST = 4;
+
+const sizeOf = (size, counts) => size.words * Math.ceil(counts[size.count] / size.per);
+
+function jobOf(one, counts, block) {
+    const count = sizeOf(one.items, counts);
+    return [count, one.live, Math.ceil(count / (one.group || block)), one.shift];
+}
+
+const bytesOf = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+
+function textOf(bytes) {
+    let text = '';
+    for (let at = 0; at < bytes.length; at += 8192) text += String.fromCharCode(...bytes.subarray(at, at + 8192));
+    return btoa(text);
+}
+
+async function deviceFor(manifest, notes) {
+    const adapter = await navigator.gpu?.requestAdapter();
+    if (!adapter) return null;
+    const device = await adapter.requestDevice();  // the default limits
+    device.addEventListener('uncapturederror', (event) => notes.push(event.error.message));
+    return device;
+}
+
+async function compiled(device, manifest, notes) {
+    const modules = {};
+    for (const [name, code] of Object.entries(manifest.modules)) {
+        modules[name] = device.createShaderModule({code});
+        for (const message of (await modules[name].getCompilationInfo()).messages)
+            notes.push(`${name}:${message.lineNum}: ${message.type}: ${message.message}`);
+    }
+    return modules;
+}
+
+// Plays the parts in order; `writes` is name to base64, `view` base64. Resolves to the buffers of `reads`, and what went wrong.
+async function play(manifest, counts, writes, view, parts, reads) {
+    const notes = [], device = await deviceFor(manifest, notes);
+    if (!device) return {adapter: false};
+    const modules = await compiled(device, manifest, notes);
+    const storage = GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_SRC | GPUBufferUsage.COPY_DST;
+    const buffers = {};
+    for (const {name, size} of manifest.buffers) {
+        const words = Math.max(LEAST, sizeOf(size, counts));
+        buffers[name] = device.createBuffer({size: WORD * words, usage: storage});
+    }
+    for (const [name, text] of Object.entries(writes)) device.queue.writeBuffer(buffers[name], 0, bytesOf(text));
+    const shared = device.createBuffer({size: VIEW_BYTES, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST});
+    device.queue.writeBuffer(shared, 0, bytesOf(view));
+    const entry = (binding, buffer) => ({binding, visibility: GPUShaderStage.COMPUTE, buffer});
+    const uniformLayout = device.createBindGroupLayout({entries: [
+        entry(0, {type: 'uniform', hasDynamicOffset: true, minBindingSize: 16}),
+        entry(1, {type: 'uniform', minBindingSize: VIEW_BYTES}),
+    ]});
+    for (const part of parts) {
+        const passes = manifest.parts[part];
+        const jobs = device.createBuffer({size: SLICE * passes.length, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST});
+        const uniforms = device.createBindGroup({layout: uniformLayout, entries: [
+            {binding: 0, resource: {buffer: jobs, size: 16}},
+            {binding: 1, resource: {buffer: shared}},
+        ]});
+        const encoder = device.createCommandEncoder(), computing = encoder.beginComputePass();
+        passes.forEach((one, place) => {
+            const job = jobOf(one, counts, manifest.block), groups = one.group ? job[2] : 1;
+            device.queue.writeBuffer(jobs, SLICE * place, new Uint32Array(job));
+            if (!groups) return;
+            const names = [...one.reads, ...one.writes];
+            const layout = device.createBindGroupLayout({entries: names.map((_, binding) =>
+                entry(binding, {type: binding < one.reads.length ? 'read-only-storage' : 'storage'}))});
+            computing.setPipeline(device.createComputePipeline({
+                layout: device.createPipelineLayout({bindGroupLayouts: [uniformLayout, layout]}),
+                compute: {module: modules[one.module], entryPoint: one.entry},
+            }));
+            computing.setBindGroup(0, uniforms, [SLICE * place]);
+            computing.setBindGroup(1, device.createBindGroup({layout, entries: names.map((name, binding) =>
+                ({binding, resource: {buffer: buffers[name]}}))}));
+            const x = Math.min(groups, device.limits.maxComputeWorkgroupsPerDimension);
+            computing.dispatchWorkgroups(x, Math.ceil(groups / x));
+        });
+        computing.end();
+        device.queue.submit([encoder.finish()]);
+    }
+    const found = {};
+    for (const name of reads) {
+        const staging = device.createBuffer({size: buffers[name].size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST});
+        const encoder = device.createCommandEncoder();
+        encoder.copyBufferToBuffer(buffers[name], 0, staging, 0, buffers[name].size);
+        device.queue.submit([encoder.finish()]);
+        await staging.mapAsync(GPUMapMode.READ);
+        found[name] = textOf(new Uint8Array(staging.getMappedRange()));
+    }
+    return {adapter: true, notes, found};
+}

@@ -1,0 +1,45 @@
+"""The check that the backend webgpu must pass on an adapter before it is used there."""
+
+import pytest
+
+from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.render import self_check, webgpu
+from gsplat_edu.render.backends import resolve_backend
+
+pytestmark = pytest.mark.usefixtures("webgpu")
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    self_check._adapter_failure.cache_clear()
+    yield tmp_path / "gsplat_edu/webgpu_passed.json"
+    self_check._adapter_failure.cache_clear()
+
+
+def test_correct_kernels_are_checked_once(empty_cache, monkeypatch):
+    assert self_check.webgpu_failure() is None
+    assert webgpu.adapter_name().name in empty_cache.read_text()
+    self_check._adapter_failure.cache_clear()  # as in a new process
+    monkeypatch.setattr(self_check, "shader_error", lambda: "checked again")
+    assert self_check.webgpu_failure() is None
+    self_check._adapter_failure.cache_clear()
+    monkeypatch.setattr(self_check, "_hash_of_kernels", lambda: "of other shaders")
+    assert self_check.webgpu_failure() == "checked again"
+
+
+def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkeypatch):
+    """As if a driver had compiled a shader wrongly."""
+    right = webgpu.differentiate_frame
+
+    def wrong(*given):
+        found = right(*given)
+        found.core[:, 5] *= 1.01
+        return found
+
+    monkeypatch.setattr(webgpu, "differentiate_frame", wrong)
+    with pytest.raises(BackendUnavailableError) as raised:
+        resolve_backend("webgpu")
+    assert "its kernels failed their check on" in str(raised.value)
+    assert "the gradient of quats is wrong by 0.0" in str(raised.value)
+    assert not empty_cache.exists()

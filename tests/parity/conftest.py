@@ -1,0 +1,1 @@
+from engine.conftest import device as device, pool as pool
