@@ -38,7 +38,7 @@ PARTS = ("render", "composite_backward", "project_backward")
 
 
 def sort_and_scan() -> Program:
-    """Return a program that sorts `keys` with `values` and scans `numbers`; `live`: their count, a spare and the sum."""
+    """Return a program that sorts `keys` with `values` and scans `numbers`; `live` has count, a spare and the sum."""
     numbers = Size("keys")
     return Program(
         (
