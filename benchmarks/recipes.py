@@ -44,6 +44,7 @@ from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.writers import write_blender
 from gsplat_edu.evaluate.figures import save_figure
 from gsplat_edu.evaluate.metrics import ImageScore, OnImage, score_views, summarize
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.density.fast import PlannedDensity
@@ -229,10 +230,24 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
         options = command.options_from(parser.parse_args([str(arguments.data), *words, "--out", folder]))
         run = CaptureRun(plan(options, Limits(), quality=quality).options)
         if recipe.density is not None:
-            run.trainer.density = recipe.density(run.options.config, run.trainer.gaussians)
+            run.trainer = with_density(run, recipe.density)
         config = settings_of(run)
         results.check(name, config)
         return {"recipe": name, "seed": seed, "options": " ".join(words), "config": config, **measured(run)}
+
+
+def with_density(run: CaptureRun, density: type[PlannedDensity]) -> Trainer:
+    """Make the trainer of a run again, before its first step, with another density control."""
+    made, config = run.trainer, run.options.config
+    return Trainer(
+        made.gaussians,
+        run.dataset.train,
+        config,
+        load_backend(run.options.backend),
+        extent=made.extent,
+        density=density(config, made.gaussians),
+        parts=made.stepper.parts,
+    )
 
 
 def settings_of(run: CaptureRun) -> dict[str, Any]:
