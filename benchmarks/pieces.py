@@ -58,7 +58,7 @@ from gsplat_edu.train.length import planned_iterations
 from gsplat_edu.train.objective import PHOTO, Rendered, Term, make_objective
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import milestone, photo_factor
-from gsplat_edu.train.stepper import StepParts
+from gsplat_edu.train.stepper import StepParts, TensorStepper
 from gsplat_edu.train.trainer import Trainer
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))
@@ -152,6 +152,22 @@ class ByAbsoluteGradients(PlannedDensity):
         self.times_visible.index_add_(0, output.visible, norms.new_ones(1).expand(len(norms)))
 
 
+class ByRadius(PlannedDensity):
+    """Score by the gradient norm of the mean times the geometric mean of the half axes' extents, in photo widths.
+
+    If the signs of h = alpha dL/dalpha are random over the pixels of a Gaussian, the norm times the radius is about the
+    root of the sum of h^2 over the pixels, LiteGS' second moment, which the kernels do not give.
+    """
+
+    def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
+        """Add this view's scores to the sums of the Gaussians it shows."""
+        if self.is_over:
+            return
+        scores = output.means2d_grad_norms() * output.radii.prod(dim=-1).sqrt() / output.image.shape[1]
+        self.norm_sums.index_add_(0, output.visible, scores)
+        self.times_visible.index_add_(0, output.visible, scores.new_ones(1).expand(len(scores)))
+
+
 @dataclass(frozen=True)
 class Collecting:
     """The photo term; before the backward pass it asks for the gradients that a density control scores by.
@@ -214,6 +230,7 @@ PIECES = {
     "overgrowth": Piece(Overgrown),
     "early-cap": Piece(functools.partial(Overgrown, most=1.0)),
     "absolute-gradients": Piece(ByAbsoluteGradients),
+    "radius": Piece(ByRadius),
     "late-ssim": Piece(late_ssim=0.4),
     "deferred-harmonics": Piece(harmonics_every=16),
     "two-views-late": Piece(views_late=2),
@@ -234,6 +251,7 @@ def trainer(piece: Piece, config: TrainConfig, dataset: Dataset, gaussians: Gaus
 
 def defer_harmonics(made: Trainer, every: int) -> None:
     """Move the higher harmonics only in every n-th step until photos have their full size."""
+    assert isinstance(made.stepper, TensorStepper), "the backend cpu steps on tensors"
     optimizer, config = made.stepper.optimizer, made.config
     group = optimizer.groups["sh_rest"]
 
@@ -260,7 +278,7 @@ def trained(piece: Piece, dataset: Dataset, config: TrainConfig) -> dict[str, An
         defer_harmonics(made, piece.harmonics_every)
     counts = list[int]()
     if piece.views_late > 1:
-        before, change = made, config.iterations * 3 // 4 // piece.views_late * piece.views_late
+        before, change = made, round(0.75 * config.iterations / piece.views_late) * piece.views_late
         counts += before.run(lambda: before.iteration >= change).counts
         state = before.state()
         made = trainer(piece, dataclasses.replace(config, batch=piece.views_late), dataset, before.gaussians)
