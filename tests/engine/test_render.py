@@ -196,6 +196,15 @@ def test_almost_empty_scenes(kind):
         assert all((t.grad == 0).all() for t in gaussians.tensors().values())
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_quaternion_of_a_round_gaussian_has_no_gradient(antialiased):
+    """Exactly, since Adam turns rounding errors into whole steps; points become round Gaussians."""
+    scene = random(30, (41, 35), seed=12, log_scales=np.repeat(np.linspace(-3, -1, 30), 3).reshape(30, 3))
+    settings = dataclasses.replace(SETTINGS, antialiased=antialiased)
+    _, gradients, _ = images_and_gradients(scene, "webgpu", settings=settings)
+    assert np.all(gradients["quats"] == 0) and np.all(gradients["log_scales"] != 0)
+
+
 def test_a_mean_far_outside_the_image():
     """A wide Gaussian with its mean 400 px outside the image: moments are shifted far without losing digits."""
     far = random(4, (41, 35), seed=6).gaussians(torch.float64)
