@@ -6,6 +6,8 @@ measured.
 """
 
 import dataclasses
+import mmap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -249,6 +251,25 @@ def test_two_backward_passes_add_up():
     once, norms = gaussians.means.grad.clone(), out.means2d_grad_norms()
     loss.backward()
     assert torch.equal(gaussians.means.grad, 2 * once) and torch.equal(out.means2d_grad_norms(), 2 * norms)
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="this system does not report resident memory"
+)
+def test_memory_does_not_grow():
+    """Mesa's lavapipe kept 1.2 MB of each render when uniforms alone bounded the shaders' loops."""
+    gaussians, camera = (
+        random(500, (64, 48), seed=1).gaussians(torch.float32).trainable(),
+        random(1, (64, 48)).camera,
+    )
+
+    def resident_after(renders):
+        for _ in range(renders):
+            render(gaussians, camera, backend="webgpu").image.sum().backward()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+    before = resident_after(20)
+    assert resident_after(80) - before < 16 << 20
 
 
 def test_what_it_lacks_is_refused():

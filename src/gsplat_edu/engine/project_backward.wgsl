@@ -137,7 +137,8 @@ fn color_gradient(i: u32, g: Projected, painted: vec3<f32>) -> vec3<f32> {
         core_grads[i * OUT + 10u + k] = C0 * dc[k];
     }
     var turned = vec3<f32>(0.0);
-    for (var j = 1u; j <= view.rest; j++) {
+    let stored = bound_of(i, view.rest);
+    for (var j = 1u; j <= stored; j++) {
         let at = 3u * (i * view.rest + j - 1u);
         var basis = 0.0;
         if (j < (view.degree + 1u) * (view.degree + 1u)) {
@@ -179,7 +180,8 @@ fn clear(i: u32) {
     for (var k = 0u; k < OUT; k++) {
         core_grads[i * OUT + k] = 0.0;
     }
-    for (var k = 0u; k < 3u * view.rest; k++) {
+    let numbers = 3u * bound_of(i, view.rest);
+    for (var k = 0u; k < numbers; k++) {
         rest_grads[3u * i * view.rest + k] = 0.0;
     }
 }
