@@ -23,7 +23,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.engine import host
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import load_backend, resolve_backend
+from gsplat_edu.render.backends import gpu_of, load_backend, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from native_scenes import BACKGROUND, random
 from ours import Renderer
@@ -311,6 +311,15 @@ def test_what_needs_a_forecast_is_refused(tmp_path, capsys, backend):
     assert main(["train", capture, *run, "--max-memory", "4GiB"]) == 2
     line = f"--max-memory 4 GiB: cannot be planned for --backend {backend}; choose cpu or cuda"
     assert line in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_doctor_and_demo_name_the_gpu(tmp_path, capsys):
+    write_colmap(tmp_path / "egg", *procedural_capture(24, 6))
+    assert main(["doctor", str(tmp_path / "egg"), "--backend", "webgpu", "--no-forecast"]) == 0
+    assert f"GPU        {gpu_of('webgpu')} (backend webgpu)" in capsys.readouterr().out.splitlines()
+    demo = ["demo", "--backend", "webgpu", "--iters", "2", "--size", "16", "--out", str(tmp_path / "a.png")]
+    assert main(demo) == 0
+    assert f"rendered by webgpu on {gpu_of('webgpu')}" in capsys.readouterr().out.splitlines()
 
 
 def test_without_an_adapter_the_command_is_one_line(tmp_path, monkeypatch, capsys):
