@@ -2,11 +2,11 @@
 
     python benchmarks/gpu.py [--smoke] [--out FILE.json]
 
-Backend cuda: random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 - SSIM), backward,
-Adam. Milliseconds per stage are kernel times from torch's profiler over 20 iterations; host synchronisations are
-counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. The benchmark then
-measures the time and the gradient error, relative to the native kernels in float64, for each precision of matrix
-products. If gsplat can be imported, it renders the same scene and compares times, images and gradients.
+Backend cuda: random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 -
+SSIM), backward, Adam. Milliseconds per stage are kernel times from torch's profiler over 20 iterations; host
+synchronisations are counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. The
+benchmark then measures the time and the gradient error, relative to the native kernels in float64, for each precision
+of matrix products. If gsplat can be imported, it renders the same scene and compares times, images and gradients.
 
 Backend webgpu: the same scenes and the same training step, whose loss and Adam run on the CPU; every pass by the
 device's own clock; the gradient error in the same way. Each backend is measured where it has a GPU. Without one the
