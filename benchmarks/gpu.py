@@ -2,12 +2,15 @@
 
     python benchmarks/gpu.py [--smoke] [--out FILE.json]
 
-Random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 - SSIM), backward,
-Adam. Milliseconds per stage are kernel times from torch's profiler over 20 iterations; host synchronisations are
-counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. The benchmark then
-measures the time and the gradient error, relative to the native kernels in float64, for each precision of matrix
-products. If gsplat can be imported, it renders the same scene and compares times, images and gradients. Needs a GPU;
-without one it says so and exits with 2.
+Backend cuda: random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 -
+SSIM), backward, Adam. Milliseconds per stage are kernel times from torch's profiler over 20 iterations; host
+synchronisations are counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. The
+benchmark then measures the time and the gradient error, relative to the native kernels in float64, for each precision
+of matrix products. If gsplat can be imported, it renders the same scene and compares times, images and gradients.
+
+Backend webgpu: the same scenes and the same training step, whose loss and Adam run on the CPU; every pass by the
+device's own clock; the gradient error in the same way. Each backend is measured where it has a GPU. Without one the
+command says so and exits with 2; --smoke takes an adapter that computes on the processor.
 """
 
 from __future__ import annotations
@@ -22,9 +25,14 @@ import hardware
 import torch
 
 from gsplat_edu import Camera
+from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.engine.check import measure_frame
+from gsplat_edu.engine.frame import Pool, Scene as EngineScene
+from gsplat_edu.engine.host import Device, chosen_adapter
+from gsplat_edu.engine.view import View
 from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import load_backend
+from gsplat_edu.render.backends import gpu_of, load_backend, unavailable
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
@@ -104,9 +112,11 @@ def milliseconds(work: Callable[[], object], rounds: int) -> float:
     return 1e3 * (time.perf_counter() - start) / rounds
 
 
-def iteration(gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer: Adam) -> None:
+def iteration(
+    gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer: Adam, name: str = "cuda"
+) -> None:
     """Run one training step."""
-    backend = load_backend("cuda")
+    backend = load_backend(name)
     output = render(gaussians, cam, settings=SETTINGS, backend=backend)
     photo_loss(output.image, photo, kernel=backend.loss).backward()
     optimizer.step(gaussians.tensors())
@@ -168,22 +178,27 @@ def ceilings(scale: Scale) -> dict[str, float]:
     return {"copy GB/s": 2 * block.nbytes / copy / 1e6, "float32 TFLOP/s": operations / product / 1e9}
 
 
+def gradient_error(backend: str, count: int) -> float:
+    """Return the largest gradient error relative to the largest gradient of the native kernels in float64."""
+    cam = camera(640, 420)
+
+    def gradients(name: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+        gaussians = scene(count, "cuda" if name == "cuda" else "cpu", dtype)
+        render(gaussians, cam, settings=SETTINGS, backend=name).image.square().sum().backward()
+        return {key: tensor.grad.double().cpu() for key, tensor in gaussians.tensors().items()}
+
+    truth, ours = gradients("cpu", torch.float64), gradients(backend, torch.float32)
+    return max(float((ours[key] - t).abs().max() / t.abs().max()) for key, t in truth.items())
+
+
 def precisions(scale: Scale) -> dict[str, dict[str, float]]:
     """Return, by precision, the time and the largest gradient error relative to the largest gradient."""
     from gsplat_edu.render.triton import rasterize
 
-    cam = camera(640, 420)
-
-    def gradients(backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
-        gaussians = scene(scale.few, "cuda" if backend == "cuda" else "cpu", dtype)
-        render(gaussians, cam, settings=SETTINGS, backend=backend).image.square().sum().backward()
-        return {name: tensor.grad.double().cpu() for name, tensor in gaussians.tensors().items()}
-
-    truth, found, before = gradients("cpu", torch.float64), {}, rasterize.PRECISION
+    found, before = {}, rasterize.PRECISION
     for name in ("ieee", "tf32x3", "tf32"):
         rasterize.PRECISION = name
-        ours = gradients("cuda", torch.float32)
-        error = max(float((ours[key] - t).abs().max() / t.abs().max()) for key, t in truth.items())
+        error = gradient_error("cuda", scale.few)
         large, wide = scene(scale.many, "cuda"), camera(*scale.sizes[0])
         work = lambda: render(large, wide, settings=SETTINGS, backend="cuda").image.sum().backward()  # noqa: E731, B023
         found[name] = {"error": error, "ms": milliseconds(work, scale.rounds)}
@@ -233,19 +248,64 @@ def beside_gsplat(scale: Scale) -> dict[str, float] | None:
     return found
 
 
+def passes(count: int, width: int, height: int, rounds: int) -> dict[str, Any]:
+    """Return milliseconds of a training step on the backend webgpu, and of its passes by the device's clock."""
+    gaussians, cam = scene(count, "cpu"), camera(width, height)
+    photo = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8)
+    optimizer = Adam(gaussians.tensors(), gaussian_groups(TrainConfig(), 1.0), load_backend("webgpu").adam)
+    iteration(gaussians, cam, photo, optimizer, "webgpu")  # compiles
+    start = time.perf_counter()
+    for _ in range(rounds):
+        iteration(gaussians, cam, photo, optimizer, "webgpu")
+    spent = 1e3 * (time.perf_counter() - start) / rounds
+    parts = {name: tensor.detach().reshape(count, -1) for name, tensor in gaussians.tensors().items()}
+    core = torch.cat([parts[n] for n in ("means", "quats", "log_scales", "sh0", "logit_opacities")], dim=1)
+    rest = gaussians.sh_rest.detach().numpy()
+    view = View(cam, (0.0, 0.0, 0.0), 3, False, SETTINGS.dilation, 1.3, SETTINGS.alpha_max, SETTINGS.z_near)
+    same, found = measure_frame(Pool(Device.default()), EngineScene(core.numpy(), rest), view, rounds)
+    return {"iteration": spent, "two runs have the same bits": same, **found}
+
+
+def cuda_results(scale: Scale) -> dict[str, Any]:
+    """Measure the backend cuda."""
+    found: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "ceilings": ceilings(scale), "stages": {}}
+    for count in scale.counts:
+        for width, height in scale.sizes:
+            measured = stages(count, width, height, scale.rounds)
+            found["stages"][f"{count} at {width}x{height}"] = measured
+    return found | {"precisions": precisions(scale), "gsplat": beside_gsplat(scale)}
+
+
+def webgpu_results(scale: Scale) -> dict[str, Any]:
+    """Measure the backend webgpu; a scene that is too large for the adapter has its reason instead of times."""
+    found: dict[str, Any] = {
+        "webgpu": gpu_of("webgpu"),
+        "webgpu gradient error": gradient_error("webgpu", scale.few),
+    }
+    for count in scale.counts:
+        for width, height in scale.sizes:
+            try:
+                found[f"webgpu, {count} at {width}x{height}"] = passes(count, width, height, scale.rounds)
+            except BackendUnavailableError as error:
+                found[f"webgpu, {count} at {width}x{height}"] = str(error)
+    return found
+
+
 def main() -> int:
     """Measure, print the tables and write the JSON."""
     arguments = hardware.parser("A training iteration on a GPU, stage by stage.").parse_args()
-    if not torch.cuda.is_available():
-        print("gpu.py: torch sees no GPU; benchmarks/train_step.py measures the CPU", file=sys.stderr)
-        return 2
     scale = SMOKE if arguments.smoke else FULL
-    result: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "ceilings": ceilings(scale), "stages": {}}
-    for count in scale.counts:
-        for width, height in scale.sizes:
-            found = stages(count, width, height, scale.rounds)
-            result["stages"][f"{count} at {width}x{height}"] = found
-    result |= {"precisions": precisions(scale), "gsplat": beside_gsplat(scale)}
+    reason = unavailable("webgpu")
+    has_adapter = reason is None and (arguments.smoke or not chosen_adapter().software)
+    result: dict[str, Any] = {}
+    if torch.cuda.is_available():
+        result |= cuda_results(scale)
+    if has_adapter:
+        result |= webgpu_results(scale)
+    if not result:
+        why = reason or "its adapter computes on the processor"
+        print(f"gpu.py: no GPU: torch sees none, and webgpu has none: {why}", file=sys.stderr)
+        return 2
     hardware.report(result, arguments.out)
     for name, table in result.items():
         print(f"{name}: {table}" if not isinstance(table, dict) else name)

@@ -6,7 +6,9 @@ import torch
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.engine import host
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.render.backends import BACKENDS, gpu_of, unavailable
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -34,6 +36,19 @@ def scene(count=50):
     )
     gaussians.means[0] = torch.tensor([-7.0, 0.5, 9.25])
     return gaussians
+
+
+def test_without_a_path_the_computer_and_its_backends_are_described(capsys):
+    assert command_line.main(["info"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    names = [line.split(" ", 1)[0] for line in lines]
+    assert names[: 1 + len(BACKENDS)] == ["computer", *BACKENDS]
+    (reason,) = [unavailable("cuda")]
+    assert f"cuda       not available: {reason}" in lines if reason else "cuda" in names
+    assert "cpu        on the processor" in lines
+    if unavailable("webgpu") is None:
+        assert any(line.startswith(f"webgpu     {gpu_of('webgpu')}") for line in lines)
+        assert names.count("adapter") == len(host.adapters())
 
 
 def test_a_scene_is_described_with_warnings_for_odd_values(info, tmp_path):

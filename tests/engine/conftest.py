@@ -1,10 +1,11 @@
 """The engine is tested on the first adapter, with no more than what a browser grants by default."""
 
 import os
+import tempfile
 
 import pytest
 
-os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # Mesa complains without it
+os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # Mesa complains without it
 
 from gsplat_edu.engine import host
 from gsplat_edu.engine.frame import Pool

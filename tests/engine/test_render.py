@@ -6,6 +6,8 @@ measured.
 """
 
 import dataclasses
+import mmap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.engine import host
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import load_backend, resolve_backend
+from gsplat_edu.render.backends import gpu_of, load_backend, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from native_scenes import BACKGROUND, random
 from ours import Renderer
@@ -196,6 +198,15 @@ def test_almost_empty_scenes(kind):
         assert all((t.grad == 0).all() for t in gaussians.tensors().values())
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_quaternion_of_a_round_gaussian_has_no_gradient(antialiased):
+    """Exactly, since Adam turns rounding errors into whole steps; points become round Gaussians."""
+    scene = random(30, (41, 35), seed=12, log_scales=np.repeat(np.linspace(-3, -1, 30), 3).reshape(30, 3))
+    settings = dataclasses.replace(SETTINGS, antialiased=antialiased)
+    _, gradients, _ = images_and_gradients(scene, "webgpu", settings=settings)
+    assert np.all(gradients["quats"] == 0) and np.all(gradients["log_scales"] != 0)
+
+
 def test_a_mean_far_outside_the_image():
     """A wide Gaussian with its mean 400 px outside the image: moments are shifted far without losing digits."""
     far = random(4, (41, 35), seed=6).gaussians(torch.float64)
@@ -242,6 +253,25 @@ def test_two_backward_passes_add_up():
     assert torch.equal(gaussians.means.grad, 2 * once) and torch.equal(out.means2d_grad_norms(), 2 * norms)
 
 
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="this system does not report resident memory"
+)
+def test_memory_does_not_grow():
+    """Mesa's lavapipe kept 1.2 MB of each render when uniforms alone bounded the shaders' loops."""
+    gaussians, camera = (
+        random(500, (64, 48), seed=1).gaussians(torch.float32).trainable(),
+        random(1, (64, 48)).camera,
+    )
+
+    def resident_after(renders):
+        for _ in range(renders):
+            render(gaussians, camera, backend="webgpu").image.sum().backward()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+    before = resident_after(20)
+    assert resident_after(80) - before < 16 << 20
+
+
 def test_what_it_lacks_is_refused():
     gaussians, camera = random(3, (8, 8)).gaussians(torch.float32), random(3, (8, 8)).camera
     with pytest.raises(
@@ -281,6 +311,15 @@ def test_what_needs_a_forecast_is_refused(tmp_path, capsys, backend):
     assert main(["train", capture, *run, "--max-memory", "4GiB"]) == 2
     line = f"--max-memory 4 GiB: cannot be planned for --backend {backend}; choose cpu or cuda"
     assert line in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_doctor_and_demo_name_the_gpu(tmp_path, capsys):
+    write_colmap(tmp_path / "egg", *procedural_capture(24, 6))
+    assert main(["doctor", str(tmp_path / "egg"), "--backend", "webgpu", "--no-forecast"]) == 0
+    assert f"GPU        {gpu_of('webgpu')} (backend webgpu)" in capsys.readouterr().out.splitlines()
+    demo = ["demo", "--backend", "webgpu", "--iters", "2", "--size", "16", "--out", str(tmp_path / "a.png")]
+    assert main(demo) == 0
+    assert f"rendered by webgpu on {gpu_of('webgpu')}" in capsys.readouterr().out.splitlines()
 
 
 def test_without_an_adapter_the_command_is_one_line(tmp_path, monkeypatch, capsys):

@@ -29,7 +29,7 @@ from gsplat_edu.io.ply import load_ply
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed, Found
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import device_of, load_backend, resolve_backend
+from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.train.config import DEFAULT_STRATEGY, TrainConfig, recipe
@@ -84,7 +84,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         bar.add_task("comparing", total=None)
         diagnosis = examine(survey, _forecast_options(arguments))
     if arguments.no_forecast or diagnosis.hopeless:
-        return diagnosis, ()
+        return diagnosis, _gpu_lines(backend)
     from gsplat_edu.budget.costs import Facts, wanted_gaussians
     from gsplat_edu.budget.forecast import forecast  # it measures this machine, which takes a moment
 
@@ -100,7 +100,14 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         said = forecast(dataset, full, config, backend=backend).lines()
     except DatasetError as error:
         said = [f"none, because training would fail: {error}"]
-    return diagnosis, table_lines(zip(("forecast", *[""] * len(said)), said, strict=False))
+    rows = zip(("forecast", *[""] * len(said)), said, strict=False)
+    return diagnosis, [*table_lines(rows), *_gpu_lines(backend)]
+
+
+def _gpu_lines(backend: str) -> list[str]:
+    """Return a line that names the GPU, if the backend has one."""
+    gpu = gpu_of(backend)
+    return table_lines([("GPU", f"{gpu} (backend {backend})")]) if gpu else []
 
 
 def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
@@ -160,7 +167,8 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         corrected=appearance != "none",
         moved=moved,
     )
-    return examine_run(trained), view_lines(trained) if arguments.all_views else ()
+    views = view_lines(trained) if arguments.all_views else ()
+    return examine_run(trained), [*views, *_gpu_lines(backend)]
 
 
 def _strategy(section: object) -> str:

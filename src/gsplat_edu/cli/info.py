@@ -1,8 +1,10 @@
-"""`gsplat-edu info`: summarise a dataset, a run or a scene file on one screen."""
+"""`gsplat-edu info`: summarise a dataset, a run, a scene file or this computer on one screen."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,9 +19,11 @@ from gsplat_edu.base.text import short_number
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.data.scale import Scale
+from gsplat_edu.engine import host
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_scene, stored_bytes
 from gsplat_edu.io.lod.codec import read_index
+from gsplat_edu.render.backends import BACKENDS, gpu_of, unavailable
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
@@ -47,6 +51,11 @@ Fact = tuple[str, str]
 
 def run(arguments: argparse.Namespace) -> None:
     """Print one fact per line."""
+    if arguments.path is None:
+        Terminal().print(
+            *(f"{name:<10} {value}" for name, value in _computer_facts()), sep="\n", soft_wrap=True
+        )
+        return
     path: Path = arguments.path
     if not path.exists():
         raise ArgumentError(f"{path}: does not exist; give a dataset folder, a run folder or a scene file")
@@ -63,6 +72,19 @@ def run(arguments: argparse.Namespace) -> None:
         plain = str.maketrans(BLOCKS, PLAIN_BLOCKS)
         facts = [(name, value.translate(plain)) for name, value in facts]
     console.print(*(f"{name:<10} {value}".rstrip() for name, value in facts), sep="\n", soft_wrap=True)
+
+
+def _computer_facts() -> list[Fact]:
+    """Describe the processor, and for each backend where it runs or why it does not."""
+    facts = [("computer", f"{platform.platform(terse=True)}, {os.cpu_count()} cores, {platform.machine()}")]
+    for backend in BACKENDS:
+        reason = unavailable(backend)
+        facts.append(
+            (backend, f"not available: {reason}" if reason else gpu_of(backend) or "on the processor")
+        )
+    if host.why_unavailable() is None:
+        facts += [("adapter", f"{one.name}, {one.interface}, {one.driver}") for one in host.adapters()]
+    return facts
 
 
 def _scene_facts(path: Path) -> list[Fact]:

@@ -32,7 +32,7 @@ COMMANDS = {
     "view": "show a scene or a run in the browser",
     "studio": "take photos to a finished scene on one page in the browser",
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
-    "info": "summarise a capture, a run or a scene file on one screen",
+    "info": "summarise a capture, a run, a scene file or this computer on one screen",
 }
 """Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `cli.options`."""
 

@@ -25,7 +25,7 @@ from gsplat_edu.io.ply import save_ply
 from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
-from gsplat_edu.render.backends import load_backend, resolve_backend
+from gsplat_edu.render.backends import gpu_of, load_backend, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.compose import Start, Views, training
@@ -159,6 +159,8 @@ def run_sphere(
     summary = Summary(result, _l1(start, truth), _l1(final, truth))
     per_iteration = f"{1e3 * result.seconds / iters:.3f} ms/iter at {options.budget.size} px"
     say(f"{iters} iters in {result.seconds:.1f} s -> {per_iteration}, K~{result.counts[-1]}")
+    if gpu := gpu_of(backend.name):
+        say(f"rendered by {backend.name} on {gpu}")
     say(f"held-out L1: init {summary.initial_l1:.4f} -> final {summary.final_l1:.4f}")
     say(f"wrote {', '.join(str(path) for path in options.files)}")
     return summary

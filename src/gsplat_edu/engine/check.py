@@ -106,7 +106,7 @@ def _same_bits(first: tuple[Frame, FrameGradients], second: tuple[Frame, FrameGr
     )
 
 
-def _measured(pool: Pool, scene: Scene, view: View, rounds: int) -> tuple[bool, dict[str, object]]:
+def measure_frame(pool: Pool, scene: Scene, view: View, rounds: int) -> tuple[bool, dict[str, object]]:
     """Render and differentiate; return whether two runs have the same bits, and what was counted and measured.
 
     Times are medians over the rounds, in milliseconds: of the device by part and entry point, and of the host's calls.
@@ -165,7 +165,7 @@ def _report(count: int, width: int, height: int, rounds: int) -> dict[str, dict[
     device = Device.default()
     name = device.name
     checks = _exact(device, min(NUMBERS, max(count, 1)))
-    same, found = _measured(Pool(device), _random_scene(count), _view(width, height), rounds)
+    same, found = measure_frame(Pool(device), _random_scene(count), _view(width, height), rounds)
     return {
         "adapter": {"name": name.name, "kind": name.kind, "interface": name.interface, "driver": name.driver},
         "adapters": {str(place): other.name for place, other in enumerate(adapters())},

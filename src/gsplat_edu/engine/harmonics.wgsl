@@ -52,10 +52,17 @@ fn harmonic_slope(j: u32, d: vec3<f32>) -> vec3<f32> {
     }
 }
 
+// The same number, which does not exceed i + 16. Mesa's lavapipe inlines uniforms that alone bound a loop, and compiles the
+// shader again for each dispatch; a bound that also depends on the Gaussian keeps it from that.
+fn bound_of(i: u32, number: u32) -> u32 {
+    return min(number, i + 16u);
+}
+
 // The colour of a Gaussian seen along d, before the floor at 0: sum_j b_j(d) sh_j + 0.5.
 fn color_along(i: u32, d: vec3<f32>) -> vec3<f32> {
     var color = C0 * core3(i * CORE + 10u) + SH_OFFSET;
-    for (var j = 1u; j < (view.degree + 1u) * (view.degree + 1u); j++) {
+    let used = bound_of(i, (view.degree + 1u) * (view.degree + 1u));
+    for (var j = 1u; j < used; j++) {
         let at = 3u * (i * view.rest + j - 1u);
         color += harmonic(j, d) * vec3<f32>(rest[at], rest[at + 1u], rest[at + 2u]);
     }

@@ -3,7 +3,7 @@
 //     moments of h -> J W M -> (J W, quaternion, log scale) -> mean;   colour -> (coefficients, direction -> mean)
 //
 // Sigma2d^-1 = L' L, y = L d: moments are taken in y, where they are of order 1; in d they grow with the ellipse and cancel.
-// With r = (J W) M, w = L r and N the matrix of moments: dL/dr = L' N w. As in native/project_backward.cpp.
+// With r = (J W) M, w = L r and N the matrix of moments: dL/dr = L' N w.
 
 const OUT = 16u;             // as `core`, then |(gu W/2, gv H/2)|, and one unused
 const SLOT = 10u;
@@ -76,40 +76,38 @@ fn whiten(g: Projected, sums: Sums) -> Moments {
     return w;
 }
 
-// dL/dq of a unit quaternion from G = dL/dR (columns), without its component along q.
-fn turn_gradient(q: vec4<f32>, G: mat3x3<f32>) -> vec4<f32> {
-    let w = q.x;
-    let x = q.y;
-    let y = q.z;
-    let z = q.w;
-    // G[column][row]
-    let dw = x * (G[1].z - G[2].y) + y * (G[2].x - G[0].z) + z * (G[0].y - G[1].x);
-    let dx = y * (G[1].x + G[0].y) + z * (G[2].x + G[0].z) + w * (G[1].z - G[2].y) - 2.0 * x * (G[1].y + G[2].z);
-    let dy = x * (G[1].x + G[0].y) + z * (G[2].y + G[1].z) + w * (G[2].x - G[0].z) - 2.0 * y * (G[0].x + G[2].z);
-    let dz = x * (G[2].x + G[0].z) + y * (G[2].y + G[1].z) + w * (G[0].y - G[1].x) - 2.0 * z * (G[0].x + G[1].y);
-    let d = 2.0 * vec4<f32>(dw, dx, dy, dz);
-    return d - dot(d, q) * q;
+// dL/dq of a unit quaternion from the gradient of a rotation about the Gaussian's own axes: 2 q (0, torque).
+fn turn_gradient(q: vec4<f32>, torque: vec3<f32>) -> vec4<f32> {
+    return 2.0 * vec4<f32>(-dot(q.yzw, torque), q.x * torque + cross(q.yzw, torque));
 }
 
 // Propagates the moments to scales and quaternion, which it stores, and to the rows of J W. `lit` is antialiasing's part:
 // the opacity's factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r with Sigma before the dilation.
+//
+// With p = (J W) R, r = p S and W = L p: dL/dr = B r with a symmetric B, so with Q = p' B p the scales get s_k² Q_kk and a
+// turn about axis i gets Q_jk (s_j² - s_k²). That is exactly 0 for a round Gaussian, whose quaternion Adam would move otherwise,
+// by a whole step for each rounding error. With f = t0 x t1 in the Gaussian's axes, antialiasing's part of Q_jk is
+// -lit s_i² f_j f_k, and that of Q_kk is lit (s_i² f_j² + s_j² f_i²): no term cancels.
 fn shape_gradient(i: u32, g: Projected, m: Moments, lit: f32, to: ptr<function, Through>) {
-    let across0 = cross(g.r1, g.n);              // c0 r0 - b0 r1
-    let across1 = cross(g.n, g.r0);              // a0 r1 - b0 r0
-    let w0 = m.L.x / g.c * (view.dilation * g.r0 + across0);      // sx r0 + sy r1 = sx (r0 - b/c r1)
-    let w1 = m.L.z * g.r1;
+    let p0 = g.t0 * g.R;
+    let p1 = g.t1 * g.R;
+    let flat = cross(g.t0, g.t1) * g.R;
+    let ss = g.s * g.s;
+    let across0 = cross(p1 * ss, flat);          // (c0 r0 - b0 r1) / s
+    let across1 = cross(flat, p0 * ss);          // (a0 r1 - b0 r0) / s
+    let w0 = m.L.x / g.c * (view.dilation * p0 + across0);        // sx p0 + sy p1 = sx (p0 - b/c p1)
+    let w1 = m.L.z * p1;
     let dw0 = m.m00 * w0 + m.m01 * w1;
     let dw1 = m.m01 * w0 + m.m11 * w1;
     let extra0 = lit * across0;
     let extra1 = lit * across1;
-    let scale = w0 * dw0 + w1 * dw1 + g.r0 * extra0 + g.r1 * extra1;
-    let dr0 = (m.L.x * dw0 + extra0) * g.s;
-    let dr1 = (m.L.y * dw0 + m.L.z * dw1 + extra1) * g.s;
-    (*to).d0 = g.R * dr0;
-    (*to).d1 = g.R * dr1;
+    let scale = ss * (w0 * dw0 + w1 * dw1 + lit * (ss.yzx * flat.zxy * flat.zxy + ss.zxy * flat.yzx * flat.yzx));
+    (*to).d0 = g.R * (ss * (m.L.x * dw0 + extra0));
+    (*to).d1 = g.R * (ss * (m.L.y * dw0 + m.L.z * dw1 + extra1));
     (*to).total = scale.x + scale.y + scale.z;
-    let G = mat3x3<f32>(g.t0 * dr0.x + g.t1 * dr1.x, g.t0 * dr0.y + g.t1 * dr1.y, g.t0 * dr0.z + g.t1 * dr1.z);
-    let dq = turn_gradient(g.q, G) / g.q_length;
+    let Q = w0.yzx * dw0.zxy + w1.yzx * dw1.zxy - lit * ss * flat.yzx * flat.zxy;
+    let torque = Q * (g.s.yzx - g.s.zxy) * (g.s.yzx + g.s.zxy);
+    let dq = turn_gradient(g.q, torque) / g.q_length;
     for (var k = 0u; k < 4u; k++) {
         core_grads[i * OUT + 3u + k] = dq[k];
     }
@@ -139,7 +137,8 @@ fn color_gradient(i: u32, g: Projected, painted: vec3<f32>) -> vec3<f32> {
         core_grads[i * OUT + 10u + k] = C0 * dc[k];
     }
     var turned = vec3<f32>(0.0);
-    for (var j = 1u; j <= view.rest; j++) {
+    let stored = bound_of(i, view.rest);
+    for (var j = 1u; j <= stored; j++) {
         let at = 3u * (i * view.rest + j - 1u);
         var basis = 0.0;
         if (j < (view.degree + 1u) * (view.degree + 1u)) {
@@ -181,7 +180,8 @@ fn clear(i: u32) {
     for (var k = 0u; k < OUT; k++) {
         core_grads[i * OUT + k] = 0.0;
     }
-    for (var k = 0u; k < 3u * view.rest; k++) {
+    let numbers = 3u * bound_of(i, view.rest);
+    for (var k = 0u; k < numbers; k++) {
         rest_grads[3u * i * view.rest + k] = 0.0;
     }
 }

@@ -103,6 +103,16 @@ def interpreted() -> bool:
     return os.environ.get("TRITON_INTERPRET", "0").lower() in ("1", "true", "on", "yes", "y")
 
 
+def gpu_of(backend: str) -> str | None:
+    """Return the name of the GPU on which an available backend runs, and its interface; None on the processor."""
+    if backend == "webgpu":
+        adapter = host.chosen_adapter()
+        return f"{adapter.name}, {adapter.interface}{', which computes on the processor' * adapter.software}"
+    if backend == "cuda":
+        return "Triton's interpreter" if interpreted() else f"{torch.cuda.get_device_name()}, CUDA"
+    return None
+
+
 def device_of(backend: str) -> torch.device:
     """Return the device on which a backend needs its tensors."""
     return torch.device("cuda" if backend == "cuda" and torch.cuda.is_available() else "cpu")

@@ -10,4 +10,5 @@ EXAMPLE = "example: gsplat-edu info captures/plush"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's argument."""
-    parser.add_argument("path", type=Path, metavar="PATH", help="capture, run folder or scene file")
+    meant = "capture, run folder or scene file; without it, describe this computer and its GPUs"
+    parser.add_argument("path", type=Path, metavar="PATH", nargs="?", help=meant)
