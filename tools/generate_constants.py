@@ -37,7 +37,7 @@ NAMES = (
 )
 WGSL_NAMES = (
     *("THINNEST", "ALPHA_MIN", "T_STOP", "DET_FLOOR", "SPLAT_LIMIT_F32", "COLOR_LIMIT", "RIM_SLACK"),
-    *("C0", "C1", "C2", "C3", "SH_OFFSET"),
+    *("C0", "C1", "C2", "C3", "SH_OFFSET", "SSIM_C1", "SSIM_C2"),
 )
 SSIM_TAPS = 6
 """Taps of one half of SSIM's window: the central one and five on one side."""
@@ -53,10 +53,15 @@ def header() -> str:
     lines += ["", "namespace gsplat {", "", f"constexpr int TILE = {c.TILE};"]
     lines += [_line(name, getattr(c, name)) for name in NAMES]
     lines += [_line(f"LOG2_{name}", math.log2(getattr(c, name))) for name in ("ALPHA_MIN", "ALPHA_MAX")]
+    lines.append(_line("SSIM_TAP", ssim_taps()))
+    return "\n".join([*lines, "", "}  // namespace gsplat", ""])
+
+
+def ssim_taps() -> tuple[float, ...]:
+    """Return one half of SSIM's window, from its middle."""
     window = [math.exp(-(k**2) / (2 * c.SSIM_SIGMA**2)) for k in range(SSIM_TAPS)]
     total = window[0] + 2 * sum(window[1:])
-    lines.append(_line("SSIM_TAP", tuple(tap / total for tap in window)))
-    return "\n".join([*lines, "", "}  // namespace gsplat", ""])
+    return tuple(tap / total for tap in window)
 
 
 def _line(name: str, value: float | tuple[float, ...]) -> str:
@@ -83,7 +88,11 @@ def shader() -> str:
         "LN2": math.log(2),
         "SQRT_HALF_LOG2E": math.sqrt(math.log2(math.e) / 2),
     }
-    return "\n".join([*lines, *(_wgsl_line(*entry) for entry in logarithms.items()), ""])
+    lines += [_wgsl_line(*entry) for entry in logarithms.items()]
+    lines.append(
+        f"const SSIM_TAP = array<f32, {SSIM_TAPS}>({', '.join(f'{tap!r}f' for tap in ssim_taps())});"
+    )
+    return "\n".join([*lines, ""])
 
 
 def _wgsl_line(name: str, value: float) -> str:

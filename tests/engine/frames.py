@@ -4,6 +4,7 @@ import numpy as np
 
 from gsplat_edu.engine import frame
 from gsplat_edu.engine.view import View
+from gsplat_edu.scene.camera import Camera
 from native_scenes import BACKGROUND
 
 
@@ -28,3 +29,8 @@ def view_of(scene, **changes):
 
 def drawn(pool, scene, **changes):
     return frame.draw_frame(pool, packed(scene), view_of(scene, **changes))
+
+
+def plain_view(H, W):
+    camera = Camera(np.eye(3), np.zeros(3), 30.0, 30.0, W / 2, H / 2, H, W)
+    return View(camera, (0.0, 0.0, 0.0), 0, False, 0.3, None, 0.99, 0.01)

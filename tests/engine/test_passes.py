@@ -8,9 +8,10 @@ from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine import host
 from gsplat_edu.engine.frame import program
 from gsplat_edu.engine.passes import FOLDER, LIMITS, MODULES, Buffer, Pass, Program, Size, module_source
+from gsplat_edu.engine.step import step_program
 
 PROGRAM = program(16, True)
-PASSES = {(one.module, one.entry): one for one in PROGRAM.passes()}
+PASSES = {(one.module, one.entry): one for each in (PROGRAM, step_program(16)) for one in each.passes()}
 BYTES = {"u32": 4, "f32": 4, "vec2<f32>": 8, "vec4<f32>": 16, "Splat": 48}
 
 
@@ -59,7 +60,7 @@ def test_every_shader_belongs_to_a_module():
     assert {path.stem for path in FOLDER.glob("*.wgsl")} == {
         name for files in MODULES.values() for name in files
     }
-    assert {one.module for one in PROGRAM.passes()} == set(MODULES)
+    assert {module for module, _ in PASSES} == set(MODULES)
 
 
 def test_no_float_atomics_and_no_test_that_a_compiler_may_assume_away():

@@ -58,23 +58,9 @@ def program(tile_bits: int, with_features: bool) -> Program:
         tile_bits: Bits of the number of tiles, by which pairs are sorted.
         with_features: Whether it also composites features, four at a time.
     """
-    buffers = (
-        *(Buffer("core", Size("gaussians", CORE)), Buffer("rest", Size("rest"))),
-        *(Buffer("records", Size("gaussians", RECORD)), Buffer("seen", GAUSSIANS)),
-        *(Buffer("spans", Size("gaussians", 2)), Buffer("radii", Size("gaussians", 2))),
-        *(Buffer(name, GAUSSIANS) for name in ("depth_keys", "order", "starts")),
-        *sort_scratch("depth_sort", "gaussians"),
-        Buffer("gaussian_sums", scan_scratch(GAUSSIANS)),
-        *(Buffer(name, PAIR) for name in ("tile_keys", "slot_of", "owner")),
-        *sort_scratch("tile_sort", "pairs"),
-        *(Buffer("tiles", EDGES), Buffer("done", EDGES)),
-        *(Buffer("image", Size("pixels", PIXEL)), Buffer("grads", Size("pixels", GRADS))),
-        Buffer("slots", Size("pairs", SLOT)),
-        *(Buffer("core_grads", Size("gaussians", OUT)), Buffer("rest_grads", Size("rest"))),
-        *(Buffer("camera_sums", Size("gaussians", CAMERA_NUMBERS, 64)), Buffer("live", Size("live"))),
-    )
+    buffers = render_buffers()
     parts = {
-        "render": _forward(tile_bits),
+        "render": render_passes(tile_bits),
         "composite_backward": (_composite_backward("records", "image", "slots"),),
         "project_backward": _project_backward(),
     }
@@ -91,7 +77,27 @@ def program(tile_bits: int, with_features: bool) -> Program:
     return Program(buffers, parts)
 
 
-def _forward(tile_bits: int) -> tuple[Pass, ...]:
+def render_buffers() -> tuple[Buffer, ...]:
+    """Return the buffers of a render and its gradients, without those of features."""
+    return (
+        *(Buffer("core", Size("gaussians", CORE)), Buffer("rest", Size("rest"))),
+        *(Buffer("records", Size("gaussians", RECORD)), Buffer("seen", GAUSSIANS)),
+        *(Buffer("spans", Size("gaussians", 2)), Buffer("radii", Size("gaussians", 2))),
+        *(Buffer(name, GAUSSIANS) for name in ("depth_keys", "order", "starts")),
+        *sort_scratch("depth_sort", "gaussians"),
+        Buffer("gaussian_sums", scan_scratch(GAUSSIANS)),
+        *(Buffer(name, PAIR) for name in ("tile_keys", "slot_of", "owner")),
+        *sort_scratch("tile_sort", "pairs"),
+        *(Buffer("tiles", EDGES), Buffer("done", EDGES)),
+        *(Buffer("image", Size("pixels", PIXEL)), Buffer("grads", Size("pixels", GRADS))),
+        Buffer("slots", Size("pairs", SLOT)),
+        *(Buffer("core_grads", Size("gaussians", OUT)), Buffer("rest_grads", Size("rest"))),
+        *(Buffer("camera_sums", Size("gaussians", CAMERA_NUMBERS, 64)), Buffer("live", Size("live"))),
+    )
+
+
+def render_passes(tile_bits: int) -> tuple[Pass, ...]:
+    """Return the passes of a render whose pairs are sorted by so many bits."""
     sources, lists = ("live", "order", "spans", "records"), ("live", "records", "order", "starts")
     return (
         Pass("project", "project", ("core", "rest"), ("records", "seen", "spans"), GAUSSIANS, 64),
@@ -123,6 +129,11 @@ def _composite(records: str, image: str, without_background: int) -> Pass:
 def _composite_backward(records: str, image: str, slots: str) -> Pass:
     reads = (records, "owner", "slot_of", "tiles", "done", image, "grads")
     return Pass("composite_backward", "composite_backward", reads, (slots,), EDGES, 1)
+
+
+def gradient_passes() -> tuple[Pass, ...]:
+    """Return the passes from the gradient of the image to those of the Gaussians."""
+    return (_composite_backward("records", "image", "slots"), *_project_backward())
 
 
 def _project_backward() -> tuple[Pass, ...]:
@@ -246,18 +257,18 @@ class Pool:
 
     def room(self, gaussians: int, tiles: int) -> int:
         """Return the number of pairs to make room for: what frames of this size needed, or two per Gaussian."""
-        return self._pairs.get((gaussians, tiles), _rounded(2 * gaussians))
+        return self._pairs.get((gaussians, tiles), rounded_pairs(2 * gaussians))
 
     def note(self, gaussians: int, tiles: int, pairs: int) -> int:
         """Remember how many pairs a frame has, and return the room for as many."""
         if len(self._pairs) > MOST_SIZES:
             self._pairs.clear()
-        room = max(self._pairs.get((gaussians, tiles), 0), _rounded(pairs))
+        room = max(self._pairs.get((gaussians, tiles), 0), rounded_pairs(pairs))
         self._pairs[(gaussians, tiles)] = room
         return room
 
 
-def _rounded(pairs: int) -> int:
+def rounded_pairs(pairs: int) -> int:
     """Round up by a quarter at most, so that frames of similar size share buffers."""
     step = 1 << max(pairs.bit_length() - 3, 0)
     return max(-(-pairs // step) * step, FEWEST_PAIRS)

@@ -5,9 +5,6 @@
 // Names are those of native/gaussian_math.h.
 
 const CORE = 14u;            // mean 3, quaternion 4, log scales 3, sh0 3, logit 1
-const LN2_HIGH = 0.693145751953125;      // its 16 bits times a whole number below 256 are exact
-const LN2_LOW = 1.42860677e-6;
-const SCALE_MOST = 80.0;     // natural logarithm; exp(80) squared overflows
 
 @group(1) @binding(0) var<storage, read> core: array<f32>;
 @group(1) @binding(1) var<storage, read> rest: array<f32>;
@@ -39,32 +36,8 @@ struct Projected {
     valid: bool,
 }
 
-// e^x for |x| up to 80 within about 2 ULP; the built-in may err by 3 + 2 |x|.
-fn exp_exact(x: f32) -> f32 {
-    let k = round(x * 1.44269504);
-    let r = kept(x - k * LN2_HIGH) - k * LN2_LOW;
-    let tail = 0.0416666667 + r * (0.00833333333 + r * (0.00138888889 + r * 0.000198412698));
-    let p = 1.0 + r * (1.0 + r * (0.5 + r * (0.166666667 + r * tail)));
-    let half = i32(k) / 2;                // in two factors: 2^k may leave the range of a float
-    let other = i32(k) - half;
-    return p * bitcast<f32>(u32(half + 127) << 23u) * bitcast<f32>(u32(other + 127) << 23u);
-}
-
 fn core3(at: u32) -> vec3<f32> {
     return vec3<f32>(core[at], core[at + 1u], core[at + 2u]);
-}
-
-// R(q) of a unit quaternion.
-fn rotation(q: vec4<f32>) -> mat3x3<f32> {
-    let w = q.x;
-    let x = q.y;
-    let y = q.z;
-    let z = q.w;
-    return mat3x3<f32>(
-        vec3<f32>(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        vec3<f32>(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
-        vec3<f32>(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
-    );
 }
 
 fn project_mean(i: u32, g: ptr<function, Projected>) {

@@ -22,7 +22,9 @@ from typing import Any
 import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.engine.failures import first_line, one_line
 from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
+from gsplat_edu.engine.transfers import Kept, Ticket
 
 INSTALL = 'pip install "gsplat-edu[gpu]"'
 """Installs wgpu."""
@@ -78,7 +80,7 @@ def why_unavailable() -> str | None:
     try:
         found = adapters()
     except Exception as error:  # a driver's library that does not load raises anything
-        return f"wgpu does not start here ({_first_line(error)}); use the backend cpu"
+        return f"wgpu does not start here ({first_line(error)}); use the backend cpu"
     wanted = os.environ.get(ADAPTER_VARIABLE, "")
     if not found:
         return (
@@ -127,6 +129,10 @@ class Device:
 
     Raises:
         BackendUnavailableError: it does not start.
+
+    Attributes:
+        sent: Bytes written to its buffers so far.
+        received: Bytes read from them.
     """
 
     def __init__(
@@ -135,13 +141,15 @@ class Device:
         self.name, chosen = _adapters()[adapter]
         wanted = {key: chosen.limits[key] for key in LIMITS} if limits is None else dict(limits)
         self.measures = TIMESTAMPS in chosen.features
-        with _one_line(f"the adapter {self.name.name} does not start"):
+        with one_line(f"the adapter {self.name.name} does not start"):
             self.device = chosen.request_device_sync(
                 required_limits=wanted, required_features=[TIMESTAMPS] if self.measures else []
             )
         self.limits: Mapping[str, int] = wanted
         self.most_groups = most_groups or wanted["max-compute-workgroups-per-dimension"]
         self.lock = threading.RLock()
+        self.sent = self.received = 0
+        self._staging: dict[int, list[Any]] = {}
         self._modules: dict[str, Any] = {}
         self._pipelines: dict[tuple[str, str, int, int], Any] = {}
 
@@ -170,6 +178,35 @@ class Device:
         """
         return Memory(self, program, counts, poison)
 
+    def keep(self, array: np.ndarray) -> Kept:
+        """Put an array of four-byte numbers on the device, to be copied into a program's buffers there.
+
+        Raises:
+            BackendUnavailableError: the device has too little memory.
+        """
+        import wgpu
+
+        with self.lock, one_line(f"{self.name.name} has no {array.nbytes / 2**20:.0f} MiB for a photo"):
+            usage = wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
+            buffer = self.device.create_buffer_with_data(data=np.ascontiguousarray(array), usage=usage)
+        self.sent += array.nbytes
+        return Kept(buffer, array.nbytes)
+
+    def staging(self, size: int) -> Any:  # noqa: ANN401
+        """Return a buffer of so many bytes that can be mapped; `Ticket.words` hands it back."""
+        import wgpu
+
+        if waiting := self._staging.setdefault(size, []):
+            return waiting.pop()
+        return self.device.create_buffer(
+            size=size, usage=wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
+        )
+
+    def free_staging(self, staging: Any) -> None:  # noqa: ANN401
+        """Take back what `staging` returned, when it was read."""
+        self.received += staging.size
+        self._staging[staging.size].append(staging)
+
     def check_fits(self, program: Program, counts: Mapping[str, int]) -> None:
         """Check that no buffer is larger than the device allows.
 
@@ -195,7 +232,7 @@ class Device:
 
     def _compiled(self, one: Pass) -> tuple[Any, Any]:
         if one.module not in self._modules:
-            with _one_line(f"{self.name.name} refuses the shader {one.module}"):
+            with one_line(f"{self.name.name} refuses the shader {one.module}"):
                 self._modules[one.module] = self.device.create_shader_module(code=module_source(one.module))
         kinds = ["read-only-storage"] * len(one.reads) + ["storage"] * len(one.writes)
         storage = self.device.create_bind_group_layout(
@@ -203,7 +240,7 @@ class Device:
         )
         layout = self.device.create_pipeline_layout(bind_group_layouts=[self.uniform_layout, storage])
         stage = {"module": self._modules[one.module], "entry_point": one.entry}
-        with _one_line(f"{self.name.name} refuses the shader {one.module}.{one.entry}"):
+        with one_line(f"{self.name.name} refuses the shader {one.module}.{one.entry}"):
             return self.device.create_compute_pipeline(layout=layout, compute=stage), storage
 
     @functools.cached_property
@@ -235,7 +272,7 @@ class Memory:
         self._words = {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in program.buffers}
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
-        with _one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):
+        with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):
             self._buffers = {
                 name: make(size=WORD * words, usage=storage) for name, words in self._words.items()
             }
@@ -285,8 +322,54 @@ class Memory:
                 f"{name}: has {self._words[name]} words, not {array.size} of {array.itemsize} bytes"
             )
         if array.size:
-            with _one_line(f"{self.device.name.name} does not take {name}"):
+            with one_line(f"{self.device.name.name} does not take {name}"):
                 self.device.device.queue.write_buffer(self._buffers[name], 0, np.ascontiguousarray(array))
+            self.device.sent += array.nbytes
+
+    def read(self, name: str) -> np.ndarray:
+        """Wait for all that was submitted, and return a buffer's contents as uint32.
+
+        Raises:
+            BackendUnavailableError: the device fails.
+        """
+        with self.device.lock, one_line(f"{self.device.name.name} does not give {name}"):
+            encoder = self.device.device.create_command_encoder()
+            return self._read_after(encoder, (name,))[name]
+
+    def take(self, other: Memory, names: Iterable[str]) -> None:
+        """Copy buffers from another program's on the same device, as far as both reach."""
+        with self.device.lock, one_line(f"{self.device.name.name} does not copy"):
+            encoder = self.device.device.create_command_encoder()
+            for name in names:
+                size = WORD * min(self._words[name], other._words[name])
+                encoder.copy_buffer_to_buffer(other._buffers[name], 0, self._buffers[name], 0, size)
+            self.device.device.queue.submit([encoder.finish()])
+
+    def submit(self, part: str, view: bytes, read: str, kept: Kept | None = None, into: str = "") -> Ticket:
+        """Play a part of the program as one submission, without waiting for it.
+
+        Args:
+            part: Its name.
+            view: Begin of the uniform block that its passes share.
+            read: A small buffer, whose contents at the end of the part the ticket returns.
+            kept: What is copied to the beginning of the buffer `into` before.
+            into: That buffer's name.
+
+        Raises:
+            BackendUnavailableError: the device fails.
+        """
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+            encoder = self._begun(view)
+            if kept is not None:
+                encoder.copy_buffer_to_buffer(kept.buffer, 0, self._buffers[into], 0, kept.nbytes)
+            self._compute(encoder, part)
+            size = self._bytes_of((read,))
+            staging = self.device.staging(size)
+            encoder.copy_buffer_to_buffer(self._buffers[read], 0, staging, 0, WORD * self._words[read])
+            self.device.device.queue.submit([encoder.finish()])
+            device = self.device
+            arrival = staging.map_async("READ", 0, size)
+            return Ticket(device.name.name, device.lock, staging, arrival, device.free_staging)
 
     def play(self, part: str, view: bytes = b"", read: Iterable[str] = ()) -> dict[str, np.ndarray]:
         """Play a part of the program as one submission, and wait for it if something is read.
@@ -300,24 +383,34 @@ class Memory:
             BackendUnavailableError: the device fails.
         """
         names = tuple(read)
-        with self.device.lock, _one_line(f"{self.device.name.name} fails in {part}"):
-            queue = self.device.device.queue
-            if view:
-                queue.write_buffer(self._view, 0, view)
-            encoder = self.device.device.create_command_encoder()
-            computing = encoder.begin_compute_pass()
-            for call in self._recorded[part]:
-                _dispatch(computing, call)
-            computing.end()
-            offset = 0
-            staging = self._staging_for(names)
-            for name in names:
-                encoder.copy_buffer_to_buffer(
-                    self._buffers[name], 0, staging, offset, WORD * self._words[name]
-                )
-                offset += WORD * self._words[name]
-            queue.submit([encoder.finish()])
-            return self._collected(names, staging)
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+            encoder = self._begun(view)
+            self._compute(encoder, part)
+            return self._read_after(encoder, names)
+
+    def _begun(self, view: bytes) -> Any:  # noqa: ANN401
+        """Return an encoder, after writing the uniform block."""
+        if view:
+            self.device.device.queue.write_buffer(self._view, 0, view)
+            self.device.sent += len(view)
+        return self.device.device.create_command_encoder()
+
+    def _compute(self, encoder: Any, part: str) -> None:  # noqa: ANN401
+        """Record the passes of a part."""
+        computing = encoder.begin_compute_pass()
+        for call in self._recorded[part]:
+            _dispatch(computing, call)
+        computing.end()
+
+    def _read_after(self, encoder: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:  # noqa: ANN401
+        """Submit what was recorded, and return buffers as they are then."""
+        offset = 0
+        staging = self._staging_for(names)
+        for name in names:
+            encoder.copy_buffer_to_buffer(self._buffers[name], 0, staging, offset, WORD * self._words[name])
+            offset += WORD * self._words[name]
+        self.device.device.queue.submit([encoder.finish()])
+        return self._collected(names, staging)
 
     def times(self, part: str) -> dict[str, float]:
         """Play a part once more, pass by pass, and return the milliseconds that the device took for each entry point.
@@ -331,7 +424,7 @@ class Memory:
             raise BackendUnavailableError(f"backend 'webgpu': {self.device.name.name} has no timestamps")
         make, recorded = self.device.device, self._recorded[part]
         passes = [one for one in self.program.parts[part] if one.groups(self.counts)]
-        with self.device.lock, _one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
             queries = make.create_query_set(type="timestamp", count=2 * len(passes))
             usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
             resolved = make.create_buffer(size=16 * len(passes), usage=usage)
@@ -366,6 +459,7 @@ class Memory:
         staging.map_sync("READ", 0, size)
         words = np.frombuffer(staging.read_mapped(0, size), dtype=np.uint32)
         staging.unmap()
+        self.device.received += size
         lengths = [self._words[name] for name in names]
         return dict(zip(names, np.split(words, np.cumsum(lengths)[:-1]), strict=False))
 
@@ -374,40 +468,12 @@ class Memory:
         return -(-WORD * sum(self._words[name] for name in names) // 8) * 8
 
 
-class _one_line:  # noqa: N801  used like a function
-    """Turns what wgpu raises into one line."""
-
-    def __init__(self, what: str) -> None:
-        self.what = what
-
-    def __enter__(self) -> None:
-        """Nothing to prepare."""
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        """Translate errors of wgpu."""
-        if error is not None and _is_of_wgpu(error):
-            raise BackendUnavailableError(
-                f"backend 'webgpu': {self.what} ({_first_line(error)}); use the backend cpu"
-            ) from error
-
-
 def _dispatch(computing: Any, call: Call) -> None:  # noqa: ANN401
     pipeline, uniforms, storage, offset, x, y = call
     computing.set_pipeline(pipeline)
     computing.set_bind_group(0, uniforms, [offset])
     computing.set_bind_group(1, storage)
     computing.dispatch_workgroups(x, y)
-
-
-def _is_of_wgpu(error: BaseException) -> bool:
-    import wgpu
-
-    return isinstance(error, (wgpu.GPUError, RuntimeError))
-
-
-def _first_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0] if lines else 'no message'}"
 
 
 def _entry(binding: int, buffer: Mapping[str, object]) -> dict[str, object]:

@@ -17,13 +17,24 @@ FOLDER = Path(__file__).parent
 MODULES: dict[str, tuple[str, ...]] = {
     "scan": ("job", "scan"),
     "sort": ("job", "sort"),
-    "project": ("job", "view", "constants", "gaussian", "harmonics", "ellipse", "project"),
+    "project": ("job", "view", "constants", "elementary", "gaussian", "harmonics", "ellipse", "project"),
     "order": ("job", "order"),
     "intersect": ("job", "view", "constants", "ellipse", "intersect"),
     "composite": ("job", "view", "constants", "splat", "composite"),
     "composite_backward": ("job", "view", "constants", "splat", "composite_backward"),
     "features": ("job", "features"),
-    "project_backward": ("job", "view", "constants", "gaussian", "harmonics", "project_backward"),
+    "project_backward": (
+        "job",
+        "view",
+        "constants",
+        "elementary",
+        "gaussian",
+        "harmonics",
+        "project_backward",
+    ),
+    "loss": ("job", "view", "constants", "step", "loss"),
+    "adam": ("job", "view", "step", "elementary", "adam"),
+    "noise": ("job", "view", "step", "elementary", "noise"),
 }
 """Shader modules, and the WGSL files that are joined to each."""
 

@@ -22,6 +22,7 @@ struct View {
     rest: u32,               // harmonics per Gaussian in `rest`
     antialiased: u32,
     zero: u32,               // 0, but the compiler does not know
+    numbers: array<vec4<u32>, 20>,   // of a step of training: see step.wgsl
 }
 
 @group(0) @binding(1) var<uniform> view: View;

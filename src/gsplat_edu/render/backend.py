@@ -16,6 +16,7 @@ from gsplat_edu.ops.noise import NoiseKernel
 from gsplat_edu.ops.recolor import RecolorKernel
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput
+from gsplat_edu.render.resident import ResidentRun
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
@@ -50,6 +51,8 @@ class Backend:
         lacks: Names of `FEATURES` that it does not offer.
         stepper: Makes a `gsplat_edu.train.stepper.Stepper` that keeps a whole run on the device, from the arguments of
             `TensorStepper`; None to step on torch's tensors with the kernels above.
+        resident: Makes a training on the device for Gaussians of so many harmonics besides the first. `training`
+            uses it if the device can do all of its parts, and warns if it cannot. None if there is none.
     """
 
     name: str
@@ -61,6 +64,7 @@ class Backend:
     recolored: RecolorKernel
     lacks: frozenset[str] = field(default_factory=frozenset)
     stepper: Callable[..., Any] | None = None
+    resident: Callable[[int], ResidentRun] | None = None
 
     def require(self, feature: str, what: str) -> None:
         """Check that the backend offers a feature.

@@ -165,9 +165,12 @@ def _dense() -> Backend:
 @functools.cache
 def _webgpu() -> Backend:
     from gsplat_edu.render.webgpu import render_webgpu
+    from gsplat_edu.render.webgpu_resident import WebgpuRun
 
     others = _cpu() if kernels.REASON is None else _dense()  # its tensors are on the CPU
-    return dataclasses.replace(others, name="webgpu", rasterize=render_webgpu, lacks=WEBGPU_LACKS)
+    return dataclasses.replace(
+        others, name="webgpu", rasterize=render_webgpu, lacks=WEBGPU_LACKS, resident=WebgpuRun
+    )
 
 
 @functools.cache

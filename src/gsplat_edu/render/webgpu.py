@@ -70,10 +70,7 @@ def render_webgpu(
     value, pose = split_camera(camera)
     background = tuple(extra.background.detach().tolist())
     degree = min(settings.sh_degree, gaussians.sh_degree)
-    view = View(
-        value, background, degree, settings.antialiased, settings.dilation, settings.jacobian_limit,
-        settings.alpha_max, settings.z_near,
-    )  # fmt: skip
+    view = engine_view(value, settings, background, degree)
     call = _Call(view, settings.depth)
     tensors = gaussians.tensors()
     parameters = [tensors[name] for name in (*CORE, "sh_rest")]
@@ -97,6 +94,22 @@ def render_webgpu(
         features=None if extra.features is None else mixed,
         median_depth=median if settings.median_depth else None,
     )
+
+
+def engine_view(camera: Camera, settings: RenderSettings, background: tuple[float, ...], degree: int) -> View:
+    """Return camera and settings as the engine takes them.
+
+    Args:
+        camera: The camera.
+        settings: The settings.
+        background: (3,) the colour behind everything.
+        degree: Degree of the harmonics that are used; the Gaussians have them.
+    """
+    red, green, blue = background
+    return View(
+        camera, (red, green, blue), degree, settings.antialiased, settings.dilation, settings.jacobian_limit,
+        settings.alpha_max, settings.z_near,
+    )  # fmt: skip
 
 
 class _Rasterize(torch.autograd.Function):
@@ -163,13 +176,22 @@ def _pool() -> Pool:
     return Pool(Device.default())
 
 
+def device() -> Device:
+    """Return the device that renders.
+
+    Raises:
+        BackendUnavailableError: there is none, or it does not start.
+    """
+    return _pool().device
+
+
 def adapter_name() -> AdapterName:
     """Return the adapter that renders.
 
     Raises:
         BackendUnavailableError: there is none, or it does not start.
     """
-    return _pool().device.name
+    return device().name
 
 
 def _scene(parameters: tuple[Tensor, ...] | list[Tensor], features: Tensor | None) -> Scene:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from torch import Tensor
+
+PHOTO = "photo"
+"""Name of the term that compares image and photo; logs and progress call it the loss."""
 
 
 @dataclass(frozen=True)
@@ -14,17 +17,21 @@ class StepEvent:
 
     Args:
         iteration: The last image of the step, counted from 0: a step has `TrainConfig.batch` of them.
-        loss_tensor: () the objective's term "photo" before the step, a mean over its views, on the Gaussians' device.
         num_gaussians: Gaussians that were rendered.
-        terms: () every term of the objective before the step, by name, on the same device.
+        terms: () every term of the objective before the step, a mean over its views, by name, on the Gaussians' device.
+            If the training stays on a device, reading a term waits for the step.
         photo_factor: Divisor of the photos' width and height; see `gsplat_edu.train.schedule.photo_factor`.
     """
 
     iteration: int
-    loss_tensor: Tensor
     num_gaussians: int
-    terms: Mapping[str, Tensor] = field(default_factory=dict)
+    terms: Mapping[str, Tensor]
     photo_factor: float = 1.0
+
+    @property
+    def loss_tensor(self) -> Tensor:
+        """() the objective's term "photo"."""
+        return self.terms[PHOTO]
 
     @property
     def loss(self) -> float:
@@ -89,7 +96,7 @@ class Losses:
     """The losses of a run as numbers.
 
     They are collected on the Gaussians' device and read in batches: reading synchronises with a GPU, and keeping a
-    tensor for every step would pin heap pages.
+    tensor for every step would pin heap pages. The last step's is read after the next one has begun.
     """
 
     ROOM = 1024
@@ -97,16 +104,27 @@ class Losses:
     def __init__(self, like: Tensor) -> None:
         self._read: list[float] = []
         self._waiting, self._count = like.new_empty(self.ROOM), 0
+        self._last: Mapping[str, Tensor] | None = None
 
-    def add(self, loss: Tensor) -> None:
-        """Keep a loss, ()."""
-        self._waiting[self._count] = loss
-        self._count += 1
+    def add(self, terms: Mapping[str, Tensor]) -> None:
+        """Keep the loss among the terms of a step."""
+        self._keep_last()
+        self._last = terms
+
+    def _keep_last(self) -> None:
+        if self._last is None:
+            return
+        self._waiting[self._count] = self._last[PHOTO]
+        self._count, self._last = self._count + 1, None
         if self._count == self.ROOM:
-            self.read()
+            self._move()
+
+    def _move(self) -> None:
+        self._read += self._waiting[: self._count].tolist()
+        self._count = 0
 
     def read(self) -> list[float]:
         """Return all losses so far."""
-        self._read += self._waiting[: self._count].tolist()
-        self._count = 0
+        self._keep_last()
+        self._move()
         return self._read

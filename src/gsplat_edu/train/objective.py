@@ -22,6 +22,7 @@ from gsplat_edu.ops.losses import LossKernel, photo_loss
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.feed import Draw, Target
 
@@ -33,9 +34,6 @@ a third of the start's Gaussians, views of an aerial capture of a city a tenth
 OUTSIDE_WEIGHT = 0.3
 """Weight of the mean alpha outside the masks of an object. 0.1 leaves 1.4 times the alpha outside, 3 costs 1.3 dB
 inside (benchmarks/RESULTS.md)."""
-
-PHOTO = "photo"
-"""Name of the term that compares image and photo; logs and progress call it the loss."""
 
 
 @dataclass(frozen=True, eq=False)

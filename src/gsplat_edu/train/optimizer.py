@@ -116,6 +116,18 @@ class Adam:
         self._views, root = views, math.sqrt(views)
         self.learning_rates = {name: root * group.rate_at(iteration) for name, group in self.groups.items()}
 
+    def advance(self) -> dict[str, AdamNumbers]:
+        """Count a step, and return its numbers by group; something else then moves parameters and moments."""
+        views, root = self._views, math.sqrt(self._views)
+        self.steps += views
+        found = {}
+        for name, group in self.groups.items():
+            b1, b2 = group.betas
+            corrections = 1 - b1**self.steps, 1 - b2**self.steps
+            eps = group.eps / root
+            found[name] = AdamNumbers(self.learning_rates[name], b1**views, b2**views, eps, *corrections)
+        return found
+
     @torch.no_grad()
     def step(self, parameters: Mapping[str, Tensor], in_backward: AdamInBackward | None = None) -> None:
         """Update every parameter that has a gradient, in place, and clear the gradients.
@@ -128,15 +140,9 @@ class Adam:
         Raises:
             ArgumentError: the moments of a group do not fit its parameter.
         """
-        views, root = self._views, math.sqrt(self._views)
-        self.steps += views
         deferred: dict[str, Moments] = {}
-        for name, group in self.groups.items():
+        for name, numbers in self.advance().items():
             parameter, m, v = parameters[name], self.first[name], self.second[name]
-            b1, b2 = group.betas
-            corrections = 1 - b1**self.steps, 1 - b2**self.steps
-            rate, eps = self.learning_rates[name], group.eps / root
-            numbers = AdamNumbers(rate, b1**views, b2**views, eps, *corrections)
             if in_backward is not None and name in RAW:
                 _check_moments(name, parameter, (m, v))
                 deferred[name] = Moments(m, v, parameter.grad, numbers)

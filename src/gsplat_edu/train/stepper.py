@@ -40,8 +40,8 @@ Reduce = Callable[[Mapping[str, Tensor], int], None]
 """Called with all parameters and the number of views: turns the sum over the views in each `grad` into the gradient to
 apply. Processes that share a step call it with the rows that each of them moves."""
 
-Terms = dict[str, Tensor]
-"""() every term of the objective, by name."""
+Terms = Mapping[str, Tensor]
+"""() every term of the objective, by name; reading one may wait for the step."""
 
 
 @one_thread()

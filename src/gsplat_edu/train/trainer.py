@@ -25,11 +25,12 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Change, Event, Losses, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
-from gsplat_edu.train.objective import PHOTO, make_objective
+from gsplat_edu.train.objective import make_objective
 from gsplat_edu.train.optimizer import MOMENTS
+from gsplat_edu.train.resident import make_stepper
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
-from gsplat_edu.train.stepper import StepParts as StepParts, Stepper, StepView, TensorStepper
+from gsplat_edu.train.stepper import StepParts as StepParts, Stepper, StepView
 from gsplat_edu.train.tempo import Tempo
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import ViewModel
@@ -116,7 +117,7 @@ class Trainer:
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, outside=empty)
         objective = parts.objective or make_objective(config, loss=backend.loss)
         groups = gaussian_groups(config, extent)
-        make: Callable[..., Stepper] = backend.stepper or TensorStepper
+        make: Callable[..., Stepper] = backend.stepper or make_stepper
         self.stepper = make(gaussians, backend, groups, objective, density, parts, config.batch)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
@@ -171,7 +172,7 @@ class Trainer:
         with reused_buffers():
             while self.iteration < self.config.iterations:
                 step = self._step()
-                losses.add(step.loss_tensor)
+                losses.add(step.terms)
                 counts.append(step.num_gaussians)
                 self._tell(step, receivers)
                 for event in self._change(step.iteration):
@@ -192,7 +193,7 @@ class Trainer:
             self.transients.find(self.gaussians, settings, self.view_model.camera, factor)
         terms = self.stepper.step(self._views(self._draw()), position)
         self.iteration += self.config.batch
-        return StepEvent(self.iteration - 1, terms[PHOTO], self.stepper.count, terms, factor)
+        return StepEvent(self.iteration - 1, self.stepper.count, terms, factor)
 
     def _change(self, iteration: int) -> Iterator[Change]:
         """Let the density strategy act at every position that the step passed; yield what it did.

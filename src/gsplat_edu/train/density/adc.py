@@ -8,6 +8,7 @@ Chapter: 09_train_in_3d.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -72,20 +73,40 @@ class AdaptiveDensityControl:
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Clone, split, prune and reset when the schedule says so."""
-        config, events = self.config, list[Change]()
-        self.is_over = iteration + 1 >= config.adc.densify_stop
-        if iteration - config.batch + 1 >= config.adc.densify_stop:
-            return gaussians, events
-        due = milestone(iteration, config.densify_every, config.batch)
-        if due is not None and config.densify_start < due < config.adc.densify_stop:
+        events = list[Change]()
+        self.passed(iteration)
+        if self._densify_is_due(iteration):
             gaussians, densified = self._densify(iteration, gaussians, optimizer)
             events.append(densified)
         if self._reset_is_due(iteration):
-            ceiling = math.log(config.adc.reset_opacity / (1 - config.adc.reset_opacity))
+            opacity = self.config.adc.reset_opacity
+            ceiling = math.log(opacity / (1 - opacity))
             gaussians.logit_opacities.clamp_(max=ceiling)
             optimizer.forget("logit_opacities")
-            events.append(ResetEvent(iteration, config.adc.reset_opacity))
+            events.append(ResetEvent(iteration, opacity))
         return gaussians, events
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether the schedule says to densify or to reset; see `FollowsDevice.is_due`."""
+        return self._densify_is_due(iteration) or self._reset_is_due(iteration)
+
+    def passed(self, iteration: int, rate: float = 0.0) -> None:
+        """Note the iteration; see `FollowsDevice.passed`."""
+        self.is_over = iteration + 1 >= self.config.adc.densify_stop
+
+    def observed(self) -> dict[str, Tensor]:
+        """Return the statistics; see `FollowsDevice.observed`."""
+        return {name: getattr(self, name) for name in STATISTICS}
+
+    def absorb(self, statistics: Mapping[str, Tensor]) -> None:
+        """Replace the statistics; see `FollowsDevice.absorb`."""
+        for name in STATISTICS:
+            setattr(self, name, statistics[name])
+
+    def _densify_is_due(self, iteration: int) -> bool:
+        config = self.config
+        due = milestone(iteration, config.densify_every, config.batch)
+        return due is not None and config.densify_start < due < config.adc.densify_stop
 
     def _densify(
         self, iteration: int, gaussians: Gaussians, optimizer: Adam

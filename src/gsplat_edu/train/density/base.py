@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from gsplat_edu.ops.noise import NoiseNumbers
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.events import Change
@@ -61,4 +63,36 @@ class DensityStrategy(Protocol):
         Raises:
             ArgumentError: the state does not fit these Gaussians; nothing has changed.
         """
+        ...
+
+
+@runtime_checkable
+class FollowsDevice(DensityStrategy, Protocol):
+    """A strategy for Gaussians that stay on a device: `update` is called only when it is due.
+
+    The device collects the statistics in place of `observe`, unless `is_over`.
+    """
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether `update` would read the Gaussians, or change them other than by noise."""
+        ...
+
+    def passed(self, iteration: int, rate: float) -> NoiseNumbers | None:
+        """Do what else `update` does after a step at which it is not due.
+
+        Args:
+            iteration: As for `update`.
+            rate: The learning rate of the means.
+
+        Returns:
+            The noise to add; None for none.
+        """
+        ...
+
+    def observed(self) -> Mapping[str, Tensor]:
+        """Return the statistics, (N,) each, by name: "norm_sums" and "times_visible", or none."""
+        ...
+
+    def absorb(self, statistics: Mapping[str, Tensor]) -> None:
+        """Replace the statistics by those of a device, which went on from `observed`."""
         ...

@@ -9,6 +9,7 @@ Its settings are in `gsplat_edu.train.config`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -75,9 +76,9 @@ class PlannedDensity:
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Prune, and split up to the plan, when the schedule says so."""
         config = self.config
-        self.is_over = iteration >= config.fast.stop
-        due = milestone(iteration, config.densify_every, config.batch)
-        if due is None or due <= config.densify_start:
+        self.passed(iteration)
+        due = self._due(iteration)
+        if due is None:
             return gaussians, []
         growing = due <= config.fast.stop
         # Nothing replaces faint Gaussians later. Those below ALPHA_MIN are never drawn, and get no gradient.
@@ -92,6 +93,27 @@ class PlannedDensity:
         self._forget(replaced)
         counts = 2 * len(children[0]), int((~keep).sum())
         return replaced, [DensifyEvent(iteration, 0, *counts, num_gaussians=len(replaced))]
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether the schedule says to prune and split; see `FollowsDevice.is_due`."""
+        return self._due(iteration) is not None
+
+    def passed(self, iteration: int, rate: float = 0.0) -> None:
+        """Note the iteration; see `FollowsDevice.passed`."""
+        self.is_over = iteration >= self.config.fast.stop
+
+    def observed(self) -> dict[str, Tensor]:
+        """Return the statistics; see `FollowsDevice.observed`."""
+        return {name: getattr(self, name) for name in STATISTICS}
+
+    def absorb(self, statistics: Mapping[str, Tensor]) -> None:
+        """Replace the statistics; see `FollowsDevice.absorb`."""
+        for name in STATISTICS:
+            setattr(self, name, statistics[name])
+
+    def _due(self, iteration: int) -> int | None:
+        due = milestone(iteration, self.config.densify_every, self.config.batch)
+        return due if due is not None and due > self.config.densify_start else None
 
     def _highest(self, keep: Bool[Tensor, " N"], count: int) -> Bool[Tensor, " N"]:
         """Select the `count` Gaussians of the highest positive score, of equal ones the first."""

@@ -11,6 +11,7 @@ Source: Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Car
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -73,18 +74,35 @@ class MCMC:
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Relocate and grow when the schedule says so; add noise after every step."""
-        config, events = self.config, list[Change]()
-        due = milestone(iteration, config.densify_every, config.batch)
-        if due is not None and config.densify_start < due < config.mcmc.stop and len(gaussians):
-            dead = (gaussians.opacities <= config.min_opacity) | ~gaussians.finite_rows()
+        events = list[Change]()
+        if self.is_due(iteration) and len(gaussians):
+            dead = (gaussians.opacities <= self.config.min_opacity) | ~gaussians.finite_rows()
             num_relocated = self._relocate(gaussians, optimizer, torch.nonzero(dead)[:, 0])
             newborn = self._newborn(gaussians, optimizer)
             keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
             gaussians = replace(gaussians, optimizer, keep, newborn)  # sorts them, also if none is added
             num_added = len(gaussians) - len(keep)
             events.append(RelocateEvent(iteration, num_relocated, num_added, len(gaussians)))
-        self._add_noise(gaussians, optimizer.learning_rates["means"])
+        self._add_noise(gaussians, self.passed(iteration, optimizer.learning_rates["means"]))
         return gaussians, events
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether the schedule says to relocate and grow; see `FollowsDevice.is_due`."""
+        config = self.config
+        due = milestone(iteration, config.densify_every, config.batch)
+        return due is not None and config.densify_start < due < config.mcmc.stop
+
+    def passed(self, iteration: int, rate: float) -> NoiseNumbers:
+        """Draw the noise that every step adds; see `FollowsDevice.passed`."""
+        seed = int(torch.randint(2**62, (1,), generator=self.generator))  # checkpoints store the generator
+        return NoiseNumbers(seed, rate * self.config.mcmc.noise, NOISE_SHARPNESS, NOISE_THRESHOLD)
+
+    def observed(self) -> dict[str, Tensor]:
+        """Return nothing: relocation needs no statistics."""
+        return {}
+
+    def absorb(self, statistics: Mapping[str, Tensor]) -> None:
+        """Do nothing."""
 
     def _relocate(self, gaussians: Gaussians, optimizer: Adam, dead: Int64[Tensor, " D"]) -> int:
         """Move dead Gaussians onto living ones, in place. Do nothing if all are dead."""
@@ -130,7 +148,7 @@ class MCMC:
         gaussians.log_scales[hosts] += factor.log()[:, None].to(gaussians.log_scales)
         optimizer.forget_rows(hosts)
 
-    def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
+    def _add_noise(self, gaussians: Gaussians, numbers: NoiseNumbers) -> None:
         """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I).
 
         The rate of a batch is larger by the root of its size, and so the sum of the noise of its images is kept.
@@ -138,8 +156,6 @@ class MCMC:
         """
         far = None if self.shell is None else self.shell.holds(gaussians.means)
         places = None if far is None else gaussians.means[far]
-        seed = int(torch.randint(2**62, (1,), generator=self.generator))  # checkpoints store the generator
-        numbers = NoiseNumbers(seed, rate * self.config.mcmc.noise, NOISE_SHARPNESS, NOISE_THRESHOLD)
         self._noise(gaussians, numbers)
         if far is not None and places is not None:
             gaussians.means[far] = places
