@@ -14,7 +14,9 @@ from browsers import chromium
 from engine.frames import packed, view_of
 from float32_backends import SMALLER
 from gsplat_edu.engine import frame
+from gsplat_edu.engine.frame import PAIRS, VISIBLE
 from gsplat_edu.engine.passes import manifest, sort_bits
+from gsplat_edu.engine.step import GROUPS, HALT, L1, LIVE, Photo, StepNumbers, step_program
 
 SCRIPT = (Path(__file__).parent / "host.js").read_text()
 FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
@@ -39,32 +41,29 @@ def text_of(array):
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-def played(page, scene, view, grads, room):
-    n, H, W = len(scene.core), view.camera.H, view.camera.W
-    counts = {
-        "gaussians": n,
-        "rest": scene.rest.size,
-        "pixels": H * W,
-        "edges": view.tiles + 2,
-        "live": frame.LIVE,
-    }
-    writes = {"core": text_of(scene.core), "rest": text_of(scene.rest), "grads": text_of(grads)}
+def played(page, program, counts, writes, block, parts, reads):
+    """Play parts of a program in the browser, and return buffers as uint32."""
+    given = {name: text_of(array) for name, array in writes.items()}
+    block = text_of(np.frombuffer(block, dtype=np.uint8))
     result = page.evaluate(
-        "given => play(...given)",
-        [
-            manifest(frame.program(sort_bits(view.tiles.bit_length()), False)),
-            counts | {"pairs": room},
-            writes,
-            text_of(np.frombuffer(view.packed(scene.rest.shape[1]), dtype=np.uint8)),
-            list(PARTS),
-            list(READS),
-        ],
+        "given => play(...given)", [manifest(program), counts, given, block, list(parts), list(reads)]
     )
     if not result["adapter"]:
         pytest.skip("this Chromium has no WebGPU adapter")
     assert result["notes"] == []
     return {
         name: np.frombuffer(base64.b64decode(text), dtype=np.uint32) for name, text in result["found"].items()
+    }
+
+
+def counts_of(scene, view, room, live):
+    return {
+        "gaussians": len(scene.core),
+        "rest": scene.rest.size,
+        "pixels": view.camera.H * view.camera.W,
+        "edges": view.tiles + 2,
+        "live": live,
+        "pairs": room,
     }
 
 
@@ -75,7 +74,10 @@ def test_image_and_gradients_in_a_browser(page, pool, name):
     ours = frame.draw_frame(pool, scene, view)
     grads = np.random.default_rng(1).normal(size=(*ours.transmittance.shape, frame.GRADS)).astype(np.float32)
     expected = frame.differentiate_frame(ours, scene, grads, None)
-    found = played(page, scene, view, grads, ours.memory.counts["pairs"])
+    counts = counts_of(scene, view, ours.memory.counts["pairs"], frame.LIVE)
+    program = frame.program(sort_bits(view.tiles.bit_length()), False)
+    writes = {"core": scene.core, "rest": scene.rest, "grads": grads}
+    found = played(page, program, counts, writes, view.packed(scene.rest.shape[1]), PARTS, READS)
     assert found["live"][: frame.SPARE].tolist() == [len(ours.visible), ours.num_pairs]
     image = found["image"].view(np.float32).reshape(*ours.transmittance.shape, frame.PIXEL)
     assert np.abs(image[..., :3] - ours.image).max() < 1.1 / 255
@@ -93,3 +95,32 @@ def test_image_and_gradients_in_a_browser(page, pool, name):
     for part in (slice(0, 9), slice(9, 12), slice(12, 16)):
         bound = 6e-4 * len(scene.core) * np.abs(expected.camera[part]).max()
         assert np.abs(camera[part] - expected.camera[part]).max() <= bound
+
+
+def test_a_step_of_training_in_a_browser(page, device):
+    """The gradients of the photo's loss arrive in Adam's first moments; loss, visible Gaussians and pairs in `live`."""
+    scene, view = packed(SMALLER["random"]), view_of(SMALLER["random"])
+    H, W = view.camera.H, view.camera.W
+    photo = Photo.packed((255 * np.random.default_rng(2).random((H, W, 3))).astype(np.uint8), None)
+    rates = dict.fromkeys(GROUPS, (1e-3, 0.9, 0.999, 1e-15, 0.1, 0.001))
+    numbers = StepNumbers(rates, opacity_weight=0.01, scale_weight=0.01, collects=True)
+    block = view.packed(scene.rest.shape[1]) + numbers.packed(H * W, len(scene.core), photo.floats)
+    program = step_program(sort_bits(view.tiles.bit_length()))
+    counts = counts_of(scene, view, 1 << 16, LIVE)
+    writes = {"core": scene.core, "rest": scene.rest, "photo": photo.words}
+    reads = ("live", "core_first", "rest_first", "statistics")
+    found = played(page, program, counts, writes, block, ("step",), reads)
+    memory = device.allocate(program, counts)
+    for name, array in writes.items():
+        memory.write(name, array)
+    expected = memory.play("step", block, read=reads)
+    assert found["live"][[VISIBLE, PAIRS, HALT]].tolist() == expected["live"][[VISIBLE, PAIRS, HALT]].tolist()
+    assert found["live"].view(np.float32)[L1:] == pytest.approx(
+        expected["live"].view(np.float32)[L1:], rel=1e-4
+    )
+    core, truth = (each["core_first"].view(np.float32).reshape(-1, frame.CORE) for each in (found, expected))
+    for part in np.split(np.arange(frame.CORE), [3, 7, 10, 13]):
+        assert np.abs(core[:, part] - truth[:, part]).max() <= 6e-4 * np.abs(truth[:, part]).max() > 0
+    for name in ("rest_first", "statistics"):
+        one, other = (each[name].view(np.float32) for each in (found, expected))
+        assert np.abs(one - other).max() <= 6e-4 * np.abs(other).max() > 0

@@ -3,6 +3,9 @@
 import pytest
 
 from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.engine import host
+from gsplat_edu.engine.frame import Pool
+from gsplat_edu.engine.passes import LIMITS, MODULES
 from gsplat_edu.render import self_check, webgpu
 from gsplat_edu.render.backends import resolve_backend
 
@@ -43,3 +46,37 @@ def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkey
     assert "its kernels failed their check on" in str(raised.value)
     assert "the gradient of quats is wrong by 0.0" in str(raised.value)
     assert not empty_cache.exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "right", "wrong", "message"),
+    [
+        ("loss", "2.0 * pair.x * blurred", "1.9 * pair.x * blurred", "a training's gradient of "),
+        ("loss", "sums.x += abs(", "sums.x += 1.01 * abs(", "the loss of a test scene is wrong by 0.0"),
+        ("adam", "by.new2 * g * g", "by.new2 * g", "a step of Adam for means is wrong"),
+        (
+            "adam",
+            "1.0);\n    }\n    let far",
+            "2.0);\n    }\n    let far",
+            "counts other Gaussians as visible",
+        ),
+        ("noise", "0x9E3779B9u", "0x9E3779B8u", "a training's noise is wrong by "),
+    ],
+    ids=["gradient", "value", "adam", "statistics", "noise"],
+)
+def test_a_wrong_step_is_refused(monkeypatch, file, right, wrong, message):
+    """As if a driver had compiled a pass of a step wrongly."""
+    source = host.module_source
+
+    def changed(module):
+        text = source(module)
+        if file in MODULES[module]:
+            assert right in text
+            text = text.replace(right, wrong)
+        return text
+
+    monkeypatch.setattr(host, "module_source", changed)
+    pool = Pool(host.Device(limits=LIMITS))
+    monkeypatch.setattr(webgpu, "_pool", lambda: pool)
+    failure = self_check.shader_error()
+    assert failure is not None and message in failure

@@ -158,6 +158,18 @@ def test_photos_beyond_the_room_are_sent_again_with_the_same_result(capture):
     assert_same(plain, streamed)
 
 
+def test_photos_on_disk_are_read_once_at_each_size(capture):
+    views, points, colors = capture
+    reads = []
+
+    def stored(view):
+        return View.stored(view.camera, lambda: reads.append(view.name) or view.read(), view.name)
+
+    run = trainer(([stored(view) for view in views], points, colors), iterations=40, fast_start_factor=1.0)
+    run.run()
+    assert sorted(reads) == sorted(view.name for view in views)
+
+
 def bytes_of_steps(device, side, splats):
     """Return the bytes sent and received in five steps between which nothing is due, with photos on the device."""
     capture = procedural_capture(side, 2, splats=splats)

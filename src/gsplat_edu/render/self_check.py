@@ -26,6 +26,7 @@ from gsplat_edu.engine.passes import FOLDER
 from gsplat_edu.ops import kernels
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.render.step_check import step_error
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -121,10 +122,14 @@ def kernel_error(device: torch.device) -> str | None:
 
 
 def shader_error() -> str | None:
-    """Do the same on the adapter of the backend webgpu."""
+    """Do the same on the adapter of the backend webgpu, and compare a step of a training that stays there."""
     from gsplat_edu.render.webgpu import render_webgpu
+    from gsplat_edu.render.webgpu_resident import WebgpuRun
 
-    return _error(render_webgpu, torch.device("cpu"))
+    scene = check_scene(torch.float32)
+    return _error(render_webgpu, torch.device("cpu")) or step_error(
+        WebgpuRun(scene.sh_rest.shape[1]), scene, CHECK_CAMERA, SETTINGS, _exact, GRADIENT_BOUND
+    )
 
 
 def _error(render: Render, device: torch.device) -> str | None:

@@ -79,8 +79,8 @@ class ViewFeed:
     """An endless sequence of views and targets, determined by the seed.
 
     A photo on disk is read while the previous step runs. A photo in memory that is not opaque is composited over a
-    fixed background only once. A GPU caches as many targets as fit, and their photos are not read again; targets over
-    random backgrounds are made for every step.
+    fixed background only once. As many targets as fit into `room` are cached, and their photos are not read again;
+    targets over random backgrounds are made for every step.
 
     Args:
         views: Views to draw from, at least one.
@@ -88,7 +88,7 @@ class ViewFeed:
         seed: Seed of the order.
         background: Colour behind photos that are not opaque; None for a random colour per draw.
         device: Device of the Gaussians.
-        room: Bytes of targets to cache on a GPU; `DEVICE_SHARE` of the free memory if None.
+        room: Bytes of targets to cache; if None, `DEVICE_SHARE` of a GPU's free memory, and 0 on the CPU.
         outside: Whether targets contain the pixels that the capture's masks exclude.
     """
 
@@ -189,7 +189,7 @@ class ViewFeed:
         planes = (photo.mask, draw.opaque, None if outside is None else eroded(outside))
         moved = [None if plane is None else torch.from_numpy(plane).to(self._device) for plane in planes]
         target = Target(torch.from_numpy(photo.over(background)).to(self._device), *moved)
-        if self._device.type != "cpu" and photo.alpha is None and target.nbytes <= self._room:
+        if photo.alpha is None and target.nbytes <= self._room:
             self._kept[view] = target
             self._room -= target.nbytes
         return target

@@ -115,6 +115,10 @@ def _known(name: str, term: object, backend: Backend) -> bool:
     return (name, type(term)) in ((OPACITY, MeanOpacity), (SCALE, MeanScale))
 
 
+PHOTO_ROOM = 1 << 30
+"""Bytes of targets in memory, so that a photo is read and decoded once; the device has photos of its own."""
+
+
 class _LateTerms(Mapping[str, Tensor]):
     """The terms of a step, read from the device when one is asked for."""
 
@@ -141,6 +145,8 @@ class ResidentStepper:
         run: The training on the device.
         density: The density strategy of the host.
     """
+
+    photo_room: int | None = PHOTO_ROOM
 
     def __init__(self, host: TensorStepper, run: ResidentRun, density: DensityStrategy | None) -> None:
         assert density is None or isinstance(density, FollowsDevice)
@@ -177,7 +183,7 @@ class ResidentStepper:
         self._load()
         optimizer, photo = self._host.optimizer, view.draw.photo
         optimizer.schedule(iteration)
-        constant = view.draw.view if photo is not None and photo.alpha is None else None
+        constant = view.draw.view if photo is None or photo.alpha is None else None
         target = RunTarget(view.draw.index, view.target.image, view.target.mask, constant)
         sums = self._run.step(
             view.draw.view.camera, view.settings, target, optimizer.advance(), self._rules(iteration)

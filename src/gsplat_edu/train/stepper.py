@@ -134,10 +134,14 @@ class Stepper(Protocol):
         objective: What is minimised.
         parts: The other parts of a step.
         places: The places of a batch whose views this process renders.
+        photo_room: Bytes of targets that the feed is to keep; None for the rule of `ViewFeed`.
     """
 
     @property
     def gaussians(self) -> Gaussians: ...  # noqa: D102
+
+    @property
+    def photo_room(self) -> int | None: ...  # noqa: D102
 
     @property
     def count(self) -> int: ...  # noqa: D102
@@ -202,6 +206,8 @@ class TensorStepper:
     Raises:
         ArgumentError: parts do not fit one another, the batch or the backend.
     """
+
+    photo_room: int | None = None
 
     def __init__(
         self,

@@ -114,11 +114,12 @@ class Trainer:
         self._callbacks = tuple(callbacks)
         behind, device = None if config.random_background else config.background, gaussians.means.device
         empty = config.outside_masks == "empty"
-        self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, outside=empty)
         objective = parts.objective or make_objective(config, loss=backend.loss)
         groups = gaussian_groups(config, extent)
         make: Callable[..., Stepper] = backend.stepper or make_stepper
         self.stepper = make(gaussians, backend, groups, objective, density, parts, config.batch)
+        room = self.stepper.photo_room
+        self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, room, empty)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
     @property
