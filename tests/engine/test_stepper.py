@@ -230,3 +230,14 @@ def test_a_strategy_that_does_not_follow_a_device_is_named(capture):
     assert why_not(*given, Watcher(), host.parts, 1) == "the density strategy does not follow a device"
     team = dataclasses.replace(host.parts, team=Two())
     assert why_not(*given, run.density, team, 1) == "processes share the step"
+
+
+def test_a_training_that_loses_all_gaussians_goes_on_without_them(capture):
+    """As on the other backends; the run's folder then says so."""
+    runs = [
+        trainer(capture, backend, 8, strategy="adc", min_opacity=0.99, densify_stop=8)
+        for backend in ("webgpu", "cpu")
+    ]
+    ours, native = (run.run().losses for run in runs)
+    assert [run.stepper.count for run in runs] == [0, 0]
+    assert ours == pytest.approx(native, rel=8 * 3e-4)

@@ -165,18 +165,25 @@ class Device:
             raise BackendUnavailableError(f"backend 'webgpu': {reason}")
         return Device(adapters().index(chosen_adapter()))
 
-    def allocate(self, program: Program, counts: Mapping[str, int], poison: bool = False) -> Memory:
+    def allocate(
+        self,
+        program: Program,
+        counts: Mapping[str, int],
+        poison: bool = False,
+        like: Memory | None = None,
+    ) -> Memory:
         """Allocate a program's buffers.
 
         Args:
             program: The program.
             counts: Its counts by name.
             poison: Fill the buffers with noise instead of zeros, so that tests find what is read before it is written.
+            like: Its buffers are used again where name and size agree, with their contents; do not use it any more.
 
         Raises:
             BackendUnavailableError: the device has too little memory or too small buffers; the message says which.
         """
-        return Memory(self, program, counts, poison)
+        return Memory(self, program, counts, poison, like)
 
     def keep(self, array: np.ndarray) -> Kept:
         """Put an array of four-byte numbers on the device, to be copied into a program's buffers there.
@@ -260,9 +267,17 @@ class Memory:
         program: The program.
         counts: Its counts by name.
         poison: Whether they begin with noise.
+        like: Has buffers to use again.
     """
 
-    def __init__(self, device: Device, program: Program, counts: Mapping[str, int], poison: bool) -> None:
+    def __init__(
+        self,
+        device: Device,
+        program: Program,
+        counts: Mapping[str, int],
+        poison: bool,
+        like: Memory | None = None,
+    ) -> None:
         import wgpu
 
         device.check_fits(program, counts)
@@ -273,9 +288,9 @@ class Memory:
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
         with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):
-            self._buffers = {
-                name: make(size=WORD * words, usage=storage) for name, words in self._words.items()
-            }
+            self._buffers = {} if like is None else like._shared(self._words)
+            for name in self._words.keys() - self._buffers:
+                self._buffers[name] = make(size=WORD * self._words[name], usage=storage)
             self._view = make(size=VIEW_BYTES, usage=usage.UNIFORM | usage.COPY_DST)
         if poison:
             noise = np.random.default_rng(0)
@@ -311,6 +326,12 @@ class Memory:
                 recorded.append((pipeline, uniforms, storage, SLICE * place, x, -(-groups // x)))
         return recorded
 
+    def _shared(self, words: Mapping[str, int]) -> dict[str, Any]:
+        """Return the buffers of these names that have these sizes."""
+        return {
+            name: buffer for name, buffer in self._buffers.items() if words.get(name) == self._words[name]
+        }
+
     def write(self, name: str, array: np.ndarray) -> None:
         """Write an array of four-byte numbers to the beginning of a buffer.
 
@@ -335,15 +356,6 @@ class Memory:
         with self.device.lock, one_line(f"{self.device.name.name} does not give {name}"):
             encoder = self.device.device.create_command_encoder()
             return self._read_after(encoder, (name,))[name]
-
-    def take(self, other: Memory, names: Iterable[str]) -> None:
-        """Copy buffers from another program's on the same device, as far as both reach."""
-        with self.device.lock, one_line(f"{self.device.name.name} does not copy"):
-            encoder = self.device.device.create_command_encoder()
-            for name in names:
-                size = WORD * min(self._words[name], other._words[name])
-                encoder.copy_buffer_to_buffer(other._buffers[name], 0, self._buffers[name], 0, size)
-            self.device.device.queue.submit([encoder.finish()])
 
     def submit(self, part: str, view: bytes, read: str, kept: Kept | None = None, into: str = "") -> Ticket:
         """Play a part of the program as one submission, without waiting for it.

@@ -141,10 +141,12 @@ class Resident:
             BackendUnavailableError: the device has too little memory or too small buffers; the message says which.
         """
         self.settle()
-        self.count = len(state["core"])
+        count = len(state["core"])
+        like = self._memory if count == self.count else None
         self._memory = self._last = None  # given back before the next one is asked for
-        self._pairs = rounded_pairs(int(self._most_pairs_each * self.count))
-        memory = self._allocate()
+        self.count = count
+        self._pairs = rounded_pairs(int(self._most_pairs_each * count))
+        memory = self._allocate(like)
         for name in STATE:
             memory.write(name, state[name])
         self._memory = memory
@@ -226,7 +228,7 @@ class Resident:
             _words(other)
         self._waiting.clear()
         self._pairs = rounded_pairs(int(live[PAIRS]))
-        self._reallocate()
+        self._memory = self._allocate(self._here)
         for each in again:
             self._submit(each)
             if each.noise is not None:
@@ -271,15 +273,10 @@ class Resident:
         if pixels > self._pixels or view.tiles > self._tiles:
             self.settle()
             self._pixels, self._tiles = max(pixels, self._pixels), max(view.tiles, self._tiles)
-            self._reallocate()
+            self._memory = self._allocate(self._here)
 
-    def _reallocate(self) -> None:
-        old = self._here
-        memory = self._allocate()
-        memory.take(old, STATE)
-        self._memory = memory
-
-    def _allocate(self) -> Memory:
+    def _allocate(self, like: Memory | None) -> Memory:
+        """Return buffers, those of another size new, and all others with what is in them."""
         counts = {
             "gaussians": self.count,
             "rest": self.count * self.harmonics * 3,
@@ -288,7 +285,7 @@ class Resident:
             "pairs": self._pairs,
             "live": LIVE,
         }
-        memory = self.device.allocate(step_program(sort_bits(self._tiles.bit_length())), counts)
+        memory = self.device.allocate(step_program(sort_bits(self._tiles.bit_length())), counts, like=like)
         memory.write("live", np.zeros(LIVE, dtype=np.uint32))
         return memory
 
