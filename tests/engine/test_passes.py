@@ -1,6 +1,8 @@
 """The shaders fit their description and a browser's default limits, and what fails says so in one line."""
 
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -109,3 +111,18 @@ def test_the_adapter_can_be_named(device, monkeypatch):
     assert host.why_unavailable().startswith(
         "GSPLAT_EDU_ADAPTER: is 'Voodoo 2', which no adapter's name contains; there are: "
     )
+
+
+@pytest.mark.own_process
+def test_torch_can_import_triton_after_an_adapter_was_used(device):
+    """Two libraries of LLVM, Mesa's and Triton's, are then in one process."""
+    pytest.importorskip("triton")
+    script = """
+import torch
+from gsplat_edu.engine.host import Device
+Device.default()
+torch.optim.LBFGS([torch.zeros(1, requires_grad=True)])
+print("both")
+"""
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "both\n"), done.stderr

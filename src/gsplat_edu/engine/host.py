@@ -23,6 +23,7 @@ import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.failures import first_line, one_line
+from gsplat_edu.engine.llvm import load_triton
 from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
 from gsplat_edu.engine.transfers import Kept, Ticket
 
@@ -108,6 +109,7 @@ def chosen_adapter() -> AdapterName:
 def _adapters() -> tuple[tuple[AdapterName, Any], ...]:
     import wgpu
 
+    load_triton()
     found = []
     for adapter in wgpu.gpu.enumerate_adapters_sync():
         info = adapter.info
