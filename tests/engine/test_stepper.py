@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.base.errors import BackendWarning
+from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.engine import frame
 from gsplat_edu.render.backends import load_backend
@@ -14,6 +14,7 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
+from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.resident import ResidentStepper, why_not
@@ -174,11 +175,15 @@ def bytes_of_steps(device, side, splats):
     """Return the bytes sent and received in five steps between which nothing is due, with photos on the device."""
     capture = procedural_capture(side, 2, splats=splats)
     run = trainer(capture, iterations=30, densify_every=1000, fast_start_factor=1.0)
-    counted = []
-    run.run(
-        lambda: run.iteration >= 13,
-        [lambda _, event: event.iteration in (7, 12) and counted.append((device.sent, device.received))],
-    )
+    counted, unfinished = [], set()
+
+    def count(_, event):
+        unfinished.add(len(run.stepper._run.resident._waiting))
+        if event.iteration in (7, 12):
+            counted.append((device.sent, device.received))
+
+    run.run(lambda: run.iteration >= 13, [count])
+    assert unfinished == {1}, "no step waits for itself"
     (sent, received), (sent_later, received_later) = counted
     return sent_later - sent, received_later - received
 
@@ -220,6 +225,13 @@ def test_a_strategy_that_does_not_follow_a_device_is_named(capture):
 
         def load_state(self, tensors, numbers, gaussians): ...
 
+    class Curious(PlannedDensity):
+        def observe(self, gaussians, output):
+            super().observe(gaussians, output)
+
+    class Renamed(PlannedDensity):
+        pass
+
     class Two(Alone):
         size = 2
 
@@ -228,6 +240,12 @@ def test_a_strategy_that_does_not_follow_a_device_is_named(capture):
     given = (run.gaussians, backend, host.objective)
     assert why_not(*given, run.density, host.parts, 1) is None
     assert why_not(*given, Watcher(), host.parts, 1) == "the density strategy does not follow a device"
+    config, start = run.config, run.gaussians
+    assert (
+        why_not(*given, Curious(config, start), host.parts, 1)
+        == "the density strategy does not follow a device"
+    )
+    assert why_not(*given, Renamed(config, start), host.parts, 1) is None
     team = dataclasses.replace(host.parts, team=Two())
     assert why_not(*given, run.density, team, 1) == "processes share the step"
 
@@ -241,3 +259,25 @@ def test_a_training_that_loses_all_gaussians_goes_on_without_them(capture):
     ours, native = (run.run().losses for run in runs)
     assert [run.stepper.count for run in runs] == [0, 0]
     assert ours == pytest.approx(native, rel=8 * 3e-4)
+
+
+def test_a_step_that_gets_no_room_ends_the_run_and_saves_nothing(capture, device, monkeypatch):
+    """The host has counted steps that did not happen, so no checkpoint is written from then on."""
+    monkeypatch.setattr(frame, "FEWEST_PAIRS", 8)
+    run = trainer(capture)
+    run.stepper._run.resident._most_pairs_each = 0.0
+    right = device.check_fits
+
+    def tight(program, counts):
+        if counts.get("pairs", 0) > 8:
+            right(program, counts | {"pairs": 1 << 30})
+        right(program, counts)
+
+    monkeypatch.setattr(device, "check_fits", tight)
+    message = r"^backend 'webgpu': the buffer slots needs 40960 MiB for .*; use the backend cpu$"
+    with pytest.raises(BackendUnavailableError, match=message):
+        run.run()
+    with pytest.raises(BackendUnavailableError, match=message):
+        run.state()
+    with pytest.raises(BackendUnavailableError, match=message):
+        run.run()

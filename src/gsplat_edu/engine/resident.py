@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.frame import CORE, PAIRS, PIXEL, VISIBLE, rounded_pairs
 from gsplat_edu.engine.host import Device, Memory
 from gsplat_edu.engine.passes import sort_bits
@@ -129,6 +130,7 @@ class Resident:
         self._photos: dict[int, tuple[object, _KeptPhoto]] = {}
         self._photo_room = photo_room
         self._last: View | None = None
+        self._failure: BackendUnavailableError | None = None
 
     def load(self, state: Mapping[str, np.ndarray]) -> None:
         """Begin with Gaussians, moments and statistics.
@@ -140,7 +142,9 @@ class Resident:
         Raises:
             BackendUnavailableError: the device has too little memory or too small buffers; the message says which.
         """
-        self.settle()
+        if self._failure is None:
+            self.settle()
+        self._failure = None
         count = len(state["core"])
         like = self._memory if count == self.count else None
         self._memory = self._last = None  # given back before the next one is asked for
@@ -189,11 +193,12 @@ class Resident:
             numbers: Rates and weights.
 
         Raises:
-            BackendUnavailableError: the device fails, or has no buffers that large; what the steps before this one
-                changed is kept.
+            BackendUnavailableError: the device fails, or has no buffers that large.
         """
         pixels = view.camera.H * view.camera.W
         one = _Step(view, self._photo(index, photo, constant), numbers, Result(self, 3 * pixels))
+        if self._failure is not None:
+            raise self._failure
         self._submit(one)
         while len(self._waiting) > IN_FLIGHT:
             self.collect()
@@ -210,7 +215,13 @@ class Resident:
         self._here.play("noise", noise.packed())
 
     def settle(self) -> None:
-        """Wait for all steps."""
+        """Wait for all steps.
+
+        Raises:
+            BackendUnavailableError: the device fails; or a step found no room and could not get it, now or before.
+        """
+        if self._failure is not None:
+            raise self._failure
         while self._waiting:
             self.collect()
 
@@ -228,7 +239,13 @@ class Resident:
             _words(other)
         self._waiting.clear()
         self._pairs = rounded_pairs(int(live[PAIRS]))
-        self._memory = self._allocate(self._here)
+        try:
+            self._memory = self._allocate(self._here)
+        except BackendUnavailableError as error:
+            self._failure = (
+                error  # the host has counted steps that did not happen: nothing may be saved from now on
+            )
+            raise
         for each in again:
             self._submit(each)
             if each.noise is not None:

@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import ItemsView, Iterator
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
 PHOTO = "photo"
 """Name of the term that compares image and photo; logs and progress call it the loss."""
+
+
+@runtime_checkable
+class Terms(Protocol):
+    """() every term of an objective, by name; if a training stays on a device, reading one waits for the step.
+
+    It is a protocol and not a mapping, so that nothing that checks types reads a term.
+    """
+
+    def __getitem__(self, name: str, /) -> Tensor: ...
+
+    def __iter__(self) -> Iterator[str]: ...
+
+    def __len__(self) -> int: ...
+
+    def items(self) -> ItemsView[str, Tensor]: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -25,7 +42,7 @@ class StepEvent:
 
     iteration: int
     num_gaussians: int
-    terms: Mapping[str, Tensor]
+    terms: Terms
     photo_factor: float = 1.0
 
     @property
@@ -104,9 +121,9 @@ class Losses:
     def __init__(self, like: Tensor) -> None:
         self._read: list[float] = []
         self._waiting, self._count = like.new_empty(self.ROOM), 0
-        self._last: Mapping[str, Tensor] | None = None
+        self._last: Terms | None = None
 
-    def add(self, terms: Mapping[str, Tensor]) -> None:
+    def add(self, terms: Terms) -> None:
         """Keep the loss among the terms of a step."""
         self._keep_last()
         self._last = terms

@@ -95,9 +95,7 @@ def why_not(
         "reduce or adam is another function": parts.reduce is not mean_over_views or parts.adam is not None,
         "gradients are to be stored (fused=False)": not parts.fused,
         f"the Gaussians are {gaussians.means.dtype}": gaussians.means.dtype != torch.float32,
-        "the density strategy does not follow a device": not (
-            density is None or isinstance(density, FollowsDevice)
-        ),
+        "the density strategy does not follow a device": not _follows(density),
         "the objective is another class": type(objective) is not Objective,
     }
     for reason, holds in reasons.items():
@@ -107,6 +105,18 @@ def why_not(
         if not _known(name, term, backend):
             return f"the objective has the term {name!r}"
     return None
+
+
+def _follows(density: DensityStrategy | None) -> bool:
+    """Return whether a device can collect and wait for a strategy; a subclass with other methods may need more."""
+    if density is None:
+        return True
+    owners = {
+        next(each for each in type(density).__mro__ if name in vars(each))
+        for name in ("observe", "update", "is_due")
+        if hasattr(density, name)
+    }
+    return isinstance(density, FollowsDevice) and len(owners) == 1
 
 
 def _known(name: str, term: object, backend: Backend) -> bool:

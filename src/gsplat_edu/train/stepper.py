@@ -27,7 +27,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.batches import Batch
 from gsplat_edu.train.density.base import DensityStrategy
-from gsplat_edu.train.events import Change
+from gsplat_edu.train.events import Change, Terms as Terms
 from gsplat_edu.train.feed import Draw, Target
 from gsplat_edu.train.objective import Objective, Rendered
 from gsplat_edu.train.optimizer import MOMENTS, Adam, ParameterGroup
@@ -39,9 +39,6 @@ from gsplat_edu.train.view_model import Identity, Rows, ViewModel, ViewRender
 Reduce = Callable[[Mapping[str, Tensor], int], None]
 """Called with all parameters and the number of views: turns the sum over the views in each `grad` into the gradient to
 apply. Processes that share a step call it with the rows that each of them moves."""
-
-Terms = Mapping[str, Tensor]
-"""() every term of the objective, by name; reading one may wait for the step."""
 
 
 @one_thread()
