@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 
@@ -49,8 +48,6 @@ class Backend:
         add_noise: Moves means at random along their covariances, in place.
         recolored: Applies a matrix of colours to an image, differentiably.
         lacks: Names of `FEATURES` that it does not offer.
-        stepper: Makes a `gsplat_edu.train.stepper.Stepper` that keeps a whole run on the device, from the arguments of
-            `TensorStepper`; None to step on torch's tensors with the kernels above.
         resident: Makes a training on the device for Gaussians of so many harmonics besides the first. `training`
             uses it if the device can do all of its parts, and warns if it cannot. None if there is none.
     """
@@ -63,7 +60,6 @@ class Backend:
     add_noise: NoiseKernel
     recolored: RecolorKernel
     lacks: frozenset[str] = field(default_factory=frozenset)
-    stepper: Callable[..., Any] | None = None
     resident: Callable[[int], ResidentRun] | None = None
 
     def require(self, feature: str, what: str) -> None:

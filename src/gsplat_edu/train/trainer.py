@@ -30,7 +30,7 @@ from gsplat_edu.train.optimizer import MOMENTS
 from gsplat_edu.train.resident import make_stepper
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
-from gsplat_edu.train.stepper import StepParts as StepParts, Stepper, StepView
+from gsplat_edu.train.stepper import StepParts as StepParts, StepView
 from gsplat_edu.train.tempo import Tempo
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import ViewModel
@@ -116,8 +116,7 @@ class Trainer:
         empty = config.outside_masks == "empty"
         objective = parts.objective or make_objective(config, loss=backend.loss)
         groups = gaussian_groups(config, extent)
-        make: Callable[..., Stepper] = backend.stepper or make_stepper
-        self.stepper = make(gaussians, backend, groups, objective, density, parts, config.batch)
+        self.stepper = make_stepper(gaussians, backend, groups, objective, density, parts, config.batch)
         room = self.stepper.photo_room
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, room, empty)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
