@@ -2,8 +2,8 @@
 
 `Trainer` draws views and decides what happens between steps; a stepper holds everything that a step changes. If a
 backend keeps Gaussians, moments and photos on its device for a whole run, the stepper of `train/resident.py` takes the
-steps there: `step` then moves nothing that grows with Gaussians or pixels, `change` and `state` read the scene back, and
-`gaussians` does so when it is asked for.
+steps there: `step` then moves nothing that grows with Gaussians or pixels, `change` and `state` read the scene back,
+and `gaussians` does so when it is asked for.
 
 Chapter: 09_train_in_3d.
 """
