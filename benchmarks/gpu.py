@@ -26,9 +26,10 @@ import torch
 
 from gsplat_edu import Camera
 from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.engine.adapters import chosen_adapter
 from gsplat_edu.engine.check import measure_frame
 from gsplat_edu.engine.frame import Pool, Scene as EngineScene
-from gsplat_edu.engine.host import Device, chosen_adapter
+from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.view import View
 from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render

@@ -7,14 +7,14 @@ import pytest
 
 os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # Mesa complains without it
 
-from gsplat_edu.engine import host
+from gsplat_edu.engine import adapters, host
 from gsplat_edu.engine.frame import Pool
 from gsplat_edu.engine.passes import LIMITS
 
 
 @pytest.fixture(scope="session")
 def device() -> host.Device:
-    if reason := host.why_unavailable():
+    if reason := adapters.why_unavailable():
         pytest.skip(reason)
     return host.Device(limits=LIMITS)
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gsplat_edu.engine import check, host
+from gsplat_edu.engine import adapters, check
 
 SMALL = ("--gaussians", "300", "--size", "40x30", "--rounds", "1")
 
@@ -57,7 +57,7 @@ def test_bad_input_is_one_line(monkeypatch, capsys):
     assert raised.value.code == 2
     assert "--size: is 'large', but has to be WIDTHxHEIGHT" in capsys.readouterr().err
     monkeypatch.undo()
-    monkeypatch.setattr(host, "_adapters", lambda: ())
+    monkeypatch.setattr(adapters, "listed_adapters", lambda: ())
     check.Device.default.cache_clear()
     assert check.main(SMALL) == 2
     assert capsys.readouterr().err.startswith("backend 'webgpu': wgpu finds no adapter")

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from gsplat_edu.base.errors import BackendUnavailableError
-from gsplat_edu.engine import host
+from gsplat_edu.engine import adapters
 from gsplat_edu.engine.frame import program
 from gsplat_edu.engine.passes import FOLDER, LIMITS, MODULES, Buffer, Pass, Program, Size, module_source
 from gsplat_edu.engine.step import step_program
@@ -91,24 +91,24 @@ def test_a_shader_that_does_not_compile_is_one_line(device, monkeypatch):
 
 
 def test_without_wgpu_or_an_adapter_the_reason_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(host.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(adapters.importlib.util, "find_spec", lambda name: None)
     assert (
-        host.why_unavailable()
+        adapters.why_unavailable()
         == 'wgpu is not installed; pip install "gsplat-edu[gpu]", or use the backend cpu'
     )
     monkeypatch.undo()
     pytest.importorskip("wgpu")
-    monkeypatch.setattr(host, "_adapters", lambda: ())
-    assert host.why_unavailable().startswith(
+    monkeypatch.setattr(adapters, "listed_adapters", lambda: ())
+    assert adapters.why_unavailable().startswith(
         "wgpu finds no adapter for Vulkan, Metal or DirectX 12; install the driver"
     )
 
 
 def test_the_adapter_can_be_named(device, monkeypatch):
     monkeypatch.setenv("GSPLAT_EDU_ADAPTER", device.name.name[:4].upper())
-    assert host.why_unavailable() is None
+    assert adapters.why_unavailable() is None
     monkeypatch.setenv("GSPLAT_EDU_ADAPTER", "Voodoo 2")
-    assert host.why_unavailable().startswith(
+    assert adapters.why_unavailable().startswith(
         "GSPLAT_EDU_ADAPTER: is 'Voodoo 2', which no adapter's name contains; there are: "
     )
 

@@ -20,7 +20,7 @@ from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.engine import host
+from gsplat_edu.engine import adapters
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import gpu_of, load_backend, resolve_backend
@@ -323,7 +323,7 @@ def test_doctor_and_demo_name_the_gpu(tmp_path, capsys):
 
 
 def test_without_an_adapter_the_command_is_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(host, "_adapters", lambda: ())
+    monkeypatch.setattr(adapters, "listed_adapters", lambda: ())
     save_ply(tmp_path / "a.ply", random(5, (8, 8)).gaussians(torch.float32))
     command = [
         "render",

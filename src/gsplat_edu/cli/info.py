@@ -19,7 +19,7 @@ from gsplat_edu.base.text import short_number
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.data.scale import Scale
-from gsplat_edu.engine import host
+from gsplat_edu.engine import adapters
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_scene, stored_bytes
 from gsplat_edu.io.lod.codec import read_index
@@ -82,8 +82,8 @@ def _computer_facts() -> list[Fact]:
         facts.append(
             (backend, f"not available: {reason}" if reason else gpu_of(backend) or "on the processor")
         )
-    if host.why_unavailable() is None:
-        facts += [("adapter", f"{one.name}, {one.interface}, {one.driver}") for one in host.adapters()]
+    if adapters.why_unavailable() is None:
+        facts += [("adapter", f"{one.name}, {one.interface}, {one.driver}") for one in adapters.adapters()]
     return facts
 
 

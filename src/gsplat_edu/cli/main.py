@@ -95,14 +95,19 @@ def _run(name: str, arguments: argparse.Namespace) -> None:
         module = options.runner(arguments) if hasattr(options, "runner") else name
         importlib.import_module(f"gsplat_edu.cli.{module}").run(arguments)
     except ArgumentError as error:
-        if (told := _as_option(str(error))) == str(error):
+        if (told := _as_option(str(error), "settings" in arguments)) == str(error):
             raise
         raise ArgumentError(told) from error
 
 
-def _as_option(message: str) -> str:
-    """Name the option of a setting that an error of the library names: "batch: is" becomes "--batch: is"."""
+def _as_option(message: str, has_set: bool) -> str:
+    """Name the option of a setting that an error of the library names: "batch: is" becomes "--batch: is".
+
+    Args:
+        message: The error.
+        has_set: Whether the command gives settings by --set.
+    """
     name, colon, rest = message.partition(": ")
-    if colon and name in {setting.name for setting in SETTINGS}:
-        return f"{option_of(name)}: {rest}"
-    return message
+    if not colon or name not in {setting.name for setting in SETTINGS}:
+        return message
+    return f"{option_of(name) if has_set else '--' + name.replace('_', '-')}: {rest}"

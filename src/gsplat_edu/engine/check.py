@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.engine.adapters import adapters
 from gsplat_edu.engine.frame import GRADS, Frame, FrameGradients, Pool, Scene, differentiate_frame, draw_frame
-from gsplat_edu.engine.host import Device, adapters
+from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.passes import Buffer, Program, Size, scan, scan_scratch, sort, sort_scratch
 from gsplat_edu.engine.view import View
 from gsplat_edu.scene.camera import Camera

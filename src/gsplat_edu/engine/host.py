@@ -11,24 +11,18 @@ A part of a program is one submission. Nothing is read back but what `read` name
 from __future__ import annotations
 
 import functools
-import importlib.util
-import os
 import struct
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
-from gsplat_edu.engine.failures import first_line, one_line
-from gsplat_edu.engine.llvm import load_triton
+from gsplat_edu.engine.adapters import adapters, chosen_adapter, listed_adapters, why_unavailable
+from gsplat_edu.engine.failures import one_line
 from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
 from gsplat_edu.engine.transfers import Kept, Ticket
-
-INSTALL = 'pip install "gsplat-edu[gpu]"'
-"""Installs wgpu."""
 
 SLICE = 256
 """Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
@@ -39,86 +33,11 @@ LEAST = 4
 VIEW_BYTES = 512
 """Bytes of the uniform block that all passes of a part share: camera and settings."""
 
-ADAPTER_VARIABLE = "GSPLAT_EDU_ADAPTER"
-"""Environment variable with a part of the name of the adapter to use."""
-
 TIMESTAMPS = "timestamp-query"
 """The optional feature of measuring passes."""
 
 Call = tuple[Any, Any, Any, int, int, int]
 """Pipeline, uniforms, storage, offset of the job, workgroups in two dimensions."""
-
-KINDS = ("DiscreteGPU", "IntegratedGPU", "VirtualGPU", "Unknown", "CPU")
-"""Kinds of adapters, best first."""
-
-
-@dataclass(frozen=True)
-class AdapterName:
-    """An adapter as it is listed.
-
-    Args:
-        name: Its device's name.
-        kind: One of `KINDS`.
-        interface: "Vulkan", "Metal" or "D3D12".
-        driver: The driver's description of itself.
-    """
-
-    name: str
-    kind: str
-    interface: str
-    driver: str
-
-    @property
-    def software(self) -> bool:
-        """Whether it computes on the CPU."""
-        return self.kind == "CPU"
-
-
-def why_unavailable() -> str | None:
-    """Return why no adapter can be used here; None if one can."""
-    if importlib.util.find_spec("wgpu") is None:
-        return f"wgpu is not installed; {INSTALL}, or use the backend cpu"
-    try:
-        found = adapters()
-    except Exception as error:  # a driver's library that does not load raises anything
-        return f"wgpu does not start here ({first_line(error)}); use the backend cpu"
-    wanted = os.environ.get(ADAPTER_VARIABLE, "")
-    if not found:
-        return (
-            "wgpu finds no adapter for Vulkan, Metal or DirectX 12; install the driver of the GPU, or on Debian and "
-            "Ubuntu mesa-vulkan-drivers, which computes on the CPU, or use the backend cpu"
-        )
-    if not any(wanted.lower() in name.name.lower() for name in found):
-        names = ", ".join(name.name for name in found)
-        return f"{ADAPTER_VARIABLE}: is {wanted!r}, which no adapter's name contains; there are: {names}"
-    return None
-
-
-def adapters() -> tuple[AdapterName, ...]:
-    """List the adapters, best first; OpenGL's, which repeat them, are left out."""
-    return tuple(name for name, _ in _adapters())
-
-
-def chosen_adapter() -> AdapterName:
-    """Return the best adapter, or the first whose name contains `GSPLAT_EDU_ADAPTER`; call `why_unavailable` before."""
-    wanted = os.environ.get(ADAPTER_VARIABLE, "").lower()
-    return next(name for name in adapters() if wanted in name.name.lower())
-
-
-@functools.cache
-def _adapters() -> tuple[tuple[AdapterName, Any], ...]:
-    import wgpu
-
-    load_triton()
-    found = []
-    for adapter in wgpu.gpu.enumerate_adapters_sync():
-        info = adapter.info
-        name = AdapterName(info["device"], info["adapter_type"], info["backend_type"], info["description"])
-        if name.interface != "OpenGL":
-            found.append((name, adapter))
-    return tuple(
-        sorted(found, key=lambda pair: KINDS.index(pair[0].kind) if pair[0].kind in KINDS else len(KINDS))
-    )
 
 
 class Device:
@@ -140,7 +59,7 @@ class Device:
     def __init__(
         self, adapter: int = 0, limits: Mapping[str, int] | None = None, most_groups: int | None = None
     ) -> None:
-        self.name, chosen = _adapters()[adapter]
+        self.name, chosen = listed_adapters()[adapter]
         wanted = {key: chosen.limits[key] for key in LIMITS} if limits is None else dict(limits)
         self.measures = TIMESTAMPS in chosen.features
         with one_line(f"the adapter {self.name.name} does not start"):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
-from gsplat_edu.engine import host
+from gsplat_edu.engine import adapters
 from gsplat_edu.ops import kernels
 from gsplat_edu.ops.adam import adam_in_torch, adam_natively
 from gsplat_edu.ops.losses import l1_ssim, l1_ssim_in_torch
@@ -77,7 +77,7 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
     if name == "cpu":
         return kernels.REASON
     if name == "webgpu":
-        return host.why_unavailable() or _webgpu_failure()
+        return adapters.why_unavailable() or _webgpu_failure()
     if name == "cuda":
         if importlib.util.find_spec("triton") is None:
             return "triton is not installed; pip install triton, or use the backend cpu"
@@ -92,9 +92,7 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
 
 def _webgpu_failure() -> str | None:
     if failure := webgpu_failure():
-        return (
-            f"its kernels failed their check on {host.chosen_adapter().name}: {failure}; use the backend cpu"
-        )
+        return f"its kernels failed their check on {adapters.chosen_adapter().name}: {failure}; use the backend cpu"
     return None
 
 
@@ -106,7 +104,7 @@ def interpreted() -> bool:
 def gpu_of(backend: str) -> str | None:
     """Return the name of the GPU on which an available backend runs, and its interface; None on the processor."""
     if backend == "webgpu":
-        adapter = host.chosen_adapter()
+        adapter = adapters.chosen_adapter()
         return f"{adapter.name}, {adapter.interface}{', which computes on the processor' * adapter.software}"
     if backend == "cuda":
         return "Triton's interpreter" if interpreted() else f"{torch.cuda.get_device_name()}, CUDA"

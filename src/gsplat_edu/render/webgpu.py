@@ -19,8 +19,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.engine.adapters import AdapterName
 from gsplat_edu.engine.frame import GRADS, Pool, Scene, differentiate_frame, draw_frame
-from gsplat_edu.engine.host import AdapterName, Device
+from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.view import View
 from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
