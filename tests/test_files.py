@@ -1,7 +1,6 @@
 import errno
 import os
 import stat
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -57,9 +56,9 @@ def test_an_error_names_the_requested_file_and_the_reason(tmp_path, monkeypatch)
     def refuse(*words, **options):
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".scene.ab12cd34.ply"))
 
-    for name in ("mkstemp", None):
+    for name in ("open", None):
         if name is not None:
-            monkeypatch.setattr(tempfile, name, refuse)
+            monkeypatch.setattr(os, name, refuse)
         else:
             monkeypatch.undo()
         with pytest.raises(OSError) as caught, written_aside(tmp_path / "scene.ply") as aside:

@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import re
+import secrets
 import socket
 import tempfile
 import time
@@ -30,17 +31,17 @@ def written_aside(path: Path) -> Iterator[Path]:
         OSError: the folder cannot be created or written to. An existing file at `path` stays unchanged.
     """
     prefix = f".{path.stem}.{_this_machine()}-{os.getpid()}-"  # remove_leftovers asks whether this process still runs
+    aside = path.parent / f"{prefix}{secrets.token_hex(4)}{path.suffix}"
     with named_failure(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    aside = Path(name)
-    try:
+    try:  # the name is known before the file exists, so that an interruption never leaves it
+        with named_failure(path):
+            os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
         with named_failure(path, aside):
             yield aside
             umask = os.umask(0)
             os.umask(umask)
-            aside.chmod(0o666 & ~umask)  # mkstemp creates files that only their owner can read
+            aside.chmod(0o666 & ~umask)  # until now only the owner could read it
             aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
