@@ -53,6 +53,11 @@ def spelled_seconds(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
+def option_flag(name: str) -> str:
+    """Return the option of a name: "max_gaussians" becomes "--max-gaussians"."""
+    return f"--{name.replace('_', '-')}"
+
+
 def legible(text: str) -> str:
     """Replace lone surrogates, so that every UTF-8 encoder accepts the text.
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.text import option_flag
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.cli.ranks import num_processes
@@ -110,4 +111,4 @@ def _as_option(message: str, has_set: bool) -> str:
     name, colon, rest = message.partition(": ")
     if not colon or name not in {setting.name for setting in SETTINGS}:
         return message
-    return f"{option_of(name) if has_set else '--' + name.replace('_', '-')}: {rest}"
+    return f"{option_of(name) if has_set else option_flag(name)}: {rest}"

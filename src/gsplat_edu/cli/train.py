@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.locks import locked
+from gsplat_edu.base.text import option_flag
 from gsplat_edu.budget.deadline import Deadline, stopwatch
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Plan, plan
@@ -315,7 +316,7 @@ def with_choices(
 
     def take(options: RunOptions, name: str, remedy: Remedy) -> RunOptions:
         if remedy.reason:
-            say(f"--{name.replace('_', '-')} {remedy.value}: {remedy.reason}")
+            say(f"{option_flag(name)} {remedy.value}: {remedy.reason}")
         return replace(options, config=options.config.changed(**{name: remedy.value}))
 
     if by_photos := [name for name in names if name in CHOICES]:

@@ -18,8 +18,6 @@ from gsplat_edu.render.resident import RunRules, RunState, RunSums, RunTarget
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 
-MOMENTS = ("first", "second")
-
 
 class WebgpuRun:
     """A training on the adapter; see `gsplat_edu.render.resident.ResidentRun`.

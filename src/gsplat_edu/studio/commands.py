@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.constants import AUTO
-from gsplat_edu.base.text import legible, shortened
+from gsplat_edu.base.text import legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
@@ -46,7 +46,7 @@ def _choice(*values: str) -> Option:
     def words(name: str, value: Any) -> Words:  # noqa: ANN401
         if value not in values:
             raise RefusedError(f"{name}: is {str(value)[:40]!r}, but has to be one of {', '.join(values)}")
-        return [_flag(name), str(value)]
+        return [option_flag(name), str(value)]
 
     return words
 
@@ -57,7 +57,7 @@ def _whole(least: int, most: int) -> Option:
             raise RefusedError(
                 f"{name}: is {str(value)[:40]}, but has to be a whole number from {least} to {most}"
             )
-        return [_flag(name), str(value)]
+        return [option_flag(name), str(value)]
 
     return words
 
@@ -68,14 +68,14 @@ def _number(least: float, most: float) -> Option:
             raise RefusedError(
                 f"{name}: is {str(value)[:40]}, but has to be a number from {least:g} to {most:g}"
             )
-        return [_flag(name), f"{value:g}" if value == float(f"{value:g}") else repr(value)]
+        return [option_flag(name), f"{value:g}" if value == float(f"{value:g}") else repr(value)]
 
     return words
 
 
 def _word_or(word: str, number: Option) -> Option:
     def words(name: str, value: Any) -> Words:  # noqa: ANN401
-        return [_flag(name), word] if value == word else number(name, value)
+        return [option_flag(name), word] if value == word else number(name, value)
 
     return words
 
@@ -83,7 +83,7 @@ def _word_or(word: str, number: Option) -> Option:
 def _switch(name: str, value: Any) -> Words:  # noqa: ANN401
     if not isinstance(value, bool):
         raise RefusedError(f"{name}: is {str(value)[:40]}, but has to be true or false")
-    return [_flag(name)] if value else []
+    return [option_flag(name)] if value else []
 
 
 def _text(name: str, value: Any) -> Words:  # noqa: ANN401
@@ -96,7 +96,7 @@ def _text(name: str, value: Any) -> Words:  # noqa: ANN401
         or value[0] == "-"
     ):
         raise RefusedError(f"{name}: has to be a short text that does not begin with a dash")
-    return [_flag(name), value]
+    return [option_flag(name), value]
 
 
 def _set(name: str, value: Any) -> Words:  # noqa: ANN401
@@ -115,12 +115,8 @@ def _set(name: str, value: Any) -> Words:  # noqa: ANN401
             or len(str(given)) > LONGEST_TEXT
         ):
             raise RefusedError(f"{name}.{setting}: has to be a number or a short word")
-        words += [_flag(name), f"{setting}={given}"]
+        words += [option_flag(name), f"{setting}={given}"]
     return words
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 SFM_OPTIONS: Mapping[str, Option] = {

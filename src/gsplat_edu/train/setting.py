@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from gsplat_edu.base.text import option_flag
+
 Check = Callable[[str, Any], object]
 """Raises an `ArgumentError` that names the setting if a value is out of range."""
 
@@ -65,7 +67,7 @@ class Setting:
 
 def option_of(name: str) -> str:
     """Return how the command line names a setting: "--batch", or "--set sh_every" where it has no option."""
-    return f"--{name.replace('_', '-')}" if name in WITH_OPTION else f"--set {name}"
+    return option_flag(name) if name in WITH_OPTION else f"--set {name}"
 
 
 def option_with(name: str, value: object) -> str:

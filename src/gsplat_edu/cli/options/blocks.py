@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
+from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.blocks.layout import MOST_BLOCKS, PLAN
 from gsplat_edu.cli.arguments import whole_number_text
@@ -131,7 +132,7 @@ def check_blocks(arguments: argparse.Namespace) -> None:
     if arguments.blocks is None:
         for name in ("min_views", "coarse_iterations", "until", "workers", "scheduler"):
             if getattr(arguments, name, None) is not None:
-                flag = f"--{name.replace('_', '-')}"
+                flag = option_flag(name)
                 raise ArgumentError(f"{flag}: has an effect only with --blocks; add --blocks, or omit {flag}")
         return
     block_count(arguments)
@@ -145,13 +146,13 @@ def check_blocks(arguments: argparse.Namespace) -> None:
                 raise ArgumentError(f"--{name}: does not go with --until split; {advice}")
     for name, advice in UNUSED.items():
         if getattr(arguments, name) not in (None, "none"):
-            raise ArgumentError(f"--{name.replace('_', '-')}: does not go with --blocks; {advice}")
+            raise ArgumentError(f"{option_flag(name)}: does not go with --blocks; {advice}")
     for name, advice in (("view", "watch the table"), ("clean", "run `gsplat-edu clean` on the merged run")):
         if getattr(arguments, name):
             raise ArgumentError(f"--{name}: does not go with --blocks; {advice}")
     for name in ("min_views", "coarse_iterations", "workers"):
         if getattr(arguments, name, None) is not None:
-            whole_number(f"--{name.replace('_', '-')}", getattr(arguments, name), 1)
+            whole_number(option_flag(name), getattr(arguments, name), 1)
     if arguments.coarse_iterations is not None and arguments.scene is not None:
         raise ArgumentError("--coarse-iterations: --from gives the coarse model already; omit one of them")
     if getattr(arguments, "workers", None) is not None and arguments.scheduler is not None:

@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from gsplat_edu.base.text import option_flag
 from gsplat_edu.train.config import FOR_FAST, SETTABLE
 from gsplat_edu.train.setting import COURSE_ONLY, WITH_OPTION, Setting, option_of
 
@@ -122,7 +123,7 @@ def explain_unknown(flag: str, known: Sequence[str]) -> str | None:
         flag: The unknown option, for example "--sh-every".
         known: The options of the command.
     """
-    spelled = {f"--{name.replace('_', '-')}": name for name in SETTABLE}
+    spelled = {option_flag(name): name for name in SETTABLE}
     alike = difflib.get_close_matches(flag, [*known, *spelled], n=1)
     if not alike or alike[0] not in spelled:
         return None

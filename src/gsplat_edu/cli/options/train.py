@@ -8,6 +8,7 @@ from typing import Any
 
 from gsplat_edu.base.constants import AUTO as AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
@@ -316,7 +317,7 @@ def _add_recipe(group: argparse._ArgumentGroup) -> None:
     )
     for name in ("batch", "sh_degree"):
         text = f"{meanings[name]} (default: {getattr(TrainConfig, name)})"
-        _add_number(group, f"--{name.replace('_', '-')}", text)
+        _add_number(group, option_flag(name), text)
     add_settings(group)
 
 
