@@ -171,6 +171,10 @@ def test_a_plan_or_a_record_from_elsewhere_opens_no_other_file(serial, tmp_path,
         replace(plan, capture=capture).write(copy)
         assert main(["block", str(copy), "0"]) == 2
         assert "plan.json: capture: is not a path of this computer" in capsys.readouterr().err
+    blocks = (replace(plan.blocks[0], iterations=10**400), *plan.blocks[1:])
+    replace(plan, blocks=blocks).write(copy)
+    assert main(["block", str(copy), "0"]) == 2
+    assert "recipe is damaged (iterations: is a number of 401 digits, but" in capsys.readouterr().err
     replace(plan, recipe=plan.recipe | {"backend": "tcp://192.0.2.1:1"}).write(copy)
     assert main(["block", str(copy), "0"]) == 2
     assert "recipe is damaged (backend: is" in capsys.readouterr().err

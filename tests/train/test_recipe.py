@@ -70,6 +70,13 @@ def test_rescaling_can_be_disabled_and_keeps_explicit_values():
     assert recipe(7_000, densify_stop=6_000).adc.densify_stop == 6_000
 
 
+@pytest.mark.parametrize("name", ["iterations", "max_gaussians", "seed", "densify_stop", "mcmc_stop"])
+def test_no_whole_number_exceeds_64_bits(name):
+    assert TrainConfig().changed(**{name: 2**63 - 1}).flat()[name] == 2**63 - 1
+    with pytest.raises(ArgumentError, match=f"{name}: is 9223372036854775808"):
+        TrainConfig().changed(**{name: 2**63})
+
+
 def test_short_runs_do_not_reset():
     assert recipe(2_999).adc.reset_every == 0 and recipe(2_999, rescale=False).adc.reset_every == 0
     assert recipe(3_000).adc.reset_every == 300

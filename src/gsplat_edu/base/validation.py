@@ -6,6 +6,7 @@ checked here. Return values and internal arguments carry their shapes in their a
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -23,6 +24,10 @@ else:
     # NumPy's alias requires methods that tuples have only in its stub file, so it cannot be checked at run
     # time; float64_array does that.
     ArrayLike = Any
+
+LARGEST_WHOLE = 2**63 - 1
+"""Largest whole number that a setting may have, the largest int64: larger ones overflow NumPy, torch and, beyond 1,024
+bits, a float. Records from disk may hold any number of digits."""
 
 Shape = Sequence[int | str]
 """An expected shape. A number requires that size; a letter allows any size, but the same one at each occurrence; "..."
@@ -108,7 +113,7 @@ def in_range(name: str, value: float, low: float, high: float = np.inf, *, open_
     return number
 
 
-def whole_number(name: str, value: object, low: int, high: int | None = None) -> int:
+def whole_number(name: str, value: object, low: int, high: int = LARGEST_WHOLE) -> int:
     """Check that a value is a whole number between `low` and `high`.
 
     Returns:
@@ -121,8 +126,9 @@ def whole_number(name: str, value: object, low: int, high: int | None = None) ->
         number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         number = None
-    if number is None or number < low or (high is not None and number > high):
-        bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
+    if number is None or not low <= number <= high:
+        open_above = high == LARGEST_WHOLE and (number is None or number < low)
+        bounds = f"of at least {low}" if open_above else f"from {low} to {high}"
         raise ArgumentError(f"{name}: is {quoted(value)}, but has to be a whole number {bounds}")
     return number
 
@@ -168,6 +174,8 @@ def offers(name: str, value: object, protocol: type) -> None:
 
 def quoted(value: object) -> str:
     """Return a scalar or a short word as Python writes it, of other values the type: a message is one line."""
+    if isinstance(value, int) and value.bit_length() > 128:
+        return f"a number of {value.bit_length() // math.log2(10) + 1:.0f} digits"  # Python refuses to print 4,301
     text = repr(value) if isinstance(value, bool | int | float | str | bytes | None) else ""
     return text if 0 < len(text) <= 40 else f"of type {type(value).__name__}"
 

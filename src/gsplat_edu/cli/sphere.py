@@ -34,9 +34,6 @@ from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Callback, Trainer, TrainResult
 
-MAX_SEED = 2**63 - 1
-"""Largest seed of torch's generators."""
-
 
 @dataclass(frozen=True)
 class SphereOptions:
@@ -63,7 +60,7 @@ class SphereOptions:
         """Check the ranges."""
         for name, value in (*self.budget._asdict().items(), ("k0", self.k0)):
             whole_number(f"--{name}", value, 1)
-        whole_number("--seed", self.seed, 0, MAX_SEED)
+        whole_number("--seed", self.seed, 0)
         if self.k0 > self.budget.cap:
             raise ArgumentError(
                 f"--k0: is {self.k0}, more than --cap {self.budget.cap}; lower --k0 or raise --cap"

@@ -7,15 +7,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from gsplat_edu.base.errors import CheckpointError
-
-LARGEST_WHOLE = 2**63
-"""Integers must be smaller than this in absolute value."""
+from gsplat_edu.base.validation import LARGEST_WHOLE
 
 Check = Callable[[object], bool]
 
 
 def _whole(value: object) -> bool:
-    return type(value) is int and abs(value) < LARGEST_WHOLE
+    return type(value) is int and abs(value) <= LARGEST_WHOLE
 
 
 def _number(value: object) -> bool:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from gsplat_edu.base.validation import float64_array, in_range, one_of, whole_number
+from gsplat_edu.base.validation import LARGEST_WHOLE, float64_array, in_range, one_of, whole_number
 from gsplat_edu.train.setting import Check
 
 
-def accept_whole(low: int, high: int | None = None) -> Check:
+def accept_whole(low: int, high: int = LARGEST_WHOLE) -> Check:
     """Return a check for whole numbers within bounds."""
     return lambda name, value: whole_number(name, value, low, high)
 

@@ -226,7 +226,7 @@ class TrainConfig:
     )
     seed: int = _number(
         0,
-        _whole(0, 2**63 - 1),
+        _whole(0),
         "Seed of the view order, splits, relocations, noise, and of the choice of start points over the cap.",
     )
     means_rate: float = _number(
@@ -483,6 +483,7 @@ def stretched(config: TrainConfig, iterations: int) -> TrainConfig:
     Raises:
         ArgumentError: the number is out of range.
     """
+    whole_number("iterations", iterations, 1)
     values = config.flat()
     moved = {
         name: max(round(values[name] * iterations / config.iterations), 1)
