@@ -1,5 +1,6 @@
 import hashlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -14,11 +15,16 @@ import torch
 import checkpoints
 from gsplat_edu.base.errors import CheckpointError, ProcessLostError, SplatError
 from gsplat_edu.cli.main import main
+from gsplat_edu.data.capture import Cloud
+from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.data.textured_box import box_orbit, photograph_box
+from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.runs.options import DataSettings, RunOptions
 from gsplat_edu.runs.processes import check_alike, facts, pack, unpack
 from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.team import ALONE
 from ranks import together
@@ -208,6 +214,45 @@ def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tm
     ]
     assert found[0] == found[1]
     assert victim is None or "resuming after" in (tmp_path / "said").read_text()
+
+
+@pytest.mark.own_process
+def test_points_that_one_process_triangulates_start_all(tmp_path):
+    pytest.importorskip("pycolmap")
+    views = [
+        View(camera, photograph_box(camera), name=f"{i:02d}.png")
+        for i, camera in enumerate(box_orbit(16, turn=math.pi))
+    ]
+    write_transforms(tmp_path / "box", views, [])
+    words = ["train", str(tmp_path / "box"), "--batch", "2", "--iterations", "20", "--max-gaussians", "900"]
+    words += ["--eval-every", "0"]
+    assert main([*words, "--out", str(tmp_path / "alone")]) == 0
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    done = subprocess.run(
+        [*launcher, "-m", "gsplat_edu", *words, "--out", str(tmp_path / "several")],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "start points from the given poses" in done.stdout
+    for path in ("points.ply", "point_cloud/iteration_20/point_cloud.ply"):
+        assert (tmp_path / "several" / path).read_bytes() == (tmp_path / "alone" / path).read_bytes(), path
+
+
+def test_the_first_process_gives_the_start_points(capture, tmp_path):
+    cloud = load_dataset(capture)
+    chosen = tmp_path / "chosen.ply"
+    write_points_ply(chosen, Cloud(cloud.points[::2] + cloud.origin, cloud.colors[::2]))
+    train(options(capture, tmp_path / "alone", points=chosen))
+
+    def work(team):
+        train(options(capture, tmp_path / "run", points=chosen if team.rank == 0 else None), team)
+
+    together(2, work)
+    assert scene(tmp_path / "run") == scene(tmp_path / "alone")
 
 
 def rank_of(launcher, rank):

@@ -26,7 +26,7 @@ from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.length import quality_of
 from gsplat_edu.cli.options.settings import given
-from gsplat_edu.cli.options.train import AUTO, RANDOM_POINTS, left_open, options_from
+from gsplat_edu.cli.options.train import AUTO, left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars
@@ -107,7 +107,6 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
         arguments.out,
         TrainConfig().changed(**train),
         DataSettings(**data),
-        points=None if arguments.points == RANDOM_POINTS else arguments.points,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
     )
@@ -131,7 +130,7 @@ def _run(
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     options = with_poses(options_from(arguments), arguments, console, say)
     reader = CaptureReader(options.data)
-    if team.size == 1 and arguments.points is None:
+    if arguments.points is None:
         options = with_points(options, reader, seconds, console, say)
     chosen = _planned(arguments, options, reader, deadline, console, say)
     with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:

@@ -13,6 +13,7 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import timedelta
 from importlib.metadata import version
 from typing import Any
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.errors import ProcessLostError, SplatError
+from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.ops.kernels import native
 from gsplat_edu.train.team import ALONE, Alone
 
@@ -168,6 +170,14 @@ def facts() -> dict[str, str]:
         "instruction set of torch (ATEN_CPU_CAPABILITY)": torch.backends.cpu.get_cpu_capability(),
         "rounding of exponentials and products": _rounding(),
     }
+
+
+def with_points_of_first(dataset: Dataset, team: Member) -> Dataset:
+    """Return the dataset with the start points of process 0, which may have triangulated them."""
+    points, colors = torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors)
+    measured = torch.tensor([dataset.measured])
+    points, colors, measured = team.exchange([[points, colors, measured]] * team.size)[0]
+    return replace(dataset, points=points.numpy(), colors=colors.numpy(), measured=bool(measured))
 
 
 def check_alike(team: Processes, what: str, found: dict[str, str]) -> None:

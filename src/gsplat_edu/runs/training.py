@@ -29,7 +29,7 @@ from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evalua
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
-from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of
+from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of, with_points_of_first
 from gsplat_edu.runs.refined import aligned_score, with_refined_cameras, write_refined
 from gsplat_edu.runs.skies import shell_around, start_sky, with_room_for
 from gsplat_edu.runs.source import Source, open_source
@@ -184,7 +184,8 @@ class CaptureRun:
         self.seconds = 0.0
         self._began: float | None = None  # during training: when the count of seconds started
         settings = as_trained(options.data_settings, options.config.appearance)
-        self.dataset = Dataset.of(reader_for(options.data, reader), settings, points=options.points)
+        dataset = Dataset.of(reader_for(options.data, reader), settings, points=options.points)
+        self.dataset = with_points_of_first(dataset, team)
         for note in self.dataset.notes:
             say(str(note))
         check(self.dataset)
