@@ -51,14 +51,14 @@ async function play(manifest, counts, writes, view, parts, reads) {
     device.queue.writeBuffer(shared, 0, bytesOf(view));
     const entry = (binding, buffer) => ({binding, visibility: GPUShaderStage.COMPUTE, buffer});
     const uniformLayout = device.createBindGroupLayout({entries: [
-        entry(0, {type: 'uniform', hasDynamicOffset: true, minBindingSize: 16}),
+        entry(0, {type: 'uniform', hasDynamicOffset: true, minBindingSize: 32}),
         entry(1, {type: 'uniform', minBindingSize: VIEW_BYTES}),
     ]});
     for (const part of parts) {
         const passes = manifest.parts[part];
         const jobs = device.createBuffer({size: SLICE * passes.length, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST});
         const uniforms = device.createBindGroup({layout: uniformLayout, entries: [
-            {binding: 0, resource: {buffer: jobs, size: 16}},
+            {binding: 0, resource: {buffer: jobs, size: 32}},
             {binding: 1, resource: {buffer: shared}},
         ]});
         const encoder = device.createCommandEncoder(), computing = encoder.beginComputePass();

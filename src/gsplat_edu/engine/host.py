@@ -5,14 +5,17 @@
     memory.write("keys", keys)
     found = memory.play("sort", read=("keys",))
 
-A part of a program is one submission. Nothing is read back but what `read` names.
+A part of a program is one submission, or several on a slow device (`pace.py`). Nothing is read back but what `read`
+names.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import struct
 import threading
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -20,9 +23,13 @@ import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import adapters, chosen_adapter, listed_adapters, why_unavailable
-from gsplat_edu.engine.failures import one_line
+from gsplat_edu.engine.failures import listen, one_line, wait
+from gsplat_edu.engine.pace import Pace, Stretch
 from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
 from gsplat_edu.engine.transfers import Kept, Ticket
+
+JOB_BYTES = 32
+"""Bytes of a job in the uniform buffer."""
 
 SLICE = 256
 """Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
@@ -47,6 +54,7 @@ class Device:
         adapter: Its place in `adapters()`.
         limits: What it is asked for, by the names of `LIMITS`; None for all that the adapter has.
         most_groups: Workgroups in one dimension; more continue in the second.
+        pace: How long its submissions may take.
 
     Raises:
         BackendUnavailableError: it does not start.
@@ -54,11 +62,17 @@ class Device:
     Attributes:
         sent: Bytes written to its buffers so far.
         received: Bytes read from them.
+        answered: When the last submission was seen to be done, by `time.perf_counter`.
     """
 
     def __init__(
-        self, adapter: int = 0, limits: Mapping[str, int] | None = None, most_groups: int | None = None
+        self,
+        adapter: int = 0,
+        limits: Mapping[str, int] | None = None,
+        most_groups: int | None = None,
+        pace: Pace | None = None,
     ) -> None:
+        listen()
         self.name, chosen = listed_adapters()[adapter]
         wanted = {key: chosen.limits[key] for key in LIMITS} if limits is None else dict(limits)
         self.measures = TIMESTAMPS in chosen.features
@@ -68,11 +82,47 @@ class Device:
             )
         self.limits: Mapping[str, int] = wanted
         self.most_groups = most_groups or wanted["max-compute-workgroups-per-dimension"]
+        self.pace = pace or Pace()
         self.lock = threading.RLock()
-        self.sent = self.received = 0
+        self.sent, self.received, self.answered = 0, 0, 0.0
         self._staging: dict[int, list[Any]] = {}
         self._modules: dict[str, Any] = {}
         self._pipelines: dict[tuple[str, str, int, int], Any] = {}
+
+    def renewed(self) -> Device:
+        """Return a new device on the same adapter, in place of one that is lost.
+
+        Raises:
+            BackendUnavailableError: the adapter is gone, or does not start.
+        """
+        with contextlib.suppress(Exception):  # a lost device may refuse anything; this ends wgpu's thread for it
+            self.device.destroy()
+        listed_adapters.cache_clear()
+        if self.name not in adapters():
+            raise BackendUnavailableError(
+                f"backend 'webgpu': {self.name.name} is gone; restart the computer or its driver, or use the backend cpu"
+            )
+        return Device(adapters().index(self.name), self.limits, self.most_groups, self.pace)
+
+    def is_lost(self) -> bool:
+        """Return whether the system has reset the device or taken it away."""
+        import wgpu
+
+        try:
+            self.device.create_buffer(size=SLICE, usage=wgpu.BufferUsage.COPY_DST).destroy()
+        except wgpu.GPUOutOfMemoryError:
+            return False
+        except (wgpu.GPUError, RuntimeError):
+            return True
+        return False
+
+    def wait(self, arrival: Any) -> None:  # noqa: ANN401
+        """Wait for what wgpu promises.
+
+        Raises:
+            DeviceLostError: the device is lost.
+        """
+        wait(arrival, f"{self.name.name} does not answer", self)
 
     @staticmethod
     @functools.cache
@@ -114,7 +164,7 @@ class Device:
         """
         import wgpu
 
-        with self.lock, one_line(f"{self.name.name} has no {array.nbytes / 2**20:.0f} MiB for a photo"):
+        with self.lock, one_line(f"{self.name.name} has no {array.nbytes / 2**20:.0f} MiB for a photo", self):
             usage = wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
             buffer = self.device.create_buffer_with_data(data=np.ascontiguousarray(array), usage=usage)
         self.sent += array.nbytes
@@ -160,7 +210,7 @@ class Device:
 
     def _compiled(self, one: Pass) -> tuple[Any, Any]:
         if one.module not in self._modules:
-            with one_line(f"{self.name.name} refuses the shader {one.module}"):
+            with one_line(f"{self.name.name} refuses the shader {one.module}", self):
                 self._modules[one.module] = self.device.create_shader_module(code=module_source(one.module))
         kinds = ["read-only-storage"] * len(one.reads) + ["storage"] * len(one.writes)
         storage = self.device.create_bind_group_layout(
@@ -168,13 +218,13 @@ class Device:
         )
         layout = self.device.create_pipeline_layout(bind_group_layouts=[self.uniform_layout, storage])
         stage = {"module": self._modules[one.module], "entry_point": one.entry}
-        with one_line(f"{self.name.name} refuses the shader {one.module}.{one.entry}"):
+        with one_line(f"{self.name.name} refuses the shader {one.name}", self):
             return self.device.create_compute_pipeline(layout=layout, compute=stage), storage
 
     @functools.cached_property
     def uniform_layout(self) -> Any:  # noqa: ANN401
         """The layout of group 0: the job of the pass, and the view."""
-        job = {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": 16}
+        job = {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": JOB_BYTES}
         return self.device.create_bind_group_layout(
             entries=[_entry(0, job), _entry(1, {"type": "uniform", "min_binding_size": VIEW_BYTES})]
         )
@@ -208,7 +258,7 @@ class Memory:
         self._words = {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in program.buffers}
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
-        with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):
+        with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}", device):
             self._buffers = {} if like is None else like._shared(self._words)
             for name in self._words.keys() - self._buffers:
                 self._buffers[name] = make(size=WORD * self._words[name], usage=storage)
@@ -218,34 +268,49 @@ class Memory:
             for name, words in self._words.items():
                 self.write(name, noise.integers(0, 2**32, words, dtype=np.uint32))
         self._staging: Any = None
-        self._recorded = {part: self._bind(passes) for part, passes in program.parts.items()}
+        self._bell: Any = None
+        self._groups = {
+            part: [(one.name, one.groups(counts)) for one in passes] for part, passes in program.parts.items()
+        }
+        self._bound: dict[Pass, tuple[Any, Any]] = {}
+        self._recorded = {
+            part: self._calls(part, [Stretch(place, 0, groups) for place, (_, groups) in enumerate(each) if groups])
+            for part, each in self._groups.items()
+        }
+        self._cuts: dict[str, tuple[list[list[Stretch]], list[list[Call]]]] = {}
 
-    def _bind(self, passes: Sequence[Pass]) -> list[Call]:
-        """Return the call of each pass that has any workgroups."""
+    def _calls(self, part: str, stretches: Sequence[Stretch]) -> list[Call]:
+        """Return the calls that dispatch stretches of a part's passes."""
         import wgpu
 
-        make = self.device.device.create_bind_group
+        passes = self.program.parts[part]
+        numbers = [passes[place].job(self.counts, first) for place, first, _ in stretches]
         jobs = self.device.device.create_buffer_with_data(
-            data=b"".join(struct.pack("<4I", *one.job(self.counts)).ljust(SLICE, b"\0") for one in passes),
+            data=b"".join(struct.pack("<5I", *each).ljust(SLICE, b"\0") for each in numbers) or bytes(SLICE),
             usage=wgpu.BufferUsage.UNIFORM,
         )
-        uniforms = make(
+        uniforms = self.device.device.create_bind_group(
             layout=self.device.uniform_layout,
             entries=[
-                {"binding": 0, "resource": {"buffer": jobs, "offset": 0, "size": 16}},
+                {"binding": 0, "resource": {"buffer": jobs, "offset": 0, "size": JOB_BYTES}},
                 {"binding": 1, "resource": {"buffer": self._view, "offset": 0, "size": VIEW_BYTES}},
             ],
         )
-        recorded = []
-        for place, one in enumerate(passes):
-            if groups := one.groups(self.counts):
-                pipeline, layout = self.device.pipeline(one)
-                bound = [{"buffer": self._buffers[name]} for name in (*one.reads, *one.writes)]
-                entries = [{"binding": k, "resource": each} for k, each in enumerate(bound)]
-                x = min(groups, self.device.most_groups)
-                storage = make(layout=layout, entries=entries)
-                recorded.append((pipeline, uniforms, storage, SLICE * place, x, -(-groups // x)))
-        return recorded
+        calls = []
+        for row, (place, _, groups) in enumerate(stretches):
+            pipeline, storage = self._bind(passes[place])
+            x = min(groups, self.device.most_groups)
+            calls.append((pipeline, uniforms, storage, SLICE * row, x, -(-groups // x)))
+        return calls
+
+    def _bind(self, one: Pass) -> tuple[Any, Any]:
+        """Return the pipeline of a pass, and its buffers as a bind group."""
+        if one not in self._bound:
+            pipeline, layout = self.device.pipeline(one)
+            bound = [{"buffer": self._buffers[name]} for name in (*one.reads, *one.writes)]
+            entries = [{"binding": k, "resource": each} for k, each in enumerate(bound)]
+            self._bound[one] = pipeline, self.device.device.create_bind_group(layout=layout, entries=entries)
+        return self._bound[one]
 
     def _shared(self, words: Mapping[str, int]) -> dict[str, Any]:
         """Return the buffers of these names that have these sizes."""
@@ -264,7 +329,7 @@ class Memory:
                 f"{name}: has {self._words[name]} words, not {array.size} of {array.itemsize} bytes"
             )
         if array.size:
-            with one_line(f"{self.device.name.name} does not take {name}"):
+            with one_line(f"{self.device.name.name} does not take {name}", self.device):
                 self.device.device.queue.write_buffer(self._buffers[name], 0, np.ascontiguousarray(array))
             self.device.sent += array.nbytes
 
@@ -274,7 +339,7 @@ class Memory:
         Raises:
             BackendUnavailableError: the device fails.
         """
-        with self.device.lock, one_line(f"{self.device.name.name} does not give {name}"):
+        with self.device.lock, one_line(f"{self.device.name.name} does not give {name}", self.device):
             encoder = self.device.device.create_command_encoder()
             return self._read_after(encoder, (name,))[name]
 
@@ -291,18 +356,19 @@ class Memory:
         Raises:
             BackendUnavailableError: the device fails.
         """
-        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             encoder = self._begun(view)
             if kept is not None:
                 encoder.copy_buffer_to_buffer(kept.buffer, 0, self._buffers[into], 0, kept.nbytes)
-            self._compute(encoder, part)
+            encoder, pieces = self._compute(encoder, part)
             size = self._bytes_of((read,))
             staging = self.device.staging(size)
             encoder.copy_buffer_to_buffer(self._buffers[read], 0, staging, 0, WORD * self._words[read])
             self.device.device.queue.submit([encoder.finish()])
-            device = self.device
             arrival = staging.map_async("READ", 0, size)
-            return Ticket(device.name.name, device.lock, staging, arrival, device.free_staging)
+            return Ticket(
+                self.device, staging, arrival, lambda seconds: self._watch(part, seconds, pieces)
+            )
 
     def play(self, part: str, view: bytes = b"", read: Iterable[str] = ()) -> dict[str, np.ndarray]:
         """Play a part of the program as one submission, and wait for it if something is read.
@@ -316,10 +382,14 @@ class Memory:
             BackendUnavailableError: the device fails.
         """
         names = tuple(read)
-        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             encoder = self._begun(view)
-            self._compute(encoder, part)
-            return self._read_after(encoder, names)
+            encoder, pieces = self._compute(encoder, part)
+            began = time.perf_counter()
+            found = self._read_after(encoder, names)
+            if names:
+                self._watch(part, time.perf_counter() - began, pieces)
+            return found
 
     def _begun(self, view: bytes) -> Any:  # noqa: ANN401
         """Return an encoder, after writing the uniform block."""
@@ -328,12 +398,69 @@ class Memory:
             self.device.sent += len(view)
         return self.device.device.create_command_encoder()
 
-    def _compute(self, encoder: Any, part: str) -> None:  # noqa: ANN401
-        """Record the passes of a part."""
-        computing = encoder.begin_compute_pass()
-        for call in self._recorded[part]:
-            _dispatch(computing, call)
-        computing.end()
+    def _compute(self, encoder: Any, part: str) -> tuple[Any, int]:  # noqa: ANN401
+        """Record the passes of a part; all of its submissions but the last are made here.
+
+        Returns:
+            The encoder of the last one, and their number.
+        """
+        pace, groups = self.device.pace, self._groups[part]
+        if not all(pace.is_known(name, each) for name, each in groups):
+            return self._timed(encoder, part), 1
+        pieces = pace.plan(groups, self.device.most_groups)
+        if len(pieces) == 1:
+            return _recorded(encoder, self._recorded[part]), 1
+        if part not in self._cuts or self._cuts[part][0] != pieces:
+            self._cuts[part] = pieces, [self._calls(part, piece) for piece in pieces]
+        *before, last = self._cuts[part][1]
+        for calls in before:
+            encoder = self._submitted(_recorded(encoder, calls))
+        return _recorded(encoder, last), len(pieces)
+
+    def _submitted(self, encoder: Any) -> Any:  # noqa: ANN401
+        """Submit what was recorded, and return an encoder for what follows."""
+        self.device.device.queue.submit([encoder.finish()])
+        return self.device.device.create_command_encoder()
+
+    def _timed(self, encoder: Any, part: str) -> Any:  # noqa: ANN401
+        """Play a part in short stretches, wait for each and time it; returns an encoder for what follows."""
+        pace, widest = self.device.pace, self.device.most_groups
+        encoder = self._submitted(encoder)
+        _, call = self._waited(encoder)
+        encoder, again = self._waited(self.device.device.create_command_encoder())
+        call = min(call, again)
+        for place, (name, groups) in enumerate(self._groups[part]):
+            times, first, here = [], 0, pace.first_stretch(groups)
+            while first < groups:
+                calls = self._calls(part, [Stretch(place, first, here)])
+                encoder, seconds = self._waited(_recorded(encoder, calls))
+                times.append((here, seconds - call))
+                first += here
+                here = pace.next_stretch(here, seconds, groups - first, widest)
+            if times:
+                pace.note(name, times)
+        return encoder
+
+    def _waited(self, encoder: Any) -> tuple[Any, float]:  # noqa: ANN401
+        """Submit what was recorded and wait for it; return an encoder for what follows, and the seconds it took.
+
+        wgpu 0.32 cannot wait for a submission itself, so this waits for a copy at its end.
+        """
+        import wgpu
+
+        if self._bell is None:
+            usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
+            self._bell = self.device.device.create_buffer(size=SLICE, usage=usage)
+        began = time.perf_counter()
+        encoder.copy_buffer_to_buffer(next(iter(self._buffers.values())), 0, self._bell, 0, WORD * LEAST)
+        encoder = self._submitted(encoder)
+        self.device.wait(self._bell.map_async("READ", 0, WORD * LEAST))
+        seconds = time.perf_counter() - began
+        self._bell.unmap()
+        return encoder, seconds
+
+    def _watch(self, part: str, seconds: float, pieces: int) -> None:
+        self.device.pace.watch((name for name, _ in self._groups[part]), seconds, pieces)
 
     def _read_after(self, encoder: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:  # noqa: ANN401
         """Submit what was recorded, and return buffers as they are then."""
@@ -357,7 +484,7 @@ class Memory:
             raise BackendUnavailableError(f"backend 'webgpu': {self.device.name.name} has no timestamps")
         make, recorded = self.device.device, self._recorded[part]
         passes = [one for one in self.program.parts[part] if one.groups(self.counts)]
-        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             queries = make.create_query_set(type="timestamp", count=2 * len(passes))
             usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
             resolved = make.create_buffer(size=16 * len(passes), usage=usage)
@@ -389,7 +516,7 @@ class Memory:
         if not names:
             return {}
         size = self._bytes_of(names)
-        staging.map_sync("READ", 0, size)
+        self.device.wait(staging.map_async("READ", 0, size))
         words = np.frombuffer(staging.read_mapped(0, size), dtype=np.uint32)
         staging.unmap()
         self.device.received += size
@@ -399,6 +526,15 @@ class Memory:
     def _bytes_of(self, names: tuple[str, ...]) -> int:
         """Return the bytes of these buffers; mapped ranges are multiples of 8."""
         return -(-WORD * sum(self._words[name] for name in names) // 8) * 8
+
+
+def _recorded(encoder: Any, calls: Sequence[Call]) -> Any:  # noqa: ANN401
+    """Record dispatches as a compute pass, and return the encoder."""
+    computing = encoder.begin_compute_pass()
+    for call in calls:
+        _dispatch(computing, call)
+    computing.end()
+    return encoder
 
 
 def _dispatch(computing: Any, call: Call) -> None:  # noqa: ANN401
