@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from gsplat_edu.base.errors import BackendUnavailableError
 
@@ -15,6 +15,7 @@ class DeviceLostError(BackendUnavailableError):
     """The system reset the device or took it away. Its buffers are gone; another device may work."""
 
 
+@runtime_checkable
 class Losable(Protocol):
     """Something on a device that can be lost."""
 

@@ -95,7 +95,9 @@ class Device:
         Raises:
             BackendUnavailableError: the adapter is gone, or does not start.
         """
-        with contextlib.suppress(Exception):  # a lost device may refuse anything; this ends wgpu's thread for it
+        with contextlib.suppress(
+            Exception
+        ):  # a lost device may refuse anything; this ends wgpu's thread for it
             self.device.destroy()
         listed_adapters.cache_clear()
         if self.name not in adapters():
@@ -274,7 +276,9 @@ class Memory:
         }
         self._bound: dict[Pass, tuple[Any, Any]] = {}
         self._recorded = {
-            part: self._calls(part, [Stretch(place, 0, groups) for place, (_, groups) in enumerate(each) if groups])
+            part: self._calls(
+                part, [Stretch(place, 0, groups) for place, (_, groups) in enumerate(each) if groups]
+            )
             for part, each in self._groups.items()
         }
         self._cuts: dict[str, tuple[list[list[Stretch]], list[list[Call]]]] = {}
@@ -366,9 +370,7 @@ class Memory:
             encoder.copy_buffer_to_buffer(self._buffers[read], 0, staging, 0, WORD * self._words[read])
             self.device.device.queue.submit([encoder.finish()])
             arrival = staging.map_async("READ", 0, size)
-            return Ticket(
-                self.device, staging, arrival, lambda seconds: self._watch(part, seconds, pieces)
-            )
+            return Ticket(self.device, staging, arrival, lambda seconds: self._watch(part, seconds, pieces))
 
     def play(self, part: str, view: bytes = b"", read: Iterable[str] = ()) -> dict[str, np.ndarray]:
         """Play a part of the program as one submission, and wait for it if something is read.

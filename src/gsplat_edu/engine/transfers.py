@@ -5,14 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gsplat_edu.engine.failures import one_line
-
-if TYPE_CHECKING:
-    from gsplat_edu.engine.host import Device
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +37,7 @@ class Ticket:
 
     def __init__(
         self,
-        device: Device,
+        device: Any,  # noqa: ANN401  a Device of host.py, which imports this module
         staging: Any,  # noqa: ANN401
         arrival: Any,  # noqa: ANN401
         took: Callable[[float], None],
