@@ -73,7 +73,13 @@ def test_a_browser_splits_passes_with_the_same_bits(page, pool):
     grads = np.random.default_rng(1).normal(size=(view.camera.H, view.camera.W, frame.GRADS))
     program = frame.program(sort_bits(view.tiles.bit_length()), False)
     writes = {"core": scene.core, "rest": scene.rest, "grads": grads.astype(np.float32)}
-    given = (counts_of(scene, view, 1 << 12, frame.LIVE), writes, view.packed(scene.rest.shape[1]), PARTS, READS)
+    given = (
+        counts_of(scene, view, 1 << 12, frame.LIVE),
+        writes,
+        view.packed(scene.rest.shape[1]),
+        PARTS,
+        READS,
+    )
     whole, split = (played(page, program, *given, most) for most in (0, 2))
     assert whole["image"].any() and whole["core_grads"].any()
     for name in READS:

@@ -188,7 +188,7 @@ def test_a_device_that_is_lost_again_and_again_ends_the_run_and_its_checkpoint_c
     lose(losable)
     with pytest.raises(
         DeviceLostError,
-        match=r"^backend 'webgpu': .* was lost 3 times during the same work; .* --resume continues",
+        match="was lost 3 times .* --resume",
     ) as raised:
         run.run()
     assert "\n" not in str(raised.value) and len(devices) == 2
@@ -210,9 +210,7 @@ def test_an_adapter_that_is_gone_is_named(losable, monkeypatch):
     none.cache_clear = listed.cache_clear
     for module in (adapters, host):
         monkeypatch.setattr(module, "listed_adapters", none)
-    with pytest.raises(
-        BackendUnavailableError, match=r"^backend 'webgpu': .* is gone; restart the computer or its driver"
-    ):
+    with pytest.raises(BackendUnavailableError, match=r"^backend 'webgpu': .* is gone; restart the computer"):
         losable.renew(lost)
     assert losable.device is lost
 

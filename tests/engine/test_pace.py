@@ -7,7 +7,7 @@ import pytest
 
 from engine.frames import drawn, packed, view_of
 from float32_backends import SMALLER
-from gsplat_edu.engine import frame, host
+from gsplat_edu.engine import dispatch, frame, host
 from gsplat_edu.engine.pace import GROWTH, REACH, Pace, Stretch, Timing
 from gsplat_edu.engine.passes import LIMITS, sort_bits
 from gsplat_edu.engine.step import GROUPS, LIVE, STATE, Noise, Photo, StepNumbers, step_program
@@ -22,13 +22,13 @@ def paced(limit, **given):
 
 def counted(device, monkeypatch):
     """Return a list that grows by the workgroups of each submission."""
-    submitted, recorded = [], host._recorded
+    submitted, recorded = [], dispatch.recorded
 
     def count(encoder, calls):
         submitted.append(sum(x * y for *_, x, y in calls))
         return recorded(encoder, calls)
 
-    monkeypatch.setattr(host, "_recorded", count)
+    monkeypatch.setattr(dispatch, "recorded", count)
     return submitted
 
 

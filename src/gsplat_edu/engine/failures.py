@@ -1,4 +1,4 @@
-"""What wgpu raises becomes one line that names the adapter and what to do; a lost device is told from other failures."""
+"""What wgpu raises becomes one line that names the adapter and what to do; a lost device is told apart."""
 
 from __future__ import annotations
 

@@ -13,38 +13,24 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import struct
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import adapters, chosen_adapter, listed_adapters, why_unavailable
+from gsplat_edu.engine.dispatch import JOB_BYTES, LEAST, SLICE, VIEW_BYTES, Parts, dispatch
 from gsplat_edu.engine.failures import listen, one_line, wait
-from gsplat_edu.engine.pace import Pace, Stretch
+from gsplat_edu.engine.pace import Pace
 from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
+from gsplat_edu.engine.room import why_too_large
 from gsplat_edu.engine.transfers import Kept, Ticket
-
-JOB_BYTES = 32
-"""Bytes of a job in the uniform buffer."""
-
-SLICE = 256
-"""Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
-
-LEAST = 4
-"""Words of the smallest buffer: one row of four numbers, which is the largest type of an array."""
-
-VIEW_BYTES = 512
-"""Bytes of the uniform block that all passes of a part share: camera and settings."""
 
 TIMESTAMPS = "timestamp-query"
 """The optional feature of measuring passes."""
-
-Call = tuple[Any, Any, Any, int, int, int]
-"""Pipeline, uniforms, storage, offset of the job, workgroups in two dimensions."""
 
 
 class Device:
@@ -102,7 +88,7 @@ class Device:
         listed_adapters.cache_clear()
         if self.name not in adapters():
             raise BackendUnavailableError(
-                f"backend 'webgpu': {self.name.name} is gone; restart the computer or its driver, or use the backend cpu"
+                f"backend 'webgpu': {self.name.name} is gone; restart the computer, or use the backend cpu"
             )
         return Device(adapters().index(self.name), self.limits, self.most_groups, self.pace)
 
@@ -191,17 +177,11 @@ class Device:
         """Check that no buffer is larger than the device allows.
 
         Raises:
-            BackendUnavailableError: one is; the message names it.
+            BackendUnavailableError: one is; the message names it, and how many would fit.
         """
         most = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
-        largest = max(program.buffers, key=lambda buffer: buffer.size.of(counts))
-        size = WORD * largest.size.of(counts)
-        if size > most:
-            raise BackendUnavailableError(
-                f"backend 'webgpu': the buffer {largest.name} needs {size / 2**20:.0f} MiB for "
-                f"{', '.join(f'{count} {name}' for name, count in counts.items())}, but {self.name.name} allows "
-                f"{most / 2**20:.0f}; use the backend cpu"
-            )
+        if why := why_too_large(program, counts, most, self.name.name):
+            raise BackendUnavailableError(f"backend 'webgpu': {why}, or use the backend cpu")
 
     def pipeline(self, one: Pass) -> tuple[Any, Any]:
         """Return the compiled pipeline of a pass, and the layout of its storage buffers."""
@@ -270,51 +250,7 @@ class Memory:
             for name, words in self._words.items():
                 self.write(name, noise.integers(0, 2**32, words, dtype=np.uint32))
         self._staging: Any = None
-        self._bell: Any = None
-        self._groups = {
-            part: [(one.name, one.groups(counts)) for one in passes] for part, passes in program.parts.items()
-        }
-        self._bound: dict[Pass, tuple[Any, Any]] = {}
-        self._recorded = {
-            part: self._calls(
-                part, [Stretch(place, 0, groups) for place, (_, groups) in enumerate(each) if groups]
-            )
-            for part, each in self._groups.items()
-        }
-        self._cuts: dict[str, tuple[list[list[Stretch]], list[list[Call]]]] = {}
-
-    def _calls(self, part: str, stretches: Sequence[Stretch]) -> list[Call]:
-        """Return the calls that dispatch stretches of a part's passes."""
-        import wgpu
-
-        passes = self.program.parts[part]
-        numbers = [passes[place].job(self.counts, first) for place, first, _ in stretches]
-        jobs = self.device.device.create_buffer_with_data(
-            data=b"".join(struct.pack("<5I", *each).ljust(SLICE, b"\0") for each in numbers) or bytes(SLICE),
-            usage=wgpu.BufferUsage.UNIFORM,
-        )
-        uniforms = self.device.device.create_bind_group(
-            layout=self.device.uniform_layout,
-            entries=[
-                {"binding": 0, "resource": {"buffer": jobs, "offset": 0, "size": JOB_BYTES}},
-                {"binding": 1, "resource": {"buffer": self._view, "offset": 0, "size": VIEW_BYTES}},
-            ],
-        )
-        calls = []
-        for row, (place, _, groups) in enumerate(stretches):
-            pipeline, storage = self._bind(passes[place])
-            x = min(groups, self.device.most_groups)
-            calls.append((pipeline, uniforms, storage, SLICE * row, x, -(-groups // x)))
-        return calls
-
-    def _bind(self, one: Pass) -> tuple[Any, Any]:
-        """Return the pipeline of a pass, and its buffers as a bind group."""
-        if one not in self._bound:
-            pipeline, layout = self.device.pipeline(one)
-            bound = [{"buffer": self._buffers[name]} for name in (*one.reads, *one.writes)]
-            entries = [{"binding": k, "resource": each} for k, each in enumerate(bound)]
-            self._bound[one] = pipeline, self.device.device.create_bind_group(layout=layout, entries=entries)
-        return self._bound[one]
+        self._parts = Parts(device, program, counts, self._buffers, self._view)
 
     def _shared(self, words: Mapping[str, int]) -> dict[str, Any]:
         """Return the buffers of these names that have these sizes."""
@@ -364,13 +300,15 @@ class Memory:
             encoder = self._begun(view)
             if kept is not None:
                 encoder.copy_buffer_to_buffer(kept.buffer, 0, self._buffers[into], 0, kept.nbytes)
-            encoder, pieces = self._compute(encoder, part)
+            encoder, pieces = self._parts.record(encoder, part)
             size = self._bytes_of((read,))
             staging = self.device.staging(size)
             encoder.copy_buffer_to_buffer(self._buffers[read], 0, staging, 0, WORD * self._words[read])
             self.device.device.queue.submit([encoder.finish()])
             arrival = staging.map_async("READ", 0, size)
-            return Ticket(self.device, staging, arrival, lambda seconds: self._watch(part, seconds, pieces))
+            return Ticket(
+                self.device, staging, arrival, lambda seconds: self._parts.watch(part, seconds, pieces)
+            )
 
     def play(self, part: str, view: bytes = b"", read: Iterable[str] = ()) -> dict[str, np.ndarray]:
         """Play a part of the program as one submission, and wait for it if something is read.
@@ -386,11 +324,11 @@ class Memory:
         names = tuple(read)
         with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             encoder = self._begun(view)
-            encoder, pieces = self._compute(encoder, part)
+            encoder, pieces = self._parts.record(encoder, part)
             began = time.perf_counter()
             found = self._read_after(encoder, names)
             if names:
-                self._watch(part, time.perf_counter() - began, pieces)
+                self._parts.watch(part, time.perf_counter() - began, pieces)
             return found
 
     def _begun(self, view: bytes) -> Any:  # noqa: ANN401
@@ -399,70 +337,6 @@ class Memory:
             self.device.device.queue.write_buffer(self._view, 0, view)
             self.device.sent += len(view)
         return self.device.device.create_command_encoder()
-
-    def _compute(self, encoder: Any, part: str) -> tuple[Any, int]:  # noqa: ANN401
-        """Record the passes of a part; all of its submissions but the last are made here.
-
-        Returns:
-            The encoder of the last one, and their number.
-        """
-        pace, groups = self.device.pace, self._groups[part]
-        if not all(pace.is_known(name, each) for name, each in groups):
-            return self._timed(encoder, part), 1
-        pieces = pace.plan(groups, self.device.most_groups)
-        if len(pieces) == 1:
-            return _recorded(encoder, self._recorded[part]), 1
-        if part not in self._cuts or self._cuts[part][0] != pieces:
-            self._cuts[part] = pieces, [self._calls(part, piece) for piece in pieces]
-        *before, last = self._cuts[part][1]
-        for calls in before:
-            encoder = self._submitted(_recorded(encoder, calls))
-        return _recorded(encoder, last), len(pieces)
-
-    def _submitted(self, encoder: Any) -> Any:  # noqa: ANN401
-        """Submit what was recorded, and return an encoder for what follows."""
-        self.device.device.queue.submit([encoder.finish()])
-        return self.device.device.create_command_encoder()
-
-    def _timed(self, encoder: Any, part: str) -> Any:  # noqa: ANN401
-        """Play a part in short stretches, wait for each and time it; returns an encoder for what follows."""
-        pace, widest = self.device.pace, self.device.most_groups
-        encoder = self._submitted(encoder)
-        _, call = self._waited(encoder)
-        encoder, again = self._waited(self.device.device.create_command_encoder())
-        call = min(call, again)
-        for place, (name, groups) in enumerate(self._groups[part]):
-            times, first, here = [], 0, pace.first_stretch(groups)
-            while first < groups:
-                calls = self._calls(part, [Stretch(place, first, here)])
-                encoder, seconds = self._waited(_recorded(encoder, calls))
-                times.append((here, seconds - call))
-                first += here
-                here = pace.next_stretch(here, seconds, groups - first, widest)
-            if times:
-                pace.note(name, times)
-        return encoder
-
-    def _waited(self, encoder: Any) -> tuple[Any, float]:  # noqa: ANN401
-        """Submit what was recorded and wait for it; return an encoder for what follows, and the seconds it took.
-
-        wgpu 0.32 cannot wait for a submission itself, so this waits for a copy at its end.
-        """
-        import wgpu
-
-        if self._bell is None:
-            usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
-            self._bell = self.device.device.create_buffer(size=SLICE, usage=usage)
-        began = time.perf_counter()
-        encoder.copy_buffer_to_buffer(next(iter(self._buffers.values())), 0, self._bell, 0, WORD * LEAST)
-        encoder = self._submitted(encoder)
-        self.device.wait(self._bell.map_async("READ", 0, WORD * LEAST))
-        seconds = time.perf_counter() - began
-        self._bell.unmap()
-        return encoder, seconds
-
-    def _watch(self, part: str, seconds: float, pieces: int) -> None:
-        self.device.pace.watch((name for name, _ in self._groups[part]), seconds, pieces)
 
     def _read_after(self, encoder: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:  # noqa: ANN401
         """Submit what was recorded, and return buffers as they are then."""
@@ -484,7 +358,7 @@ class Memory:
 
         if not self.device.measures:
             raise BackendUnavailableError(f"backend 'webgpu': {self.device.name.name} has no timestamps")
-        make, recorded = self.device.device, self._recorded[part]
+        make, recorded = self.device.device, self._parts.whole[part]
         passes = [one for one in self.program.parts[part] if one.groups(self.counts)]
         with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             queries = make.create_query_set(type="timestamp", count=2 * len(passes))
@@ -494,7 +368,7 @@ class Memory:
             for place, call in enumerate(recorded):
                 marks = {"beginning_of_pass_write_index": 2 * place, "end_of_pass_write_index": 2 * place + 1}
                 computing = encoder.begin_compute_pass(timestamp_writes={"query_set": queries, **marks})
-                _dispatch(computing, call)
+                dispatch(computing, call)
                 computing.end()
             encoder.resolve_query_set(queries, 0, 2 * len(passes), resolved, 0)
             make.queue.submit([encoder.finish()])
@@ -528,23 +402,6 @@ class Memory:
     def _bytes_of(self, names: tuple[str, ...]) -> int:
         """Return the bytes of these buffers; mapped ranges are multiples of 8."""
         return -(-WORD * sum(self._words[name] for name in names) // 8) * 8
-
-
-def _recorded(encoder: Any, calls: Sequence[Call]) -> Any:  # noqa: ANN401
-    """Record dispatches as a compute pass, and return the encoder."""
-    computing = encoder.begin_compute_pass()
-    for call in calls:
-        _dispatch(computing, call)
-    computing.end()
-    return encoder
-
-
-def _dispatch(computing: Any, call: Call) -> None:  # noqa: ANN401
-    pipeline, uniforms, storage, offset, x, y = call
-    computing.set_pipeline(pipeline)
-    computing.set_bind_group(0, uniforms, [offset])
-    computing.set_bind_group(1, storage)
-    computing.dispatch_workgroups(x, y)
 
 
 def _entry(binding: int, buffer: Mapping[str, object]) -> dict[str, object]:

@@ -221,7 +221,7 @@ def replace_device(lost: Device, losses: int, what: str, error: DeviceLostError)
     if losses > MOST_LOSSES:
         raise DeviceLostError(
             f"backend 'webgpu': {name} was lost {losses} times during the same work; update its driver, lower "
-            "--max-gaussians or --resolution, or use the backend cpu; --resume continues a training from its last checkpoint"
+            "--max-gaussians or --resolution, or use the backend cpu; --resume continues from the last checkpoint"
         ) from error
     _pool().renew(lost)
     warnings.warn(f"backend 'webgpu': {name} was lost; {what} on a new device", BackendWarning, stacklevel=4)

@@ -55,7 +55,7 @@ class WebgpuRun:
 
     def read(self) -> RunState:
         """Wait for all steps, and return the state."""
-        found = self._on_a_device(lambda: self.resident.read())
+        found = self._on_a_device(lambda: self.resident.read())  # noqa: PLW0108  it may be another one
         if self._image is None and self._done:
             self._image = self.image()
         gaussians, first, second = (
@@ -69,7 +69,7 @@ class WebgpuRun:
     def image(self) -> Tensor:
         """Wait for all steps, and return the last one's image, (H, W, 3)."""
         if self._image is None:
-            self._image = torch.from_numpy(self._on_a_device(lambda: self.resident.image()))
+            self._image = torch.from_numpy(self._on_a_device(lambda: self.resident.image()))  # noqa: PLW0108
         return self._image
 
     def step(
