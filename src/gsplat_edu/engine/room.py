@@ -60,8 +60,7 @@ def most_that_fit(program: Program, counts: Mapping[str, int], most: int, name: 
     """
     words = most // WORD
     fits = [_items(buffer.size, words) for buffer in program.buffers if buffer.size.count == name]
-    if name == GAUSSIANS and counts.get(REST, 0):
-        numbers = counts[REST] // counts[GAUSSIANS]
+    if name == GAUSSIANS and (numbers := counts[REST] // max(counts[GAUSSIANS], 1)):
         fits += [
             _items(buffer.size, words) // numbers for buffer in program.buffers if buffer.size.count == REST
         ]
