@@ -1,4 +1,4 @@
-"""A training on the adapter whose process is killed, or whose device is lost, ends with the bytes of an undisturbed one.
+"""A training on the adapter whose process is killed, or whose device is lost, ends with an undisturbed one's bytes.
 
 wgpu ends the process if a submission fails because of a device that was lost just then; a run is resumed after that as
 after any kill. The processes here use the adapter as it is, without the limits of the other tests.
@@ -98,10 +98,9 @@ def whole(capture, tmp_path_factory):
 
 @pytest.mark.sliced(1, group="runs that are disturbed")
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
-@pytest.mark.parametrize(
-    ("disturb", "code"), [(KILLED, -signal.SIGKILL), (ABORTED, -signal.SIGABRT)], ids=["killed", "aborted"]
-)
-def test_a_process_that_ends_in_the_middle_is_resumed(capture, whole, tmp_path, disturb, code):
+@pytest.mark.parametrize("disturb", [KILLED, ABORTED], ids=["killed", "aborted"])
+def test_a_process_that_ends_in_the_middle_is_resumed(capture, whole, tmp_path, disturb):
+    code = -signal.SIGKILL if disturb == KILLED else -signal.SIGABRT
     done = train(capture, tmp_path / "run", disturb=disturb)
     assert done.returncode == code, done.stderr
     assert not list(tmp_path.glob("run/point_cloud/*")) and list(tmp_path.glob("run/checkpoints/*"))
