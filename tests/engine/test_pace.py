@@ -95,6 +95,7 @@ def test_a_pass_of_two_dimensions_is_split_into_stretches_of_one(device, monkeyp
     slow = paced(0.2, most_groups=3)
     frames_of(slow, scene, 1)
     slow.pace.known = dict.fromkeys(slow.pace.known, Timing(0.05, math.inf))
+    slow.pace.version += 1
     submitted = counted(device, monkeypatch)
     found = frames_of(slow, scene, 1)[0]
     assert 1 < max(submitted) <= 6  # four take the limit; a whole pass of four is two rows of three

@@ -61,7 +61,7 @@ class Parts:
             )
             for part, each in self._groups.items()
         }
-        self._cuts: dict[str, tuple[list[list[Stretch]], list[list[Call]]]] = {}
+        self._cuts: dict[str, tuple[int, list[list[Call]]]] = {}
 
     def _calls(self, part: str, stretches: Sequence[Stretch]) -> list[Call]:
         """Return the calls that dispatch stretches of a part's passes."""
@@ -103,17 +103,18 @@ class Parts:
             The encoder of the last one, and their number.
         """
         pace, groups = self._device.pace, self._groups[part]
-        if not all(pace.is_known(name, each) for name, each in groups):
-            return self._timed(encoder, part), 1
-        pieces = pace.plan(groups, self._device.most_groups)
-        if len(pieces) == 1:
-            return recorded(encoder, self.whole[part]), 1
-        if part not in self._cuts or self._cuts[part][0] != pieces:
-            self._cuts[part] = pieces, [self._calls(part, piece) for piece in pieces]
+        if part not in self._cuts or self._cuts[part][0] != pace.version:
+            if not all(pace.is_known(name, each) for name, each in groups):
+                return self._timed(encoder, part), 1
+            self._cuts[part] = pace.version, self._cut(part, pace.plan(groups, self._device.most_groups))
         *before, last = self._cuts[part][1]
         for calls in before:
             encoder = self._submitted(recorded(encoder, calls))
-        return recorded(encoder, last), len(pieces)
+        return recorded(encoder, last), len(before) + 1
+
+    def _cut(self, part: str, pieces: list[list[Stretch]]) -> list[list[Call]]:
+        """Return the calls of each submission of a part."""
+        return [self.whole[part]] if len(pieces) == 1 else [self._calls(part, piece) for piece in pieces]
 
     def _submitted(self, encoder: Any) -> Any:  # noqa: ANN401
         """Submit what was recorded, and return an encoder for what follows."""

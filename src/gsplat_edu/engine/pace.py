@@ -64,11 +64,16 @@ class Pace:
 
     Args:
         limit: Seconds that a submission may take; 0 for one workgroup in each, infinity for a part in one.
+
+    Attributes:
+        known: Timings by entry point.
+        version: Changes whenever they do, so that a plan can be kept.
     """
 
     def __init__(self, limit: float = LIMIT) -> None:
         self.limit = limit
         self.known: dict[str, Timing] = {}
+        self.version = 0
 
     def is_known(self, name: str, groups: int) -> bool:
         """Return whether an entry point was timed well enough for so many workgroups."""
@@ -114,6 +119,7 @@ class Pace:
 
         The first one may include the driver's compiler, so it counts only if it is the only one.
         """
+        self.version += 1
         stretches = [(groups, max(seconds, 0.0)) for groups, seconds in times]
         telling = [seconds / groups for groups, seconds in stretches[1:] if seconds >= ENOUGH * self.limit]
         total = sum(groups for groups, _ in stretches)
@@ -125,5 +131,6 @@ class Pace:
     def watch(self, names: Iterable[str], seconds: float, submissions: int) -> None:
         """Forget the entry points of a part that took far longer than its submissions may."""
         if seconds > SLOWEST * max(self.limit, LEAST_LIMIT) * submissions:
+            self.version += 1
             for name in names:
                 self.known.pop(name, None)
