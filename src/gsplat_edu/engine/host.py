@@ -99,7 +99,7 @@ class Device:
             program: The program.
             counts: Its counts by name.
             poison: Fill the buffers with noise instead of zeros, so that tests find what is read before it is written.
-            like: Its buffers are used again where name and size agree, with their contents; do not use it any more.
+            like: Its buffers are used again where name and size agree, with their contents; both then write to them.
 
         Raises:
             BackendUnavailableError: the device has too little memory or too small buffers; the message says which.
