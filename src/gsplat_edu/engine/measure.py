@@ -34,8 +34,8 @@ class MeasuredStep:
         passes: Dispatches.
         same_bits: Whether three steps from one state gave the same bits twice.
         step_ms: Wall time of a step in a row of them, of which the host waits for the one before the last.
-        record_ms: Of it, the host's time to record the passes.
-        submit_ms: Of it, the host's time to hand them over.
+        record_ms: Of it, the host's time to record the passes, median.
+        submit_ms: Of it, the host's time to hand them over, median.
         sent: Bytes from the host to the device per step.
         received: Bytes from the device to the host per step.
         entries: Milliseconds of each entry point by the device's clock, medians; empty without timestamps.
@@ -84,6 +84,7 @@ class _Run:
 
     def __init__(self, device: Device, scene: Scene, view: View) -> None:
         self.device, self.scene, self.view = device, scene, view
+        self.host: list[tuple[float, float]] = []  # milliseconds to record and submit each step
         pixels = view.camera.H * view.camera.W
         photo = Photo(
             np.random.default_rng(3).integers(0, 2**24, pixels, dtype=np.uint32) | np.uint32(255 << 24)
@@ -126,7 +127,10 @@ class _Run:
         """Take steps; yield what each leaves in `live`, a step late."""
         waiting = None
         for _ in range(count):
+            recording, submitting = self.device.recording, self.device.submitting
             ticket = self.memory.submit("step", self.block, "live", self.photo, "photo")
+            spent = self.device.recording - recording, self.device.submitting - submitting
+            self.host.append((1e3 * spent[0], 1e3 * spent[1]))
             if waiting is not None:
                 yield waiting.words()
             waiting = ticket
@@ -159,20 +163,19 @@ def measure_step(device: Device, scene: Scene, view: View, rounds: int) -> Measu
     same = all(np.array_equal(states[0][name], states[1][name]) for name in STATE)
     size = view.camera.W, view.camera.H
     counters = Counters.of(run.memory, scene.rest.shape[1], view.sh_degree, size)
-    before = device.recording, device.submitting, device.sent, device.received
+    before = device.sent, device.received
+    run.host.clear()
     began = time.perf_counter()
     list(run.steps(rounds))
     spent = 1e3 * (time.perf_counter() - began) / rounds
-    after = device.recording, device.submitting, device.sent, device.received
-    recording, submitting, sent, received = ((b - a) / rounds for a, b in zip(before, after, strict=True))
+    sent, received = (device.sent - before[0]) / rounds, (device.received - before[1]) / rounds
+    recording, submitting = np.median(run.host, axis=0).tolist()
     entries: dict[str, float] = {}
     if device.measures:
         runs = [run.memory.times("step") for _ in range(rounds)]
         entries = {name: float(np.median([one[name] for one in runs])) for name in runs[0]}
     passes = sum(one.groups(run.memory.counts) > 0 for one in run.memory.program.parts["step"])
-    return MeasuredStep(
-        counters, passes, same, spent, 1e3 * recording, 1e3 * submitting, sent, received, entries
-    )
+    return MeasuredStep(counters, passes, same, spent, recording, submitting, sent, received, entries)
 
 
 def as_table(rows: Mapping[str, Mapping[str, float]]) -> str:
