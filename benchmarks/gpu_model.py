@@ -12,6 +12,7 @@ a random scene.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.measure import as_table
 from gsplat_edu.engine.model import GPUS, PIXELS, Counters, forecast, step_costs
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import load_backend
+from gsplat_edu.render.backends import load_backend, unavailable
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.webgpu import engine_view
 from gsplat_edu.runs.cleaning import open_subject
@@ -47,13 +48,17 @@ def counted(gaussians: Gaussians, cameras: list[Camera], settings: RenderSetting
     return counters, float(pixels()["pixels"].sum()) / max(PIXELS * counters.taken, 1)
 
 
-def main() -> None:
+def main() -> int:
     """Print the forecast and write the JSON."""
     parser = hardware.parser("A training step on GPUs, by a model.")
     parser.add_argument(
         "run", nargs="?", type=Path, help="run whose Gaussians and held-out views are counted"
     )
     arguments = parser.parse_args()
+    counts_here = arguments.run is not None or arguments.smoke
+    if counts_here and (reason := unavailable("webgpu")):
+        print(f"gpu_model.py: no GPU draws the scene: {reason}", file=sys.stderr)
+        return 2
     result: dict[str, Any] = {"assumptions": "computed, not measured; see gsplat_edu.engine.model"}
     if arguments.run is not None:
         subject = open_subject(arguments.run, None, load_backend("cpu"))
@@ -75,7 +80,8 @@ def main() -> None:
         if name in result:
             print(f"{name}: {result[name]}")
     print(as_table(rows))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

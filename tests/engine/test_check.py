@@ -31,6 +31,12 @@ def test_the_report(device, tmp_path, capsys):
         assert all(time >= 0 for part in passes.values() for time in part.values())
 
 
+def test_as_many_gaussians_as_fit():
+    assert check.default_count(True, 2 << 30) == 10_000
+    assert check.default_count(False, 2 << 30) == 1_000_000
+    assert check.default_count(False, 128 << 20) == (128 << 20) // 180
+
+
 @pytest.mark.parametrize("broken", ["sort", "bits"])
 def test_a_wrong_result_exits_with_1(monkeypatch, capsys, broken):
     """As a driver that sorts wrongly, or adds up in another order each time."""

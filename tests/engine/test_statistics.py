@@ -9,9 +9,15 @@ import torch
 from engine.frames import packed, view_of
 from float32_backends import ILL_CONDITIONED, POSE, SETTINGS, SMALLER, images_and_gradients
 from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.clean.evidence import gather
+from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.engine import frame
 from gsplat_edu.engine.statistics import Asked, statistics_program
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.initialize import from_points
 from native_scenes import random
 
 NAMES = ("absgrad", "weight_sum", "weight_max", "pixels", "error_sum")
@@ -185,3 +191,18 @@ def test_a_frame_shares_its_buffers_with_its_statistics():
         assert own == {"errors", "weighed", "statistic_slots", "collected"}
         assert all(sizes.get(one.name, one.size) == one.size for one in program.buffers)
         assert program is statistics_program(whole, of_features)
+
+
+def test_cleaning_finds_the_same_evidence():
+    """`gsplat_edu.clean` asks for two passes of each view; it judges by sums, which agree as gradients do."""
+    views, points, colors = procedural_capture(40, 3, splats=80)
+    gaussians = from_points(points, colors, recipe(10))
+    found, truth = (
+        gather(gaussians, views, RenderSettings(median_depth=True), load_backend(name))
+        for name in ("webgpu", "cpu")
+    )
+    assert truth.weight.max() > 1 and (truth.gain != 0).any()
+    for name in ("weight", "peak", "gain", "spread"):
+        ours, expected = getattr(found, name), getattr(truth, name)
+        assert np.abs(ours - expected).max() <= 1e-3 * np.abs(expected).max(), name
+    np.testing.assert_array_equal(found.views, truth.views)
