@@ -1,6 +1,6 @@
 """How long does each stage of a training iteration take on a GPU, and how close is it to the hardware's limits?
 
-    python benchmarks/gpu.py [--smoke] [--out FILE.json]
+    python benchmarks/gpu.py [CAPTURE] [--minutes M] [--smoke] [--out FILE.json]
 
 Backend cuda: random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 -
 SSIM), backward, Adam. Milliseconds per stage are kernel times from torch's profiler over 20 iterations; host
@@ -8,28 +8,41 @@ synchronisations are counted too. Ceilings (copying 1 GiB, a float32 matrix prod
 benchmark then measures the time and the gradient error, relative to the native kernels in float64, for each precision
 of matrix products. If gsplat can be imported, it renders the same scene and compares times, images and gradients.
 
-Backend webgpu: the same scenes and the same training step, whose loss and Adam run on the CPU; every pass by the
-device's own clock; the gradient error in the same way. Each backend is measured where it has a GPU. Without one the
-command says so and exits with 2; --smoke takes an adapter that computes on the processor.
+Backend webgpu: the same scenes, and a training step as it stays on the device: its stages by the device's own clock,
+the host's time to record and submit it, passes, and bytes between host and device; beside them what the model
+(gsplat_edu.engine.model) computes from the scene's counters. The gradient error in the same way.
+
+First, each backend trains a capture with adc for 7,000 iterations. What does not begin within --minutes is left out.
+
+Each backend is measured where it has a GPU. Without one the command says so and exits with 2; --smoke takes an adapter
+that computes on the processor.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import hardware
+import numpy as np
 import torch
+from captures import capture
 
+import gsplat_edu.cli.main as command_line
 from gsplat_edu import Camera
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import chosen_adapter
-from gsplat_edu.engine.check import measure_frame
-from gsplat_edu.engine.frame import Pool, Scene as EngineScene
+from gsplat_edu.engine.frame import Scene as EngineScene
 from gsplat_edu.engine.host import Device
+from gsplat_edu.engine.measure import as_table, measure_step
 from gsplat_edu.engine.view import View
 from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
@@ -113,11 +126,9 @@ def milliseconds(work: Callable[[], object], rounds: int) -> float:
     return 1e3 * (time.perf_counter() - start) / rounds
 
 
-def iteration(
-    gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer: Adam, name: str = "cuda"
-) -> None:
+def iteration(gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer: Adam) -> None:
     """Run one training step."""
-    backend = load_backend(name)
+    backend = load_backend("cuda")
     output = render(gaussians, cam, settings=SETTINGS, backend=backend)
     photo_loss(output.image, photo, kernel=backend.loss).backward()
     optimizer.step(gaussians.tensors())
@@ -249,35 +260,54 @@ def beside_gsplat(scale: Scale) -> dict[str, float] | None:
     return found
 
 
-def passes(count: int, width: int, height: int, rounds: int) -> dict[str, Any]:
-    """Return milliseconds of a training step on the backend webgpu, and of its passes by the device's clock."""
-    gaussians, cam = scene(count, "cpu"), camera(width, height)
-    photo = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8)
-    optimizer = Adam(gaussians.tensors(), gaussian_groups(TrainConfig(), 1.0), load_backend("webgpu").adam)
-    iteration(gaussians, cam, photo, optimizer, "webgpu")  # compiles
-    start = time.perf_counter()
-    for _ in range(rounds):
-        iteration(gaussians, cam, photo, optimizer, "webgpu")
-    spent = 1e3 * (time.perf_counter() - start) / rounds
-    parts = {name: tensor.detach().reshape(count, -1) for name, tensor in gaussians.tensors().items()}
+def packed(gaussians: Gaussians) -> EngineScene:
+    """Return Gaussians as the engine takes them."""
+    parts = {
+        name: tensor.detach().reshape(len(gaussians), -1) for name, tensor in gaussians.tensors().items()
+    }
     core = torch.cat([parts[n] for n in ("means", "quats", "log_scales", "sh0", "logit_opacities")], dim=1)
-    rest = gaussians.sh_rest.detach().numpy()
+    return EngineScene(core.numpy(), np.ascontiguousarray(gaussians.sh_rest.detach().numpy()))
+
+
+def resident_step(count: int, width: int, height: int, rounds: int) -> dict[str, Any]:
+    """Return what a training step on the device of webgpu takes, by stage, beside what the model computes."""
+    gaussians, cam = scene(count, "cpu"), camera(width, height)
     view = View(cam, (0.0, 0.0, 0.0), 3, False, SETTINGS.dilation, 1.3, SETTINGS.alpha_max, SETTINGS.z_near)
-    same, found = measure_frame(Pool(Device.default()), EngineScene(core.numpy(), rest), view, rounds)
-    return {"iteration": spent, "two runs have the same bits": same, **found}
+    found = measure_step(Device.default(), packed(gaussians), view, rounds)
+    return {"two runs have the same bits": found.same_bits, **found.report()}
 
 
-def cuda_results(scale: Scale) -> dict[str, Any]:
+def trained(folder: Path, backend: str, iterations: int) -> dict[str, float]:
+    """Train a capture with adc; return seconds, iterations per second and the held-out PSNR."""
+    with tempfile.TemporaryDirectory() as scratch:
+        out = Path(scratch) / "run"
+        words = ["train", str(folder), "--out", str(out), "--strategy", "adc", "--backend", backend]
+        start = time.perf_counter()
+        with contextlib.redirect_stdout(io.StringIO()):
+            code = command_line.main([*words, "--iterations", str(iterations), "--eval-every", "0"])
+        if code != 0:
+            raise SystemExit(f"gpu.py: the training on {backend} failed")
+        seconds = time.perf_counter() - start
+        psnr = json.loads((out / "metrics.json").read_text())["test"]["psnr"]
+    return {"iterations": iterations, "s": seconds, "iterations per s": iterations / seconds, "PSNR": psnr}
+
+
+LEFT_OUT = "left out: the time was over"
+
+
+def cuda_results(scale: Scale, over: Callable[[], bool]) -> dict[str, Any]:
     """Measure the backend cuda."""
     found: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "ceilings": ceilings(scale), "stages": {}}
     for count in scale.counts:
         for width, height in scale.sizes:
-            measured = stages(count, width, height, scale.rounds)
+            measured = LEFT_OUT if over() else stages(count, width, height, scale.rounds)
             found["stages"][f"{count} at {width}x{height}"] = measured
+    if over():
+        return found | {"precisions": LEFT_OUT, "gsplat": LEFT_OUT}
     return found | {"precisions": precisions(scale), "gsplat": beside_gsplat(scale)}
 
 
-def webgpu_results(scale: Scale) -> dict[str, Any]:
+def webgpu_results(scale: Scale, over: Callable[[], bool]) -> dict[str, Any]:
     """Measure the backend webgpu; a scene that is too large for the adapter has its reason instead of times."""
     found: dict[str, Any] = {
         "webgpu": gpu_of("webgpu"),
@@ -285,33 +315,50 @@ def webgpu_results(scale: Scale) -> dict[str, Any]:
     }
     for count in scale.counts:
         for width, height in scale.sizes:
+            name = f"webgpu, {count} at {width}x{height}"
             try:
-                found[f"webgpu, {count} at {width}x{height}"] = passes(count, width, height, scale.rounds)
+                found[name] = LEFT_OUT if over() else resident_step(count, width, height, scale.rounds)
             except BackendUnavailableError as error:
-                found[f"webgpu, {count} at {width}x{height}"] = str(error)
+                found[name] = str(error)
     return found
+
+
+def show(result: dict[str, Any]) -> None:
+    """Print the figures, stages as tables."""
+    for name, table in result.items():
+        print(f"{name}: {table}" if not isinstance(table, dict) else name)
+        for key, value in table.items() if isinstance(table, dict) else ():
+            if key == "stages":
+                print(as_table(value))
+            else:
+                print(f"  {key}: {value}")
 
 
 def main() -> int:
     """Measure, print the tables and write the JSON."""
-    arguments = hardware.parser("A training iteration on a GPU, stage by stage.").parse_args()
+    parser = hardware.parser("A training iteration on a GPU, stage by stage.")
+    default = "snowmiku97 in $GSPLAT_EDU_DATA, else a procedural one"
+    parser.add_argument("capture", nargs="?", type=Path, help=f"capture to train (default: {default})")
+    parser.add_argument("--minutes", type=float, default=8.0, help="begin nothing after so long (default: 8)")
+    arguments = parser.parse_args()
     scale = SMOKE if arguments.smoke else FULL
+    end = time.monotonic() + 60 * arguments.minutes
     reason = unavailable("webgpu")
     has_adapter = reason is None and (arguments.smoke or not chosen_adapter().software)
-    result: dict[str, Any] = {}
-    if torch.cuda.is_available():
-        result |= cuda_results(scale)
-    if has_adapter:
-        result |= webgpu_results(scale)
-    if not result:
+    backends = ["cuda"] * torch.cuda.is_available() + ["webgpu"] * has_adapter
+    if not backends:
         why = reason or "its adapter computes on the processor"
         print(f"gpu.py: no GPU: torch sees none, and webgpu has none: {why}", file=sys.stderr)
         return 2
+    result: dict[str, Any] = {}
+    with capture(arguments.capture, arguments.smoke) as folder:
+        for name in backends:
+            result[f"training, {name}"] = trained(folder, name, 5 if arguments.smoke else 7000)
+    for name, results in {"cuda": cuda_results, "webgpu": webgpu_results}.items():
+        if name in backends:
+            result |= results(scale, lambda: time.monotonic() > end)
     hardware.report(result, arguments.out)
-    for name, table in result.items():
-        print(f"{name}: {table}" if not isinstance(table, dict) else name)
-        for key, value in table.items() if isinstance(table, dict) else ():
-            print(f"  {key}: {value}")
+    show(result)
     return 0
 
 

@@ -15,8 +15,10 @@ from engine.frames import packed, view_of
 from float32_backends import SMALLER
 from gsplat_edu.engine import frame
 from gsplat_edu.engine.frame import PAIRS, VISIBLE
-from gsplat_edu.engine.passes import manifest, sort_bits
+from gsplat_edu.engine.passes import Program, manifest, sort_bits
+from gsplat_edu.engine.statistics import Asked, statistics_program
 from gsplat_edu.engine.step import GROUPS, HALT, L1, LIVE, Photo, StepNumbers, step_program
+from gsplat_edu.render.output import STATISTICS
 
 SCRIPT = (Path(__file__).parent / "host.js").read_text()
 FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
@@ -114,6 +116,32 @@ def test_image_and_gradients_in_a_browser(page, pool, name):
     for part in (slice(0, 9), slice(9, 12), slice(12, 16)):
         bound = 6e-4 * len(scene.core) * np.abs(expected.camera[part]).max()
         assert np.abs(camera[part] - expected.camera[part]).max() <= bound
+
+
+def test_statistics_and_the_stop_per_pixel_in_a_browser(page, pool):
+    scene, view = (
+        packed(SMALLER["opaque, tiles stop"]),
+        view_of(SMALLER["opaque, tiles stop"], pixel_stop=True),
+    )
+    ours = frame.draw_frame(pool, scene, view)
+    size, generator = ours.transmittance.shape, np.random.default_rng(1)
+    grads = generator.normal(size=(*size, frame.GRADS)).astype(np.float32)
+    errors = generator.random(size).astype(np.float32)
+    block = view.packed(scene.rest.shape[1])
+    expected = frame.differentiate_frame(ours, scene, grads, None, Asked(block, errors)).statistics
+    drawing = frame.program(sort_bits(view.tiles.bit_length()), False)
+    counting = statistics_program(drawing, False)
+    buffers = tuple(dict.fromkeys((*drawing.buffers, *counting.buffers)))
+    program = Program(buffers, {**drawing.parts, **counting.parts})
+    counts = counts_of(scene, view, ours.memory.counts["pairs"], frame.LIVE)
+    writes = {"core": scene.core, "rest": scene.rest, "grads": grads, "errors": errors}
+    found = played(page, program, counts, writes, block, ("render", "statistics"), ("image", "collected"))
+    image = found["image"].view(np.float32).reshape(*size, frame.PIXEL)
+    assert np.abs(image[..., :3] - ours.image).max() < 1.1 / 255 and image[..., 3].min() > 1e-4 * (1 - 1e-6)
+    collected = found["collected"].view(np.float32).reshape(expected.shape)
+    for column in range(expected.shape[1]):
+        bound = 2 if column == STATISTICS.index("pixels") else 6e-4 * expected[:, column].max()
+        assert np.abs(collected[:, column] - expected[:, column]).max() <= bound, STATISTICS[column]
 
 
 def test_a_step_of_training_in_a_browser(page, device):

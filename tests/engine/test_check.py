@@ -18,13 +18,23 @@ def adapter(device, monkeypatch):
 def test_the_report(device, tmp_path, capsys):
     assert check.main([*SMALL, "--out", str(tmp_path / "a.json")]) == 0
     report = json.loads((tmp_path / "a.json").read_text())
-    assert report == json.loads(capsys.readouterr().out)
-    assert len(report["checks"]) == 3 and all(report["checks"].values())
+    printed = capsys.readouterr().out
+    text, table = printed[: printed.index("\n}\n") + 2], printed[printed.index("\n}\n") + 3 :]
+    assert report == json.loads(text)
+    assert table.startswith("| stage | ") and "| step | " in table and "(computed)" in table
+    assert report["step"]["passes"] > 60 and report["step"]["bytes sent a step"] == 416
+    assert len(report["checks"]) == 4 and all(report["checks"].values())
     assert 0 < report["counted"]["visible"] <= 300 <= report["counted"]["pairs"] + 300
     if device.measures:
         passes = report["milliseconds of passes"]
         assert set(passes["render"]) >= {"project", "scatter", "composite"}
         assert all(time >= 0 for part in passes.values() for time in part.values())
+
+
+def test_as_many_gaussians_as_fit():
+    assert check.default_count(True, 2 << 30) == 10_000
+    assert check.default_count(False, 2 << 30) == 1_000_000
+    assert check.default_count(False, 128 << 20) == (128 << 20) // 180
 
 
 @pytest.mark.parametrize("broken", ["sort", "bits"])
@@ -46,7 +56,8 @@ def test_a_wrong_result_exits_with_1(monkeypatch, capsys, broken):
 
         monkeypatch.setattr(check, "draw_frame", unstable)
     assert check.main(SMALL) == 1
-    checks = json.loads(capsys.readouterr().out)["checks"]
+    printed = capsys.readouterr().out
+    checks = json.loads(printed[: printed.index("\n}\n") + 2])["checks"]
     (failed,) = [name for name, passed in checks.items() if not passed]
     assert failed == {"sort": "the sort is stable and right", "bits": "two runs have the same bits"}[broken]
 

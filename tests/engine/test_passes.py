@@ -10,10 +10,12 @@ from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine import adapters
 from gsplat_edu.engine.frame import program
 from gsplat_edu.engine.passes import FOLDER, LIMITS, MODULES, Buffer, Pass, Program, Size, module_source
+from gsplat_edu.engine.statistics import statistics_program
 from gsplat_edu.engine.step import step_program
 
 PROGRAM = program(16, True)
-PASSES = {(one.module, one.entry): one for each in (PROGRAM, step_program(16)) for one in each.passes()}
+PROGRAMS = (PROGRAM, step_program(16), statistics_program(PROGRAM, False))
+PASSES = {(one.module, one.entry): one for each in PROGRAMS for one in each.passes()}
 BYTES = {"u32": 4, "f32": 4, "vec2<f32>": 8, "vec4<f32>": 16, "Splat": 48}
 
 

@@ -137,5 +137,5 @@ def test_wrong_requests_are_named():
     with pytest.raises(ArgumentError, match="call backward on a loss of this image first"):
         statistics()
     dense = render(scene.gaussians(), scene.camera, backend="torch")
-    with pytest.raises(ArgumentError, match="only the backend cpu"):
+    with pytest.raises(ArgumentError, match="only the backends cpu and webgpu"):
         dense.collect("pixels")

@@ -81,7 +81,8 @@ def script(path, *words, folder):
 def test_a_benchmark_runs(path, tmp_path):
     out = tmp_path / "deep" / "figures.json"
     code, said, complained = script(path, "--smoke", "--out", out, folder=tmp_path)
-    if path.name == "gpu.py" and not torch.cuda.is_available() and unavailable("webgpu"):
+    needs = {"gpu.py": not torch.cuda.is_available(), "gpu_model.py": True}.get(path.name, False)
+    if needs and unavailable("webgpu"):
         assert (code, complained.count("\n")) == (2, 1) and "no GPU" in complained
         return
     if path.name == "ladder" and "compiler" in complained:

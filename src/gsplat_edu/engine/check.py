@@ -2,10 +2,12 @@
 
     python -m gsplat_edu.engine.check [--gaussians N] [--size WxH] [--rounds N] [--out FILE.json]
 
-Scan and sort of a million numbers are compared with NumPy, two renders and their gradients with one another, bit by
-bit. Then the device measures every pass of a render and of its gradients with its own clock. `render(...,
-backend="webgpu")` compares images and gradients with the CPU itself, before its first use. Exits with 1 if a
-comparison fails, with 2 if there is no adapter.
+Scan and sort of a million numbers are compared with NumPy, two renders and their gradients with one another, and three
+steps of training with the same three, bit by bit. Then the device measures every pass of a render, of its gradients and
+of a step of training that stays on the device, with its own clock if it has one; the host measures how long it takes to
+record and submit a step, and counts the bytes that cross. Beside the step's stages stands what a model computes for
+them (`gsplat_edu.engine.model`). `render(..., backend="webgpu")` compares images and gradients with the CPU itself,
+before its first use. Exits with 1 if a comparison fails, with 2 if there is no adapter.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import adapters
 from gsplat_edu.engine.frame import GRADS, Frame, FrameGradients, Pool, Scene, differentiate_frame, draw_frame
 from gsplat_edu.engine.host import Device
-from gsplat_edu.engine.passes import Buffer, Program, Size, scan, scan_scratch, sort, sort_scratch
+from gsplat_edu.engine.measure import as_table, measure_step
+from gsplat_edu.engine.passes import WORD, Buffer, Program, Size, scan, scan_scratch, sort, sort_scratch
 from gsplat_edu.engine.view import View
 from gsplat_edu.scene.camera import Camera
 
@@ -33,6 +36,12 @@ SUMMARY = "Check the engine on this computer's adapter, and measure its passes."
 
 NUMBERS = 1 << 20
 """Numbers that are scanned and sorted."""
+
+MANY, FEW = 1_000_000, 10_000
+"""Gaussians that are measured on a GPU, and on an adapter that computes on the CPU."""
+
+HARMONICS = 15
+"""Harmonics of each, besides the first."""
 
 PARTS = ("render", "composite_backward", "project_backward")
 """Parts of a program that are measured."""
@@ -85,7 +94,7 @@ def _random_scene(count: int) -> Scene:
         rng.normal(size=(count, 3)),
         rng.normal(size=(count, 1)),
     )
-    rest = 0.2 * rng.normal(size=(count, 15, 3)).astype(np.float32)
+    rest = 0.2 * rng.normal(size=(count, HARMONICS, 3)).astype(np.float32)
     return Scene(np.concatenate(columns, axis=1).astype(np.float32), rest)
 
 
@@ -143,7 +152,9 @@ def measure_frame(pool: Pool, scene: Scene, view: View, rounds: int) -> tuple[bo
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the checks; see the module."""
     parser = argparse.ArgumentParser(prog="python -m gsplat_edu.engine.check", description=SUMMARY)
-    parser.add_argument("--gaussians", type=int, default=1_000_000, help="default: 1000000")
+    parser.add_argument(
+        "--gaussians", type=int, help="default: 1000000, or what fits; 10000 if it computes on the CPU"
+    )
     parser.add_argument("--size", default="990x742", help="of the image, px (default: 990x742)")
     parser.add_argument("--rounds", type=int, default=5, help="measurements of each pass (default: 5)")
     parser.add_argument("--out", type=Path, help="write the results as JSON")
@@ -157,16 +168,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     print(json.dumps(report, indent=2))
+    print(as_table(report["step"]["stages"]))  # type: ignore[arg-type]
     if given.out:
         given.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return 0 if all(report["checks"].values()) else 1
 
 
-def _report(count: int, width: int, height: int, rounds: int) -> dict[str, dict[str, object]]:
+def default_count(software: bool, binding: int) -> int:
+    """Return how many Gaussians to measure.
+
+    Args:
+        software: Whether the adapter computes on the CPU.
+        binding: Bytes of its largest binding, into which their harmonics have to fit.
+    """
+    return FEW if software else min(MANY, binding // (WORD * 3 * HARMONICS))
+
+
+def _report(given: int | None, width: int, height: int, rounds: int) -> dict[str, dict[str, object]]:
     device = Device.default()
-    name = device.name
+    name, binding = device.name, device.limits["max-storage-buffer-binding-size"]
+    count = default_count(name.software, binding) if given is None else given
     checks = _exact(device, min(NUMBERS, max(count, 1)))
-    same, found = measure_frame(Pool(device), _random_scene(count), _view(width, height), rounds)
+    scene, view = _random_scene(count), _view(width, height)
+    same, found = measure_frame(Pool(device), scene, view, rounds)
+    step = measure_step(device, scene, view, rounds)
     return {
         "adapter": {"name": name.name, "kind": name.kind, "interface": name.interface, "driver": name.driver},
         "adapters": {str(place): other.name for place, other in enumerate(adapters())},
@@ -177,7 +202,12 @@ def _report(count: int, width: int, height: int, rounds: int) -> dict[str, dict[
             "system": platform.platform(),
         },
         "scene": {"gaussians": count, "width": width, "height": height},
-        "checks": {**checks, "two runs have the same bits": same},
+        "checks": {
+            **checks,
+            "two runs have the same bits": same,
+            "two trainings have the same bits": step.same_bits,
+        },
+        "step": step.report(),
         **{key: value for key, value in found.items() if isinstance(value, dict)},
     }
 

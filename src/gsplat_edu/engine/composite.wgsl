@@ -5,6 +5,8 @@
 // A tile stops once the transmittance of all its pixels is below 1e-4, as in every other renderer here. Each pixel
 // notes after how many splats of a batch of 64 its own is. The largest of these numbers is where the tile stops; if that
 // is within the batch, the pixels go back to its start and repeat it up to there.
+// With the stop per pixel, a pixel ends before the splat that would take its transmittance to 1e-4 or below, and keeps what
+// it has; a negative T marks it. Its tile stops once all of its pixels have ended.
 // The median depth is that of the splat where T falls below one half, 0 if it never does.
 
 @group(1) @binding(0) var<storage, read> records: array<vec4<f32>>;
@@ -31,11 +33,16 @@ fn blended(start: Pixel, pixel: vec2<f32>, count: u32, fell: ptr<function, u32>)
     for (var j = 0u; j < count; j++) {
         let a = batch[j].a;
         let power = power_at(a, batch[j].b, pixel - a.xy);
-        if (power >= LOG2_ALPHA_MIN) {
+        if (power >= LOG2_ALPHA_MIN && state.T > 0.0) {
             let paint = batch[j].paint;
             let w = state.T * alpha_of(power);
-            state.mixed += w * paint;
             let after = state.T - w;
+            if (after <= view.least_left) {
+                state.T = -state.T;
+                *fell = j + 1u;
+                continue;
+            }
+            state.mixed += w * paint;
             if (state.T >= 0.5 && after < 0.5) {
                 state.median = paint.w;
             }
@@ -96,12 +103,13 @@ fn composite(@builtin(workgroup_id) id: vec3<u32>, @builtin(num_workgroups) grou
     }
     if (inside) {
         let out = 6u * (at.y * view.size.x + at.x);
-        let behind = select(view.background.xyz, vec3<f32>(0.0), job.shift != 0u);   // features have no background
-        let color = state.mixed.xyz + state.T * behind;
+        let T = abs(state.T);
+        let behind = select(view.background, vec3<f32>(0.0), job.shift != 0u);   // features have no background
+        let color = state.mixed.xyz + T * behind;
         image[out] = color.x;
         image[out + 1u] = color.y;
         image[out + 2u] = color.z;
-        image[out + 3u] = state.T;
+        image[out + 3u] = T;
         image[out + 4u] = state.mixed.w;
         image[out + 5u] = state.median;
     }

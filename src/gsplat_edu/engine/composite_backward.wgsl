@@ -49,16 +49,13 @@ fn load_pixel(tile: u32, lane: u32) {
 fn add_pixel(splat: Splat, tile: u32, lane: u32, sums: ptr<function, Sums>) {
     let d = vec2<f32>(pixel_of(tile, lane)) - splat.a.xy;
     let power = power_at(splat.a, splat.b, d);
-    if (power >= LOG2_ALPHA_MIN) {
-        let alpha = alpha_of(power);
+    let at = light[lane];
+    if (power >= LOG2_ALPHA_MIN && at.x > 0.0) {
         let g = upstream[lane];
-        let at = light[lane];
-        let w = at.x * alpha;
-        let drawn = w * dot(g, splat.paint);
-        let left = at.y - drawn;
-        light[lane] = vec2<f32>(at.x - w, left);
-        let h = select(drawn - left * (alpha / (1.0 - alpha)), 0.0, power >= view.log2_alpha_max);
-        (*sums).painted += w * g;
+        let share = share_of(power, at, g, splat.paint);
+        let h = share.h;
+        light[lane] = share.left;
+        (*sums).painted += share.w * g;
         (*sums).h += h;
         (*sums).first += h * d;
         (*sums).second += h * vec3<f32>(d.x * d.x, d.x * d.y, d.y * d.y);

@@ -29,6 +29,7 @@ from gsplat_edu.engine.passes import (
     sort_bits,
     sort_scratch,
 )
+from gsplat_edu.engine.statistics import Asked, collect
 from gsplat_edu.engine.view import View
 
 CORE, OUT, RECORD, SLOT, PIXEL, GRADS, CAMERA_NUMBERS = 14, 16, 16, 10, 6, 5, 16
@@ -37,6 +38,9 @@ of the camera's gradient."""
 
 VISIBLE, PAIRS, SPARE, LIVE = 0, 1, 2, 4
 """Places in `live`, and its length."""
+
+STEEP = 2
+"""Statistics, the first ones, that features add to."""
 
 GROUP = 4
 """Features per pass: composite has room for three colours and a depth."""
@@ -217,6 +221,8 @@ class FrameGradients:
         norms: (N,), |(gu W/2, gv H/2)| with the gradient (gu, gv) of the position in the image.
         camera: (16,) float64: R row by row, the eye, fx, fy, cx, cy.
         features: (N, C), or None.
+        statistics: (N, 6) as `gsplat_edu.engine.statistics.collect` returns them, or None. Absolute gradients are sums
+            over the colours and each group of `GROUP` features.
     """
 
     core: np.ndarray
@@ -224,6 +230,7 @@ class FrameGradients:
     norms: np.ndarray
     camera: np.ndarray
     features: np.ndarray | None
+    statistics: np.ndarray | None
 
 
 class Pool:
@@ -344,7 +351,11 @@ def _drawn_features(memory: Memory, scene: Scene, H: int, W: int) -> np.ndarray 
 
 
 def differentiate_frame(
-    frame: Frame, scene: Scene, grads: np.ndarray, of_features: np.ndarray | None
+    frame: Frame,
+    scene: Scene,
+    grads: np.ndarray,
+    of_features: np.ndarray | None,
+    asked: Asked | None = None,
 ) -> FrameGradients:
     """Propagate gradients of a frame's images to the Gaussians and the camera.
 
@@ -353,6 +364,7 @@ def differentiate_frame(
         scene: The Gaussians of the frame.
         grads: (H, W, 5) float32, of image, transmittance and depth.
         of_features: (H, W, C) float32, of the image of the features; None for zero.
+        asked: Asks for statistics; None for none.
 
     Raises:
         BackendUnavailableError: the device fails.
@@ -360,7 +372,12 @@ def differentiate_frame(
     memory, n = frame.memory, len(scene.core)
     memory.write("grads", grads)
     memory.play("composite_backward")
-    to_features = None if of_features is None else _features_backward(memory, scene, of_features)
+    statistics = None if asked is None else collect(memory, asked)
+    to_features = None
+    if of_features is not None:
+        to_features, steep = _features_backward(memory, scene, of_features, asked)
+        if statistics is not None:
+            statistics[:, :STEEP] += steep
     found = memory.play("project_backward", read=("core_grads", "rest_grads", "camera_sums"))
     core = found["core_grads"].view(np.float32)[: n * OUT].reshape(n, OUT)
     sums = found["camera_sums"].view(np.float32)[: -(-n // 64) * CAMERA_NUMBERS].reshape(-1, CAMERA_NUMBERS)
@@ -370,13 +387,17 @@ def differentiate_frame(
         core[:, CORE].copy(),
         sums.sum(axis=0, dtype=np.float64),
         to_features,
+        statistics,
     )
 
 
-def _features_backward(memory: Memory, scene: Scene, gradient: np.ndarray) -> np.ndarray:
-    """Return the gradient of the features, and add their share of the moments to the slots of all pairs."""
+def _features_backward(
+    memory: Memory, scene: Scene, gradient: np.ndarray, asked: Asked | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gradient of the features and their absolute gradients; add their share to the slots of all pairs."""
     H, W, channels = gradient.shape
     n, found = len(scene.core), []
+    steep = np.zeros((n, STEEP), dtype=np.float32)
     for place, group in enumerate(scene.groups()):
         own = gradient[..., GROUP * place : GROUP * (place + 1)]
         grads = np.zeros((H, W, GRADS), dtype=np.float32)
@@ -386,4 +407,6 @@ def _features_backward(memory: Memory, scene: Scene, gradient: np.ndarray) -> np
         memory.write("grads", grads)
         words = memory.play("features_backward", read=("feature_grads",))["feature_grads"]
         found.append(words.view(np.float32)[: n * GROUP].reshape(n, GROUP))
-    return np.concatenate(found, axis=1)[:, :channels]
+        if asked is not None:
+            steep += collect(memory, asked, of_features=True)[:, :STEEP]
+    return np.concatenate(found, axis=1)[:, :channels], steep

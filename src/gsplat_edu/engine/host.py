@@ -49,6 +49,8 @@ class Device:
         sent: Bytes written to its buffers so far.
         received: Bytes read from them.
         answered: When the last submission was seen to be done, by `time.perf_counter`.
+        recording: Seconds in which `Memory.submit` recorded passes.
+        submitting: Seconds in which it handed them over.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class Device:
         self.pace = pace or Pace()
         self.lock = threading.RLock()
         self.sent, self.received, self.answered = 0, 0, 0.0
+        self.recording = self.submitting = 0.0
         self._staging: dict[int, list[Any]] = {}
         self._modules: dict[str, Any] = {}
         self._pipelines: dict[tuple[str, str, int, int], Any] = {}
@@ -137,7 +140,7 @@ class Device:
             program: The program.
             counts: Its counts by name.
             poison: Fill the buffers with noise instead of zeros, so that tests find what is read before it is written.
-            like: Its buffers are used again where name and size agree, with their contents; do not use it any more.
+            like: Its buffers are used again where name and size agree, with their contents; both then write to them.
 
         Raises:
             BackendUnavailableError: the device has too little memory or too small buffers; the message says which.
@@ -297,6 +300,7 @@ class Memory:
             BackendUnavailableError: the device fails.
         """
         with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
+            began = time.perf_counter()
             encoder = self._begun(view)
             if kept is not None:
                 encoder.copy_buffer_to_buffer(kept.buffer, 0, self._buffers[into], 0, kept.nbytes)
@@ -304,7 +308,11 @@ class Memory:
             size = self._bytes_of((read,))
             staging = self.device.staging(size)
             encoder.copy_buffer_to_buffer(self._buffers[read], 0, staging, 0, WORD * self._words[read])
-            self.device.device.queue.submit([encoder.finish()])
+            device, commands = self.device, encoder.finish()
+            recorded = time.perf_counter()
+            device.device.queue.submit([commands])
+            device.recording += recorded - began
+            device.submitting += time.perf_counter() - recorded
             arrival = staging.map_async("READ", 0, size)
             return Ticket(
                 self.device, staging, arrival, lambda seconds: self._parts.watch(part, seconds, pieces)

@@ -22,6 +22,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "intersect": ("job", "view", "constants", "ellipse", "intersect"),
     "composite": ("job", "view", "constants", "splat", "composite"),
     "composite_backward": ("job", "view", "constants", "splat", "composite_backward"),
+    "statistics": ("job", "view", "constants", "splat", "statistics"),
     "features": ("job", "features"),
     "project_backward": (
         "job",

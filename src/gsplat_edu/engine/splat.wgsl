@@ -25,3 +25,24 @@ fn pixel_of(tile: u32, lane: u32) -> vec2<u32> {
     let size = u32(TILE);
     return vec2<u32>(tile % view.tiles_x, tile / view.tiles_x) * size + vec2<u32>(lane % size, lane / size);
 }
+
+// What a splat takes from a pixel in the backward pass, and what it leaves: see composite_backward.wgsl.
+struct Share {
+    w: f32,
+    h: f32,
+    left: vec2<f32>,         // T, R; T is negative in a pixel that has ended
+}
+
+// Of a splat that is drawn in a pixel with T and R `at`, and gradient `g` of colour and depth.
+fn share_of(power: f32, at: vec2<f32>, g: vec4<f32>, paint: vec4<f32>) -> Share {
+    let alpha = alpha_of(power);
+    let w = at.x * alpha;
+    let after = at.x - w;
+    if (after <= view.least_left) {
+        return Share(0.0, 0.0, vec2<f32>(-at.x, at.y));
+    }
+    let drawn = w * dot(g, paint);
+    let left = at.y - drawn;
+    let h = select(drawn - left * (alpha / (1.0 - alpha)), 0.0, power >= view.log2_alpha_max);
+    return Share(w, h, vec2<f32>(after, left));
+}

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsplat_edu.base.constants import TILE
+from gsplat_edu.base.constants import T_STOP, TILE
 from gsplat_edu.scene.camera import Camera
 
 FARTHEST = 3e38
 """Stands for infinity, which WGSL lets a compiler assume away."""
+
+NO_STOP = -1.0
+"""Transmittance that no pixel reaches."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,7 @@ class View:
         jacobian_limit: Multiple of half the field of view, or None.
         alpha_max: Clamp of alpha.
         z_near: World units.
+        pixel_stop: Whether compositing ends for each pixel by itself.
     """
 
     camera: Camera
@@ -38,6 +42,7 @@ class View:
     jacobian_limit: float | None
     alpha_max: float
     z_near: float
+    pixel_stop: bool = False
 
     @property
     def tiles_x(self) -> int:
@@ -66,7 +71,7 @@ class View:
             *(*(eye - high), 0.0),
             *(camera.fx, camera.fy, camera.cx, camera.cy),
             *(bounds[0][0], bounds[1][0], bounds[0][1], bounds[1][1]),
-            *(*self.background, 0.0),
+            *(*self.background, T_STOP if self.pixel_stop else NO_STOP),
             *(self.z_near, self.dilation, self.alpha_max, math.log2(self.alpha_max)),
         )
         whole = (camera.W, camera.H, self.tiles_x, self.tiles, self.sh_degree, rest, int(self.antialiased), 0)

@@ -10,7 +10,8 @@ struct View {
     middle: vec2<f32>,       // cx, cy, px
     low: vec2<f32>,          // bounds of x/z and y/z inside the Jacobian
     high: vec2<f32>,
-    background: vec4<f32>,
+    background: vec3<f32>,
+    least_left: f32,         // a pixel ends before the splat that would leave it this transmittance or less; -1: it never does
     z_near: f32,
     dilation: f32,           // px²
     alpha_max: f32,

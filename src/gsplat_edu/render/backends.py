@@ -26,7 +26,7 @@ from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
 CUDA_LACKS = frozenset({"stop", "processes", "statistics"})
 """What the Triton kernels do not offer."""
 
-WEBGPU_LACKS = frozenset({"stop", "processes", "statistics", "forecast"})
+WEBGPU_LACKS = frozenset({"processes", "forecast"})
 """What the WGSL kernels do not offer."""
 
 

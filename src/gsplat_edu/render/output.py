@@ -114,8 +114,9 @@ class RenderOutput:
         """Ask the backward pass for statistics of the visible Gaussians. Call it before that pass.
 
         Each statistic is a sum or maximum over the pixels of this image, with w = T alpha. They have the same bits for
-        any number of threads. After several passes, they describe the last one. With more than 32 features, "absgrad"
-        is the sum over groups of 32 of them: at least the sum of the absolute values.
+        any number of threads. After several passes, they describe the last one. "absgrad" is
+        the sum over the features that are composited together: at least the sum of the absolute values. On the backend
+        cpu, these are colours with 32 features, then 32 each; on webgpu colours, then four features each.
 
         Args:
             names: "absgrad": (M, 2) sums of |d loss / d mean in the image|, each pixel's by itself (AbsGS); per px.
@@ -135,7 +136,7 @@ class RenderOutput:
         if not names or ("error_sum" in names) != (errors is not None):
             raise ArgumentError("collect: give at least one name, and errors exactly with error_sum")
         if self.collector is None:
-            raise ArgumentError("collect: only the backend cpu collects statistics")
+            raise ArgumentError("collect: only the backends cpu and webgpu collect statistics")
         found = self.collector(errors)
 
         def statistics() -> dict[str, Tensor]:

@@ -50,7 +50,7 @@ class RenderSettings:
         alpha_max: Clamp of a splat's alpha in a pixel, 1/255 to 0.9999; gsplat uses 0.999.
         stop: When compositing ends before the last Gaussian. "tile": for the pixels of a 16x16 tile together, once all
             of their transmittances are below 1e-4. "pixel": for each pixel, before the first Gaussian that would take
-            its transmittance to 1e-4 or below, as in Kerbl et al.'s code and gsplat; only the backend cpu offers it.
+            its transmittance to 1e-4 or below, as in Kerbl et al.'s code and gsplat; cpu and webgpu offer it.
         z_near: Gaussians whose means are at this camera depth or nearer are not drawn, world units.
 
     Raises:

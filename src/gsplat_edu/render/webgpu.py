@@ -25,12 +25,13 @@ from gsplat_edu.engine.adapters import AdapterName
 from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.frame import GRADS, FrameGradients, Pool, Scene, differentiate_frame, draw_frame
 from gsplat_edu.engine.host import Device
+from gsplat_edu.engine.statistics import Asked
 from gsplat_edu.engine.view import View
 from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians, check_tensor
 
 T = TypeVar("T")
 
@@ -51,6 +52,8 @@ class _Call:
     radii: Tensor = field(init=False)
     num_pairs: int = field(init=False)
     norms: Tensor | None = None
+    asked: Asked | None = None
+    statistics: Tensor | None = None
 
 
 def render_webgpu(
@@ -102,7 +105,24 @@ def render_webgpu(
         norms,
         features=None if extra.features is None else mixed,
         median_depth=median if settings.median_depth else None,
+        collector=functools.partial(_collect, call, tensors["sh_rest"].shape[1]),
     )
+
+
+def _collect(call: _Call, rest: int, errors: Tensor | None) -> Callable[[], Tensor]:
+    """Ask for statistics of the next backward pass; return a function that returns them for the visible Gaussians."""
+    given = None
+    if errors is not None:
+        check_tensor("errors", errors, (call.view.camera.H, call.view.camera.W), {})
+        given = errors.detach().to("cpu", torch.float32).contiguous().numpy().copy()
+    call.asked = Asked(call.view.packed(rest), given)
+
+    def found() -> Tensor:
+        if call.statistics is None:
+            raise ArgumentError("collect: there is nothing yet; call backward on a loss of this image first")
+        return call.statistics[call.visible]
+
+    return found
 
 
 def engine_view(camera: Camera, settings: RenderSettings, background: tuple[float, ...], degree: int) -> View:
@@ -117,7 +137,7 @@ def engine_view(camera: Camera, settings: RenderSettings, background: tuple[floa
     red, green, blue = background
     return View(
         camera, (red, green, blue), degree, settings.antialiased, settings.dilation, settings.jacobian_limit,
-        settings.alpha_max, settings.z_near,
+        settings.alpha_max, settings.z_near, settings.stop == "pixel",
     )  # fmt: skip
 
 
@@ -169,9 +189,11 @@ class _Rasterize(torch.autograd.Function):
         def differentiated() -> FrameGradients:
             if ctx.frame.memory.device is not device():  # that one was lost after the render
                 ctx.frame = draw_frame(_pool(), scene, call.view)
-            return differentiate_frame(ctx.frame, scene, upstream.numpy(), feature_grads)
+            return differentiate_frame(ctx.frame, scene, upstream.numpy(), feature_grads, call.asked)
 
         found = surviving(differentiated)
+        if found.statistics is not None:
+            call.statistics = torch.from_numpy(found.statistics)
         norms = torch.from_numpy(found.norms)
         call.norms = norms if call.norms is None else call.norms + norms
         behind = (
