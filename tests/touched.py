@@ -28,6 +28,9 @@ FEW = 6
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     "src/gsplat_edu/render": ("native", "parity", "gradients"),
     "src/gsplat_edu/render/triton": ("gpu",),
+    "src/gsplat_edu/render/webgpu.py": ("engine",),
+    "src/gsplat_edu/render/webgpu_resident.py": ("engine",),
+    "src/gsplat_edu/train/resident.py": ("engine",),
     "native": ("native",),
     "benchmarks/ladder": ("ladder",),
     "conformance": ("conformance", "gpu/test_conformance.py"),

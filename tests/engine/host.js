@@ -1,12 +1,23 @@
 // A host of the engine's programs in a browser: it plays what `passes.manifest` describes, as host.py does from Python.
 
-const WORD = 4, SLICE = 256, VIEW_BYTES = 512, LEAST = 4;
+const WORD = 4, JOB_BYTES = 32, SLICE = 256, VIEW_BYTES = 512, LEAST = 4;
 
 const sizeOf = (size, counts) => size.words * Math.ceil(counts[size.count] / size.per);
 
-function jobOf(one, counts, block) {
+function jobOf(one, counts, block, first) {
     const count = sizeOf(one.items, counts);
-    return [count, one.live, Math.ceil(count / (one.group || block)), one.shift];
+    return [count, one.live, Math.ceil(count / (one.group || block)), one.shift, first];
+}
+
+// The dispatches of a part: each pass in stretches of at most so many workgroups.
+function stretchesOf(passes, counts, block, most) {
+    const found = [];
+    for (const one of passes) {
+        const groups = one.group ? jobOf(one, counts, block, 0)[2] : 1;
+        for (let first = 0; first < groups; first += most)
+            found.push({one, job: jobOf(one, counts, block, first), groups: Math.min(most, groups - first)});
+    }
+    return found;
 }
 
 const bytesOf = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -35,8 +46,9 @@ async function compiled(device, manifest, notes) {
     return modules;
 }
 
-// Plays the parts in order; `writes` is name to base64, `view` base64. Resolves to the buffers of `reads`, and what went wrong.
-async function play(manifest, counts, writes, view, parts, reads) {
+// Plays the parts in order; `writes` is name to base64, `view` base64. Every `most` workgroups are a submission; 0 plays a
+// part in one. Resolves to the buffers of `reads`, and what went wrong.
+async function play(manifest, counts, writes, view, parts, reads, most = 0) {
     const notes = [], device = await deviceFor(manifest, notes);
     if (!device) return {adapter: false};
     const modules = await compiled(device, manifest, notes);
@@ -51,36 +63,49 @@ async function play(manifest, counts, writes, view, parts, reads) {
     device.queue.writeBuffer(shared, 0, bytesOf(view));
     const entry = (binding, buffer) => ({binding, visibility: GPUShaderStage.COMPUTE, buffer});
     const uniformLayout = device.createBindGroupLayout({entries: [
-        entry(0, {type: 'uniform', hasDynamicOffset: true, minBindingSize: 16}),
+        entry(0, {type: 'uniform', hasDynamicOffset: true, minBindingSize: JOB_BYTES}),
         entry(1, {type: 'uniform', minBindingSize: VIEW_BYTES}),
     ]});
     for (const part of parts) {
-        const passes = manifest.parts[part];
-        const jobs = device.createBuffer({size: SLICE * passes.length, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST});
+        const stretches = stretchesOf(manifest.parts[part], counts, manifest.block, most || Infinity);
+        const jobs = device.createBuffer({size: SLICE * stretches.length, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST});
         const uniforms = device.createBindGroup({layout: uniformLayout, entries: [
-            {binding: 0, resource: {buffer: jobs, size: 16}},
+            {binding: 0, resource: {buffer: jobs, size: JOB_BYTES}},
             {binding: 1, resource: {buffer: shared}},
         ]});
-        const encoder = device.createCommandEncoder(), computing = encoder.beginComputePass();
-        passes.forEach((one, place) => {
-            const job = jobOf(one, counts, manifest.block), groups = one.group ? job[2] : 1;
-            device.queue.writeBuffer(jobs, SLICE * place, new Uint32Array(job));
-            if (!groups) return;
+        stretches.forEach(({job}, row) => device.queue.writeBuffer(jobs, SLICE * row, new Uint32Array(job)));
+        let encoder = device.createCommandEncoder(), computing = encoder.beginComputePass();
+        const submit = () => {
+            computing.end();
+            device.queue.submit([encoder.finish()]);
+        };
+        const bound = new Map();
+        stretches.forEach(({one, groups}, row) => {
             const names = [...one.reads, ...one.writes];
-            const layout = device.createBindGroupLayout({entries: names.map((_, binding) =>
-                entry(binding, {type: binding < one.reads.length ? 'read-only-storage' : 'storage'}))});
-            computing.setPipeline(device.createComputePipeline({
-                layout: device.createPipelineLayout({bindGroupLayouts: [uniformLayout, layout]}),
-                compute: {module: modules[one.module], entryPoint: one.entry},
-            }));
-            computing.setBindGroup(0, uniforms, [SLICE * place]);
-            computing.setBindGroup(1, device.createBindGroup({layout, entries: names.map((name, binding) =>
-                ({binding, resource: {buffer: buffers[name]}}))}));
+            if (!bound.has(one)) {
+                const layout = device.createBindGroupLayout({entries: names.map((_, binding) =>
+                    entry(binding, {type: binding < one.reads.length ? 'read-only-storage' : 'storage'}))});
+                const pipeline = device.createComputePipeline({
+                    layout: device.createPipelineLayout({bindGroupLayouts: [uniformLayout, layout]}),
+                    compute: {module: modules[one.module], entryPoint: one.entry},
+                });
+                const storage = device.createBindGroup({layout, entries: names.map((name, binding) =>
+                    ({binding, resource: {buffer: buffers[name]}}))});
+                bound.set(one, {pipeline, storage});
+            }
+            const {pipeline, storage} = bound.get(one);
+            computing.setPipeline(pipeline);
+            computing.setBindGroup(0, uniforms, [SLICE * row]);
+            computing.setBindGroup(1, storage);
             const x = Math.min(groups, device.limits.maxComputeWorkgroupsPerDimension);
             computing.dispatchWorkgroups(x, Math.ceil(groups / x));
+            if (most && row + 1 < stretches.length) {
+                submit();
+                encoder = device.createCommandEncoder();
+                computing = encoder.beginComputePass();
+            }
         });
-        computing.end();
-        device.queue.submit([encoder.finish()]);
+        submit();
     }
     const found = {};
     for (const name of reads) {

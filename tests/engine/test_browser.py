@@ -43,12 +43,12 @@ def text_of(array):
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-def played(page, program, counts, writes, block, parts, reads):
-    """Play parts of a program in the browser, and return buffers as uint32."""
+def played(page, program, counts, writes, block, parts, reads, most=0):
+    """Play parts of a program in the browser, and return buffers as uint32; see `play` in host.js."""
     given = {name: text_of(array) for name, array in writes.items()}
     block = text_of(np.frombuffer(block, dtype=np.uint8))
     result = page.evaluate(
-        "given => play(...given)", [manifest(program), counts, given, block, list(parts), list(reads)]
+        "given => play(...given)", [manifest(program), counts, given, block, list(parts), list(reads), most]
     )
     if not result["adapter"]:
         pytest.skip("this Chromium has no WebGPU adapter")
@@ -67,6 +67,25 @@ def counts_of(scene, view, room, live):
         "live": live,
         "pairs": room,
     }
+
+
+def test_a_browser_splits_passes_with_the_same_bits(page, pool):
+    """Two workgroups in each submission, against a part in one."""
+    scene, view = packed(SMALLER["random"]), view_of(SMALLER["random"])
+    grads = np.random.default_rng(1).normal(size=(view.camera.H, view.camera.W, frame.GRADS))
+    program = frame.program(sort_bits(view.tiles.bit_length()), False)
+    writes = {"core": scene.core, "rest": scene.rest, "grads": grads.astype(np.float32)}
+    given = (
+        counts_of(scene, view, 1 << 12, frame.LIVE),
+        writes,
+        view.packed(scene.rest.shape[1]),
+        PARTS,
+        READS,
+    )
+    whole, split = (played(page, program, *given, most) for most in (0, 2))
+    assert whole["image"].any() and whole["core_grads"].any()
+    for name in READS:
+        np.testing.assert_array_equal(whole[name], split[name])
 
 
 @pytest.mark.sliced(1)

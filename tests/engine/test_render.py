@@ -181,6 +181,26 @@ def test_huge_values_are_drawn_or_not_as_by_the_native_kernels(kind):
         assert (gradients[key] - truth).abs().max() <= 3e-4 * truth.abs().max(), key
 
 
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 1023, 1024, 1025, 100_000])
+def test_any_number_of_gaussians(count):
+    """Around the sizes of workgroups and blocks. Depths are far enough apart for float32, so the order is the same."""
+    rng = np.random.default_rng(count)
+    scales = rng.normal(-2.0 - 0.15 * np.log(count), 0.3, (count, 3))
+    scene = random(count, (75, 50), seed=count, log_scales=scales)
+    seen = (scene.means - scene.camera.eye) @ scene.camera.R.T
+    seen[:, 2] = 3.0 + 2.0 * rng.permutation(count) / count
+    scene = dataclasses.replace(scene, means=seen @ scene.camera.R + scene.camera.eye)
+    values, gradients, out = images_and_gradients(scene, "webgpu")
+    truths, expected, oracle = images_and_gradients(scene, "cpu")
+    assert len(out.visible) == len(oracle.visible) > 0
+    assert abs(out.num_pairs - oracle.num_pairs) <= 2 + count // 10_000
+    for key, truth in truths.items():
+        assert np.abs(values[key] - truth).max() < 1.1 * max(1.0, np.abs(truth).max()) / 255, key
+    for key, truth in expected.items():
+        parts = count if key in POSE else 1
+        assert np.abs(gradients[key] - truth).max() <= parts * 3e-4 * np.abs(truth).max(), key
+
+
 @pytest.mark.parametrize("kind", ["empty", "behind", "faint", "one"])
 def test_almost_empty_scenes(kind):
     scene = random(0 if kind == "empty" else 1 if kind == "one" else 9, (17, 33), seed=2)

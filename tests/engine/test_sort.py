@@ -39,14 +39,16 @@ def keys_of(kind, count, bits=32):
     keys = rng.integers(0, 2**bits, count, dtype=np.uint32)
     if kind == "equal":
         keys[:] = 0xFFFFFFFF >> (32 - bits)
-    if kind == "sorted":
+    if kind in ("sorted", "reversed"):
         keys.sort()
+    if kind == "reversed":
+        keys = keys[::-1].copy()
     if kind == "few":
         keys %= 3
     return keys
 
 
-@pytest.mark.parametrize("kind", ["random", "equal", "sorted", "few"])
+@pytest.mark.parametrize("kind", ["random", "equal", "sorted", "reversed", "few"])
 @pytest.mark.parametrize("count", SIZES)
 def test_sort_is_numpy_s_stable_one(device, count, kind):
     keys = keys_of(kind, count)
@@ -56,9 +58,12 @@ def test_sort_is_numpy_s_stable_one(device, count, kind):
     np.testing.assert_array_equal(values, order)
 
 
-def test_a_million(device):
-    keys = keys_of("random", 10**6)
-    keys[::3] = 12345
+@pytest.mark.sliced(1)
+@pytest.mark.parametrize("kind", ["random", "equal", "sorted", "reversed"])
+def test_a_million(device, kind):
+    keys = keys_of(kind, 10**6)
+    if kind == "random":
+        keys[::3] = 12345
     memory = allocated(device, len(keys))
     ours, values = sorted_on(memory, keys)
     order = np.argsort(keys, kind="stable")
@@ -89,7 +94,7 @@ def test_fewer_keys_than_there_is_room_for(device, count):
     np.testing.assert_array_equal(values, order)
 
 
-@pytest.mark.parametrize("count", [*SIZES, 2**20 - 1, 2**20 + 1025])
+@pytest.mark.parametrize("count", [*SIZES, 10**6, 2**20 - 1, 2**20 + 1025])
 def test_scan_is_numpy_s_sum(device, count):
     numbers = keys_of("random", count) >> 20
     memory = allocated(device, count)

@@ -274,7 +274,7 @@ def test_a_step_that_gets_no_room_ends_the_run_and_saves_nothing(capture, device
         right(program, counts)
 
     monkeypatch.setattr(device, "check_fits", tight)
-    message = r"^backend 'webgpu': the buffer slots needs 40960 MiB for .*; use the backend cpu$"
+    message = r"^backend 'webgpu': the buffer slots needs 40960 MiB for .*, or use the backend cpu$"
     with pytest.raises(BackendUnavailableError, match=message):
         run.run()
     with pytest.raises(BackendUnavailableError, match=message):

@@ -10,7 +10,7 @@
     ├── ProcessLostError                     another process of a shared training ended
     └── NotEnoughMemoryError                 work needs more memory than is free
 
-    BackendWarning                           "auto" takes another backend than the machine suggests
+    BackendWarning                           a backend is replaced, leaves its device or loses it
 
 Every message is one line that says what is wrong, where, and what to do next. The command line prints that
 line and exits with 2.
@@ -36,7 +36,7 @@ class BackendUnavailableError(SplatError):
 
 
 class BackendWarning(UserWarning):
-    """The backend "auto" is not the one that this machine suggests; the message says why."""
+    """A backend does not do what one would expect, such as stay on its device; the message says why."""
 
 
 class DatasetError(SplatError):

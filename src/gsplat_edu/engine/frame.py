@@ -260,7 +260,19 @@ class Pool:
 
     def keep(self, memory: Memory) -> None:
         """Take back the buffers of a frame. Finalizers call it from any thread, so it takes no lock."""
-        self._waiting.append(memory)
+        if memory.device is self.device:
+            self._waiting.append(memory)
+
+    def renew(self, lost: Device) -> None:
+        """Go on with a new device in place of one that is lost, unless that has happened already.
+
+        Raises:
+            BackendUnavailableError: its adapter is gone, or does not start.
+        """
+        with lost.lock:
+            if self.device is lost:
+                self.device = lost.renewed()
+                self._waiting.clear()
 
     def room(self, gaussians: int, tiles: int) -> int:
         """Return the number of pairs to make room for: what frames of this size needed, or two per Gaussian."""

@@ -5,40 +5,32 @@
     memory.write("keys", keys)
     found = memory.play("sort", read=("keys",))
 
-A part of a program is one submission. Nothing is read back but what `read` names.
+A part of a program is one submission, or several on a slow device (`pace.py`). Nothing is read back but what `read`
+names.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import struct
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import adapters, chosen_adapter, listed_adapters, why_unavailable
-from gsplat_edu.engine.failures import one_line
+from gsplat_edu.engine.dispatch import JOB_BYTES, LEAST, SLICE, VIEW_BYTES, Parts, dispatch
+from gsplat_edu.engine.failures import listen, one_line, wait
+from gsplat_edu.engine.pace import Pace
 from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
+from gsplat_edu.engine.room import why_too_large
 from gsplat_edu.engine.transfers import Kept, Ticket
-
-SLICE = 256
-"""Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
-
-LEAST = 4
-"""Words of the smallest buffer: one row of four numbers, which is the largest type of an array."""
-
-VIEW_BYTES = 512
-"""Bytes of the uniform block that all passes of a part share: camera and settings."""
 
 TIMESTAMPS = "timestamp-query"
 """The optional feature of measuring passes."""
-
-Call = tuple[Any, Any, Any, int, int, int]
-"""Pipeline, uniforms, storage, offset of the job, workgroups in two dimensions."""
 
 
 class Device:
@@ -48,6 +40,7 @@ class Device:
         adapter: Its place in `adapters()`.
         limits: What it is asked for, by the names of `LIMITS`; None for all that the adapter has.
         most_groups: Workgroups in one dimension; more continue in the second.
+        pace: How long its submissions may take.
 
     Raises:
         BackendUnavailableError: it does not start.
@@ -55,13 +48,19 @@ class Device:
     Attributes:
         sent: Bytes written to its buffers so far.
         received: Bytes read from them.
+        answered: When the last submission was seen to be done, by `time.perf_counter`.
         recording: Seconds in which `Memory.submit` recorded passes.
         submitting: Seconds in which it handed them over.
     """
 
     def __init__(
-        self, adapter: int = 0, limits: Mapping[str, int] | None = None, most_groups: int | None = None
+        self,
+        adapter: int = 0,
+        limits: Mapping[str, int] | None = None,
+        most_groups: int | None = None,
+        pace: Pace | None = None,
     ) -> None:
+        listen()
         self.name, chosen = listed_adapters()[adapter]
         wanted = {key: chosen.limits[key] for key in LIMITS} if limits is None else dict(limits)
         self.measures = TIMESTAMPS in chosen.features
@@ -71,12 +70,50 @@ class Device:
             )
         self.limits: Mapping[str, int] = wanted
         self.most_groups = most_groups or wanted["max-compute-workgroups-per-dimension"]
+        self.pace = pace or Pace()
         self.lock = threading.RLock()
-        self.sent = self.received = 0
+        self.sent, self.received, self.answered = 0, 0, 0.0
         self.recording = self.submitting = 0.0
         self._staging: dict[int, list[Any]] = {}
         self._modules: dict[str, Any] = {}
         self._pipelines: dict[tuple[str, str, int, int], Any] = {}
+
+    def renewed(self) -> Device:
+        """Return a new device on the same adapter, in place of one that is lost.
+
+        Raises:
+            BackendUnavailableError: the adapter is gone, or does not start.
+        """
+        with contextlib.suppress(
+            Exception
+        ):  # a lost device may refuse anything; this ends wgpu's thread for it
+            self.device.destroy()
+        listed_adapters.cache_clear()
+        if self.name not in adapters():
+            raise BackendUnavailableError(
+                f"backend 'webgpu': {self.name.name} is gone; restart the computer, or use the backend cpu"
+            )
+        return Device(adapters().index(self.name), self.limits, self.most_groups, self.pace)
+
+    def is_lost(self) -> bool:
+        """Return whether the system has reset the device or taken it away."""
+        import wgpu
+
+        try:
+            self.device.create_buffer(size=SLICE, usage=wgpu.BufferUsage.COPY_DST).destroy()
+        except wgpu.GPUOutOfMemoryError:
+            return False
+        except (wgpu.GPUError, RuntimeError):
+            return True
+        return False
+
+    def wait(self, arrival: Any) -> None:  # noqa: ANN401
+        """Wait for what wgpu promises.
+
+        Raises:
+            DeviceLostError: the device is lost.
+        """
+        wait(arrival, f"{self.name.name} does not answer", self)
 
     @staticmethod
     @functools.cache
@@ -118,7 +155,7 @@ class Device:
         """
         import wgpu
 
-        with self.lock, one_line(f"{self.name.name} has no {array.nbytes / 2**20:.0f} MiB for a photo"):
+        with self.lock, one_line(f"{self.name.name} has no {array.nbytes / 2**20:.0f} MiB for a photo", self):
             usage = wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
             buffer = self.device.create_buffer_with_data(data=np.ascontiguousarray(array), usage=usage)
         self.sent += array.nbytes
@@ -143,17 +180,11 @@ class Device:
         """Check that no buffer is larger than the device allows.
 
         Raises:
-            BackendUnavailableError: one is; the message names it.
+            BackendUnavailableError: one is; the message names it, and how many would fit.
         """
         most = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
-        largest = max(program.buffers, key=lambda buffer: buffer.size.of(counts))
-        size = WORD * largest.size.of(counts)
-        if size > most:
-            raise BackendUnavailableError(
-                f"backend 'webgpu': the buffer {largest.name} needs {size / 2**20:.0f} MiB for "
-                f"{', '.join(f'{count} {name}' for name, count in counts.items())}, but {self.name.name} allows "
-                f"{most / 2**20:.0f}; use the backend cpu"
-            )
+        if why := why_too_large(program, counts, most, self.name.name):
+            raise BackendUnavailableError(f"backend 'webgpu': {why}, or use the backend cpu")
 
     def pipeline(self, one: Pass) -> tuple[Any, Any]:
         """Return the compiled pipeline of a pass, and the layout of its storage buffers."""
@@ -164,7 +195,7 @@ class Device:
 
     def _compiled(self, one: Pass) -> tuple[Any, Any]:
         if one.module not in self._modules:
-            with one_line(f"{self.name.name} refuses the shader {one.module}"):
+            with one_line(f"{self.name.name} refuses the shader {one.module}", self):
                 self._modules[one.module] = self.device.create_shader_module(code=module_source(one.module))
         kinds = ["read-only-storage"] * len(one.reads) + ["storage"] * len(one.writes)
         storage = self.device.create_bind_group_layout(
@@ -172,13 +203,13 @@ class Device:
         )
         layout = self.device.create_pipeline_layout(bind_group_layouts=[self.uniform_layout, storage])
         stage = {"module": self._modules[one.module], "entry_point": one.entry}
-        with one_line(f"{self.name.name} refuses the shader {one.module}.{one.entry}"):
+        with one_line(f"{self.name.name} refuses the shader {one.name}", self):
             return self.device.create_compute_pipeline(layout=layout, compute=stage), storage
 
     @functools.cached_property
     def uniform_layout(self) -> Any:  # noqa: ANN401
         """The layout of group 0: the job of the pass, and the view."""
-        job = {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": 16}
+        job = {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": JOB_BYTES}
         return self.device.create_bind_group_layout(
             entries=[_entry(0, job), _entry(1, {"type": "uniform", "min_binding_size": VIEW_BYTES})]
         )
@@ -212,7 +243,7 @@ class Memory:
         self._words = {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in program.buffers}
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
-        with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):
+        with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}", device):
             self._buffers = {} if like is None else like._shared(self._words)
             for name in self._words.keys() - self._buffers:
                 self._buffers[name] = make(size=WORD * self._words[name], usage=storage)
@@ -222,34 +253,7 @@ class Memory:
             for name, words in self._words.items():
                 self.write(name, noise.integers(0, 2**32, words, dtype=np.uint32))
         self._staging: Any = None
-        self._recorded = {part: self._bind(passes) for part, passes in program.parts.items()}
-
-    def _bind(self, passes: Sequence[Pass]) -> list[Call]:
-        """Return the call of each pass that has any workgroups."""
-        import wgpu
-
-        make = self.device.device.create_bind_group
-        jobs = self.device.device.create_buffer_with_data(
-            data=b"".join(struct.pack("<4I", *one.job(self.counts)).ljust(SLICE, b"\0") for one in passes),
-            usage=wgpu.BufferUsage.UNIFORM,
-        )
-        uniforms = make(
-            layout=self.device.uniform_layout,
-            entries=[
-                {"binding": 0, "resource": {"buffer": jobs, "offset": 0, "size": 16}},
-                {"binding": 1, "resource": {"buffer": self._view, "offset": 0, "size": VIEW_BYTES}},
-            ],
-        )
-        recorded = []
-        for place, one in enumerate(passes):
-            if groups := one.groups(self.counts):
-                pipeline, layout = self.device.pipeline(one)
-                bound = [{"buffer": self._buffers[name]} for name in (*one.reads, *one.writes)]
-                entries = [{"binding": k, "resource": each} for k, each in enumerate(bound)]
-                x = min(groups, self.device.most_groups)
-                storage = make(layout=layout, entries=entries)
-                recorded.append((pipeline, uniforms, storage, SLICE * place, x, -(-groups // x)))
-        return recorded
+        self._parts = Parts(device, program, counts, self._buffers, self._view)
 
     def _shared(self, words: Mapping[str, int]) -> dict[str, Any]:
         """Return the buffers of these names that have these sizes."""
@@ -268,7 +272,7 @@ class Memory:
                 f"{name}: has {self._words[name]} words, not {array.size} of {array.itemsize} bytes"
             )
         if array.size:
-            with one_line(f"{self.device.name.name} does not take {name}"):
+            with one_line(f"{self.device.name.name} does not take {name}", self.device):
                 self.device.device.queue.write_buffer(self._buffers[name], 0, np.ascontiguousarray(array))
             self.device.sent += array.nbytes
 
@@ -278,7 +282,7 @@ class Memory:
         Raises:
             BackendUnavailableError: the device fails.
         """
-        with self.device.lock, one_line(f"{self.device.name.name} does not give {name}"):
+        with self.device.lock, one_line(f"{self.device.name.name} does not give {name}", self.device):
             encoder = self.device.device.create_command_encoder()
             return self._read_after(encoder, (name,))[name]
 
@@ -295,12 +299,12 @@ class Memory:
         Raises:
             BackendUnavailableError: the device fails.
         """
-        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             began = time.perf_counter()
             encoder = self._begun(view)
             if kept is not None:
                 encoder.copy_buffer_to_buffer(kept.buffer, 0, self._buffers[into], 0, kept.nbytes)
-            self._compute(encoder, part)
+            encoder, pieces = self._parts.record(encoder, part)
             size = self._bytes_of((read,))
             staging = self.device.staging(size)
             encoder.copy_buffer_to_buffer(self._buffers[read], 0, staging, 0, WORD * self._words[read])
@@ -310,7 +314,9 @@ class Memory:
             device.recording += recorded - began
             device.submitting += time.perf_counter() - recorded
             arrival = staging.map_async("READ", 0, size)
-            return Ticket(device.name.name, device.lock, staging, arrival, device.free_staging)
+            return Ticket(
+                self.device, staging, arrival, lambda seconds: self._parts.watch(part, seconds, pieces)
+            )
 
     def play(self, part: str, view: bytes = b"", read: Iterable[str] = ()) -> dict[str, np.ndarray]:
         """Play a part of the program as one submission, and wait for it if something is read.
@@ -324,10 +330,14 @@ class Memory:
             BackendUnavailableError: the device fails.
         """
         names = tuple(read)
-        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             encoder = self._begun(view)
-            self._compute(encoder, part)
-            return self._read_after(encoder, names)
+            encoder, pieces = self._parts.record(encoder, part)
+            began = time.perf_counter()
+            found = self._read_after(encoder, names)
+            if names:
+                self._parts.watch(part, time.perf_counter() - began, pieces)
+            return found
 
     def _begun(self, view: bytes) -> Any:  # noqa: ANN401
         """Return an encoder, after writing the uniform block."""
@@ -335,13 +345,6 @@ class Memory:
             self.device.device.queue.write_buffer(self._view, 0, view)
             self.device.sent += len(view)
         return self.device.device.create_command_encoder()
-
-    def _compute(self, encoder: Any, part: str) -> None:  # noqa: ANN401
-        """Record the passes of a part."""
-        computing = encoder.begin_compute_pass()
-        for call in self._recorded[part]:
-            _dispatch(computing, call)
-        computing.end()
 
     def _read_after(self, encoder: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:  # noqa: ANN401
         """Submit what was recorded, and return buffers as they are then."""
@@ -363,9 +366,9 @@ class Memory:
 
         if not self.device.measures:
             raise BackendUnavailableError(f"backend 'webgpu': {self.device.name.name} has no timestamps")
-        make, recorded = self.device.device, self._recorded[part]
+        make, recorded = self.device.device, self._parts.whole[part]
         passes = [one for one in self.program.parts[part] if one.groups(self.counts)]
-        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}"):
+        with self.device.lock, one_line(f"{self.device.name.name} fails in {part}", self.device):
             queries = make.create_query_set(type="timestamp", count=2 * len(passes))
             usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
             resolved = make.create_buffer(size=16 * len(passes), usage=usage)
@@ -373,7 +376,7 @@ class Memory:
             for place, call in enumerate(recorded):
                 marks = {"beginning_of_pass_write_index": 2 * place, "end_of_pass_write_index": 2 * place + 1}
                 computing = encoder.begin_compute_pass(timestamp_writes={"query_set": queries, **marks})
-                _dispatch(computing, call)
+                dispatch(computing, call)
                 computing.end()
             encoder.resolve_query_set(queries, 0, 2 * len(passes), resolved, 0)
             make.queue.submit([encoder.finish()])
@@ -397,7 +400,7 @@ class Memory:
         if not names:
             return {}
         size = self._bytes_of(names)
-        staging.map_sync("READ", 0, size)
+        self.device.wait(staging.map_async("READ", 0, size))
         words = np.frombuffer(staging.read_mapped(0, size), dtype=np.uint32)
         staging.unmap()
         self.device.received += size
@@ -407,14 +410,6 @@ class Memory:
     def _bytes_of(self, names: tuple[str, ...]) -> int:
         """Return the bytes of these buffers; mapped ranges are multiples of 8."""
         return -(-WORD * sum(self._words[name] for name in names) // 8) * 8
-
-
-def _dispatch(computing: Any, call: Call) -> None:  # noqa: ANN401
-    pipeline, uniforms, storage, offset, x, y = call
-    computing.set_pipeline(pipeline)
-    computing.set_bind_group(0, uniforms, [offset])
-    computing.set_bind_group(1, storage)
-    computing.dispatch_workgroups(x, y)
 
 
 def _entry(binding: int, buffer: Mapping[str, object]) -> dict[str, object]:

@@ -5,11 +5,12 @@ struct Job {
     live: u32,     // place of the number of items in the buffer `live`
     blocks: u32,   // workgroups that have items
     shift: u32,    // lowest bit of the sort's digit; 1 for a composite without background
+    first: u32,    // first workgroup of this dispatch: a long pass is dispatched in several stretches
 }
 
 @group(0) @binding(0) var<uniform> job: Job;
 
 // Workgroups beyond the limit of one dimension continue in the second.
 fn group_of(id: vec3<u32>, groups: vec3<u32>) -> u32 {
-    return id.y * groups.x + id.x;
+    return job.first + id.y * groups.x + id.x;
 }

@@ -96,7 +96,7 @@ class Buffer:
 
 @dataclass(frozen=True)
 class Pass:
-    """One dispatch.
+    """One dispatch, or several: a host may cut its workgroups into stretches at any place (`pace.py`).
 
     Args:
         module: A name in `MODULES`.
@@ -118,10 +118,20 @@ class Pass:
     live: int = 0
     shift: int = 0
 
-    def job(self, counts: Mapping[str, int]) -> tuple[int, int, int, int]:
-        """Return the numbers of `Job` in `job.wgsl`: count, live, blocks, shift."""
+    def job(self, counts: Mapping[str, int], first: int = 0) -> tuple[int, int, int, int, int]:
+        """Return the numbers of `Job` in `job.wgsl`: count, live, blocks, shift, first.
+
+        Args:
+            counts: The program's counts.
+            first: The first workgroup of the dispatch. One that is not the whole pass has one dimension.
+        """
         count = self.items.of(counts)
-        return count, self.live, -(-count // (self.group or BLOCK)), self.shift
+        return count, self.live, -(-count // (self.group or BLOCK)), self.shift, first
+
+    @property
+    def name(self) -> str:
+        """Module and entry point."""
+        return f"{self.module}.{self.entry}"
 
     def groups(self, counts: Mapping[str, int]) -> int:
         """Return the number of workgroups."""

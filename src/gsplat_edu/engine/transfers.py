@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,32 +29,35 @@ class Ticket:
     """What a submission leaves in a small buffer; `Memory.submit` makes it.
 
     Args:
-        name: The adapter's.
-        lock: Of the device.
+        device: The device.
         staging: The copy of the buffer.
         arrival: Is fulfilled when the copy can be read.
-        free: Takes `staging` back.
+        took: Receives the seconds that the device took, at most.
     """
 
     def __init__(
         self,
-        name: str,
-        lock: AbstractContextManager[Any],
+        device: Any,  # noqa: ANN401  a Device of host.py, which imports this module
         staging: Any,  # noqa: ANN401
         arrival: Any,  # noqa: ANN401
-        free: Callable[[Any], None],
+        took: Callable[[float], None],
     ) -> None:
-        self._name, self._lock, self._staging, self._arrival, self._free = name, lock, staging, arrival, free
+        self._device, self._staging, self._arrival, self._took = device, staging, arrival, took
+        self._began = time.perf_counter()
 
     def words(self) -> np.ndarray:
         """Wait for the submission, and return the contents as uint32; call it once.
 
         Raises:
-            BackendUnavailableError: the device fails.
+            BackendUnavailableError: the device fails; a `DeviceLostError` if it is lost.
         """
-        with self._lock, one_line(f"{self._name} does not answer"):
-            self._arrival.sync_wait()
+        device = self._device
+        with device.lock, one_line(f"{device.name.name} does not answer", device):
+            device.wait(self._arrival)
+            now = time.perf_counter()
+            self._took(now - max(self._began, device.answered))
+            device.answered = now
             words = np.frombuffer(self._staging.read_mapped(0, self._staging.size), dtype=np.uint32).copy()
             self._staging.unmap()
-            self._free(self._staging)
+            device.free_staging(self._staging)
             return words

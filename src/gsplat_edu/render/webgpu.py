@@ -10,18 +10,20 @@ one device give the same bits.
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError, BackendWarning
 from gsplat_edu.engine.adapters import AdapterName
-from gsplat_edu.engine.frame import GRADS, Pool, Scene, differentiate_frame, draw_frame
+from gsplat_edu.engine.failures import DeviceLostError
+from gsplat_edu.engine.frame import GRADS, FrameGradients, Pool, Scene, differentiate_frame, draw_frame
 from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.statistics import Asked
 from gsplat_edu.engine.view import View
@@ -30,6 +32,11 @@ from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians, check_tensor
+
+T = TypeVar("T")
+
+MOST_LOSSES = 2
+"""How often a lost device is replaced before the work is given up."""
 
 CORE = {"means": 3, "quats": 4, "log_scales": 3, "sh0": 3, "logit_opacities": 1}
 """Parameters in the order of `Scene.core`, and how many numbers each has."""
@@ -149,7 +156,7 @@ class _Rasterize(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         scene = _scene(parameters, features)
-        frame = draw_frame(_pool(), scene, call.view)
+        frame = surviving(lambda: draw_frame(_pool(), scene, call.view))
         call.visible, call.radii = torch.from_numpy(frame.visible), torch.from_numpy(frame.radii)
         call.num_pairs = frame.num_pairs
         planes = (frame.image, frame.transmittance, frame.depth, frame.features, frame.median_depth)
@@ -178,7 +185,13 @@ class _Rasterize(torch.autograd.Function):
             upstream[..., 4] = of_depth
         feature_grads = None if of_features is None else of_features.contiguous().numpy()
         scene = _scene(parameters, features)
-        found = differentiate_frame(ctx.frame, scene, upstream.numpy(), feature_grads, call.asked)
+
+        def differentiated() -> FrameGradients:
+            if ctx.frame.memory.device is not device():  # that one was lost after the render
+                ctx.frame = draw_frame(_pool(), scene, call.view)
+            return differentiate_frame(ctx.frame, scene, upstream.numpy(), feature_grads, call.asked)
+
+        found = surviving(differentiated)
         if found.statistics is not None:
             call.statistics = torch.from_numpy(found.statistics)
         norms = torch.from_numpy(found.norms)
@@ -208,6 +221,48 @@ def device() -> Device:
         BackendUnavailableError: there is none, or it does not start.
     """
     return _pool().device
+
+
+def replace_device(lost: Device, losses: int, what: str, error: DeviceLostError) -> None:
+    """Replace a lost device, and say so.
+
+    Args:
+        lost: The device.
+        losses: How often that has happened during this work, this time included.
+        what: What happens now.
+        error: What was noticed.
+
+    Raises:
+        DeviceLostError: it has happened too often.
+        BackendUnavailableError: the adapter is gone, or does not start.
+
+    Warns:
+        BackendWarning: the device is replaced.
+    """
+    name = lost.name.name
+    if losses > MOST_LOSSES:
+        raise DeviceLostError(
+            f"backend 'webgpu': {name} was lost {losses} times during the same work; update its driver, lower "
+            "--max-gaussians or --resolution, or use the backend cpu; --resume continues from the last checkpoint"
+        ) from error
+    _pool().renew(lost)
+    warnings.warn(f"backend 'webgpu': {name} was lost; {what} on a new device", BackendWarning, stacklevel=4)
+
+
+def surviving(action: Callable[[], T]) -> T:
+    """Return what a function returns; if the device is lost meanwhile, call the function again on a new device.
+
+    Raises:
+        BackendUnavailableError: the device fails, or is lost too often.
+    """
+    losses = 0
+    while True:
+        used = device()
+        try:
+            return action()
+        except DeviceLostError as error:
+            losses += 1
+            replace_device(used, losses, "the image is rendered again", error)
 
 
 def adapter_name() -> AdapterName:

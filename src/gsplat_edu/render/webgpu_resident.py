@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.resident import Resident, Result
 from gsplat_edu.engine.step import NO_SHELL, Noise, Photo, StepNumbers
 from gsplat_edu.ops.moments import AdamNumbers
@@ -18,9 +20,17 @@ from gsplat_edu.render.resident import RunRules, RunState, RunSums, RunTarget
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 
+T = TypeVar("T")
+
+MOST_STEPS, MOST_PHOTO_BYTES = 500, 1 << 29
+"""Steps, and bytes of their photos, that are kept to be repeated; beyond, the state is read from the device."""
+
 
 class WebgpuRun:
     """A training on the adapter; see `gsplat_edu.render.resident.ResidentRun`.
+
+    It keeps what it has done since the last time that the host had the state. If the device is lost, it does the same
+    again on a new one, which gives the same bits.
 
     Args:
         harmonics: K, per Gaussian besides the first.
@@ -31,27 +41,36 @@ class WebgpuRun:
 
     def __init__(self, harmonics: int) -> None:
         self.resident = Resident(webgpu.device(), harmonics)
+        self._start: RunState | None = None
+        self._done: list[Callable[[], None]] = []
+        self._photos: dict[int, int] = {}
+        self._image: Tensor | None = None
+        self._losses = 0
 
     def load(self, state: RunState) -> None:
         """Begin with this state."""
-        statistics = torch.stack([state.norm_sums, state.times_visible], dim=1)
-        arrays = {"statistics": statistics.numpy()}
-        for prefix, tensors in (("", state.gaussians), ("_first", state.first), ("_second", state.second)):
-            arrays |= {f"core{prefix}": _core(tensors), f"rest{prefix}": _array(tensors["sh_rest"])}
-        self.resident.load(arrays)
+        self._on_a_device(lambda: self.resident.load(_arrays(state)))
+        self._begin_from(state)
+        self._image = None
 
     def read(self) -> RunState:
         """Wait for all steps, and return the state."""
-        found = self.resident.read()
+        found = self._on_a_device(lambda: self.resident.read())  # noqa: PLW0108  it may be another one
+        if self._image is None and self._done:
+            self._image = self.image()
         gaussians, first, second = (
             _tensors(found[f"core{suffix}"], found[f"rest{suffix}"]) for suffix in ("", "_first", "_second")
         )
         norm_sums, times_visible = torch.from_numpy(found["statistics"]).unbind(dim=1)
-        return RunState(gaussians, first, second, norm_sums.contiguous(), times_visible.contiguous())
+        state = RunState(gaussians, first, second, norm_sums.contiguous(), times_visible.contiguous())
+        self._begin_from(state)
+        return state
 
     def image(self) -> Tensor:
         """Wait for all steps, and return the last one's image, (H, W, 3)."""
-        return torch.from_numpy(self.resident.image())
+        if self._image is None:
+            self._image = torch.from_numpy(self._on_a_device(lambda: self.resident.image()))  # noqa: PLW0108
+        return self._image
 
     def step(
         self,
@@ -74,21 +93,70 @@ class WebgpuRun:
         )
         mask = None if target.mask is None else target.mask.numpy()
         degree = min(settings.sh_degree, math.isqrt(self.resident.harmonics + 1) - 1)
-        result = self.resident.step(
-            webgpu.engine_view(camera, settings, settings.background, degree),
-            target.index,
-            lambda: Photo.packed(target.image.numpy(), mask),
-            target.constant,
-            numbers,
-        )
-        return lambda: _sums(result, numbers, count)
+        view = webgpu.engine_view(camera, settings, settings.background, degree)
+        result: Result
+
+        def step() -> None:
+            nonlocal result
+            result = self.resident.step(
+                view,
+                target.index,
+                lambda: Photo.packed(target.image.numpy(), mask),
+                target.constant,
+                numbers,
+            )
+
+        self._do(step)
+        self._image = None
+        self._photos[id(target.image)] = target.image.nbytes
+        if len(self._done) >= MOST_STEPS or sum(self._photos.values()) > MOST_PHOTO_BYTES:
+            self.read()
+        return lambda: self._on_a_device(lambda: _sums(result, numbers, count))
 
     def add_noise(self, numbers: NoiseNumbers, rules: RunRules) -> None:
         """Move the means at random after the last step."""
         seed = numbers.seed & WORD, numbers.seed >> 32
-        self.resident.add_noise(
-            Noise(seed, numbers.amount, numbers.sharpness, numbers.threshold, _shell(rules))
-        )
+        noise = Noise(seed, numbers.amount, numbers.sharpness, numbers.threshold, _shell(rules))
+        self._do(lambda: self.resident.add_noise(noise))
+
+    def _begin_from(self, state: RunState) -> None:
+        self._start, self._done, self._photos, self._losses = state, [], {}, 0
+
+    def _do(self, action: Callable[[], None]) -> None:
+        """Do something that changes the state, and keep it to be done again."""
+        self._on_a_device(action)
+        self._done.append(action)
+
+    def _on_a_device(self, action: Callable[[], T]) -> T:
+        """Return what a function returns; if the device is lost meanwhile, do everything again on a new one."""
+        lost: DeviceLostError | None = None
+        while True:
+            used = self.resident.device
+            try:
+                if lost is not None:
+                    self._losses += 1
+                    what = f"{len(self._done)} steps and what followed them are done again"
+                    webgpu.replace_device(used, self._losses, what, lost)
+                    self.resident = Resident(webgpu.device(), self.resident.harmonics)
+                    lost = None
+                    if self._start is not None:
+                        self.resident.load(_arrays(self._start))
+                    for done in self._done:
+                        done()
+                return action()
+            except DeviceLostError as error:
+                if lost is not None:
+                    raise
+                lost = error
+
+
+def _arrays(state: RunState) -> dict[str, np.ndarray]:
+    """Return a state as the engine takes it."""
+    statistics = torch.stack([state.norm_sums, state.times_visible], dim=1)
+    arrays = {"statistics": statistics.numpy()}
+    for prefix, tensors in (("", state.gaussians), ("_first", state.first), ("_second", state.second)):
+        arrays |= {f"core{prefix}": _core(tensors), f"rest{prefix}": _array(tensors["sh_rest"])}
+    return arrays
 
 
 def _sums(result: Result, numbers: StepNumbers, count: int) -> RunSums:
