@@ -22,14 +22,11 @@ import numpy as np
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import adapters, chosen_adapter, listed_adapters, why_unavailable
 from gsplat_edu.engine.failures import one_line
-from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
+from gsplat_edu.engine.passes import LEAST as LEAST, LIMITS, WORD, Pass, Program, module_source
 from gsplat_edu.engine.transfers import Kept, Ticket
 
 SLICE = 256
 """Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
-
-LEAST = 4
-"""Words of the smallest buffer: one row of four numbers, which is the largest type of an array."""
 
 VIEW_BYTES = 512
 """Bytes of the uniform block that all passes of a part share: camera and settings."""
@@ -139,13 +136,18 @@ class Device:
         self.received += staging.size
         self._staging[staging.size].append(staging)
 
+    @property
+    def largest(self) -> int:
+        """Bytes of the largest buffer that a pass can use."""
+        return min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
+
     def check_fits(self, program: Program, counts: Mapping[str, int]) -> None:
         """Check that no buffer is larger than the device allows.
 
         Raises:
             BackendUnavailableError: one is; the message names it.
         """
-        most = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
+        most = self.largest
         largest = max(program.buffers, key=lambda buffer: buffer.size.of(counts))
         size = WORD * largest.size.of(counts)
         if size > most:
@@ -209,7 +211,7 @@ class Memory:
         self.device, self.program, self.counts = device, program, dict(counts)
         usage = wgpu.BufferUsage
         storage = usage.STORAGE | usage.COPY_SRC | usage.COPY_DST
-        self._words = {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in program.buffers}
+        self._words = program.words(counts)
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
         with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}"):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.engine.resident import Resident, Result
+from gsplat_edu.engine.room import kept_photos
 from gsplat_edu.engine.step import NO_SHELL, Noise, Photo, StepNumbers
 from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import WORD, NoiseNumbers
@@ -24,13 +25,14 @@ class WebgpuRun:
 
     Args:
         harmonics: K, per Gaussian besides the first.
+        photo_room: Bytes of photos to keep there, at most `gsplat_edu.engine.resident.PHOTO_ROOM`, which None means.
 
     Raises:
         BackendUnavailableError: there is no adapter, or it does not start.
     """
 
-    def __init__(self, harmonics: int) -> None:
-        self.resident = Resident(webgpu.device(), harmonics)
+    def __init__(self, harmonics: int, photo_room: int | None = None) -> None:
+        self.resident = Resident(webgpu.device(), harmonics, kept_photos(photo_room))
 
     def load(self, state: RunState) -> None:
         """Begin with this state."""
@@ -98,6 +100,7 @@ def _sums(result: Result, numbers: StepNumbers, count: int) -> RunSums:
         (1.0 - k) * sums.l1 + k * sums.dissimilarity,
         numbers.opacity_weight * sums.opacity / max(averaged, 1),
         numbers.scale_weight * sums.scale / max(3 * count, 1),
+        sums.pairs,
     )
 
 
