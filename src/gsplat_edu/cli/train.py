@@ -18,6 +18,7 @@ from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.text import option_flag
+from gsplat_edu.budget.choice import Prospect, choose_backend, resumed_backend
 from gsplat_edu.budget.deadline import Deadline, stopwatch
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Plan, plan
@@ -274,6 +275,8 @@ def _planned(
     if arguments.resolution == AUTO and not (arguments.resume and options.folder.exists()):
         options = _with_resolution(options, reader, say)
     options = with_choices(options, reader, left_open(arguments), console, say)
+    if arguments.backend == AUTO and num_processes() == 1:
+        options = _with_backend(options, reader, say)
     limits = Limits(arguments.max_memory, deadline)
     fixed = given(arguments, PLANNED)
     with progress_bar(console, "") as bar:
@@ -289,6 +292,19 @@ def _planned(
     for sentence in chosen.sentences:
         say(sentence)
     return chosen
+
+
+def _with_backend(
+    options: RunOptions, reader: CaptureReader, say: Callable[[str], None], allow_software: bool = False
+) -> RunOptions:
+    """Choose the backend, and say so if there is a GPU; a resumed run goes on with its own if that is webgpu."""
+    if options.resume and options.folder.exists():
+        decision = resumed_backend(options.folder.read_config().get("backend"))
+    else:
+        decision = choose_backend(Prospect.of(options, reader), allow_software=allow_software).decision
+    if decision.matters:
+        say(str(decision))
+    return replace(options, backend=decision.backend)
 
 
 def _with_resolution(options: RunOptions, reader: CaptureReader, say: Callable[[str], None]) -> RunOptions:

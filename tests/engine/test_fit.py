@@ -12,9 +12,9 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.engine import frame, host
+from gsplat_edu.engine.fit import HARMONICS, most_that_fit, why_too_large
 from gsplat_edu.engine.frame import draw_frame
 from gsplat_edu.engine.passes import LIMITS
-from gsplat_edu.engine.room import HARMONICS, most_that_fit, why_too_large
 from gsplat_edu.engine.step import step_program
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render import webgpu
