@@ -8,6 +8,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import spelled_bytes
 from gsplat_edu.budget.costs import TRAINED_PAIRS, harmonics_of
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.engine.room import Room
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.options import RunOptions
@@ -30,20 +31,21 @@ def most_gaussians(room: Room, config: TrainConfig) -> int:
     return room.most_gaussians(harmonics_of(config.sh_degree), TRAINED_PAIRS)
 
 
-def check_device(options: RunOptions, dataset: Dataset) -> None:
+def check_device(options: RunOptions, reader: CaptureReader) -> None:
     """Check that the photos and the cap of a run that stays on a device fit into its buffers.
 
     Args:
         options: The run, as planned.
-        dataset: Its capture at training size.
+        reader: Its capture, which is read only if the run stays on a device.
 
     Raises:
         ArgumentError: they do not; the message says what would fit.
         BackendUnavailableError: the device does not start.
+        DatasetError: the capture cannot be read.
     """
     room = None if leaves_device(options.config) else room_of(options.backend)
     if room is not None:
-        check_room(room, options.config, dataset)
+        check_room(room, options.config, Dataset.of(reader, options.data_settings, points=options.points))
 
 
 def check_room(room: Room, config: TrainConfig, dataset: Dataset) -> None:

@@ -269,17 +269,17 @@ def plan(
     if options.resume and options.folder.exists():
         said = f"{limits}: a resumed run keeps the values of its config.json; memory is not planned again"
         options = taken_up(options, given)
-        _check_device(options, reader)
+        check_device(options, reader)
         return Plan(options, sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
         found = _with_planned_count(options, given, reader)
-        _check_device(found.options, reader)
+        check_device(found.options, reader)
         return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
     request, measured = _measured(options, limits, given, rescale, reader)
     if request.by_time:
         request = dataclasses.replace(request, trial=tried(options, reader, request.facts.train, progress))
     found = choose(request, measured, 0.0 if limits.time is None else limits.time.spent)
-    _check_device(found.options, reader)
+    check_device(found.options, reader)
     return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
 
 
@@ -315,10 +315,6 @@ def _measured(
     )
     probed = tuple(factor for factor in factors if factor >= first.factor)
     return dataclasses.replace(request, factors=probed), measured
-
-
-def _check_device(options: RunOptions, reader: CaptureReader) -> None:
-    check_device(options, Dataset.of(reader, options.data_settings, points=options.points))
 
 
 def _with_planned_count(options: RunOptions, given: Collection[str], reader: CaptureReader) -> Plan:
