@@ -104,5 +104,7 @@ def test_commands_say_it_in_one_line_and_write_nothing(tmp_path, monkeypatch, ca
     command = ["train", str(tmp_path / "egg"), "--out", str(tmp_path / "run"), "--backend", "webgpu"]
     assert main([*command, "--iterations", "5"]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
-    assert "hold a view of 7,281 pixels, but photos have 120x90; give --resolution 90, or --backend cpu" in line
+    assert (
+        "hold a view of 7,281 pixels, but photos have 120x90; give --resolution 90, or --backend cpu" in line
+    )
     assert not list((tmp_path / "run").glob("**/*.ply"))

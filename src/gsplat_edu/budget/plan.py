@@ -277,7 +277,8 @@ def plan(
         return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
     request, measured = _measured(options, limits, given, rescale, reader)
     if request.by_time:
-        request = dataclasses.replace(request, trial=tried(options, reader, request.facts.train, progress))
+        trial = tried(options, reader, request.facts.train, progress, limits.time)
+        request = dataclasses.replace(request, trial=trial)
     found = choose(request, measured, 0.0 if limits.time is None else limits.time.spent)
     check_device(found.options, reader)
     return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
@@ -476,6 +477,8 @@ def _sentences(request: Request, plan: Plan, at_cap: int) -> tuple[str, ...]:
     sentences = [f"{request.limits}: chosen {chosen or 'nothing, because every option was given'}"]
     if request.by_time and not plan.by_time:
         sentences.append(f"the training ends before the limit: {request.trial}")
+    if request.trial is not None and request.trial.cut:
+        sentences.append("a quarter of the time did not suffice to try how long so few photos may be trained")
     if found is not None:
         sentences += [f"forecast: {line}" for line in found.lines()]
         if cap is not None and cap > found.gaussians[1]:
