@@ -21,7 +21,7 @@ from gsplat_edu.render.resident import RunRules, RunState, RunSums, RunTarget
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 
-T = TypeVar("T")
+_Found = TypeVar("_Found")
 
 MOST_STEPS = 500
 """Steps that are kept to be taken again. Beyond, or beyond `REPEATED_PHOTOS`, the state is read from the device."""
@@ -130,7 +130,7 @@ class WebgpuRun:
         self._on_a_device(action)
         self._done.append(action)
 
-    def _on_a_device(self, action: Callable[[], T]) -> T:
+    def _on_a_device(self, action: Callable[[], _Found]) -> _Found:
         """Return what a function returns; if the device is lost meanwhile, do everything again on a new one."""
         lost: DeviceLostError | None = None
         while True:
