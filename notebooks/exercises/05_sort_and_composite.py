@@ -46,6 +46,6 @@ two = (
 apart = np.linalg.norm(two[0] - camera.eye, axis=-1)
 two_by_distance = splat_image(camera, two, np.argsort(apart))[0]
 print(f"two splats: {np.abs(two_by_distance - splat_image(camera, two)[0]).max():.2f}")
-assert apart[0] < apart[1] and np.abs(two_by_distance - splat_image(camera, two)[0]).max() > 0.5
+assert apart[0] < apart[1] and np.abs(two_by_distance - splat_image(camera, two)[0]).max() > 0.2
 # Neither is right where splats pass through each other. The distance stays as it is when the camera turns on the spot,
 # so that nothing pops then; the depth is what a projection has at hand.
