@@ -4,7 +4,7 @@
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
-set-up cells folded.
+set-up cells folded and with moving figures (`tools/site_figures.py`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ import tempfile
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
+
+from site_figures import with_figures
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "gsplat_edu"
@@ -171,6 +173,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
             if cell["cell_type"] == "markdown":
                 cell["source"] = relinked("".join(cell["source"]), page, stage)
         fold_set_up(notebook)
+        with_figures(page.stem, notebook)
         _write(stage / page, json.dumps(notebook))
     for name in modules():
         _write(stage / "reference" / f"{name}.md", _reference(name, documented=name in members))

@@ -51,15 +51,17 @@ def write(name: str, value: object) -> None:
 
 
 def splats_before(gaussians: Gaussians, norms: torch.Tensor, camera: Any) -> list[list[float]]:
-    """List what the rule looks at: u, v, xx, xy, yy (px), mean gradient (NDC), largest scale, opacity."""
+    """List u, v, xx, xy, yy (px), mean gradient (NDC), largest scale, opacity, and 1 for the near half of the sphere."""
     with torch.no_grad():
         means = gaussians.means.double().numpy()
         covariances = cov3d_t(gaussians.log_scales.double(), gaussians.quats.double()).numpy()
-        rest = torch.stack([norms, gaussians.scales.amax(dim=-1), gaussians.opacities], dim=-1).double().numpy()
+        rest = (
+            torch.stack([norms, gaussians.scales.amax(dim=-1), gaussians.opacities], dim=-1).double().numpy()
+        )
     in_camera = camera.world_to_cam(means)
-    u, v, _ = camera.project(in_camera)
+    u, v, z = camera.project(in_camera)
     cov2d = project_cov3d(covariances, in_camera, camera)
-    columns = [u, v, cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1], *rest.T]
+    columns = [u, v, cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1], *rest.T, z < np.linalg.norm(camera.eye)]
     return [[float(f"{value:.6g}") for value in row] for row in np.stack(columns, axis=-1)]
 
 
