@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
-from gsplat_edu import sphere_shell
+from gsplat_edu import Camera, sphere_shell
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
@@ -50,8 +49,8 @@ def write(name: str, value: object) -> None:
     print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
 
 
-def splats_before(gaussians: Gaussians, norms: torch.Tensor, camera: Any) -> list[list[float]]:
-    """List u, v, xx, xy, yy (px), mean gradient (NDC), largest scale, opacity, and 1 for the near half of the sphere."""
+def splats_before(gaussians: Gaussians, norms: torch.Tensor, camera: Camera) -> list[list[float]]:
+    """List u, v, xx, xy, yy (px), mean gradient (NDC), largest scale, opacity, and 1 for the near half."""
     with torch.no_grad():
         means = gaussians.means.double().numpy()
         covariances = cov3d_t(gaussians.log_scales.double(), gaussians.quats.double()).numpy()

@@ -70,8 +70,8 @@ gsplatPlay.figures.training = function (place) {
         shown.redraw();
         return text;
     });
-    const help = "Move the slider, also with the arrow keys. The first hundred iterations change most; each densification " +
-        "costs a little at first. Trained by the kernels of chapter 12, in the steps of this chapter.";
+    const help = "Move the slider, also with the arrow keys. The loss jumps after iterations 400 and 500: two children are a " +
+        "worse guess than the parent that was fitted. Trained by the kernels of chapter 12, in the steps of this chapter.";
     place.append(shown.canvas, scrub.row, told, element("p", { class: "play-help" }, help));
     scrub.told();
     return { state, told, slider: scrub.input };
