@@ -43,6 +43,9 @@ USE = {
 }
 """Documents for users, with their titles in the sidebar."""
 
+LEARN = {"docs/GLOSSARY.md": "Glossary"}
+"""Documents beside the chapters."""
+
 BUILD_ON = {
     "docs/PYTHON.md": "Python examples",
     "docs/GSPLAT.md": "From gsplat",
@@ -163,7 +166,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
         members: Modules whose pages show their documentation; those of the others have only a title and links.
     """
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
-    documents = [Path(name) for name in (*USE, *BUILD_ON) if not name.endswith("/index.md")]
+    documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if not name.endswith("/index.md")]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
     for page in [*documents, *records]:
         _write(stage / page, relinked((ROOT / page).read_text(encoding="utf-8"), page, stage))
@@ -294,7 +297,8 @@ def _toctree(options: str, pages: Iterable[str]) -> str:
 def _contents(chapters: list[Path]) -> str:
     """Return the sidebar with its sections: learn, use, build on."""
     sections = {
-        "Learn": [str(page.with_suffix("")) for page in chapters],
+        "Learn": [str(page.with_suffix("")) for page in chapters]
+        + [f"{title} <{name.removesuffix('.md')}>" for name, title in LEARN.items()],
         "Use": [f"{title} <{name.removesuffix('.md')}>" for name, title in USE.items()],
         "Build on": [f"{title} <{name.removesuffix('.md')}>" for name, title in BUILD_ON.items()],
     }

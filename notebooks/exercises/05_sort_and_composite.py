@@ -26,8 +26,8 @@ for alpha in (ALPHA_MIN, 0.05, 0.5, ALPHA_MAX):
     assert (1 - alpha) ** n < T_STOP * (1 + 1e-9) and (1 - alpha) ** (n - 1) > T_STOP * (1 - 1e-9)
 
 # %% [markdown]
-# **Exercise 3 (open).** Sort by the distance from the eye instead of the depth along the axis. Why does the picture of
-# the sphere not change at all? Find two splats for which it does. When would you prefer which order?
+# **Exercise 3 (open).** Sort by the distance from the eye instead of the depth along the axis. Why does the picture
+# of the sphere not change at all? Find two splats for which it does. When would you prefer which order?
 
 # %%
 to_eye = np.linalg.norm(means - CAMERA.eye, axis=-1)
