@@ -35,7 +35,8 @@ def pages(tmp_path_factory):
         added = [cell["source"] for cell in notebook["cells"] if cell["id"].startswith("figure-")]
         assert len(added) == len(notebook["cells"]) - before
         head = '<!doctype html><meta name="viewport" content="width=device-width">'
-        head += '<link rel="stylesheet" href="../_static/site.css"><style>body { margin: 0; --color-brand-primary: #2962ff; }</style>'
+        head += '<link rel="stylesheet" href="../_static/site.css">'
+        head += "<style>body { margin: 0; --color-brand-primary: #2962ff; }</style>"
         (out / "notebooks" / f"{chapter}.html").write_text(head + "\n".join(added))
     return out / "notebooks"
 
