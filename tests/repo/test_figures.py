@@ -164,7 +164,9 @@ def test_fates_are_those_of_the_training(opened):
 
 
 def test_the_training_on_record_is_that_of_the_chapter():
-    record = data("training")
+    record, recipe = data("training"), tool("figure_data")
+    assert record["frames"] == list(recipe.FRAMES) and record["size"] == recipe.SIZE
+    assert data("density")["iteration"] == recipe.DENSIFIED and len(data("sphere")["means"]) == recipe.SHELL
     notebook = (ROOT / "notebooks" / "09_train_in_3d.ipynb").read_text()
     printed = re.findall(r"iter +(\d+)  L1 ([\d.]+)  K (\d+)", notebook)
     assert len(printed) == 8
