@@ -42,7 +42,9 @@ def taught(module: Path) -> bool:
     dotted = ".".join(module.relative_to(ROOT / "src").with_suffix("").parts)
     text = "\n".join(path.read_text() for path in SOURCES)
     named = re.search(r"^Chapters?: ", module.read_text(), flags=re.MULTILINE)
-    return bool(named) or re.search(rf"^from {re.escape(dotted)} import ", text, flags=re.MULTILINE) is not None
+    return (
+        bool(named) or re.search(rf"^from {re.escape(dotted)} import ", text, flags=re.MULTILINE) is not None
+    )
 
 
 @functools.cache
