@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # 13 - From photos to a scene
+# # 14 - From photos to a scene
 #
 # Everything so far was trained on photos that a renderer took, from cameras that were written down before the first
 # photo existed. A phone writes a folder of photos. It does not say where it was held, its focal length is not
