@@ -16,12 +16,12 @@
 #
 # [Chapter 12](12_the_backward_pass.ipynb) differentiates a picture by what stands on the screen: a position, a conic, a
 # colour and an opacity per splat. Suppose that is all we have. Two cameras stand side by side and look at one Gaussian.
-# Each compares its picture with its photo, and takes a step on the numbers it has derivatives of.
-#
-# `to_screen` goes from a Gaussian's raw numbers to the screen as chapters 03, 04 and 06 derived it, one Gaussian at a
-# time. The two functions after it are chapter 12's: the picture, and its derivatives on the screen.
+# Each compares its picture with its photo, and takes a step on the numbers it has derivatives of. Below, `to_screen`
+# takes one Gaussian's raw numbers to the screen, as chapters 03, 04 and 06 derived it; `paint` and `screen_slopes`
+# are chapter 12's picture and its derivatives on the screen.
 
 # %%
+import functools
 import os
 from types import SimpleNamespace
 
@@ -94,26 +94,26 @@ hidden = gaussian([0.2, -0.2, 0.4], [0.6, 0.25, 0.1], [9, 3, -2, 5], 1.5, [1.2, 
 guess = gaussian([-0.1, 0.1, -0.3], [0.3, 0.3, 0.3], [1, 0.1, 0, 0], 0.5, [0, 0, 0], 0)
 photos = [paint([to_screen(hidden, camera)], camera)[0] for camera in pair]
 fig, axes = plt.subplots(1, 2, figsize=(9, 3.3), layout="constrained")
-rows, turn = [], np.linspace(0, 2 * np.pi, 100)
+rows, turn = {}, np.linspace(0, 2 * np.pi, 100)
 for ax, camera, photo, side in zip(axes, pair, photos, ("left", "right"), strict=True):
     x = to_screen(guess, camera)
     u_bar, *_ = next(screen_slopes([x], camera, paint([x], camera)[0] - photo))
     step = -6 * u_bar / np.linalg.norm(u_bar)  # six pixels downhill
-    rows.append((x.u[1], x.u[1] + step[1]))
-    print(f"{side:5}: row {rows[-1][0]:.2f}, after a step of 6 px row {rows[-1][1]:.2f}")
+    rows[side] = x.u[1], x.u[1] + step[1]
     ax.imshow(np.clip(photo, 0, 1), interpolation="nearest")
     rim = np.linalg.cholesky(np.linalg.inv(x.conic)) @ [np.cos(turn), np.sin(turn)]
     ax.plot(*(x.u[:, None] + rim), color="w")
     ax.quiver(*x.u, *step, color="w", angles="xy", scale_units="xy", scale=1)
     ax.set(title=f"{side} photo, the guess, its step", xlabel="u (px)", ylabel="v (px)")
 plt.show()
-assert rows[0][0] == rows[1][0] and abs(rows[0][1] - rows[1][1]) > 0.5
+print("row before and after the step:", {side: np.round(row, 2).tolist() for side, row in rows.items()})
+assert rows["left"][0] == rows["right"][0] and abs(rows["left"][1] - rows["right"][1]) > 0.5
 
 # %% [markdown]
 # Cameras side by side see a point in the same row, whatever its depth. After the step the rows differ: no Gaussian
 # looks like this to both, and a third camera has nothing to draw. The steps were taken on two pictures of a thing. They
 # have to be taken on the thing: on its mean $\mu$, log-scales $\ell$, quaternion $q$, logit $\lambda$ and coefficients
-# $k_i$. With the camera's rotation $W$ and centre $e$ this is `to_screen`:
+# $k_i$. This is `to_screen`, with the camera's rotation $W$ and centre $e$; $\odot$ multiplies entry by entry.
 #
 # $$p = W(\mu - e), \quad u = f \odot \tfrac{p_{xy}}{p_z} + c_0, \quad n = \tfrac{q}{|q|}, \quad M = R(n)\,
 # \mathrm{diag}(e^{\ell}), \quad N = J(p)\, W M, \quad \Sigma = N N^\top + 0.3\, I, \quad \Lambda = \Sigma^{-1},$$
@@ -122,6 +122,7 @@ assert rows[0][0] == rows[1][0] and abs(rows[0][1] - rows[1][1]) > 0.5
 # o = \tfrac{1}{1 + e^{-\lambda}} .$$
 #
 # Chapter 12 delivers derivatives by $u$, $\Lambda$, $c$ and $o$. Each link has to carry them one link further back.
+# Depth enters the picture only as an order, which does not change until two splats swap: it has no derivative.
 #
 # ## One rule for every link
 #
@@ -135,9 +136,8 @@ assert rows[0][0] == rows[1][0] and abs(rows[0][1] - rows[1][1]) > 0.5
 #
 # $$\langle A, B\,C \rangle = \langle B^\top A,\; C \rangle = \langle A\,C^\top,\; B \rangle . $$
 #
-# That is the chain rule, read from its end: the large matrix $\partial Y / \partial X$ is never built. If $X$ is used
-# twice, its two shares add. Below each link is checked alone: $\bar Y$ is drawn at random, so that
-# $L = \langle \bar Y, Y \rangle$, and every entry of $X$ is nudged both ways.
+# That is the chain rule, read from its end: no matrix $\partial Y / \partial X$ is built. If $X$ is used twice, its two
+# shares add. Below each link is checked alone, with $L = \langle \bar Y, Y \rangle$ for a $\bar Y$ drawn at random.
 #
 # A difference means something only where the function is smooth. Divisions by a depth of about 3, an exponential, a
 # length, the inverse of a matrix with 0.3 on its diagonal and polynomials are. Two corners are not, the clamp in $J$
@@ -192,23 +192,22 @@ def conic_backward(conic_bar, conic):
     return -conic @ np.array([[A, B / 2], [B / 2, C]]) @ conic
 
 
-conic_bar, cov = rng.normal(size=3), np.linalg.inv(inside.conic)
-Sigma_bar, where = conic_backward(conic_bar, inside.conic), [0, 1, 1, 2]  # A, B, B, C; each B by half
-shares = (conic_bar[where] * [1, 0.5, 0.5, 1]).reshape(2, 2)
-agrees("Sigma from conic", Sigma_bar, lambda cov: (shares * np.linalg.inv(cov)).sum(), cov)
+conic_bar, Sigma = rng.normal(size=3), np.linalg.inv(inside.conic)
+Sigma_bar = conic_backward(conic_bar, inside.conic)
+shares = [1, 0.5, 0.5, 1] * conic_bar[[0, 1, 1, 2]]  # A, half of B, half of B, C
+agrees("Sigma from conic", Sigma_bar, lambda Sigma: shares @ np.linalg.inv(Sigma).ravel(), Sigma)
 
 # %% [markdown]
 # ## A product with its own transpose
 #
-# $\Sigma$ holds $N$ twice: $d\Sigma = dN\, N^\top + N\, dN^\top$. The first term gives $\langle \bar\Sigma N, dN \rangle$.
-# The second is its transpose and $\bar\Sigma$ is symmetric, so it gives the same again. $N = J\,(W M)$ takes the rule
-# once for each factor:
+# $\Sigma$ holds $N$ twice: $d\Sigma = dN\, N^\top + N\, dN^\top$. The first term gives $\langle \bar\Sigma N,
+# dN \rangle$. The second is its transpose and $\bar\Sigma$ is symmetric, so it gives the same again. $N = J\,(W M)$
+# takes the rule once for each factor:
 #
 # $$\bar N = 2\, \bar\Sigma N, \qquad \bar M = (J W)^\top \bar N, \qquad \bar J = \bar N\, (W M)^\top .$$
 
 # %%
-x = inside
-N_bar = 2 * Sigma_bar @ x.N
+x, N_bar = inside, 2 * Sigma_bar @ inside.N
 M_bar, J_bar = (x.J @ W).T @ N_bar, N_bar @ (W @ x.M).T
 agrees("N from Sigma", N_bar, lambda N: (Sigma_bar * (N @ N.T)).sum(), x.N)
 agrees("M from N", M_bar, lambda M: (N_bar * (x.J @ W @ M)).sum(), x.M)
@@ -217,8 +216,8 @@ agrees("J from N", J_bar, lambda J: (N_bar * (J @ W @ x.M)).sum(), x.J)
 # %% [markdown]
 # ## The mean moves the affine camera
 #
-# $J$ is chapter 04's affine camera, fitted at the mean. When the mean moves, $J$ changes, and the ellipse with it. Treat
-# it as a constant, and the mean's gradient is wrong. With $r = (p_x / p_z,\; p_y / p_z)$
+# $J$ is chapter 04's affine camera, fitted at the mean. When the mean moves, $J$ changes, and the ellipse with it. As a
+# constant it would make the mean's gradient wrong. With $r = (p_x / p_z,\; p_y / p_z)$
 #
 # $$J = \frac{1}{p_z} \begin{pmatrix} f_x & 0 & -f_x r_1 \\ 0 & f_y & -f_y r_2 \end{pmatrix}, \qquad
 # dr = \frac{dp_{xy} - r\, dp_z}{p_z} . $$
@@ -233,8 +232,8 @@ agrees("J from N", J_bar, lambda J: (N_bar * (J @ W @ x.M)).sum(), x.J)
 # so wrong that its ellipse would cover the picture. A clamped number does not move, so the second term of $\bar r$ is
 # zero there, and $\langle \bar J, J \rangle$ takes the clamped $J$. The position is never clamped; its term stays.
 #
-# **Predict:** a Gaussian leaves the image sideways, at a constant depth. What does its width on the screen do on the
-# way, what beyond the clamp, and what does the derivative do at the clamp?
+# > **Predict.** A Gaussian leaves the image sideways, at a constant depth. What does its width on the screen do on the
+# > way, and what beyond the clamp? What does the derivative of the width do at the clamp?
 
 
 # %%
@@ -244,25 +243,25 @@ def mean_backward(u_bar, J_bar, x):
     return np.array([*r_bar / z, -(r_bar @ r + (J_bar * x.J).sum()) / z])
 
 
-def moved(p, limit=LIMIT):
-    return to_screen(near | {"means": camera.eye + W.T @ p}, camera, limit)
+def changed(limit=LIMIT, **arrays):
+    return to_screen(near | arrays, camera, limit)
 
 
 u_bar = rng.normal(size=2)
 for link, x in (("mean from u and J, inside", inside), ("mean from u and J, clamped", clamped)):
-    slopes = mean_backward(u_bar, J_bar, x)
-    agrees(link, slopes, lambda p: u_bar @ moved(p).u + (J_bar * moved(p).J).sum(), x.p)
+    both = W.T @ mean_backward(u_bar, J_bar, x)
+    agrees(link, both, lambda m: u_bar @ changed(means=m).u + (J_bar * changed(means=m).J).sum(), x.means)
 
 fig, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
 for limit, style in ((None, "--"), (LIMIT, "-")):
-    walk = [moved(np.array([3 * r, 0.2, 3]), limit) for r in np.linspace(-0.2, 1.2, SWEEP)]
+    walk = [changed(limit, means=camera.eye + W.T @ [3 * r, 0.2, 3]) for r in np.linspace(-0.2, 1.2, SWEEP)]
     grads = [2 * np.diag([1, 0]) @ x.N @ (W @ x.M).T for x in walk]  # of J, for L = Sigma_uu
     slopes = [mean_backward(np.zeros(2), grad, x)[0] for grad, x in zip(grads, walk, strict=True)]
     at, label = [x.p[0] / 3 for x in walk], "clamped at 1.3" if limit else "not clamped"
     axes[0].plot(at, [x.N[0] @ x.N[0] for x in walk], style, label=label)
     axes[1].plot(at, slopes, style, label=label)
-    dots = [differences(lambda p, by=limit: (moved(p, by).N[0] ** 2).sum(), x.p)[0] for x in walk[::8]]
-    axes[1].plot(at[::8], dots, "k.")
+    variance = functools.partial(lambda limit, mean: (changed(limit, means=mean).N[0] ** 2).sum(), limit)
+    axes[1].plot(at[::8], [W[0] @ differences(variance, x.means) for x in walk[::8]], "k.")
 axes[0].set(title="variance of the ellipse along u", xlabel="x/z of the mean", ylabel="variance (px²)")
 axes[1].set(title="its derivative by x; dots: differences", xlabel="x/z of the mean", ylabel="px² per unit")
 for ax in axes:
@@ -272,8 +271,7 @@ plt.show()
 assert all(slope == 0 for slope, r in zip(slopes, at, strict=True) if r > bounds[1, 0])
 
 # %% [markdown]
-# Beyond the clamp the ellipse has stopped, and the derivative is zero. At the line it jumps, because the function has a
-# corner; a difference across it would mean nothing.
+# Beyond the clamp the ellipse has stopped, and the derivative is zero. It jumps there: the function has a corner.
 #
 # ## Rotation and scales
 #
@@ -283,18 +281,18 @@ assert all(slope == 0 for slope, r in zip(slopes, at, strict=True) if r > bounds
 # $$\bar\ell_k = \sum_i \bar M_{ik} M_{ik}, \qquad \bar R_{ik} = \bar M_{ik}\, s_k .$$
 #
 # $R(n)$ is quadratic in $n = (w, x, y, z)$. Its derivatives by the four are matrices with linear entries, and
-# $\bar n_j = \langle \bar R, \partial R / \partial n_j \rangle$. That is by four free numbers. What is free is not $n$
-# but $q$: from $n = q / |q|$ and $d|q| = n \cdot dq$
+# $\bar n_j = \langle \bar R, \partial R / \partial n_j \rangle$, as if the four were free. What is free is $q$. From
+# $n = q / |q|$ and $d|q| = n \cdot dq$
 #
 # $$dn = \frac{dq - n\,(n \cdot dq)}{|q|}, \qquad \bar q = \frac{\bar n - n\,(n \cdot \bar n)}{|q|} . $$
 #
-# **Predict:** in which direction does this $\bar q$ never point, and what does a step therefore do to the length of $q$?
+# > **Predict.** In which direction does this $\bar q$ never point? So what does a step do to the length of $q$?
 
 
 # %%
 def unit_backward(unit_bar, vector):
-    length = np.linalg.norm(vector)
-    return (unit_bar - vector * (vector @ unit_bar) / length**2) / length
+    unit = vector / np.linalg.norm(vector)
+    return (unit_bar - unit * (unit @ unit_bar)) / np.linalg.norm(vector)
 
 
 def quaternion_backward(R_bar, q):
@@ -308,9 +306,7 @@ x, R_bar = inside, M_bar * inside.s
 agrees("log-scales from M", (M_bar * x.M).sum(0), lambda v: (M_bar * x.R * np.exp(v)).sum(), x.log_scales)
 quat_bar = quaternion_backward(R_bar, x.quats)
 agrees("quaternion from R", quat_bar, lambda q: (R_bar * quat_to_R(q)).sum(), x.quats)
-along = abs(quat_bar @ x.quats) / np.linalg.norm(quat_bar) / np.linalg.norm(x.quats)
-print(f"share of it along q: {along:.1e}")
-assert along < 1e-14
+assert abs(quat_bar @ x.quats) < 1e-14 * np.linalg.norm(quat_bar) * np.linalg.norm(x.quats)  # perpendicular
 
 plane = np.stack(np.meshgrid(np.linspace(-2, 2, 60), [0], [0], np.linspace(-2, 2, 60)), axis=-1).squeeze()
 ring = [r * np.array([np.cos(a), 0, 0, np.sin(a)]) for r in (0.7, 1.3, 1.9) for a in np.arange(0.2, 6.2, 0.6)]
@@ -324,8 +320,7 @@ fig.colorbar(filled, ax=ax, label="L")
 plt.show()
 
 # %% [markdown]
-# The length of $q$ changes nothing, so the contours are rays, and the gradient runs around the origin, shorter the
-# longer $q$ is. A step along a tangent makes $q$ longer, never shorter.
+# The length of $q$ changes nothing: contours are rays, gradients tangents of circles, and a step makes $q$ longer.
 #
 # ## Colour, and who is looking
 #
@@ -333,8 +328,8 @@ plt.show()
 #
 # $$\bar k_i = b_i(d)\, \bar c', \qquad \bar d = \sum_i (k_i \cdot \bar c')\, \nabla b_i(d) .$$
 #
-# Each harmonic is a polynomial in $x, y, z$, and $\nabla b_i$ its three derivatives: none in degree 0, constants in
-# degree 1. Then $d$ is $\mu - e$ divided by its length, the quaternion's link: a second share of $\bar\mu$.
+# Each harmonic is a polynomial in $x, y, z$ with a gradient $\nabla b_i$. And $d$ is $\mu - e$ divided by its length,
+# the quaternion's link again: it adds a second share to $\bar\mu$.
 
 
 # %%
@@ -356,17 +351,13 @@ def color_backward(color_bar, x):
     return np.outer(x.basis, unfloored_bar), unit_backward(d_bar, x.offset)
 
 
-def color_loss(one):
-    return color_bar @ to_screen(one, camera).color
-
-
 color_bar = rng.normal(size=3)
-for count in (1, 4, 9, 16):
-    few = near | {"sh": near["sh"][:count]}
-    sh_bar, mean_bar = color_backward(color_bar, to_screen(few, camera))
-    agrees(f"coefficients, {count} x 3", sh_bar, lambda sh: color_loss(near | {"sh": sh}), few["sh"])
-    if count > 1:
-        agrees("mean", mean_bar, lambda mean, few=few: color_loss(few | {"means": mean}), near["means"])
+for few in (near["sh"][:count] for count in (1, 4, 9, 16)):
+    sh_bar, mean_bar = color_backward(color_bar, changed(sh=few))
+    agrees(f"coefficients, {len(few)} x 3", sh_bar, lambda sh: color_bar @ changed(sh=sh).color, few)
+    if len(few) > 1:
+        by_mean = functools.partial(lambda sh, mean: color_bar @ changed(sh=sh, means=mean).color, few)
+        agrees("mean by their colour", mean_bar, by_mean, near["means"])
 
 # %% [markdown]
 # ## All of it
@@ -392,7 +383,7 @@ def to_parameters(x, camera, u_bar, conic_bar, color_bar, opacity_bar):
 
 
 def by_hand(scene, camera, weights, limit=None):
-    """The picture of Gaussians, near to far, and the gradient of L = sum of weights times picture."""
+    """The picture of Gaussians, near to far, and the gradient of L = <weights, picture>."""
     seen = [to_screen(one, camera, limit) for one in scene]
     slopes = screen_slopes(seen, camera, weights)
     found = [to_parameters(x, camera, *each) for x, each in zip(seen, slopes, strict=True)]
@@ -453,6 +444,6 @@ assert losses[0] == losses[-1]
 
 # %% [markdown]
 # At every step both cameras see one thing, and the nearest guess finds it. The furthest does not move: its gradient is
-# exact, and exactly zero, because its alpha is below the floor everywhere in both photos. A derivative says what a
-# change does here, and nothing about what is out of sight. A training has to start with Gaussians that are nearly where
-# they belong, and with cameras that are right. [Chapter 14](14_photos_to_scene.ipynb) finds both in photos.
+# exact, and exactly zero, because its alpha is below the floor all over both photos. A derivative knows nothing of what
+# is out of sight. A training has to start with Gaussians that are nearly where they belong, and with cameras that are
+# right. [Chapter 14](14_photos_to_scene.ipynb) finds both in photos.
