@@ -208,7 +208,7 @@ def tests_of(root: Path, changed: Iterable[str]) -> set[str]:
         for key, places in ELSEWHERE.items():
             if path.is_relative_to(key):
                 found |= set().union(*(test_files(root / "tests" / place) for place in places))
-        if path.is_relative_to("notebooks/source"):
+        if path.parts[0] == "notebooks" and path.suffix == ".py":
             names.add(f"[{path.stem}]")
         if path.parts[0] == "benchmarks":
             names.add(f"[{'/'.join(path.parts[:2])}]")

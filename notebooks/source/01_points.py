@@ -166,6 +166,9 @@ plt.show()
 # ## Too near: holes
 #
 # Walk up to one ball. The picture grows and the points stay as many as they were.
+#
+# > **Predict.** The camera walks from distance 8 to 4 to 2. What will a pixel show that no point in front has hit:
+# > black, or something worse?
 
 # %%
 distances = (8.0, 4.0, 2.0)

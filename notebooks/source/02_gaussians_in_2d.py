@@ -201,6 +201,10 @@ assert abs(summed / mass - 1) < 8 * np.exp(-2 * np.pi**2 * np.linalg.eigvalsh(le
 # \left(1 + 2\sum_{m \ge 1} e^{-2\pi^2 m^2\sigma^2} \cos 2\pi m x\right).$$
 #
 # The 1 is what should be there. The rest is what the position does to it: it grows quickly below $\sigma = 1$.
+#
+# > **Predict.** Five round splats, the narrowest a tenth of a pixel wide and the widest one pixel, move along a line.
+# > For which of them does the light depend on where they are? A variance of 0.3 is then added to each: for which does
+# > it still?
 
 # %%
 titles = ("sampled as it is", f"after adding {DILATION} px² on the diagonal")

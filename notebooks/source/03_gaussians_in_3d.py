@@ -69,6 +69,10 @@ assert fitted[-1][0, 0] > 30 * np.var(rod[:, 0])
 # and the last chapter showed what happens when entries are changed freely. Now gradient descent changes them. A
 # flat disc is given by its values at some points; plain gradient descent on the six numbers starts from a ball
 # and has to find it.
+#
+# > **Predict.** The loss falls in each of three runs: six numbers with a high rate, six numbers with a fifth of it,
+# > and a product of scales and a quaternion. Which of them end with something that is no Gaussian? Would the loss
+# > warn you?
 
 # %%
 disc_scales, disc_quat = np.array([0.5, 0.4, 0.06]), np.array([0.9, 0.3, -0.2, 0.1])

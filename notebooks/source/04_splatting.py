@@ -273,6 +273,9 @@ for ratio in (0.01, 0.2):
 # and its rim reaches in, so means outside have to be kept. But the third column of $J$ is $-f_x\,(x/z)/z$, and beside
 # the camera, where $z$ is small, both factors grow without bound. Below, a row of equal balls stands in a half
 # circle around the camera, which looks at its middle. The samples say which of them the camera sees.
+#
+# > **Predict.** How wide does the formula draw the ball at the very end of the half circle, compared with the one in
+# > the middle: narrower, since it is hardly seen, or wider, and by how much?
 
 # %%
 around = np.radians(np.arange(-85, 86, 10))

@@ -151,6 +151,9 @@ print("weights of 12 layers:", *(f"{weight:.3f}" for weight in T[:-1] * alphas),
 # The projection kept two coordinates of each mean and dropped the third, the depth $z$ in camera axes. Sorting by it
 # and walking from near to far is all that is missing. Depth is measured along the optical axis, not from the eye, and
 # equal depths keep the order of storage. Both are conventions, and renderers have to agree on them.
+#
+# > **Predict.** The same splats as stored, in reverse, and from near to far. In what share of the sphere's pixels
+# > does sorting change the picture by more than a step: a tenth, a half, nearly all?
 
 
 # %%

@@ -95,6 +95,9 @@ assert np.abs(truth - best_constant).max() > 0.2
 # cost least to evaluate are polynomials in the components $x, y, z$ of $d$. There are fewer of them than it seems,
 # because $x^2 + y^2 + z^2 = 1$ makes many equal: $z^4$ is also $z^2 (1 - x^2 - y^2)$. How many are there up to
 # degree $L$ that differ somewhere on the sphere? Evaluate all monomials at random directions and ask for the rank.
+#
+# > **Predict.** There are 20 monomials in three variables up to degree 3. How many of them are independent on the
+# > sphere?
 
 # %%
 rng = np.random.default_rng(6)

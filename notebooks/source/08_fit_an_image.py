@@ -267,6 +267,9 @@ print(f"by differences, {2 * 9 * COUNT:,} pictures in {2 * 9 * COUNT * one:.0f} 
 # and repeat. The rate $\gamma$ is the one number left to choose. The loss is a mean over all values of the photo, so
 # each slope is as small as the photo is large; the rates below are multiples of the number of values, which takes that
 # out.
+#
+# > **Predict.** One rate for all nine numbers of a splat. What will plain descent learn with it first, and what
+# > hardly at all: colours, positions, or angles?
 
 
 # %%

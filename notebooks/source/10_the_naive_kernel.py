@@ -239,6 +239,9 @@ plt.show()
 # is only good for a toy. The count itself is too large, and no compiler makes it smaller.
 #
 # ## What it costs
+#
+# > **Predict.** The dense renderer in torch and the kernel make the same evaluations. Which is faster, and by how
+# > much? And where between them is the NumPy reference, a Python loop with a box around each splat?
 
 # %%
 numpy_seconds = processor_seconds(lambda: render_gaussians(camera, *shell), rounds=2)

@@ -85,6 +85,9 @@ plt.show()
 #
 # tiles on average, and if all pixels of a tile evaluate their list, a splat is evaluated
 # $n(t) \, t^2 = (t + b - 1)^2$ times. Small tiles mean long lists, large tiles mean wasted evaluations.
+#
+# > **Predict.** Tiles from 4 to 128 px are tried. Which makes the shortest lists, which the fewest evaluations? Can
+# > one size have both?
 
 # %%
 rng = np.random.default_rng(11)

@@ -97,6 +97,9 @@ plt.show()
 # behind adds up on the way, and $T_i = T_{i+1} / (1 - \alpha_i)$ comes back by dividing (Kerbl et al. 2023). In exact
 # arithmetic. In float32, this is what the division finds, through layers of opacity 0.99, of the $T_1 = 1$ it began
 # with:
+#
+# > **Predict.** A float32 has a precision of 24 bits, and holds nothing much below $10^{-45}$. Behind how many layers
+# > of opacity 0.99 does the division find nothing any more?
 
 
 # %%

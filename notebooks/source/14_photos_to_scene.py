@@ -321,6 +321,9 @@ assert faster > test["psnr"] - 1
 # These photos agree about the colour of every wall. Those of a phone left on automatic do not: it sets exposure and
 # white balance anew for each photo. Here every photo is made up to 0.7 stops brighter or darker, and its red and blue
 # change a little. A stop doubles the light, and a pixel's value is about the light to the power of 1/2.2.
+#
+# > **Predict.** A scene is trained on these photos as if they agreed. Where do you look for the damage first: at the
+# > edges of the box, on its painted sides, or on the plain wall behind it?
 
 # %%
 shutil.copytree(WORK / "capture", WORK / "automatic")
