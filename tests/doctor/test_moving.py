@@ -21,3 +21,5 @@ def test_photos_outside_memory_are_not_compared_but_the_command_is_named(tmp_pat
     line = moved_line(tmp_path / "run", start, absent, render, RenderSettings())
     assert line == f"to find photos that do not fit the scene: gsplat-edu doctor {tmp_path / 'run'}"
     assert moved_line(tmp_path / "run", start, load_dataset(tmp_path), render, RenderSettings()) == ""
+    line = moved_line(tmp_path / "run", start, load_dataset(tmp_path), None, RenderSettings())
+    assert line == f"to find photos that do not fit the scene: gsplat-edu doctor {tmp_path / 'run'}"

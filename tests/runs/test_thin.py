@@ -1,6 +1,7 @@
 """Captures of few photos get trials; if longer trials score worse on unseen photos, the run is shorter."""
 
 import dataclasses
+import itertools
 import shutil
 
 import numpy as np
@@ -106,3 +107,14 @@ def test_a_time_limit_does_not_train_longer_than_the_trial(given, monkeypatch, l
         assert found.iterations == longest and not found.by_time and found.profile is None
         assert "longer trainings make photos worse" in said[0]
     assert plan(options, generous, ["iterations"], reader=reader).iterations == options.config.iterations
+
+
+def test_trials_end_after_a_quarter_of_the_time(given):
+    _, options, reader = given
+    seconds = itertools.count()  # every look at the clock takes a second, and there is one per iteration
+    found = plan(options, Limits(time=Deadline(600.0, lambda: float(next(seconds)))), reader=reader)
+    assert any("a quarter of the time did not suffice" in sentence for sentence in found.sentences)
+    assert next(seconds) < 250 and found.by_time
+    calls = itertools.count()
+    trial = try_lengths(options, reader, is_over=lambda: next(calls) >= 150)
+    assert trial.cut and list(trial.scores) == [100] and trial.longest is None

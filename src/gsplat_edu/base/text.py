@@ -53,6 +53,11 @@ def spelled_seconds(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
+def spelled_bytes(size: float) -> str:
+    """Format a size: 1.25 GiB, 204 MiB."""
+    return f"{size / 2**30:.3g} GiB" if size >= 2**30 else f"{size / 2**20:.0f} MiB"
+
+
 def option_flag(name: str) -> str:
     """Return the option of a name: "max_gaussians" becomes "--max-gaussians"."""
     return f"--{name.replace('_', '-')}"

@@ -19,6 +19,7 @@ from jaxtyping import Float64, Int64
 from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.engine.room import PIXEL_BYTES, Load, Room, kept_photos
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
 from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
@@ -52,6 +53,9 @@ PER_PIXEL = 180
 
 PICTURE_BYTES = 250_000
 """Bytes per test view held for the report until it is written."""
+
+TILE_PIXELS = 128
+"""Assumed pixels per tile, of 16 x 16: the tiles at the borders of a photo reach beyond it."""
 
 LATER = 150 * 2**20
 """Growth of the process once it trains and evaluates, bytes, for any scene: code, threads, allocator arenas."""
@@ -160,6 +164,8 @@ class Measurements:
         resident: Bytes held by the process before training.
         settled: Bytes held after the probe, with freed memory returned to the system.
         noise: Spread of the times of equal steps, as a factor.
+        exchange: Seconds per Gaussian to read the state of a training from a device and to send it back.
+        room: What that device has room for; None for the processor and CUDA.
     """
 
     backend: str
@@ -171,6 +177,8 @@ class Measurements:
     resident: int
     settled: int
     noise: float = 1.0
+    exchange: float = 0.0
+    room: Room | None = None
 
     @property
     def process(self) -> int:
@@ -205,6 +213,23 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
         grown = now + added if config.strategy == "adc" else int(config.mcmc.growth * now)
         counts[moment + 1 :] = min(grown, cap)
     return counts
+
+
+def exchanged_gaussians(config: TrainConfig, counts: Int64[np.ndarray, " iterations"]) -> int:
+    """Return the Gaussians that go from a device to the processor and back, summed over all changes of the density.
+
+    Args:
+        config: The run.
+        counts: The Gaussians at every iteration.
+    """
+    stops = {"adc": config.adc.densify_stop, "mcmc": config.mcmc.stop, "fast": config.fast.stop}
+    stop = min(stops.get(config.strategy, 0), len(counts) - 1)
+    return int(counts[config.densify_start : stop : config.densify_every].sum())
+
+
+def harmonics_of(sh_degree: int) -> int:
+    """Return the harmonics of a Gaussian besides the first."""
+    return (sh_degree + 1) ** 2 - 1
 
 
 def pixel_share(config: TrainConfig) -> float:
@@ -273,6 +298,7 @@ class Footprint:
         pairs: Pairs of Gaussian and tile in one view of the start scene.
         sh_degree: SH degree of the Gaussians.
         batch: Views of a step, whose gradients are held as partial sums: one more for each doubling.
+        room: The device on which the training stays; None for the processor and CUDA.
     """
 
     facts: Facts
@@ -280,14 +306,25 @@ class Footprint:
     pairs: int
     sh_degree: int
     batch: int = 1
+    room: Room | None = None
 
     @property
     def _per_gaussian(self) -> int:
         floats = 11 + 3 * (self.sh_degree + 1) ** 2
         return (COPIES + math.ceil(math.log2(self.batch))) * 4 * floats + PER_GAUSSIAN
 
+    def on_device(self, gaussians: int, image_memory: int) -> int:
+        """Return the peak memory on the device, bytes; 0 without one. Arguments as for `parts`."""
+        if self.room is None:
+            return 0
+        facts, pairs = self.facts, max(self.pairs, TRAINED_PAIRS * gaussians)
+        pixels = math.ceil(facts.largest)
+        load = Load(gaussians, harmonics_of(self.sh_degree), pixels, math.ceil(pixels / TILE_PIXELS), pairs)
+        photos = PIXEL_BYTES * math.ceil(facts.pixels) * facts.train
+        return load.bytes() + min(photos, kept_photos(image_memory))
+
     def parts(self, gaussians: int, image_memory: int) -> dict[str, int]:
-        """Return the peak memory by part, bytes.
+        """Return the peak memory of the process by part, bytes, with the device's if it shares that memory.
 
         Args:
             gaussians: Largest number of Gaussians.
@@ -300,12 +337,14 @@ class Footprint:
         found = {
             "program": self.process,
             "photos": kept,
-            "Gaussians": gaussians * self._per_gaussian + pairs * PER_PAIR,
+            "Gaussians": gaussians * self._per_gaussian + (0 if self.room else pairs * PER_PAIR),
             "images": int(PER_PIXEL * facts.largest + read_again) + facts.test * PICTURE_BYTES,
         }
         # Photos are first read before any Gaussian exists, several at once and at full size.
         reading = int(facts.workers * facts.decoding * facts.full)
         found["images"] = max(found["images"], reading - found["Gaussians"])
+        if self.room is not None and self.room.shared:
+            found["device"] = self.on_device(gaussians, image_memory)
         return found
 
     def peak(self, gaussians: int, image_memory: int) -> int:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import torch
 
-from gsplat_edu.base.text import short_number, spelled_seconds
+from gsplat_edu.base.text import short_number, spelled_bytes as spelled_bytes, spelled_seconds
 from gsplat_edu.budget.costs import (
     Facts,
     Footprint,
     Measurements,
+    exchanged_gaussians,
     expected_counts,
     pixel_share,
     reduced_bytes,
@@ -45,9 +46,12 @@ class Forecast:
         backend: The rendering backend.
         gaussians: Numbers of Gaussians at the start and at the end.
         steps: Duration of the first and of the last iteration, s.
-        seconds: Seconds by part: "reading", "training", "judging" (intermediate evaluations), "saving", "ending".
-        memory: Peak bytes by part: "program", "photos", "Gaussians", "images".
+        seconds: Seconds by part: "reading", "training", "judging" (intermediate evaluations), "saving", "ending"; and
+            on a device "density", for what its changes move between device and processor.
+        memory: Peak bytes by part: "program", "photos", "Gaussians", "images", and "device" for one that shares the
+            processor's memory.
         factor: Uncertainty of the time, as a factor.
+        apart: Peak bytes on a device with memory of its own; 0 for others.
     """
 
     iterations: int
@@ -57,6 +61,7 @@ class Forecast:
     seconds: dict[str, float]
     memory: dict[str, int]
     factor: float
+    apart: int = 0
 
     @property
     def total(self) -> float:
@@ -73,20 +78,16 @@ class Forecast:
         parts = ", ".join(f"{name} {spelled_seconds(s)}" for name, s in self.seconds.items() if s >= 0.5)
         first, last = (short_number(1e3 * s, 3) for s in self.steps)
         grown = " to ".join(f"{count:,}" for count in dict.fromkeys(self.gaussians))
+        apart = f", and {spelled_bytes(self.apart)} on the GPU" if self.apart else ""
         held = ", ".join(f"{name} {spelled_bytes(size)}" for name, size in self.memory.items())
         return [
             f"time: about {spelled_seconds(self.total)} for {self.iterations:,} iterations on {self.backend}"
             + (f" ({parts})" if parts else ""),
             f"an iteration: {first} ms at first, {last} ms at the end; {grown} Gaussians",
-            f"memory: up to {spelled_bytes(self.peak)} ({held})",
+            f"memory: up to {spelled_bytes(self.peak)} ({held}){apart}",
             f"accuracy: time within a factor of {self.factor:.1f}, memory within {MEMORY_UNCERTAINTY}; "
             "measured just now, with whatever else is running",
         ]
-
-
-def spelled_bytes(size: float) -> str:
-    """Format a size: 1.25 GiB, 204 MiB."""
-    return f"{size / 2**30:.3g} GiB" if size >= 2**30 else f"{size / 2**20:.0f} MiB"
 
 
 def predict(
@@ -118,7 +119,8 @@ def predict(
         return speed.seconds(float(counts[iteration]), pixels) + reading_again
 
     process = measured.process + reduced_bytes(config, facts)
-    footprint = Footprint(facts, process, measured.pairs, config.sh_degree, config.batch)
+    room, most = measured.room, int(counts.max())
+    footprint = Footprint(facts, process, measured.pairs, config.sh_degree, config.batch, room)
     evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))
     saving = saving_seconds(float(counts.mean()), config.sh_degree)
     views = facts.train + facts.test
@@ -133,9 +135,11 @@ def predict(
             "judging": evaluations * facts.test * measured.score * facts.pixels,
             "saving": saved * saving,
             "ending": ending_seconds(facts, measured.score, measured.picture) + 2 * saving,
+            **({} if room is None else {"density": measured.exchange * exchanged_gaussians(config, counts)}),
         },
-        memory=footprint.parts(int(counts.max()), image_memory),
+        memory=footprint.parts(most, image_memory),
         factor=TIME_UNCERTAINTY * min(measured.noise, 2.0),
+        apart=0 if room is None or room.shared else footprint.on_device(most, image_memory),
     )
 
 

@@ -30,10 +30,12 @@ from gsplat_edu.budget.costs import (
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
 from gsplat_edu.budget.length import tried, with_iterations, with_planned_length
+from gsplat_edu.budget.on_device import cap_sentence, check_device, most_gaussians, room_of
 from gsplat_edu.budget.planned import flags, taken_up
 from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.engine.room import Room
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.start import scene_start
@@ -147,6 +149,7 @@ class Request:
         facts: The capture at the size given by the user, or at the size of its files.
         factors: Allowed downscaling factors, ascending.
         trial: Of a capture with few photos; its longest training bounds the iterations.
+        room: The device on which the training stays; None for the processor and CUDA.
     """
 
     options: RunOptions
@@ -156,6 +159,12 @@ class Request:
     facts: Facts
     factors: tuple[float, ...] = (1.0,)
     trial: ThinTrial | None = None
+    room: Room | None = None
+
+    @property
+    def most_on_device(self) -> int | None:
+        """How many Gaussians the device has room for, with the pairs of a trained scene; None without one."""
+        return None if self.room is None else most_gaussians(self.room, self.options.config)
 
     @property
     def most_iterations(self) -> int:
@@ -187,12 +196,27 @@ class Request:
         if "max_gaussians" in self.given:
             return config
         caps = [] if cap is None else [max(easily_read(cap), self.least)]
+        caps += self.device_caps(config, factor)
         if config.strategy in ("mcmc", "fast") or (self.by_time and config.strategy == "adc"):
             facts = self.facts.smaller(factor)
             wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
             guarded = config.strategy == "adc"
             caps.append(easily_read(math.ceil(GUARD * wanted)) if guarded else max(wanted, self.least))
         return dataclasses.replace(config, max_gaussians=min(caps) if caps else None)
+
+    def wanted(self, config: TrainConfig, factor: float) -> int:
+        """Return the Gaussians that a run plans, or for adc may be expected to reach, without regard to memory."""
+        facts = self.facts.smaller(factor)
+        wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+        return math.ceil(GUARD * wanted) if config.strategy == "adc" else wanted
+
+    def device_caps(self, config: TrainConfig, factor: float) -> list[int]:
+        """Return the cap that the device's buffers need, if the run would grow beyond it."""
+        most = self.most_on_device
+        grows = config.strategy != "none" and most is not None
+        return (
+            [easily_read(most)] if grows and most is not None and most < self.wanted(config, factor) else []
+        )
 
 
 @dataclass(frozen=True)
@@ -244,14 +268,19 @@ def plan(
         given, first_sentences = (*given, "iterations"), (said,)
     if options.resume and options.folder.exists():
         said = f"{limits}: a resumed run keeps the values of its config.json; memory is not planned again"
-        return Plan(taken_up(options, given), sentences=(said,) if limits.memory is not None else ())
+        options = taken_up(options, given)
+        check_device(options, reader)
+        return Plan(options, sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
-        found = _with_planned_count(options, reader)
+        found = _with_planned_count(options, given, reader)
+        check_device(found.options, reader)
         return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
     request, measured = _measured(options, limits, given, rescale, reader)
     if request.by_time:
-        request = dataclasses.replace(request, trial=tried(options, reader, request.facts.train, progress))
+        trial = tried(options, reader, request.facts.train, progress, limits.time)
+        request = dataclasses.replace(request, trial=trial)
     found = choose(request, measured, 0.0 if limits.time is None else limits.time.spent)
+    check_device(found.options, reader)
     return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
 
 
@@ -261,7 +290,7 @@ def _measured(
     """Return the input of a plan with limits, and measurements with the largest photos that fit into memory."""
     if "forecast" in load_backend(options.backend).lacks:
         raise ArgumentError(
-            f"{limits}: cannot be planned for --backend {options.backend}; choose cpu or cuda"
+            f"{limits}: cannot be planned for --backend {options.backend}; choose cpu, cuda or webgpu"
         )
     settings = options.data_settings
     chosen = {"resolution": settings.resolution, "max_gaussians": options.config.max_gaussians}
@@ -277,7 +306,8 @@ def _measured(
     if options.scene is not None:
         scene, _ = scene_start(options.scene, options.config, dataset.origin)
         facts = dataclasses.replace(facts, points=len(scene))
-    request = Request(options, limits, fixed, rescale, facts, factors)
+    room = room_of(options.backend)
+    request = Request(options, limits, fixed, rescale, facts, factors, room=room)
     length = options.config.iterations
     first = _within_memory(request, resident_bytes() + LATER, START_PAIRS * facts.points, length, factors)
     reduced = dataclasses.replace(settings, resolution=_resolution(request, first.factor), image_memory=0)
@@ -288,19 +318,28 @@ def _measured(
     return dataclasses.replace(request, factors=probed), measured
 
 
-def _with_planned_count(options: RunOptions, reader: CaptureReader) -> Plan:
-    """Choose the number of Gaussians that the fast recipe grows to, unless it is given."""
-    config = options.config
-    if config.strategy != "fast" or config.max_gaussians is not None:
+def _with_planned_count(options: RunOptions, given: Collection[str], reader: CaptureReader) -> Plan:
+    """Choose the number of Gaussians that the fast recipe grows to, or a cap that a device needs; keep one given."""
+    config, room = options.config, room_of(options.backend)
+    if config.max_gaussians is not None or not (config.strategy == "fast" or room is not None):
         return Plan(options)
     dataset = Dataset.of(reader, options.data_settings, points=options.points)
     facts = Facts.of(dataset)
     if options.scene is not None:
         facts = dataclasses.replace(facts, points=len(scene_start(options.scene, config, dataset.origin)[0]))
-    request = Request(options, Limits(), frozenset({"iterations"}), True, facts)
+    request = Request(options, Limits(), frozenset({*given, "iterations"}), True, facts, room=room)
     config = request.config(config.iterations, 1.0, None)
-    said = f"the recipe plans {config.max_gaussians:,} Gaussians; --max-gaussians changes that"
-    return Plan(dataclasses.replace(options, config=config), sentences=(said,))
+    sentences = _device_sentences(request, config)
+    if config.strategy == "fast" and not sentences:
+        sentences = (f"the recipe plans {config.max_gaussians:,} Gaussians; --max-gaussians changes that",)
+    return Plan(dataclasses.replace(options, config=config), sentences=sentences)
+
+
+def _device_sentences(request: Request, config: TrainConfig, factor: float = 1.0) -> tuple[str, ...]:
+    """Return a sentence that explains a cap that the device's buffers need; none if they need none."""
+    capped = "max_gaussians" not in request.given and bool(request.device_caps(config, factor))
+    wanted = request.wanted(config, factor)
+    return (cap_sentence(request.room, config, wanted),) if request.room is not None and capped else ()
 
 
 def choose(request: Request, measured: Measurements, spent: float) -> Plan:
@@ -338,9 +377,10 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     forecast = _predicted(request, measured, choice, config)
     found = Plan(options, by_time, forecast, profile=profile)
     at_cap = Footprint(
-        facts, process + reduced_bytes(config, facts), pairs, config.sh_degree, config.batch
+        facts, process + reduced_bytes(config, facts), pairs, config.sh_degree, config.batch, request.room
     ).peak(found.max_gaussians or 0, found.image_memory)
-    return dataclasses.replace(found, sentences=_sentences(request, found, at_cap))
+    needed = _device_sentences(request, config, choice.factor)
+    return dataclasses.replace(found, sentences=(*needed, *_sentences(request, found, at_cap)))
 
 
 def _within_memory(
@@ -355,7 +395,7 @@ def _within_memory(
         facts = request.facts.smaller(factor)
         reduced = reduced_bytes(request.options.config, facts)
         config = request.config(iterations, factor, None)
-        footprint = Footprint(facts, process + reduced, pairs, config.sh_degree, config.batch)
+        footprint = Footprint(facts, process + reduced, pairs, config.sh_degree, config.batch, request.room)
         wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         if config.strategy == "none":
             wanted = facts.points
@@ -437,6 +477,8 @@ def _sentences(request: Request, plan: Plan, at_cap: int) -> tuple[str, ...]:
     sentences = [f"{request.limits}: chosen {chosen or 'nothing, because every option was given'}"]
     if request.by_time and not plan.by_time:
         sentences.append(f"the training ends before the limit: {request.trial}")
+    if request.trial is not None and request.trial.cut:
+        sentences.append("a quarter of the time did not suffice to try how long so few photos may be trained")
     if found is not None:
         sentences += [f"forecast: {line}" for line in found.lines()]
         if cap is not None and cap > found.gaussians[1]:

@@ -133,7 +133,8 @@ def add_backend(parser: argparse._ActionsContainer) -> None:
         "--backend",
         default=AUTO,
         metavar="NAME",
-        help=f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu"
+        help=f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu; for a"
+        " training also webgpu on a GPU that passes and is forecast to be faster than cpu"
         " (default: %(default)s)",
     )
 

@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.terminal import Bar, Terminal
@@ -77,16 +78,20 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         whole_number("--iterations", arguments.iterations, 1)
     backend = resolve_backend(arguments.backend)
     if "forecast" in load_backend(backend).lacks and not arguments.no_forecast:
-        raise ArgumentError(f"--backend {backend}: has no forecast; choose cpu or cuda, or add --no-forecast")
+        raise ArgumentError(
+            f"--backend {backend}: has no forecast; choose cpu, cuda or webgpu, or add --no-forecast"
+        )
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         survey = prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))
         bar.add_task("comparing", total=None)
         diagnosis = examine(survey, _forecast_options(arguments))
+    from gsplat_edu.budget.choice import Prospect, choose_backend, usual_choice
+
+    auto = arguments.backend == AUTO
     if arguments.no_forecast or diagnosis.hopeless:
-        return diagnosis, _gpu_lines(backend)
+        return diagnosis, [*_gpu_lines(backend), *(_auto_lines(usual_choice()) if auto else ())]
     from gsplat_edu.budget.costs import Facts, wanted_gaussians
-    from gsplat_edu.budget.forecast import forecast  # it measures this machine, which takes a moment
 
     if arguments.resolution is None and (side := side_for_training(survey)) is not None:
         settings = DataSettings(resolution=float(side))  # as the command in the advice trains
@@ -97,11 +102,21 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         config = recipe(length, strategy=DEFAULT_STRATEGY)
         cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         config = dataclasses.replace(config, max_gaussians=cap)
-        said = forecast(dataset, full, config, backend=backend).lines()
+        prospect = Prospect(dataset, full, config)
+        chosen = choose_backend(prospect) if auto else None
+        backend = backend if chosen is None else chosen.backend
+        measured = None if chosen is None else chosen.measured.get(backend)
+        said = prospect.forecast(measured or prospect.measured(backend)).lines()
+        why = [] if chosen is None else _auto_lines(f"{backend}: {chosen.decision.reason}")
     except DatasetError as error:
-        said = [f"none, because training would fail: {error}"]
+        said, why = [f"none, because training would fail: {error}"], []
     rows = zip(("forecast", *[""] * len(said)), said, strict=False)
-    return diagnosis, [*table_lines(rows), *_gpu_lines(backend)]
+    return diagnosis, [*table_lines(rows), *_gpu_lines(backend), *why]
+
+
+def _auto_lines(choice: str) -> list[str]:
+    """Return a line that says what `--backend auto` takes, and why."""
+    return table_lines([("auto", f"takes {choice}")])
 
 
 def _gpu_lines(backend: str) -> list[str]:

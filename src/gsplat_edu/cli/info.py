@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gsplat_edu.base.constants import ALPHA_MIN
-from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, CheckpointError
 from gsplat_edu.base.text import short_number
+from gsplat_edu.budget.choice import usual_choice
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.data.scale import Scale
@@ -82,9 +83,19 @@ def _computer_facts() -> list[Fact]:
         facts.append(
             (backend, f"not available: {reason}" if reason else gpu_of(backend) or "on the processor")
         )
+    facts.append(("auto", f"takes {_usual_choice()}"))
     if adapters.why_unavailable() is None:
         facts += [("adapter", f"{one.name}, {one.interface}, {one.driver}") for one in adapters.adapters()]
     return facts
+
+
+def _usual_choice() -> str:
+    """Return what `--backend auto` takes, and why."""
+    reason = adapters.why_unavailable()
+    try:
+        return usual_choice(adapters.Listing(adapters.adapters() if reason is None else (), reason))
+    except BackendUnavailableError as error:
+        return f"none: {error}"
 
 
 def _scene_facts(path: Path) -> list[Fact]:

@@ -18,17 +18,18 @@ from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.text import option_flag
+from gsplat_edu.budget.choice import Prospect, choose_backend, resumed_backend
 from gsplat_edu.budget.deadline import Deadline, stopwatch
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Plan, plan
 from gsplat_edu.budget.planned import PLANNED
-from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.length import quality_of
 from gsplat_edu.cli.options.settings import given
 from gsplat_edu.cli.options.train import AUTO, left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
+from gsplat_edu.cli.result import tell_result
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.data.colmap import find_model
@@ -37,14 +38,9 @@ from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.finding import Remedy
-from gsplat_edu.doctor.moving import moved_line
-from gsplat_edu.doctor.remedies import CHOICES, ENOUGH, remedies_for, transients_for
+from gsplat_edu.doctor.remedies import CHOICES, remedies_for, transients_for
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
-from gsplat_edu.jobs import emitter
-from gsplat_edu.jobs.events import Metric
-from gsplat_edu.render.api import render
 from gsplat_edu.runs.cleaning import cleaner
-from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.pilot import ORDER, PILOT_STEPS, refinement_for
 from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
@@ -176,7 +172,7 @@ def _run(
             export = functools.partial(export_all, arguments.export, bar, options.backend, say)
             clean = _cleaner(capture, say) if arguments.clean else None
             result = capture.finish(scored, export if arguments.export else None, clean)
-        _report(capture, result, say)
+        tell_result(capture, result, say, limited=deadline is not None)
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
             broadcast.stay(lambda: view.watched)
@@ -274,6 +270,8 @@ def _planned(
     if arguments.resolution == AUTO and not (arguments.resume and options.folder.exists()):
         options = _with_resolution(options, reader, say)
     options = with_choices(options, reader, left_open(arguments), console, say)
+    if arguments.backend == AUTO and num_processes() == 1:
+        options = _with_backend(options, reader, say)
     limits = Limits(arguments.max_memory, deadline)
     fixed = given(arguments, PLANNED)
     with progress_bar(console, "") as bar:
@@ -289,6 +287,19 @@ def _planned(
     for sentence in chosen.sentences:
         say(sentence)
     return chosen
+
+
+def _with_backend(
+    options: RunOptions, reader: CaptureReader, say: Callable[[str], None], allow_software: bool = False
+) -> RunOptions:
+    """Choose the backend, and say so if there is a GPU; a resumed run goes on with its own if that is webgpu."""
+    if options.resume and options.folder.exists():
+        decision = resumed_backend(options.folder.read_config().get("backend"))
+    else:
+        decision = choose_backend(Prospect.of(options, reader), allow_software=allow_software).decision
+    if decision.matters:
+        say(str(decision))
+    return replace(options, backend=decision.backend)
 
 
 def _with_resolution(options: RunOptions, reader: CaptureReader, say: Callable[[str], None]) -> RunOptions:
@@ -336,28 +347,6 @@ def with_choices(
 
 def _either(first: Callable[[], bool], second: Callable[[], bool]) -> bool:
     return first() or second()
-
-
-def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None]) -> None:
-    trainer = capture.trainer
-    rate = f"{1e3 * capture.seconds / max(trainer.iteration, 1):.1f} ms/iter"
-    say(
-        f"{trainer.iteration} iterations in {capture.seconds:.1f} s -> {rate}, {len(trainer.gaussians)} Gaussians"
-    )
-    for line in score_lines(result.test, result.train):
-        say(line)
-    for name, unit in (("psnr", "dB"), ("ssim", "")) if result.test else ():
-        emitter.emit(Metric(name, result.metrics["test"][name], unit, "test"))
-    emitter.report_output(capture.folder.path)
-    say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
-    if trainer.transients is None and len(capture.dataset.train) >= ENOUGH:
-        features = functools.partial(render, backend=capture.options.backend)
-        settings = capture.options.render_settings
-        if line := moved_line(capture.folder.path, trainer.gaussians, capture.dataset, features, settings):
-            say(line)
-    if (planned := trainer.config.iterations) > trainer.iteration:
-        folder = capture.folder.path
-        say(f"the time limit ended training before iteration {planned}; --resume continues it: {folder}")
 
 
 def _check_view(arguments: argparse.Namespace) -> None:

@@ -47,22 +47,26 @@ def moved_parts(
 
 
 def moved_line(
-    folder: Path, gaussians: Gaussians, dataset: Dataset, render: FeatureRenderer, settings: RenderSettings
+    folder: Path,
+    gaussians: Gaussians,
+    dataset: Dataset,
+    render: FeatureRenderer | None,
+    settings: RenderSettings,
 ) -> str:
     """Return a line about objects that moved: the photos that show them, or the command to find them.
 
-    The comparison takes about 20 ms per photo if photos are in memory. Otherwise reading them again would take longer,
-    and the line only names the command.
+    The comparison takes about 20 ms per photo on the CPU if photos are in memory. Otherwise reading them again would
+    take longer, and the line only names the command.
 
     Args:
         folder: The run.
         gaussians: The trained scene.
         dataset: Its capture.
-        render: Renders features.
+        render: Renders features; None to compare nothing and name the command.
         settings: The run's render settings.
     """
     doctor = command("doctor", folder)
-    if dataset.images.needed > dataset.images.budget:
+    if render is None or dataset.images.needed > dataset.images.budget:
         return f"to find photos that do not fit the scene: {doctor}"
     moved = moved_parts(gaussians, dataset.train, render, settings)
     if not moved:

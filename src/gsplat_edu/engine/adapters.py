@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import json
 import os
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsplat_edu.engine.failures import first_line
@@ -77,6 +80,46 @@ def chosen_adapter() -> AdapterName:
     return next(name for name in adapters() if wanted in name.name.lower())
 
 
+@dataclass(frozen=True)
+class Listing:
+    """The adapters of this computer, or why none can be used.
+
+    Args:
+        adapters: Best first.
+        reason: As `why_unavailable`; None if there is a usable one.
+    """
+
+    adapters: tuple[AdapterName, ...]
+    reason: str | None
+
+
+LISTING_SECONDS = 60.0
+"""Time for another process to list the adapters."""
+
+
+@functools.cache
+def listed_outside() -> Listing:
+    """List the adapters by another process.
+
+    A driver that is loaded stays: Mesa's software adapter takes 150 MiB of a process that then uses another backend.
+    """
+    if importlib.util.find_spec("wgpu") is None:
+        return Listing((), why_unavailable())
+    command = [sys.executable, "-m", "gsplat_edu.engine.adapters"]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=LISTING_SECONDS, check=True)
+        found = json.loads(done.stdout)
+        return Listing(tuple(AdapterName(**one) for one in found["adapters"]), found["reason"])
+    except (OSError, ValueError, KeyError, TypeError, subprocess.SubprocessError) as error:
+        return Listing((), f"listing the adapters fails ({first_line(error)}); use the backend cpu")
+
+
+def _print_listing() -> None:
+    reason = why_unavailable()
+    found = adapters() if reason is None else ()
+    print(json.dumps({"adapters": [asdict(one) for one in found], "reason": reason}))
+
+
 @contextmanager
 def _runtime_folder() -> Iterator[None]:
     """Name a folder in XDG_RUNTIME_DIR if it is unset: Mesa prints errors without it, though we open no window."""
@@ -107,3 +150,7 @@ def listed_adapters() -> tuple[tuple[AdapterName, Any], ...]:
     return tuple(
         sorted(found, key=lambda pair: KINDS.index(pair[0].kind) if pair[0].kind in KINDS else len(KINDS))
     )
+
+
+if __name__ == "__main__":
+    _print_listing()

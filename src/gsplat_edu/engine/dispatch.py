@@ -8,16 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsplat_edu.engine.pace import Stretch
-from gsplat_edu.engine.passes import WORD, Pass, Program
+from gsplat_edu.engine.passes import LEAST, WORD, Pass, Program
 
 JOB_BYTES = 32
 """Bytes of a job in the uniform buffer."""
 
 SLICE = 256
 """Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
-
-LEAST = 4
-"""Words of the smallest buffer: one row of four numbers, which is the largest type of an array."""
 
 VIEW_BYTES = 512
 """Bytes of the uniform block that all passes of a part share: camera and settings."""

@@ -48,6 +48,9 @@ GROUP = 4
 FEWEST_PAIRS = 1 << 12
 """Room for pairs in the smallest buffers."""
 
+KEPT_FRAMES = 2
+"""Sets of buffers that wait for another frame at most."""
+
 MOST_SIZES = 64
 """Sizes of frames whose numbers of pairs are remembered."""
 
@@ -98,6 +101,30 @@ def render_buffers() -> tuple[Buffer, ...]:
         *(Buffer("core_grads", Size("gaussians", OUT)), Buffer("rest_grads", Size("rest"))),
         *(Buffer("camera_sums", Size("gaussians", CAMERA_NUMBERS, 64)), Buffer("live", Size("live"))),
     )
+
+
+def render_counts(
+    gaussians: int, harmonics: int, pixels: int, tiles: int, pairs: int, live: int = LIVE
+) -> dict[str, int]:
+    """Return the counts of the buffers of a render, or of a step.
+
+    Args:
+        gaussians: Their number.
+        harmonics: K, per Gaussian besides the first.
+        pixels: Pixels of the view.
+        tiles: Tiles of the view.
+        pairs: Pairs of Gaussian and tile for which there is room.
+        live: Words of the buffer of that name.
+    """
+    rest, edges = 3 * gaussians * harmonics, tiles + 2
+    return {
+        "gaussians": gaussians,
+        "rest": rest,
+        "pixels": pixels,
+        "edges": edges,
+        "pairs": pairs,
+        "live": live,
+    }
 
 
 def render_passes(tile_bits: int) -> tuple[Pass, ...]:
@@ -241,7 +268,7 @@ class Pool:
         most: Sets that wait at most; the oldest is given back to the device.
     """
 
-    def __init__(self, device: Device, most: int = 2) -> None:
+    def __init__(self, device: Device, most: int = KEPT_FRAMES) -> None:
         self.device = device
         self._waiting: deque[Memory] = deque(maxlen=most)
         self._pairs: dict[tuple[int, int], int] = {}
@@ -305,13 +332,12 @@ def draw_frame(pool: Pool, scene: Scene, view: View) -> Frame:
         BackendUnavailableError: the device fails, or has no buffers that large.
     """
     n, H, W = len(scene.core), view.camera.H, view.camera.W
-    counts = {"gaussians": n, "rest": scene.rest.size, "pixels": H * W, "edges": view.tiles + 2, "live": LIVE}
     wanted, room = (
         program(sort_bits(view.tiles.bit_length()), scene.features is not None),
         pool.room(n, view.tiles),
     )
     while True:
-        memory = pool.take(wanted, counts | {"pairs": room})
+        memory = pool.take(wanted, render_counts(n, scene.rest.shape[1], H * W, view.tiles, room))
         memory.write("core", scene.core)
         memory.write("rest", scene.rest)
         found = memory.play(

@@ -22,11 +22,11 @@ import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import adapters, chosen_adapter, listed_adapters, why_unavailable
-from gsplat_edu.engine.dispatch import JOB_BYTES, LEAST, SLICE, VIEW_BYTES, Parts, dispatch
+from gsplat_edu.engine.dispatch import JOB_BYTES, SLICE, VIEW_BYTES, Parts, dispatch
 from gsplat_edu.engine.failures import listen, one_line, wait
+from gsplat_edu.engine.fit import why_too_large
 from gsplat_edu.engine.pace import Pace
-from gsplat_edu.engine.passes import LIMITS, WORD, Pass, Program, module_source
-from gsplat_edu.engine.room import why_too_large
+from gsplat_edu.engine.passes import LEAST as LEAST, LIMITS, WORD, Pass, Program, module_source
 from gsplat_edu.engine.transfers import Kept, Ticket
 
 TIMESTAMPS = "timestamp-query"
@@ -176,14 +176,18 @@ class Device:
         self.received += staging.size
         self._staging[staging.size].append(staging)
 
+    @property
+    def largest(self) -> int:
+        """Bytes of the largest buffer that a pass can use."""
+        return min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
+
     def check_fits(self, program: Program, counts: Mapping[str, int]) -> None:
         """Check that no buffer is larger than the device allows.
 
         Raises:
             BackendUnavailableError: one is; the message names it, and how many would fit.
         """
-        most = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
-        if why := why_too_large(program, counts, most, self.name.name):
+        if why := why_too_large(program, counts, self.largest, self.name.name):
             raise BackendUnavailableError(f"backend 'webgpu': {why}, or use the backend cpu")
 
     def pipeline(self, one: Pass) -> tuple[Any, Any]:
@@ -240,7 +244,7 @@ class Memory:
         self.device, self.program, self.counts = device, program, dict(counts)
         usage = wgpu.BufferUsage
         storage = usage.STORAGE | usage.COPY_SRC | usage.COPY_DST
-        self._words = {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in program.buffers}
+        self._words = program.words(counts)
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
         with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}", device):

@@ -51,6 +51,9 @@ DIGITS = 1 << DIGIT_BITS
 WORD = 4
 """Bytes of a number."""
 
+LEAST = 4
+"""Words of the smallest buffer: one row of four numbers, which is the largest type of an array."""
+
 LIMITS = {
     "max-storage-buffers-per-shader-stage": 8,
     "max-storage-buffer-binding-size": 128 << 20,
@@ -149,6 +152,10 @@ class Program:
 
     buffers: tuple[Buffer, ...]
     parts: Mapping[str, tuple[Pass, ...]]
+
+    def words(self, counts: Mapping[str, int]) -> dict[str, int]:
+        """Return the length of every buffer in words, as a host allocates it."""
+        return {buffer.name: max(LEAST, buffer.size.of(counts)) for buffer in self.buffers}
 
     def passes(self) -> Iterable[Pass]:
         """Yield the passes of all parts."""

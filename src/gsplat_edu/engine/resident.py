@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
-from gsplat_edu.engine.frame import CORE, PAIRS, PIXEL, VISIBLE, rounded_pairs
+from gsplat_edu.engine.frame import CORE, PAIRS, PIXEL, VISIBLE, render_counts, rounded_pairs
 from gsplat_edu.engine.host import Device, Memory
 from gsplat_edu.engine.passes import sort_bits
 from gsplat_edu.engine.step import (
@@ -23,12 +23,15 @@ from gsplat_edu.engine.step import (
     L1,
     LIVE,
     OPACITY,
+    PAIRS_AT_FIRST,
+    PAIRS_SPARE,
     SCALE,
     STATE,
     STATISTICS,
     Noise,
     Photo,
     StepNumbers,
+    pairs_room,
     step_program,
 )
 from gsplat_edu.engine.transfers import Kept, Ticket
@@ -125,7 +128,7 @@ class Resident:
         self.count = 0
         self._memory: Memory | None = None
         self._pixels, self._tiles, self._pairs = 1, 1, 0
-        self._most_pairs_each = 2.0
+        self._most_pairs_each = PAIRS_AT_FIRST
         self._waiting: deque[_Step] = deque()
         self._photos: dict[int, tuple[object, _KeptPhoto]] = {}
         self._photo_room = photo_room
@@ -149,7 +152,7 @@ class Resident:
         like = self._memory if count == self.count else None
         self._memory = self._last = None  # given back before the next one is asked for
         self.count = count
-        self._pairs = rounded_pairs(int(self._most_pairs_each * count))
+        self._pairs = pairs_room(count, self._most_pairs_each)
         memory = self._allocate(like)
         for name in STATE:
             memory.write(name, state[name])
@@ -231,7 +234,8 @@ class Resident:
         live = _words(one)
         if not live[HALT]:
             self._waiting.popleft()
-            self._most_pairs_each = max(self._most_pairs_each, 1.25 * int(live[PAIRS]) / max(self.count, 1))
+            needed = PAIRS_SPARE * int(live[PAIRS]) / max(self.count, 1)
+            self._most_pairs_each = max(self._most_pairs_each, needed)
             one.result.arrive(live)
             return
         again = list(self._waiting)
@@ -294,14 +298,7 @@ class Resident:
 
     def _allocate(self, like: Memory | None) -> Memory:
         """Return buffers, those of another size new, and all others with what is in them."""
-        counts = {
-            "gaussians": self.count,
-            "rest": self.count * self.harmonics * 3,
-            "pixels": self._pixels,
-            "edges": self._tiles + 2,
-            "pairs": self._pairs,
-            "live": LIVE,
-        }
+        counts = render_counts(self.count, self.harmonics, self._pixels, self._tiles, self._pairs, LIVE)
         memory = self.device.allocate(step_program(sort_bits(self._tiles.bit_length())), counts, like=like)
         memory.write("live", np.zeros(LIVE, dtype=np.uint32))
         return memory

@@ -1,82 +1,125 @@
-"""Whether a program's buffers fit a device, and what would.
-
-A device grants buffers up to a size: a browser's default is 128 MiB, which holds the harmonics of 745,654 Gaussians at
-degree 3. The engine keeps each kind of number in one buffer, so a scene beyond that is refused before anything starts.
-"""
+"""What an adapter has room for, and what a training takes there, from the sizes by which its buffers are made."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 
-from gsplat_edu.engine.passes import WORD, Program, Size
+from gsplat_edu.engine.frame import KEPT_FRAMES, program, render_counts
+from gsplat_edu.engine.host import Device
+from gsplat_edu.engine.passes import WORD, sort_bits
+from gsplat_edu.engine.resident import PHOTO_ROOM
+from gsplat_edu.engine.step import LIVE, PAIRS_AT_FIRST, PAIRS_SPARE, STATE, pairs_room, step_program
 
-HARMONICS = (0, 9, 24, 45)
-"""Numbers of a Gaussian's higher harmonics, by degree."""
+ENOUGH = 1 << 28
+"""More Gaussians than any adapter has room for."""
 
-GAUSSIANS, REST = "gaussians", "rest"
-"""Names of counts: Gaussians, and all of their higher harmonics."""
-
-REMEDIES = {
-    GAUSSIANS: "train with a lower --max-gaussians, reduce the scene",
-    REST: "train with a lower --max-gaussians or --sh-degree, reduce the scene",
-    "pairs": "make the image smaller (--resolution, --size), lower --max-gaussians",
-}
-"""What helps, by the count that is too large."""
-
-SMALLER_IMAGE = "make the image smaller (--resolution, --size)"
-"""Helps against any other."""
+PIXEL_BYTES = 4
+"""Bytes of a photo's pixel on the device."""
 
 
-def why_too_large(program: Program, counts: Mapping[str, int], most: int, device: str) -> str | None:
-    """Return what of a program does not fit, what would, and what to do; None if all fits.
+def kept_photos(photo_room: int | None) -> int:
+    """Return the bytes of photos that a training keeps on the device.
 
     Args:
-        program: The program.
-        counts: Its counts by name.
-        most: Bytes of the largest buffer that the device grants.
-        device: Its name.
+        photo_room: The bytes that it may keep; None for no other limit than `PHOTO_ROOM`.
     """
-    largest = max(program.buffers, key=lambda buffer: buffer.size.of(counts))
-    size, name = WORD * largest.size.of(counts), largest.size.count
-    if size <= most:
-        return None
-    of_all = ", ".join(f"{count} {each}" for each, count in counts.items())
-    needs = f"the buffer {largest.name} needs {size / 2**20:.0f} MiB for {of_all}"
-    each = GAUSSIANS if name == REST else name
-    fit, remedy = most_that_fit(program, counts, most, each), REMEDIES.get(name, SMALLER_IMAGE)
-    if name == REST and (degree := _degree_that_fits(program, counts, most)) is not None:
-        remedy = f"all fit with --sh-degree {degree} (train, convert); {remedy}"
-    return f"{needs}, but {device} allows {most / 2**20:.0f}: {fit} {each} fit; {remedy}"
+    return PHOTO_ROOM if photo_room is None else min(photo_room, PHOTO_ROOM)
 
 
-def most_that_fit(program: Program, counts: Mapping[str, int], most: int, name: str) -> int:
-    """Return the largest number of something that fits; the harmonics of each Gaussian stay as they are.
+@dataclass(frozen=True)
+class Load:
+    """What a step of a training works on.
 
     Args:
-        program: The program.
-        counts: Its counts by name.
-        most: Bytes of the largest buffer that the device grants.
-        name: Of the count.
+        gaussians: Their number.
+        harmonics: K, per Gaussian besides the first.
+        pixels: Pixels of the largest view.
+        tiles: Its tiles.
+        pairs: The most pairs of Gaussian and tile in a view.
     """
-    words = most // WORD
-    fits = [_items(buffer.size, words) for buffer in program.buffers if buffer.size.count == name]
-    if name == GAUSSIANS and (numbers := counts[REST] // max(counts[GAUSSIANS], 1)):
-        fits += [
-            _items(buffer.size, words) // numbers for buffer in program.buffers if buffer.size.count == REST
-        ]
-    return min(fits)
+
+    gaussians: int
+    harmonics: int
+    pixels: int
+    tiles: int
+    pairs: int
+
+    @property
+    def capacity(self) -> int:
+        """The pairs for which a training makes room."""
+        needed = PAIRS_SPARE * self.pairs / max(self.gaussians, 1)
+        return pairs_room(self.gaussians, max(needed, PAIRS_AT_FIRST))
+
+    def step_words(self) -> dict[str, int]:
+        """Return the words of every buffer of a step."""
+        bits = sort_bits(self.tiles.bit_length())
+        counts = render_counts(self.gaussians, self.harmonics, self.pixels, self.tiles, self.capacity, LIVE)
+        return step_program(bits).words(counts)
+
+    def frame_words(self) -> dict[str, int]:
+        """Return the words of every buffer of a render, as evaluations make it."""
+        bits = sort_bits(self.tiles.bit_length())
+        counts = render_counts(self.gaussians, self.harmonics, self.pixels, self.tiles, self.capacity)
+        return program(bits, False).words(counts)
+
+    def pair_words(self) -> int:
+        """Return the words of the buffers of a step whose size follows from the pairs."""
+        words = self.step_words()
+        buffers = step_program(sort_bits(self.tiles.bit_length())).buffers
+        return sum(words[buffer.name] for buffer in buffers if buffer.size.count == "pairs")
+
+    def bytes(self) -> int:
+        """Return the most bytes that a training takes on the device at once, without photos.
+
+        Those are the buffers of a step; those of the pairs once more, while larger ones take their place; those of
+        the renders of evaluations; and the state on its way between host and device.
+        """
+        step = self.step_words()
+        state = sum(step[name] for name in STATE)
+        frames = KEPT_FRAMES * sum(self.frame_words().values())
+        return WORD * (sum(step.values()) + self.pair_words() + frames + state)
 
 
-def _items(size: Size, words: int) -> int:
-    """Return the largest count whose size is at most so many words."""
-    return words // size.words * size.per
+@dataclass(frozen=True)
+class Room:
+    """What an adapter has room for. WebGPU does not tell how much memory is free.
+
+    Args:
+        adapter: Its name.
+        largest: Bytes of the largest buffer that a pass can use.
+        shared: Whether its memory is the processor's, so that both count together.
+    """
+
+    adapter: str
+    largest: int
+    shared: bool
+
+    def too_large(self, load: Load) -> tuple[str, int] | None:
+        """Return the name and the bytes of the largest buffer if it is larger than the adapter allows."""
+        words = load.step_words()
+        name = max(words, key=lambda name: words[name])
+        return (name, WORD * words[name]) if WORD * words[name] > self.largest else None
+
+    def most_gaussians(self, harmonics: int, pairs_each: float) -> int:
+        """Return how many Gaussians a training may have, as far as their buffers and those of their pairs go.
+
+        Args:
+            harmonics: K, per Gaussian besides the first.
+            pairs_each: Pairs per Gaussian.
+        """
+        low, high = 0, ENOUGH  # low fits, high does not
+        while high - low > 1:
+            middle = (low + high) // 2
+            fits = self.too_large(Load(middle, harmonics, 1, 1, round(pairs_each * middle))) is None
+            low, high = (middle, high) if fits else (low, middle)
+        return low
+
+    def most_pixels(self) -> int:
+        """Return how many pixels a view may have."""
+        words = Load(1, 0, 1 << 20, 1, 1).step_words()
+        return self.largest // WORD * (1 << 20) // max(words.values())
 
 
-def _degree_that_fits(program: Program, counts: Mapping[str, int], most: int) -> int | None:
-    """Return the highest degree at which the same Gaussians fit; None if there is none."""
-    count = counts[GAUSSIANS]
-    for degree in (2, 1, 0):
-        fewer = dict(counts) | {REST: count * HARMONICS[degree]}
-        if fewer[REST] < counts[REST] and most_that_fit(program, fewer, most, GAUSSIANS) >= count:
-            return degree
-    return None
+def room_of(device: Device) -> Room:
+    """Return what a device has room for."""
+    return Room(device.name.name, device.largest, device.name.kind != "DiscreteGPU")

@@ -25,6 +25,7 @@ from gsplat_edu.engine.frame import (
     gradient_passes,
     render_buffers,
     render_passes,
+    rounded_pairs,
 )
 from gsplat_edu.engine.passes import Buffer, Pass, Program, Size
 
@@ -47,6 +48,9 @@ STATE = ("core", "rest", "core_first", "core_second", "rest_first", "rest_second
 VIEW_BYTES, ROW, SHELL_ROW = 176, 16, 13
 """Bytes of the uniform block before the step's numbers, of a row of those, and the row of the shell."""
 
+PAIRS_AT_FIRST, PAIRS_SPARE = 2.0, 1.25
+"""Pairs per Gaussian for which there is room before the first step, and the factor on what a step needed."""
+
 NO_SHELL = (0.0, 0.0, 0.0, -1.0)
 """Stands for a scene without far splats."""
 
@@ -68,6 +72,16 @@ def step_program(tile_bits: int) -> Program:
     )
     parts = {"step": (*render_passes(tile_bits), *_loss(), *gradient_passes(), *_adam()), "noise": _noise()}
     return Program(buffers, parts)
+
+
+def pairs_room(gaussians: int, pairs_each: float) -> int:
+    """Return the pairs for which a training makes room.
+
+    Args:
+        gaussians: Their number.
+        pairs_each: `PAIRS_SPARE` times the most pairs per Gaussian of a step so far, at least `PAIRS_AT_FIRST`.
+    """
+    return rounded_pairs(int(pairs_each * gaussians))
 
 
 def loss_program() -> Program:

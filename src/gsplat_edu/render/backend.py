@@ -9,13 +9,14 @@ import torch
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import of_type
+from gsplat_edu.engine.room import Room
 from gsplat_edu.ops.adam import AdamKernel
 from gsplat_edu.ops.losses import LossKernel
 from gsplat_edu.ops.noise import NoiseKernel
 from gsplat_edu.ops.recolor import RecolorKernel
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput
-from gsplat_edu.render.resident import ResidentRun
+from gsplat_edu.render.resident import MakesRun
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
@@ -48,8 +49,10 @@ class Backend:
         add_noise: Moves means at random along their covariances, in place.
         recolored: Applies a matrix of colours to an image, differentiably.
         lacks: Names of `FEATURES` that it does not offer.
-        resident: Makes a training on the device for Gaussians of so many harmonics besides the first. `training`
-            uses it if the device can do all of its parts, and warns if it cannot. None if there is none.
+        resident: Makes a training on the device. `training` uses it if the device can do all of its parts, and warns
+            if it cannot. None if there is none.
+        room: Says what that device has room for; None for the processor and CUDA.
+        photo_room: Bytes of photos that a training keeps on the device; None for as many as it keeps by itself.
     """
 
     name: str
@@ -60,7 +63,9 @@ class Backend:
     add_noise: NoiseKernel
     recolored: RecolorKernel
     lacks: frozenset[str] = field(default_factory=frozenset)
-    resident: Callable[[int], ResidentRun] | None = None
+    resident: MakesRun | None = None
+    room: Callable[[], Room] | None = None
+    photo_room: int | None = None
 
     def require(self, feature: str, what: str) -> None:
         """Check that the backend offers a feature.

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
 from gsplat_edu.engine import adapters
+from gsplat_edu.engine.room import room_of
 from gsplat_edu.ops import kernels
 from gsplat_edu.ops.adam import adam_in_torch, adam_natively
 from gsplat_edu.ops.losses import l1_ssim, l1_ssim_in_torch
@@ -26,7 +27,7 @@ from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
 CUDA_LACKS = frozenset({"stop", "processes", "statistics"})
 """What the Triton kernels do not offer."""
 
-WEBGPU_LACKS = frozenset({"processes", "forecast"})
+WEBGPU_LACKS = frozenset({"processes"})
 """What the WGSL kernels do not offer."""
 
 
@@ -36,8 +37,8 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
     The first use of cuda or webgpu checks its kernels on the device (`gsplat_edu.render.self_check`).
 
     Args:
-        name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu, never webgpu; or a backend
-            by name.
+        name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu; or a backend by name. For
+            a training, `gsplat_edu.budget.choice` may choose webgpu instead of cpu.
         device: The device of the tensors to render, if they exist already: "auto" does not move them.
 
     Returns:
@@ -162,12 +163,17 @@ def _dense() -> Backend:
 
 @functools.cache
 def _webgpu() -> Backend:
-    from gsplat_edu.render.webgpu import render_webgpu
+    from gsplat_edu.render.webgpu import device, render_webgpu
     from gsplat_edu.render.webgpu_resident import WebgpuRun
 
     others = _cpu() if kernels.REASON is None else _dense()  # its tensors are on the CPU
     return dataclasses.replace(
-        others, name="webgpu", rasterize=render_webgpu, lacks=WEBGPU_LACKS, resident=WebgpuRun
+        others,
+        name="webgpu",
+        rasterize=render_webgpu,
+        lacks=WEBGPU_LACKS,
+        resident=WebgpuRun,
+        room=lambda: room_of(device()),
     )
 
 

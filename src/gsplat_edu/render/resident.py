@@ -84,11 +84,13 @@ class RunSums:
         photo: (1 - k) L1 + k (1 - SSIM).
         opacity: The weighted mean opacity.
         scale: The weighted mean scale.
+        pairs: Pairs of Gaussian and tile.
     """
 
     photo: float
     opacity: float
     scale: float
+    pairs: int
 
 
 @runtime_checkable
@@ -120,4 +122,18 @@ class ResidentRun(Protocol):
 
     def add_noise(self, numbers: NoiseNumbers, rules: RunRules) -> None:
         """Move the means at random after the last step, as `Backend.add_noise` does."""
+        ...
+
+
+@runtime_checkable
+class MakesRun(Protocol):
+    """Makes a training on a device."""
+
+    def __call__(self, harmonics: int, photo_room: int | None = None) -> ResidentRun:
+        """Make a training.
+
+        Args:
+            harmonics: K, per Gaussian besides the first.
+            photo_room: Bytes of photos to keep on the device at most; None for as many as it keeps by itself.
+        """
         ...

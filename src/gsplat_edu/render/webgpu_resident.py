@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.resident import Resident, Result
+from gsplat_edu.engine.room import kept_photos
 from gsplat_edu.engine.step import NO_SHELL, Noise, Photo, StepNumbers
 from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import WORD, NoiseNumbers
@@ -34,13 +35,15 @@ class WebgpuRun:
 
     Args:
         harmonics: K, per Gaussian besides the first.
+        photo_room: Bytes of photos to keep there, at most `gsplat_edu.engine.resident.PHOTO_ROOM`, which None means.
 
     Raises:
         BackendUnavailableError: there is no adapter, or it does not start.
     """
 
-    def __init__(self, harmonics: int) -> None:
-        self.resident = Resident(webgpu.device(), harmonics)
+    def __init__(self, harmonics: int, photo_room: int | None = None) -> None:
+        self._photo_room = kept_photos(photo_room)
+        self.resident = Resident(webgpu.device(), harmonics, self._photo_room)
         self._start: RunState | None = None
         self._done: list[Callable[[], None]] = []
         self._photos: dict[int, int] = {}
@@ -137,7 +140,7 @@ class WebgpuRun:
                     self._losses += 1
                     what = f"{len(self._done)} steps and what followed them are done again"
                     webgpu.replace_device(used, self._losses, what, lost)
-                    self.resident = Resident(webgpu.device(), self.resident.harmonics)
+                    self.resident = Resident(webgpu.device(), self.resident.harmonics, self._photo_room)
                     lost = None
                     if self._start is not None:
                         self.resident.load(_arrays(self._start))
@@ -166,6 +169,7 @@ def _sums(result: Result, numbers: StepNumbers, count: int) -> RunSums:
         (1.0 - k) * sums.l1 + k * sums.dissimilarity,
         numbers.opacity_weight * sums.opacity / max(averaged, 1),
         numbers.scale_weight * sums.scale / max(3 * count, 1),
+        sums.pairs,
     )
 
 

@@ -47,11 +47,13 @@ class ThinTrial:
         longest: Iterations after which a training gets worse; None if none of the trials was too long.
         scores: PSNR of the judging photos by iterations, dB.
         judges: Number of judging photos.
+        cut: Whether they were ended before their time.
     """
 
     longest: int | None
     scores: dict[int, float]
     judges: int
+    cut: bool = False
 
     def __str__(self) -> str:
         """Return why the training ends early; empty if it does not."""
@@ -71,7 +73,10 @@ def needs_trial(views: int) -> bool:
 
 
 def try_lengths(
-    options: RunOptions, reader: CaptureReader, progress: Callable[[], None] = lambda: None
+    options: RunOptions,
+    reader: CaptureReader,
+    progress: Callable[[], None] = lambda: None,
+    is_over: Callable[[], bool] = lambda: False,
 ) -> ThinTrial:
     """Train on most of the training photos for increasing numbers of iterations, until the others get worse.
 
@@ -79,6 +84,7 @@ def try_lengths(
         options: Options of the run.
         reader: The run's capture, of which `needs_trial`.
         progress: Called after every iteration.
+        is_over: Called after every iteration; if it returns true, only the trials that are finished count.
 
     Raises:
         DatasetError: the capture or one of its photos cannot be read.
@@ -92,6 +98,7 @@ def try_lengths(
     judges = dataset.train[HOLD_OUT // 2 :: HOLD_OUT]
     kept = tuple(view for i, view in enumerate(dataset.train) if i % HOLD_OUT != HOLD_OUT // 2)
     scores: dict[int, float] = {}
+    cut = False
     for length in LENGTHS:
         config = _config(options.config, length)
         trainer = training(config, dataclasses.replace(dataset, train=kept), load_backend(options.backend))
@@ -100,7 +107,9 @@ def try_lengths(
             if isinstance(event, StepEvent):
                 progress()
 
-        trainer.run(callbacks=[step])
+        trainer.run(is_over, [step])
+        if cut := trainer.iteration < length:
+            break
         renderer = dataclasses.replace(options, config=config).renderer
         found = score_views(trainer.gaussians, judges, renderer, config.background)
         if not found:
@@ -108,9 +117,11 @@ def try_lengths(
         scores[length] = _mean(found, config.appearance != "none")
         if scores[length] < max(scores.values()) - OVERFIT_LOSS:
             break
+    if not scores:
+        return ThinTrial(None, {}, len(judges), cut)
     best = max(scores, key=lambda length: scores[length])
     fell = scores[max(scores)] < scores[best] - OVERFIT_LOSS
-    return ThinTrial(best if fell else None, scores, len(judges))
+    return ThinTrial(best if fell else None, scores, len(judges), cut)
 
 
 def _mean(scores: list[ImageScore], fitted: bool) -> float:

@@ -252,10 +252,11 @@ class CaptureRun:
         return sorted_in_space(gaussians)
 
     def _trainer(self, gaussians: Gaussians) -> Trainer:
+        options = self.options
         return training(
-            self.options.config,
+            options.config,
             self.dataset,
-            load_backend(self.options.backend),
+            dataclasses.replace(load_backend(options.backend), photo_room=options.data_settings.image_memory),
             Start(gaussians, self._shell),
             callbacks=[self._record],
             team=self._team,

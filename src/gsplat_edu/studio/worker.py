@@ -179,13 +179,12 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     """
     from dataclasses import replace
 
+    from gsplat_edu.budget.choice import Prospect, choose_backend
     from gsplat_edu.budget.costs import Facts, wanted_gaussians
     from gsplat_edu.budget.forecast import predict
-    from gsplat_edu.budget.probe import probe
     from gsplat_edu.data.dataset import Dataset
     from gsplat_edu.data.reader import CaptureReader
     from gsplat_edu.data.settings import DataSettings
-    from gsplat_edu.render.backends import resolve_backend
     from gsplat_edu.train.capacity import advised_side
     from gsplat_edu.train.config import DEFAULT_STRATEGY, recipe
     from gsplat_edu.train.length import QUALITIES, planned_iterations
@@ -204,7 +203,10 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
         config = recipe(iterations, strategy=DEFAULT_STRATEGY)
         cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         config = replace(config, max_gaussians=cap)
-        measured = measured or probe(dataset, config, resolve_backend("auto"))
+        if measured is None:
+            prospect = Prospect(dataset, whole, config)
+            chosen = choose_backend(prospect)
+            measured = chosen.measured.get(chosen.backend) or prospect.measured(chosen.backend)
         said = predict(facts, measured, config, dataset.images.budget)
         found[name] = {
             "iterations": said.iterations,

@@ -18,6 +18,7 @@ from gsplat_edu.base.errors import BackendWarning
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.resident import ResidentRun, RunRules, RunState, RunSums, RunTarget
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy, FollowsDevice
 from gsplat_edu.train.events import PHOTO, Change
 from gsplat_edu.train.objective import MeanOpacity, MeanScale, Objective, PhotoTerm
@@ -33,6 +34,9 @@ from gsplat_edu.train.stepper import (
     mean_over_views,
 )
 from gsplat_edu.train.view_model import Identity
+
+PHOTO_ROOM = 1 << 30
+"""Bytes of targets in memory, so that a photo is read and decoded once; the device has photos of its own."""
 
 OPACITY, SCALE = "opacity", "scale"
 """Names of the terms besides the photo's that a device can differentiate."""
@@ -74,7 +78,10 @@ def make_stepper(
             stacklevel=3,
         )
         return host
-    return ResidentStepper(host, backend.resident(gaussians.sh_rest.shape[1]), density)
+    run = backend.resident(gaussians.sh_rest.shape[1], backend.photo_room)
+    # who limits the photos on the device keeps those of the processor too
+    room = PHOTO_ROOM if backend.photo_room is None else None
+    return ResidentStepper(host, run, density, room)
 
 
 def why_not(
@@ -107,6 +114,21 @@ def why_not(
     return None
 
 
+def leaves_device(config: TrainConfig) -> str | None:
+    """Return the setting of a configuration that no device can do, so that its steps pass through the processor.
+
+    It says beforehand what `why_not` says of the parts that a configuration leads to.
+    """
+    settings = {
+        f"batch is {config.batch}": config.batch > 1,
+        f"outside_masks is {config.outside_masks}": config.outside_masks != "ignore",
+    }
+    for name in ("appearance", "refine", "transients"):
+        value = getattr(config, name)
+        settings[f"{name} is {value}"] = value != "none"
+    return next((said for said, holds in settings.items() if holds), None)
+
+
 def _follows(density: DensityStrategy | None) -> bool:
     """Return whether a device can collect and wait for a strategy; a subclass with other methods may need more."""
     if density is None:
@@ -123,10 +145,6 @@ def _known(name: str, term: object, backend: Backend) -> bool:
     if type(term) is PhotoTerm:
         return name == PHOTO and term.loss in (None, backend.loss)
     return (name, type(term)) in ((OPACITY, MeanOpacity), (SCALE, MeanScale))
-
-
-PHOTO_ROOM = 1 << 30
-"""Bytes of targets in memory, so that a photo is read and decoded once; the device has photos of its own."""
 
 
 class _LateTerms(Mapping[str, Tensor]):
@@ -154,11 +172,17 @@ class ResidentStepper:
         host: Has the start; holds what was read last.
         run: The training on the device.
         density: The density strategy of the host.
+        photo_room: Bytes of targets that the feed is to keep; None for its own rule.
     """
 
-    photo_room: int | None = PHOTO_ROOM
-
-    def __init__(self, host: TensorStepper, run: ResidentRun, density: DensityStrategy | None) -> None:
+    def __init__(
+        self,
+        host: TensorStepper,
+        run: ResidentRun,
+        density: DensityStrategy | None,
+        photo_room: int | None = PHOTO_ROOM,
+    ) -> None:
+        self.photo_room = photo_room
         assert density is None or isinstance(density, FollowsDevice)
         self._host, self._run, self._density = host, run, density
         self.objective, self.parts, self.places = host.objective, host.parts, host.places

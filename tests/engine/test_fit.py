@@ -12,9 +12,9 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.engine import frame, host
+from gsplat_edu.engine.fit import HARMONICS, most_that_fit, why_too_large
 from gsplat_edu.engine.frame import draw_frame
 from gsplat_edu.engine.passes import LIMITS
-from gsplat_edu.engine.room import HARMONICS, most_that_fit, why_too_large
 from gsplat_edu.engine.step import step_program
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render import webgpu
@@ -104,5 +104,7 @@ def test_commands_say_it_in_one_line_and_write_nothing(tmp_path, monkeypatch, ca
     command = ["train", str(tmp_path / "egg"), "--out", str(tmp_path / "run"), "--backend", "webgpu"]
     assert main([*command, "--iterations", "5"]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
-    assert "pixels fit; make the image smaller (--resolution, --size), or use the backend cpu" in line
+    assert (
+        "hold a view of 7,281 pixels, but photos have 120x90; give --resolution 90, or --backend cpu" in line
+    )
     assert not list((tmp_path / "run").glob("**/*.ply"))
