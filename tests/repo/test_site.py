@@ -14,6 +14,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from browsers import chromium
+from chapters import SOURCES, tool
 from slices import SHARD, SHARDS, SOAK
 
 ROOT = Path(__file__).parents[2]
@@ -182,6 +183,44 @@ def test_no_equation_and_no_docstring_is_garbled(site):
         prose = "".join(page.prose)
         assert "$" not in prose and not re.search(r"\\[a-zA-Z]", prose), path
         assert "Return type" not in prose, "signatures have types"
+
+
+@pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_every_chapter_says_which_commit_it_was_built_from(site):
+    _, out = site
+    commit = tool("build_site").built_from()
+    for source in SOURCES:
+        text = re.sub(r"<[^>]+>", "", (out / "notebooks" / f"{source.stem}.html").read_text())
+        assert f"This page was built from notebooks/source/{source.name} at commit {commit}." in text
+
+
+def test_the_commit_of_a_working_tree_and_of_an_archive(tmp_path, monkeypatch):
+    built_from = tool("build_site").built_from
+    assert built_from(tmp_path) == "unknown"
+
+    def git(*words):
+        who = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(
+            ["git", "-C", tmp_path, *who, *words], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    git("init", "-q")
+    (tmp_path / "chapter").write_text("one")
+    git("add", "chapter")
+    git("commit", "-q", "-m", "one")
+    commit = git("rev-parse", "HEAD")[:12]
+    built_from.cache_clear()
+    assert built_from(tmp_path) == commit
+    (tmp_path / "archive").mkdir()
+    assert built_from(tmp_path / "archive") == "unknown", "of no commit of the repository around it"
+    (tmp_path / "chapter").write_text("two")
+    built_from.cache_clear()
+    assert built_from(tmp_path) == f"{commit}-dirty"
+    built_from.cache_clear()
+    monkeypatch.setenv("PATH", "")
+    assert built_from(tmp_path) == "unknown", "without git"
 
 
 def test_a_folder_that_is_not_a_site_is_not_overwritten(tmp_path):
