@@ -36,6 +36,7 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "conformance": ("conformance", "gpu/test_conformance.py"),
     "docs": ("repo/test_site.py",),
     "tools/build_site.py": ("repo/test_site.py",),
+    "tools/landing_scene.py": ("repo/test_site.py",),
     "tools/build_notebooks.py": ("repo/test_notebooks.py",),
     "tools/build_wheels.py": ("repo/test_wheels.py",),
     "packaging": ("repo/test_wheels.py",),

@@ -14,6 +14,7 @@ import ast
 import base64
 import functools
 import importlib
+import importlib.util
 import inspect
 import json
 import re
@@ -23,6 +24,7 @@ import sys
 import tempfile
 from collections.abc import Collection, Iterable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -180,6 +182,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
     for picture in PICTURES:
         shutil.copyfile(ROOT / picture, stage / "static" / Path(picture).name)
+    _tool("landing_scene").write_landing(stage / "static")
     (stage / "static" / "tiles.png").write_bytes(_figure(*TILES))
     landing = (stage / "index.md").read_text(encoding="utf-8")
     _write(stage / "index.md", landing + _contents(chapters))
@@ -194,6 +197,16 @@ def fold_set_up(notebook: dict[str, Any]) -> None:
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code" and re.match(r"(import|from) ", "".join(cell["source"])):
             cell["metadata"] = {**cell["metadata"], "tags": ["hide-input"]}
+
+
+def _tool(name: str) -> ModuleType:
+    """Import another script of this folder."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    if spec is None or spec.loader is None:
+        raise ImportError(name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @functools.cache

@@ -38,6 +38,7 @@ ELSEWHERE = {
     "build_wheels.py": "tests/repo/test_wheels.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
+    "landing_scene.py": "tools/build_site.py",
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
     "make_city.py": "tests/data/test_city.py",

@@ -4,6 +4,7 @@ Every page is built, but only the public API and an eighth of the modules, by co
 soak` documents all, which takes twice as long.
 """
 
+import math
 import re
 import subprocess
 import sys
@@ -65,7 +66,7 @@ def site(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium() as launched:
+    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as launched:
         yield launched
 
 
@@ -120,6 +121,85 @@ def test_the_landing_page_shows_pictures_and_three_ways_in(site):
     shown = re.findall(r'class="toctree-l1[^"]*"><a class="reference internal" href="(.*?)"', text)
     assert not [link for link in shown if "gsplat_edu." in link or re.search(r"decisions/\d", link)]
     assert "docs/decisions/index.html" in shown and "reference/index.html" in shown
+
+
+def overflowing(tab):
+    """List the pictures of an open page that are cropped or wider than the window."""
+    return tab.evaluate(
+        """() => [...document.querySelectorAll("article img")].filter(picture => {
+            const { left, right } = picture.getBoundingClientRect();
+            const whole = getComputedStyle(picture).objectFit === "contain"
+                || Math.abs(picture.clientWidth / picture.clientHeight - picture.naturalWidth / picture.naturalHeight) < 0.02;
+            return !picture.naturalWidth || left < 0 || right > innerWidth || !(whole || picture.closest("#scene"));
+        }).map(picture => picture.src)"""
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_the_landing_page_shows_a_live_scene_that_keys_turn(site, browser, width, height):
+    _, out = site
+    assert (out / "_static" / "scene.html").stat().st_size < 700_000
+    tab, said = browser.new_page(viewport={"width": width, "height": height}), []
+    tab.on("console", lambda message: said.append(message.text))
+    tab.on("pageerror", lambda error: said.append(str(error)))
+    tab.goto((out / "index.html").as_uri())
+    stage = tab.locator("#scene").bounding_box()
+    assert stage["y"] + stage["height"] < height, "the scene is in the first screen"
+    scene = tab.locator("#scene iframe").element_handle().content_frame()
+    scene.wait_for_function("window.viewer && viewer.isWhole")
+    pixels = """async () => [...(await viewer.setCamera({ ...viewer.view.camera, W: 64, H: 27, fx: 74, fy: 74, cx: 32, cy: 13.5 }))
+        .pixels]"""
+    drawn = scene.evaluate(pixels)
+    background = scene.evaluate("viewer.facts.settings.background")
+    differs = [abs(drawn[i] - background[0]) > 0.05 for i in range(0, len(drawn), 3)]
+    assert 0.3 < sum(differs) / len(differs) < 0.95, "houses before a sky"
+    eye, pivot = (scene.evaluate(f"viewer.view.{name}") for name in ("camera.eye", "focus"))
+    tab.locator("#scene").click()
+    for key in ("ArrowRight", "ArrowDown"):
+        tab.keyboard.press(key)
+    scene.wait_for_function(
+        "before => viewer.view.camera.eye.every((x, i) => Math.abs(x - before[i]) > 1e-3)", arg=eye
+    )
+    moved = scene.evaluate("viewer.view.camera.eye")
+    assert math.dist(moved, pivot) == pytest.approx(math.dist(eye, pivot)), "keys orbit"
+    assert scene.evaluate(pixels) != drawn
+    assert overflowing(tab) == []
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    assert [text for text in said if "GPU stall due to ReadPixels" not in text] == []
+    tab.close()
+
+
+@pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_the_wheel_scrolls_the_landing_page_until_the_scene_is_clicked(site, browser):
+    _, out = site
+    tab = browser.new_page(viewport={"width": 1200, "height": 600})
+    tab.goto((out / "index.html").as_uri())
+    scene = tab.locator("#scene iframe").element_handle().content_frame()
+    scene.wait_for_function("window.viewer && viewer.isWhole")
+    before = scene.evaluate("viewer.view.distance")
+    tab.locator("#scene").hover()
+    tab.mouse.wheel(0, 100)
+    tab.wait_for_function("scrollY > 0")
+    assert scene.evaluate("viewer.view.distance") == before
+    tab.locator("#scene").click()
+    tab.mouse.wheel(0, 100)
+    scene.wait_for_function("before => viewer.view.distance > before", arg=before)
+    tab.close()
+
+
+@pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_the_landing_page_without_scripts_shows_the_still_picture(site, browser):
+    _, out = site
+    context = browser.new_context(java_script_enabled=False)
+    tab = context.new_page()
+    tab.goto((out / "index.html").as_uri())
+    assert tab.locator("#scene img").is_visible() and tab.locator("#scene iframe").count() == 0
+    assert not tab.locator(".scripted").is_visible(), "no word about keys"
+    context.close()
 
 
 @pytest.mark.slow
