@@ -441,6 +441,6 @@ print(f"held-out L1 with cameras that are off: {worse:.4f}, with the right ones 
 assert worse > 1.2 * at_last
 
 # %% [markdown]
-# A phone gives photos and no cameras, and [chapter 14](14_photos_to_scene.ipynb) begins with a folder of photos. One debt
-# comes first. The derivatives of this page end on the screen, at the conic, and from there "the package goes on".
-# [Chapter 13](13_back_to_the_parameters.ipynb) goes on by hand, link for link, back to the numbers of the file.
+# A phone gives photos and no cameras, and [chapter 14](14_photos_to_scene.ipynb) begins with a folder of photos. One
+# debt comes first: the derivatives of this page end on the screen, at the conic, and from there "the package goes on".
+# [Chapter 13](13_back_to_the_parameters.ipynb) goes on by hand, link by link, back to the numbers of the file.

@@ -320,7 +320,8 @@ fig.colorbar(filled, ax=ax, label="L")
 plt.show()
 
 # %% [markdown]
-# The length of $q$ changes nothing: contours are rays, gradients tangents of circles, and a step makes $q$ longer.
+# The length of $q$ changes nothing: contours are rays, gradients tangents of circles, and a step makes $q$ longer. And
+# $q$ and $-q$ are one rotation, so that the picture repeats after half a turn.
 #
 # ## Colour, and who is looking
 #
@@ -443,7 +444,7 @@ for below in range(4):
 assert losses[0] == losses[-1]
 
 # %% [markdown]
-# At every step both cameras see one thing, and the nearest guess finds it. The furthest does not move: its gradient is
-# exact, and exactly zero, because its alpha is below the floor all over both photos. A derivative knows nothing of what
-# is out of sight. A training has to start with Gaussians that are nearly where they belong, and with cameras that are
-# right. [Chapter 14](14_photos_to_scene.ipynb) finds both in photos.
+# At every step both cameras see one thing, and the nearest guess comes close to it. The furthest do not move: their
+# gradient is exact, and exactly zero, because alpha is below the floor all over both photos. A derivative knows nothing
+# of what is out of sight. A training has to start with Gaussians that are nearly where they belong, and with cameras
+# that are right. [Chapter 14](14_photos_to_scene.ipynb) finds both in photos.
