@@ -52,7 +52,7 @@ LOGIT = 4.0
 SKY = (0.79, 0.86, 0.93)
 """Background of the page and of the still picture."""
 
-EYE, TARGET = (-9.2, -8.6, -12.4), (0.0, -0.9, 0.0)
+EYE, TARGET = (-10.0, -9.6, -13.4), (0.0, -1.3, 0.0)
 WIDTH, HEIGHT = 1280, 540
 """Size of the still picture, px."""
 

@@ -128,8 +128,9 @@ def overflowing(tab):
     return tab.evaluate(
         """() => [...document.querySelectorAll("article img")].filter(picture => {
             const { left, right } = picture.getBoundingClientRect();
+            const shape = picture.clientWidth / picture.clientHeight;
             const whole = getComputedStyle(picture).objectFit === "contain"
-                || Math.abs(picture.clientWidth / picture.clientHeight - picture.naturalWidth / picture.naturalHeight) < 0.02;
+                || Math.abs(shape - picture.naturalWidth / picture.naturalHeight) < 0.02;
             return !picture.naturalWidth || left < 0 || right > innerWidth || !(whole || picture.closest("#scene"));
         }).map(picture => picture.src)"""
     )
@@ -149,8 +150,10 @@ def test_the_landing_page_shows_a_live_scene_that_keys_turn(site, browser, width
     assert stage["y"] + stage["height"] < height, "the scene is in the first screen"
     scene = tab.locator("#scene iframe").element_handle().content_frame()
     scene.wait_for_function("window.viewer && viewer.isWhole")
-    pixels = """async () => [...(await viewer.setCamera({ ...viewer.view.camera, W: 64, H: 27, fx: 74, fy: 74, cx: 32, cy: 13.5 }))
-        .pixels]"""
+    pixels = """async () => {
+        const small = { W: 64, H: 27, fx: 74, fy: 74, cx: 32, cy: 13.5 };
+        return [...(await viewer.setCamera({ ...viewer.view.camera, ...small })).pixels];
+    }"""
     drawn = scene.evaluate(pixels)
     background = scene.evaluate("viewer.facts.settings.background")
     differs = [abs(drawn[i] - background[0]) > 0.05 for i in range(0, len(drawn), 3)]
