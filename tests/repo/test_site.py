@@ -123,6 +123,18 @@ def test_the_landing_page_shows_pictures_and_three_ways_in(site):
     assert "docs/decisions/index.html" in shown and "reference/index.html" in shown
 
 
+PATIENCE = 180_000
+"""Milliseconds that a test waits for the scene: a processor that other work keeps busy draws in place of a GPU."""
+
+
+def live_scene(tab):
+    """Return the frame of the scene in an open landing page, once it has drawn all splats."""
+    tab.wait_for_selector(".live #scene iframe", timeout=PATIENCE)
+    scene = tab.locator("#scene iframe").element_handle().content_frame()
+    scene.wait_for_function("window.viewer && viewer.isWhole", timeout=PATIENCE)
+    return scene
+
+
 def overflowing(tab):
     """List the pictures of an open page that are cropped or wider than the window."""
     return tab.evaluate(
@@ -148,8 +160,7 @@ def test_the_landing_page_shows_a_live_scene_that_keys_turn(site, browser, width
     tab.goto((out / "index.html").as_uri())
     stage = tab.locator("#scene").bounding_box()
     assert stage["y"] + stage["height"] < height, "the scene is in the first screen"
-    scene = tab.locator("#scene iframe").element_handle().content_frame()
-    scene.wait_for_function("window.viewer && viewer.isWhole")
+    scene = live_scene(tab)
     pixels = """async () => {
         const small = { W: 64, H: 27, fx: 74, fy: 74, cx: 32, cy: 13.5 };
         return [...(await viewer.setCamera({ ...viewer.view.camera, ...small })).pixels];
@@ -163,7 +174,9 @@ def test_the_landing_page_shows_a_live_scene_that_keys_turn(site, browser, width
     for key in ("ArrowRight", "ArrowDown"):
         tab.keyboard.press(key)
     scene.wait_for_function(
-        "before => viewer.view.camera.eye.every((x, i) => Math.abs(x - before[i]) > 1e-3)", arg=eye
+        "before => viewer.view.camera.eye.every((x, i) => Math.abs(x - before[i]) > 1e-3)",
+        arg=eye,
+        timeout=PATIENCE,
     )
     moved = scene.evaluate("viewer.view.camera.eye")
     assert math.dist(moved, pivot) == pytest.approx(math.dist(eye, pivot)), "keys orbit"
@@ -180,16 +193,15 @@ def test_the_wheel_scrolls_the_landing_page_until_the_scene_is_clicked(site, bro
     _, out = site
     tab = browser.new_page(viewport={"width": 1200, "height": 600})
     tab.goto((out / "index.html").as_uri())
-    scene = tab.locator("#scene iframe").element_handle().content_frame()
-    scene.wait_for_function("window.viewer && viewer.isWhole")
+    scene = live_scene(tab)
     before = scene.evaluate("viewer.view.distance")
     tab.locator("#scene").hover()
     tab.mouse.wheel(0, 100)
-    tab.wait_for_function("scrollY > 0")
+    tab.wait_for_function("scrollY > 0", timeout=PATIENCE)
     assert scene.evaluate("viewer.view.distance") == before
     tab.locator("#scene").click()
     tab.mouse.wheel(0, 100)
-    scene.wait_for_function("before => viewer.view.distance > before", arg=before)
+    scene.wait_for_function("before => viewer.view.distance > before", arg=before, timeout=PATIENCE)
     tab.close()
 
 

@@ -1,7 +1,8 @@
-// Puts the live scene over its still picture, which stays where scripts or WebGL2 are off.
+// Puts the live scene over its still picture, which stays where scripts or WebGL2 are off. It waits until the page
+// itself has loaded.
 "use strict";
 
-addEventListener("DOMContentLoaded", () => {
+addEventListener("load", () => {
   const stage = document.getElementById("scene");
   if (!document.createElement("canvas").getContext("webgl2")) return;
   const frame = document.createElement("iframe");
