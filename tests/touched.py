@@ -33,6 +33,7 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "src/gsplat_edu/train/resident.py": ("engine",),
     "native": ("native",),
     "benchmarks/ladder": ("ladder",),
+    "benchmarks/kernel_operations.py": ("native/test_operations.py",),
     "conformance": ("conformance", "gpu/test_conformance.py"),
     "docs": ("repo/test_site.py",),
     "tools/build_site.py": ("repo/test_site.py",),

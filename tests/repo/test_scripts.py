@@ -16,8 +16,8 @@ from processes import Program
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchmarks").glob("*/__main__.py"))
-SHARED = {"captures.py", "hardware.py", "traced.py"}
-"""Modules that the benchmarks import."""
+SHARED = {"captures.py", "hardware.py", "kernel_operations.py", "traced.py"}
+"""Modules that the benchmarks and chapters import."""
 
 MADE = {
     f"benchmarks/{name}"
