@@ -72,7 +72,7 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/runs/test_processes.py::test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed": (16, 4),
     "tests/sfm/test_video.py::test_frames_become_a_capture": (14, 1),
     "tests/train/test_vignetting.py::test_dark_corners_are_corrected_and_held_out_quality_with_them": (14, 1),
-    "tests/repo/test_notebooks.py::test_chapters_execute_on_a_reduced_budget": (14, 13),
+    "tests/repo/test_notebooks.py::test_chapters_execute_on_a_reduced_budget": (14, 14),
     "tests/train/test_transients.py::test_found_masks_recover_most_of_the_quality_of_true_masks": (13, 1),
     "tests/train/test_poses.py::test_wrong_poses_are_corrected_and_held_out_quality_with_them": (12, 1),
     "tests/runs/test_pilot.py::test_poses_are_refined_if_they_are_wrong": (11, 2),

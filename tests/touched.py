@@ -35,6 +35,10 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "benchmarks/ladder": ("ladder",),
     "conformance": ("conformance", "gpu/test_conformance.py"),
     "docs": ("repo/test_site.py",),
+    "docs/site/static": ("repo/test_figures.py",),
+    "docs/GLOSSARY.md": ("repo/test_glossary.py",),
+    "notebooks/exercises": ("repo/test_exercises.py",),
+    "tools/site_figures.py": ("repo/test_figures.py",),
     "tools/build_site.py": ("repo/test_site.py",),
     "tools/build_notebooks.py": ("repo/test_notebooks.py",),
     "tools/build_wheels.py": ("repo/test_wheels.py",),
@@ -208,7 +212,7 @@ def tests_of(root: Path, changed: Iterable[str]) -> set[str]:
         for key, places in ELSEWHERE.items():
             if path.is_relative_to(key):
                 found |= set().union(*(test_files(root / "tests" / place) for place in places))
-        if path.is_relative_to("notebooks/source"):
+        if path.parts[0] == "notebooks" and path.suffix == ".py":
             names.add(f"[{path.stem}]")
         if path.parts[0] == "benchmarks":
             names.add(f"[{'/'.join(path.parts[:2])}]")

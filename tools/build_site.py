@@ -4,7 +4,7 @@
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
-set-up cells folded.
+set-up cells folded and with moving figures (`tools/site_figures.py`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
+from site_figures import with_figures
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "gsplat_edu"
 USE = {
@@ -40,6 +42,9 @@ USE = {
     "benchmarks/RESULTS.md": "Measured results",
 }
 """Documents for users, with their titles in the sidebar."""
+
+LEARN = {"docs/GLOSSARY.md": "Glossary"}
+"""Documents beside the chapters."""
 
 BUILD_ON = {
     "docs/PYTHON.md": "Python examples",
@@ -161,7 +166,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
         members: Modules whose pages show their documentation; those of the others have only a title and links.
     """
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
-    documents = [Path(name) for name in (*USE, *BUILD_ON) if not name.endswith("/index.md")]
+    documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if not name.endswith("/index.md")]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
     for page in [*documents, *records]:
         _write(stage / page, relinked((ROOT / page).read_text(encoding="utf-8"), page, stage))
@@ -171,6 +176,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
             if cell["cell_type"] == "markdown":
                 cell["source"] = relinked("".join(cell["source"]), page, stage)
         fold_set_up(notebook)
+        with_figures(page.stem, notebook)
         _write(stage / page, json.dumps(notebook))
     for name in modules():
         _write(stage / "reference" / f"{name}.md", _reference(name, documented=name in members))
@@ -291,7 +297,8 @@ def _toctree(options: str, pages: Iterable[str]) -> str:
 def _contents(chapters: list[Path]) -> str:
     """Return the sidebar with its sections: learn, use, build on."""
     sections = {
-        "Learn": [str(page.with_suffix("")) for page in chapters],
+        "Learn": [str(page.with_suffix("")) for page in chapters]
+        + [f"{title} <{name.removesuffix('.md')}>" for name, title in LEARN.items()],
         "Use": [f"{title} <{name.removesuffix('.md')}>" for name, title in USE.items()],
         "Build on": [f"{title} <{name.removesuffix('.md')}>" for name, title in BUILD_ON.items()],
     }

@@ -166,6 +166,9 @@ plt.show()
 # ## Too near: holes
 #
 # Walk up to one ball. The picture grows and the points stay as many as they were.
+#
+# > **Predict.** The camera walks from distance 8 to 4 to 2. What will a pixel show that no point in front has hit:
+# > black, or something worse?
 
 # %%
 distances = (8.0, 4.0, 2.0)
@@ -334,8 +337,9 @@ for radius, slope in slopes.items():
     assert np.all(np.abs(jumps) >= 1 / (2 * h)) and still > 0.96
 
 # %% [markdown]
-# The slope is zero wherever it exists. Where it does not, a finite difference is one step divided by
-# whatever $h$ was chosen: it says something about $h$. There is nothing to descend.
+# The slope is zero wherever it exists. Where it does not, a [finite
+# difference](../docs/GLOSSARY.md#finite-difference) is one step divided by whatever $h$ was chosen: it says something
+# about $h$. There is nothing to descend.
 #
 # ## The obvious fix
 #

@@ -95,6 +95,9 @@ assert np.abs(truth - best_constant).max() > 0.2
 # cost least to evaluate are polynomials in the components $x, y, z$ of $d$. There are fewer of them than it seems,
 # because $x^2 + y^2 + z^2 = 1$ makes many equal: $z^4$ is also $z^2 (1 - x^2 - y^2)$. How many are there up to
 # degree $L$ that differ somewhere on the sphere? Evaluate all monomials at random directions and ask for the rank.
+#
+# > **Predict.** There are 20 monomials in three variables up to degree 3. How many of them are independent on the
+# > sphere?
 
 # %%
 rng = np.random.default_rng(6)
@@ -167,8 +170,8 @@ assert np.abs(coarse - np.eye(16)).max() > 0.1
 # one. It yields every constant of `sh_basis` in [gsplat_edu.scene.sh](../src/gsplat_edu/scene/sh.py) up to rounding,
 # which for sums of 28 terms of order one is about $10^{-14}$; ten times that is asserted. Only the order and the signs
 # are a convention: within a degree from $m = -l$ to $l$, and every second one of the sixteen negative. They are those
-# of Kerbl et al.'s code, and a scene file means nothing without them. The functions are called real spherical
-# harmonics.
+# of Kerbl et al.'s code, and a scene file means nothing without them. The functions are called real
+# [spherical harmonics](../docs/GLOSSARY.md#spherical-harmonics).
 
 # %%
 polar, azimuth = np.meshgrid(np.linspace(0, np.pi, 60), np.linspace(-np.pi, np.pi, 120), indexing="ij")

@@ -81,8 +81,8 @@ ax.set(title="what autograd keeps for one image", xlabel="number of splats", yla
 plt.show()
 
 # %% [markdown]
-# It grows with pixels times splats, and almost all of it is for pairs that do not show. A kernel keeps next to
-# nothing: it computes the values again on the way back. One pixel is enough to see how.
+# It grows with pixels times splats, and almost all of it is for pixels that a splat does not reach. A kernel keeps
+# next to nothing: it computes the values again on the way back. One pixel is enough to see how.
 #
 # ## One pixel
 #
@@ -97,6 +97,9 @@ plt.show()
 # behind adds up on the way, and $T_i = T_{i+1} / (1 - \alpha_i)$ comes back by dividing (Kerbl et al. 2023). In exact
 # arithmetic. In float32, this is what the division finds, through layers of opacity 0.99, of the $T_1 = 1$ it began
 # with:
+#
+# > **Predict.** A float32 has a precision of 24 bits, and holds nothing much below $10^{-45}$. Behind how many layers
+# > of opacity 0.99 does the division find nothing any more?
 
 
 # %%
@@ -251,8 +254,9 @@ for name, mine, theirs in zip(cloud._fields, hand, reference, strict=False):
 #
 # `atomics` adds them to the splat's own nine numbers, which all its tiles share. The addition is indivisible, so
 # nothing is lost; but float32 addition is not associative, and the order is the order of arrival. `slots` gives each
-# pair nine numbers of its own, those of a splat side by side, added up afterwards in the order of its tiles, whoever
-# wrote them and when. Two threads seldom meet at one splat: what slots buy here is not time, it is the bits.
+# pair a [*slot*](../docs/GLOSSARY.md#slot), nine numbers of its own. The slots of a splat lie side by side and are
+# added up afterwards in the order of its tiles, whoever wrote them and when. Two threads seldom meet at one splat:
+# what slots buy here is not time, it is the bits.
 
 # %%
 print("// Every pair" + (ROOT / "benchmarks/ladder/backward.cpp").read_text().split("// Every pair")[2])
@@ -438,4 +442,6 @@ print(f"held-out L1 with cameras that are off: {worse:.4f}, with the right ones 
 assert worse > 1.2 * at_last
 
 # %% [markdown]
-# A phone gives photos and no cameras. [Chapter 13](13_photos_to_scene.ipynb) begins with a folder of photos.
+# A phone gives photos and no cameras, and [chapter 14](14_photos_to_scene.ipynb) begins with a folder of photos. One
+# debt comes first: the derivatives of this page end on the screen, at the conic, and from there "the package goes on".
+# [Chapter 13](13_back_to_the_parameters.ipynb) goes on by hand, link by link, back to the numbers of the file.

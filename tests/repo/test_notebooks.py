@@ -1,13 +1,10 @@
 """The chapters redefine no name of the package, and the shipped notebooks were executed from their sources."""
 
 import ast
-import functools
-import importlib.util
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import jupytext
 import matplotlib.pyplot as plt
@@ -16,59 +13,9 @@ import numpy as np
 import pytest
 from nbclient.exceptions import CellExecutionError
 
-ROOT = Path(__file__).parents[2]
+from chapters import CHAPTERS, LINK, ROOT, SOURCES, redefinitions, tool
+
 LONGEST = 450  # largest number of lines of a chapter's source
-LINK = re.compile(r"\]\(([^)\s]+)\)")
-SOURCES = sorted((ROOT / "notebooks" / "source").glob("*.py"))
-CHAPTERS = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
-
-
-def top_level_names(text: str) -> set[str]:
-    """Collect the functions, classes and constants that a module defines."""
-    names = set()
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.add(node.name)
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            found = (n for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
-            names |= {n.id for n in found if isinstance(n.ctx, ast.Store)}
-    return names
-
-
-@functools.cache
-def public_names() -> set[str]:
-    modules = (ROOT / "src" / "gsplat_edu").rglob("*.py")
-    names = {name for module in modules for name in top_level_names(module.read_text())}
-    return {name for name in names if not name.startswith("_")}
-
-
-def redefinitions(text: str) -> set[str]:
-    """Find names of the package that a chapter binds, in any scope and by any statement."""
-    bound = set()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            bound.add(node.name)
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):
-            bound.add(node.id)
-        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
-            bound.add(node.attr)
-        elif isinstance(node, ast.arg):
-            bound.add(node.arg)
-        elif isinstance(node, ast.MatchAs | ast.MatchStar) and node.name:
-            bound.add(node.name)
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            ours = isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "gsplat_edu"
-            for alias in node.names:
-                renamed = alias.asname not in (None, alias.name)
-                bound |= (
-                    {alias.asname or alias.name, alias.name}
-                    if not ours
-                    else {alias.name}
-                    if renamed
-                    else set()
-                )
-    return bound & public_names()
 
 
 @CHAPTERS
@@ -183,14 +130,6 @@ def test_a_chapter_that_breaks_a_rule_is_rejected(old, new, what):
     assert violations(GOOD.replace(old, new, 1)) == [what]
 
 
-def tool(name):
-    """Import a script of tools/."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def figure(**settings):
     """Draw a line with a title and labels, or with the given settings."""
     made, axes = plt.subplots()
@@ -302,14 +241,14 @@ def test_numbers_in_the_prose_are_printed_on_the_page(source):
                 )
 
 
-def test_thirteen_chapters():
-    assert [path.stem[:2] for path in SOURCES] == [f"{n:02d}" for n in range(1, 14)]
+def test_fourteen_chapters():
+    assert [path.stem[:2] for path in SOURCES] == [f"{n:02d}" for n in range(1, 15)]
 
 
 @CHAPTERS
 def test_shipped_notebooks_match_their_source_and_were_executed(source):
     shipped = nbformat.read(ROOT / "notebooks" / f"{source.stem}.ipynb", as_version=4)
-    cells = jupytext.read(source).cells
+    cells = tool("build_notebooks").assembled(source).cells
     assert [(c.cell_type, c.source) for c in shipped.cells] == [(c.cell_type, c.source) for c in cells]
     code = [cell for cell in shipped.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), (

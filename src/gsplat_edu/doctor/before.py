@@ -1,6 +1,6 @@
 """Run all checks of a capture before training and combine them into one diagnosis.
 
-Chapter: 13_photos_to_scene.
+Chapter: 14_photos_to_scene.
 """
 
 from __future__ import annotations

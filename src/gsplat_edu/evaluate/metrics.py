@@ -12,7 +12,7 @@ number of threads. Renders are clamped to 0..1 first, as a screen would do. Defi
 
 A mean over images averages the images' values. It is not the PSNR of the mean error.
 
-Chapter: 13_photos_to_scene.
+Chapter: 14_photos_to_scene.
 """
 
 from __future__ import annotations

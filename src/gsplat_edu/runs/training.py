@@ -2,7 +2,7 @@
 
 The trainer knows neither files nor datasets; this module provides both and writes the results.
 
-Chapter: 13_photos_to_scene.
+Chapter: 14_photos_to_scene.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The learned Gaussians: raw parameters, and the activations that map them to rendered quantities.
 
-Chapter: 07_a_trained_scene.
+Chapters: 07_a_trained_scene, 13_back_to_the_parameters.
 """
 
 from __future__ import annotations

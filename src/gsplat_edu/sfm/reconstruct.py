@@ -1,6 +1,6 @@
 """Turn photos or a video into a capture in stages; an interrupted run resumes after the last completed stage.
 
-Chapter: 13_photos_to_scene.
+Chapter: 14_photos_to_scene.
 """
 
 from __future__ import annotations
