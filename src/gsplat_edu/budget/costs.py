@@ -343,7 +343,9 @@ class Footprint:
         # Photos are first read before any Gaussian exists, several at once and at full size.
         reading = int(facts.workers * facts.decoding * facts.full)
         found["images"] = max(found["images"], reading - found["Gaussians"])
-        if self.room is not None:  # photos that are decoded anew stay while their steps may have to be taken again
+        if (
+            self.room is not None
+        ):  # photos that are decoded anew stay while their steps may have to be taken again
             found["photos"] += min(facts.photo_bytes - kept, REPEATED_PHOTOS)
         if self.room is not None and self.room.shared:
             found["device"] = self.on_device(gaussians, image_memory)
