@@ -31,8 +31,6 @@ def top_level_names(text: str) -> set[str]:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             names.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
-            if isinstance(node.value, ast.Call) and ast.unparse(node.value.func) == "TypeVar":
-                continue  # T is the transmittance in a chapter
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             found = (n for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
             names |= {n.id for n in found if isinstance(n.ctx, ast.Store)}

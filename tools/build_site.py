@@ -4,7 +4,7 @@
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
-set-up cells folded.
+set-up cells folded and with moving figures (`tools/site_figures.py`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import ast
 import base64
 import functools
 import importlib
-import importlib.util
 import inspect
 import json
 import re
@@ -24,8 +23,9 @@ import sys
 import tempfile
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
+
+from site_figures import with_figures
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "gsplat_edu"
@@ -42,6 +42,9 @@ USE = {
     "benchmarks/RESULTS.md": "Measured results",
 }
 """Documents for users, with their titles in the sidebar."""
+
+LEARN = {"docs/GLOSSARY.md": "Glossary"}
+"""Documents beside the chapters."""
 
 BUILD_ON = {
     "docs/PYTHON.md": "Python examples",
@@ -163,7 +166,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
         members: Modules whose pages show their documentation; those of the others have only a title and links.
     """
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
-    documents = [Path(name) for name in (*USE, *BUILD_ON) if not name.endswith("/index.md")]
+    documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if not name.endswith("/index.md")]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
     for page in [*documents, *records]:
         _write(stage / page, relinked((ROOT / page).read_text(encoding="utf-8"), page, stage))
@@ -173,6 +176,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
             if cell["cell_type"] == "markdown":
                 cell["source"] = relinked("".join(cell["source"]), page, stage)
         fold_set_up(notebook)
+        with_figures(page.stem, notebook)
         notebook["cells"].append(_origin(page, len(notebook["cells"])))
         _write(stage / page, json.dumps(notebook))
     for name in modules():
@@ -182,7 +186,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
     for picture in PICTURES:
         shutil.copyfile(ROOT / picture, stage / "static" / Path(picture).name)
-    _tool("landing_scene").write_landing(stage / "static")
+    importlib.import_module("landing_scene").write_landing(stage / "static")
     (stage / "static" / "tiles.png").write_bytes(_figure(*TILES))
     landing = (stage / "index.md").read_text(encoding="utf-8")
     _write(stage / "index.md", landing + _contents(chapters))
@@ -197,16 +201,6 @@ def fold_set_up(notebook: dict[str, Any]) -> None:
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code" and re.match(r"(import|from) ", "".join(cell["source"])):
             cell["metadata"] = {**cell["metadata"], "tags": ["hide-input"]}
-
-
-def _tool(name: str) -> ModuleType:
-    """Import another script of this folder."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
-    if spec is None or spec.loader is None:
-        raise ImportError(name)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @functools.cache
@@ -333,7 +327,8 @@ def _toctree(options: str, pages: Iterable[str]) -> str:
 def _contents(chapters: list[Path]) -> str:
     """Return the sidebar with its sections: learn, use, build on."""
     sections = {
-        "Learn": [str(page.with_suffix("")) for page in chapters],
+        "Learn": [str(page.with_suffix("")) for page in chapters]
+        + [f"{title} <{name.removesuffix('.md')}>" for name, title in LEARN.items()],
         "Use": [f"{title} <{name.removesuffix('.md')}>" for name, title in USE.items()],
         "Build on": [f"{title} <{name.removesuffix('.md')}>" for name, title in BUILD_ON.items()],
     }

@@ -31,9 +31,8 @@ assert np.isclose(
 # one axis? Derive it from the formula, check it with `light`, and say what half of it would do.
 
 # %%
-enough = np.log(2 / 0.01) / (
-    2 * np.pi**2
-)  # 2 exp(-2 pi² delta) = 0.01, for a splat without any width of its own
+# 2 exp(-2 pi² delta) = 0.01, for a splat without any width of its own
+enough = np.log(2 / 0.01) / (2 * np.pi**2)
 print(f"dilation for one percent: {enough:.3f} px², the page has {DILATION}")
 # `light` moves along both axes, so the two ripples add, and their product comes on top.
 assert np.abs(light(0.01, enough) - 1).max() < 2.2 * 0.01

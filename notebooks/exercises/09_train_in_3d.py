@@ -10,7 +10,8 @@ grown_at = next(i for i, count in enumerate(result.counts) if count > result.cou
 assert max(result.counts[:grown_at]) == result.counts[0] < result.counts[grown_at]
 
 # %% [markdown]
-# **Exercise 2 (a function).** The curve of the loss is noisy, because each iteration looks at another view. Write
+# **Exercise 2 (a function).** The curve of the loss is noisy, because each iteration looks at another view; the
+# [held-out view](../docs/GLOSSARY.md#held-out-view) is looked at too seldom for a curve. Write
 # `smoothed(values, window)`: the mean over each run of so many iterations. Which window would you choose here?
 
 
@@ -26,8 +27,9 @@ assert np.isclose(curve[-1], np.mean(result.losses[-len(capture.train) :]))
 assert np.abs(np.diff(curve)).mean() < 0.2 * np.abs(np.diff(result.losses)).mean()
 
 # %% [markdown]
-# **Exercise 3 (open).** The threshold of densification is 2e-4, in units in which the image is two wide. Why not in
-# pixels? Work out for one splat how its pull depends on the resolution of the photo.
+# **Exercise 3 (open).** The threshold of [densification](../docs/GLOSSARY.md#densification) is 2e-4, in normalised
+# device coordinates ([NDC](../docs/GLOSSARY.md#ndc)), in which the image is two wide. Why not in pixels? Work out
+# for one splat how its pull depends on the resolution of the photo.
 
 
 # %%

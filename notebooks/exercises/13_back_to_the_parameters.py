@@ -25,7 +25,9 @@ def other_backward(R_bar, q):
 
 
 # The two forms differ by a multiple of |n|² - 1, whose gradient is along n, and unit_backward removes what is along n.
-assert np.allclose(other_backward(R_bar, inside.quats), quat_bar, rtol=0, atol=1e-12 * np.abs(quat_bar).max())
+assert np.allclose(
+    other_backward(R_bar, central.quats), quat_bar, rtol=0, atol=1e-12 * np.abs(quat_bar).max()
+)
 
 # %% [markdown]
 # **Exercise 3 (open).** Leave $J$'s derivative out of the mean's gradient. For which Gaussians would nobody notice?

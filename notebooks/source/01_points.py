@@ -337,8 +337,9 @@ for radius, slope in slopes.items():
     assert np.all(np.abs(jumps) >= 1 / (2 * h)) and still > 0.96
 
 # %% [markdown]
-# The slope is zero wherever it exists. Where it does not, a finite difference is one step divided by
-# whatever $h$ was chosen: it says something about $h$. There is nothing to descend.
+# The slope is zero wherever it exists. Where it does not, a [finite
+# difference](../docs/GLOSSARY.md#finite-difference) is one step divided by whatever $h$ was chosen: it says something
+# about $h$. There is nothing to descend.
 #
 # ## The obvious fix
 #

@@ -90,14 +90,15 @@ assert np.ptp(lights) < 1e-9 and np.all(np.diff(misses[: SPOTS // 2 + 1]) < 0)
 #
 # $$|A^{-1}p|^2 = p^\top (A A^\top)^{-1} p = p^\top \Sigma^{-1} p, \qquad \Sigma = A A^\top,$$
 #
-# and the footprint of a splat with its centre at $\mu$ is
+# and the [footprint](../docs/GLOSSARY.md#footprint) of a splat with its centre at $\mu$ is
 #
 # $$g(p) = \exp\left(-\tfrac{1}{2}\,(p-\mu)^\top \Sigma^{-1} (p-\mu)\right).$$
 #
-# $\Sigma$ is the covariance: if $q$ is drawn from a round Gaussian of variance 1, the mean of $p p^\top$ is
-# $A A^\top$. It is symmetric, so it has perpendicular eigenvectors, and along one with eigenvalue $\lambda$
-# the exponent is $-s^2 / 2\lambda$: a bell of standard deviation $\sqrt{\lambda}$. The contours are ellipses
-# with these axes. What is evaluated is never $\Sigma$ but its inverse, the *conic*, three numbers:
+# $\Sigma$ is the [covariance](../docs/GLOSSARY.md#covariance): if $q$ is drawn from a round Gaussian of variance 1,
+# the mean of $p p^\top$ is $A A^\top$. It is symmetric, so it has perpendicular eigenvectors, and along one with
+# eigenvalue $\lambda$ the exponent is $-s^2 / 2\lambda$: a bell of standard deviation $\sqrt{\lambda}$. The contours
+# are ellipses with these axes. What is evaluated is never $\Sigma$ but its inverse, the
+# [*conic*](../docs/GLOSSARY.md#conic), three numbers:
 #
 # $$\Sigma^{-1} = \frac{1}{\det\Sigma}
 # \begin{pmatrix} \Sigma_{yy} & -\Sigma_{xy} \\ -\Sigma_{xy} & \Sigma_{xx} \end{pmatrix}.$$
@@ -126,6 +127,10 @@ assert np.isclose(footprint(leaning, *pull @ [0.6, 0.8]), np.exp(-0.5), rtol=1e-
 print("A A' =", leaning.tolist(), " from samples:", sampled.round(2).tolist())
 
 # %% [markdown]
+# > **Why this bound.** The covariance of $n$ samples is itself random, and `sampling_error` is its standard
+# > deviation. A normal number strays five of them from its mean about once in two million draws. So if the assertion
+# > fails, the formula is wrong and not the luck.
+#
 # ## Three numbers that are not always an ellipse
 #
 # A splat will be found by changing its numbers a little, again and again. The plain way is to keep the
@@ -195,12 +200,15 @@ assert abs(summed / mass - 1) < 8 * np.exp(-2 * np.pi**2 * np.linalg.eigvalsh(le
 #
 # The tolerance in that check is a warning. It is tiny when the narrowest axis is a pixel wide. Each pixel takes the
 # value at one place, and a splat can be so narrow that it lies between all of these places. In one dimension the sum
-# over pixels at $k$ of a bell at $x$ can be written with the bell's frequencies (Poisson's summation):
+# over pixels at $k$ of a bell at $x$ can be written with the bell's frequencies
+# ([Poisson](../docs/GLOSSARY.md#poisson-summation)'s summation):
 #
 # $$\sum_k e^{-(k-x)^2/2\sigma^2} = \sqrt{2\pi}\,\sigma
 # \left(1 + 2\sum_{m \ge 1} e^{-2\pi^2 m^2\sigma^2} \cos 2\pi m x\right).$$
 #
-# The 1 is what should be there. The rest is what the position does to it: it grows quickly below $\sigma = 1$.
+# Why only these waves? One with $m$ whole periods from a pixel to the next has the same value at every pixel, so that
+# the pixels cannot tell it from a constant; all others cancel in the sum. The 1 is what should be there. The rest is
+# what the position does to it: it grows quickly below $\sigma = 1$.
 #
 # > **Predict.** Five round splats, the narrowest a tenth of a pixel wide and the widest one pixel, move along a line.
 # > For which of them does the light depend on where they are? A variance of 0.3 is then added to each: for which does
@@ -232,6 +240,10 @@ axes[0].legend()
 plt.show()
 
 # %% [markdown]
+# > **Why this bound.** Behind the dilation the variance is at least $0.3$. The first wave then has the strength
+# > $2 e^{-2\pi^2 \cdot 0.3}$, half a percent; in the next one the exponent is four times as large, which leaves
+# > nothing that would show.
+#
 # On the left the splats of a fifth of a pixel and less are there and gone again: several times too bright when a
 # pixel happens to be at the centre, dark in between. Many of them glitter. On the right are the same, repaired.
 #
@@ -257,8 +269,8 @@ print(f"ripple left in one dimension: {2 * np.exp(-2 * np.pi**2 * DILATION):.4f}
 # %% [markdown]
 # ## What it costs
 #
-# A convolution spreads light and adds none. The line above was about normalised bells; ours have peak 1,
-# before and after. So the dilated splat is larger *and* as bright in the middle, and paints
+# A convolution spreads light and adds none. The line above was about normalised bells; ours have peak 1, before and
+# after. So the [dilated](../docs/GLOSSARY.md#dilation) splat is larger *and* as bright in the middle, and paints
 #
 # $$\frac{2\pi\sqrt{\det(\Sigma + \delta I)}}{2\pi\sqrt{\det\Sigma}}$$
 #
@@ -344,8 +356,8 @@ assert np.abs(means[MODES[2]] / means[MODES[2]][0] - 1).max() < ripple
 # ## How far a splat reaches
 #
 # A Gaussian is nowhere zero. Without an end every splat would have to be evaluated at every pixel. An image has steps
-# of 1/255, and what changes a pixel by less than one step need not be drawn. With opacity $o$ its *alpha* is $o\,g$,
-# and
+# of 1/255, and what changes a pixel by less than one step need not be drawn. With opacity $o$ its
+# [*alpha*](../docs/GLOSSARY.md#alpha) is $o\,g$, and
 #
 # $$\alpha = o\,e^{-m^2/2} \ge \frac{1}{255} \quad\Longleftrightarrow\quad m^2 = d^\top\Sigma^{-1}d \le 2\ln(255\,o),$$
 #

@@ -158,8 +158,8 @@ assert drift[-1] > 0.1 and max(drift_quat) < 1e-14
 # ## Four numbers that are always a rotation
 #
 # In the plane a unit complex number turns by multiplication: it has length 1, and lengths multiply. Hamilton found
-# that in space it takes three imaginary units, $i^2 = j^2 = k^2 = ijk = -1$. With a number written as $(w, a)$, a real
-# part and a vector, these rules say
+# that in space, for [quaternions](../docs/GLOSSARY.md#quaternion), it takes three imaginary units,
+# $i^2 = j^2 = k^2 = ijk = -1$. With a number written as $(w, a)$, a real part and a vector, these rules say
 #
 # $$(w, a)(w', b) = (w w' - a \cdot b,\; w b + w' a + a \times b),$$
 #
@@ -234,6 +234,9 @@ for panel, (matrix, title) in enumerate(((np.diag(scales), "stretched: S"), (RS,
 plt.show()
 
 # %% [markdown]
+# > **Why this bound.** As in chapter 02: five standard deviations of a sample covariance, which chance exceeds about
+# > once in two million.
+#
 # ## In front of a camera
 #
 # The splat is in the world; now we need a picture of it. Take the simple camera first, one that forgets depth,
@@ -265,9 +268,9 @@ assert np.all(
 )  # the skewness of n normal numbers varies by that
 
 # %% [markdown]
-# The pinhole of [gsplat_edu.scene.camera](../src/gsplat_edu/scene/camera.py) divides by depth. Points of the near end
-# of a splat are spread out more than those of the far end. So take one that is long, leans away from the camera and
-# stands off the axis, and walk towards it along one ray.
+# The [pinhole](../docs/GLOSSARY.md#pinhole) of [gsplat_edu.scene.camera](../src/gsplat_edu/scene/camera.py) divides
+# by depth. Points of the near end of a splat are spread out more than those of the far end. So take one that is long,
+# leans away from the camera and stands off the axis, and walk towards it along one ray.
 
 # %%
 DIRECTION = np.array([0.3, 0.1, 1.0])  # of the ray, scaled to depth 1
@@ -314,14 +317,21 @@ plt.show()
 assert shifts[0] > 5 * shifts[-1] and skews[0] > 0.5
 
 # %% [markdown]
+# > **Why this bound.** With $h$ the offset in depth, $1/z = (1 - h/m_z + h^2/m_z^2 - \dots)/m_z$. The second power
+# > gives the prediction, odd powers vanish in the mean, and the fourth brings $E[h^4] = 3\,\Sigma_{zz}^2$: three
+# > times $\Sigma_{zz}/m_z^2$ of the prediction. Twice that leaves room for the rest.
+#
 # Both faults go with the size of the splat against its distance. Far away perspective is as good as affine. Near
 # the camera the image has its mean in one place, the image of its mean in another, and a long tail on one side. If
 # nothing were culled it would have no mean at all: some points lie as near to depth 0 as one likes.
 #
-# The shape of the bent image can be computed exactly, without samples. The shell of the Gaussian at $k$ standard
-# deviations has an outline in the image: where rays just touch it. Let $m$ be the mean in camera coordinates. A plane
-# through the camera with normal $n$ touches the shell when its distance from the mean, $|n \cdot m|$, is what the
-# shell reaches in that direction, $k\sqrt{n^\top\Sigma n}$. So
+# The shape of the bent image can be computed exactly, without samples. Look at a ball with one eye: the rays that
+# just touch it are a cone, and a screen cuts an ellipse out of the cone. It is easier to ask for planes than for
+# rays. A plane through the eye that touches the ball is a line in the image that touches the outline, and whoever
+# knows all tangents of a curve knows the curve. The shell of the Gaussian at $k$ standard deviations has an outline
+# in the image: where rays just touch it. Let $m$ be the mean in camera coordinates. A plane through the camera with
+# normal $n$ touches the shell when its distance from the mean, $|n \cdot m|$, is what the shell reaches in that
+# direction, $k\sqrt{n^\top\Sigma n}$. So
 #
 # $$n^\top D\,n = 0, \qquad D = m m^\top - k^2 \Sigma.$$
 #

@@ -129,10 +129,10 @@ assert np.abs(J @ close_mean).max() < 1e-12
 # $$\Sigma_{2d} = J\, W\, \Sigma\, W^\top J^\top,$$
 #
 # two by two, in square pixels, around the projected mean. The formula is that of Zwicker et al. (2001). They convolve
-# this ellipse with the pixel's low-pass filter, as chapter 02 does with its dilation, and call that EWA splatting,
-# after Heckbert's elliptical weighted average. The ellipse is the *splat*. Written out it is one line, and
-# `project_cov3d` in [gsplat_edu.scene.gaussian_math](../src/gsplat_edu/scene/gaussian_math.py) is that line for many
-# Gaussians at once.
+# this ellipse with the pixel's low-pass filter, as chapter 02 does with its dilation, and call that
+# [EWA](../docs/GLOSSARY.md#ewa-splatting) splatting, after Heckbert's elliptical weighted average. The ellipse is the
+# [*splat*](../docs/GLOSSARY.md#splat). Written out it is one line, and `project_cov3d` in
+# [gsplat_edu.scene.gaussian_math](../src/gsplat_edu/scene/gaussian_math.py) is that line for many Gaussians at once.
 
 
 # %%
@@ -189,9 +189,11 @@ plt.show()
 #
 # $$\frac{t + e a}{1 + e c} = t + e\,(a - tc) + e^2 (tc^2 - ac) + e^3 (ac^2 - tc^3) + \dots$$
 #
-# The first-order term has variance $e^2 (1 + t^2)$, and that is the ellipse. Odd and even terms are uncorrelated.
-# What the ellipse leaves out begins with the variance of the second term, $e^4 (1 + 2t^2)$, and twice the covariance
-# of the first with the third, $2 e^4 (1 + 3t^2)$. Together, as a fraction of the ellipse's own variance:
+# This is $1/(1 + x) = 1 - x + x^2 - \dots$ with $x = e c$, multiplied out. The first-order term has variance
+# $e^2 (1 + t^2)$, and that is the ellipse. Odd and even terms are uncorrelated. What the ellipse leaves out begins
+# with the variance of the second term, $e^4 (1 + 2t^2)$, and twice the covariance of the first with the third,
+# $2 e^4 (1 + 3t^2)$. The numbers are moments of normal numbers, $E[a^2] = 1$ and $E[c^4] = 3$: the second term, for
+# instance, has $t^2 (3 - 1)$ from $tc^2$ and 1 from $ac$. Together, as a fraction of the ellipse's own variance:
 #
 # $$\text{relative error} = \frac{3 + 8 t^2}{1 + t^2}\; e^2 + O(e^4).$$
 #
@@ -253,6 +255,9 @@ angle_ax.legend()
 plt.show()
 
 # %% [markdown]
+# > **Why this bound.** The standard error of a mean is the deviation of one draw over $\sqrt{n}$; the factor may
+# > stray four of them, plus a hundredth for the next term at the smallest size.
+#
 # The next term of the series is at most $69/8\; e^2$ of the first (its value far off the axis), so it may tilt
 # the fitted line, whose points stay below $e = 0.05$, by $2 \cdot 69/8 \cdot 0.05^2 = 0.043$. The tolerance of 0.06
 # has room for that. At $e = 0.15$ the marks are seen to leave the lines, upwards.
@@ -323,9 +328,9 @@ plt.show()
 #
 # The code of Kerbl et al. (2023) has a bound rather than a better formula. The mean is projected as before. Inside
 # $J$, and only there, $x/z$ and $y/z$ are clamped to the viewing directions of the image, enlarged 1.3 times around
-# its middle. A mean inside that window keeps its Jacobian to the last bit. A mean outside gets the one of the
-# window's rim: wrong, but of bounded width, so that its splat stays near its mean, out of the picture, where it
-# belongs.
+# its middle. A mean inside that window keeps its [Jacobian](../docs/GLOSSARY.md#jacobian) to the last bit. A mean
+# outside gets the one of the window's rim: wrong, but of bounded width, so that its splat stays near its mean, out of
+# the picture, where it belongs.
 
 # %%
 (low, high), _ = CAMERA.jacobian_bounds(1.3)

@@ -109,9 +109,9 @@ print(f"mean error: added and clipped {off(np.clip(added, 0, 1)):.3f}, averaged 
 #
 # $$C = \sum_i T_i\, \alpha_i\, c_i + T_{N+1}\, b, \qquad T_i = \prod_{j < i} (1 - \alpha_j).$$
 #
-# $T_i$ is the *transmittance* in front of layer $i$, the share of light that gets from there to the eye. It starts
-# at 1 and only falls. That is the advantage of the sum over the recursion: it can be evaluated from the front,
-# keeping $C$ and $T$, and then we notice when nothing more can come.
+# $T_i$ is the [*transmittance*](../docs/GLOSSARY.md#transmittance) in front of layer $i$, the share of light that
+# gets from there to the eye. It starts at 1 and only falls. That is the advantage of the sum over the recursion: it
+# can be evaluated from the front, keeping $C$ and $T$, and then we notice when nothing more can come.
 
 
 # %%
@@ -257,9 +257,9 @@ for stop in ("box", "tile"):
     assert np.array_equal(T_stopped[T_never >= T_STOP], T_never[T_never >= T_STOP])
 
 # %% [markdown]
-# A box can only stop as a whole, so it stops late; the fast renderers of later chapters stop by *tiles*, squares of
-# 16 pixels, and have more to show for it. Where a pixel is still above the limit at the end, nothing has changed to
-# the last bit.
+# A box can only stop as a whole, so it stops late; the fast renderers of later chapters stop by
+# [*tiles*](../docs/GLOSSARY.md#tile), squares of 16 pixels, and have more to show for it. Where a pixel is still
+# above the limit at the end, nothing has changed to the last bit.
 #
 # The box has a fault of its own. Three standard deviations are less than the rim, and what is cut off there is not
 # below the floor. One large round splat shows it.

@@ -170,8 +170,8 @@ assert np.abs(coarse - np.eye(16)).max() > 0.1
 # one. It yields every constant of `sh_basis` in [gsplat_edu.scene.sh](../src/gsplat_edu/scene/sh.py) up to rounding,
 # which for sums of 28 terms of order one is about $10^{-14}$; ten times that is asserted. Only the order and the signs
 # are a convention: within a degree from $m = -l$ to $l$, and every second one of the sixteen negative. They are those
-# of Kerbl et al.'s code, and a scene file means nothing without them. The functions are called real spherical
-# harmonics.
+# of Kerbl et al.'s code, and a scene file means nothing without them. The functions are called real
+# [spherical harmonics](../docs/GLOSSARY.md#spherical-harmonics).
 
 # %%
 polar, azimuth = np.meshgrid(np.linspace(0, np.pi, 60), np.linspace(-np.pi, np.pi, 120), indexing="ij")

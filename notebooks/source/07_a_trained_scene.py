@@ -134,8 +134,9 @@ for key, values in by_hand.items():
 #
 # ## What happens when one forgets
 #
-# The file holds what was trained: *raw* values. Each passes through a function of its own before it is drawn.
-# Nothing in the file says so, and a reader that forgets one of them gets a picture all the same:
+# The file holds what was trained: [*raw* values](../docs/GLOSSARY.md#raw-value). Each passes through a function of
+# its own before it is drawn. Nothing in the file says so, and a reader that forgets one of them gets a picture all
+# the same:
 #
 # > **Predict.** Four readers forget one function each: that of scales, of opacities, of colours, of quaternions.
 # > Which mistake do you see at once, and which would you pass on?

@@ -65,9 +65,9 @@ plt.show()
 
 # %% [markdown]
 # Each ellipse has nine numbers: two of a mean $\mu$ in pixels, two logarithms of scales, one angle $\theta$, three of
-# a colour $c$, one logit $\ell$ of an opacity. They are raw for the reason they are raw in a file: so that any step
-# leads to a splat. The covariance is built as chapter 03 builds it, as a product with its own transpose, and dilated
-# as chapter 02 does it:
+# a colour $c$, one [logit](../docs/GLOSSARY.md#logit) $\ell$ of an opacity. They are raw for the reason they are raw
+# in a file: so that any step leads to a splat. The covariance is built as chapter 03 builds it, as a product with its
+# own transpose, and dilated as chapter 02 does it:
 #
 # $$R = \begin{pmatrix} \cos\theta & -\sin\theta \\ \sin\theta & \cos\theta \end{pmatrix}, \qquad
 # S = \begin{pmatrix} e^{s_1} & 0 \\ 0 & e^{s_2} \end{pmatrix}, \qquad M = R S, \qquad
@@ -110,8 +110,8 @@ assert gap < 1e-12
 #
 # $$L = \frac{1}{3HW} \sum (I - I^*)^2, \qquad g = \frac{\partial L}{\partial I} = \frac{2\,(I - I^*)}{3HW}$$
 #
-# It is usually quoted in decibels, as the peak signal-to-noise ratio of what a screen would show, clipped to 0 to 1:
-# $\mathrm{PSNR} = -10 \log_{10} L$. Ten decibels more are a tenth of the error.
+# It is usually quoted in decibels, as the [peak signal-to-noise ratio](../docs/GLOSSARY.md#psnr) of what a screen
+# would show, clipped to 0 to 1: $\mathrm{PSNR} = -10 \log_{10} L$. Ten decibels more are a tenth of the error.
 
 # %%
 shown = np.mean((np.clip(wrong.image, 0, 1) - photo) ** 2)

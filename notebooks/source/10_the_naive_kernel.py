@@ -106,10 +106,10 @@ plt.show()
 #
 # ## One pixel reads every splat
 #
-# A *kernel* is the program that one pixel, or one small group of pixels, runs. Turn the loops around.
-# Where the dense renderer takes one operation and applies it to all pixels and splats, the kernel takes
-# one pixel, and lets it walk along the splats from near to far with four numbers in its hands: the
-# transmittance $T$ and three channels of colour.
+# A [*kernel*](../docs/GLOSSARY.md#kernel) is the program that one pixel, or one small group of pixels, runs. Turn the
+# loops around. Where the dense renderer takes one operation and applies it to all pixels and splats, the kernel takes
+# one pixel, and lets it walk along the splats from near to far with four numbers in its hands: the transmittance $T$
+# and three channels of colour.
 #
 # $$\alpha_i = \min\left(0.99,\; o_i \, e^{-\frac{1}{2}(A \, dx^2 + C \, dy^2) - B \, dx \, dy}\right)$$
 #
@@ -177,10 +177,11 @@ plt.show()
 #
 # ## What it should cost: a roofline by hand
 #
-# A processor does two things at limited rates: arithmetic, and moving bytes. A program that needs $F$
-# operations and $M$ bytes cannot take less time than $F / \mathrm{peak}$, nor less than
-# $M / \mathrm{bandwidth}$. Their ratio $F / M$, the *arithmetic intensity*, says which of the two limits
-# matters. Both numerators can be counted with a pencil.
+# A [roofline](../docs/GLOSSARY.md#roofline) is a picture of two limits. A processor does two things at limited rates:
+# arithmetic, and moving bytes. A program that needs $F$ operations and $M$ bytes cannot take less time than
+# $F / \mathrm{peak}$, nor less than $M / \mathrm{bandwidth}$. Their ratio $F / M$, the [*arithmetic
+# intensity*](../docs/GLOSSARY.md#arithmetic-intensity), says which of the two limits matters. Both numerators can be
+# counted with a pencil.
 #
 # Every evaluation does two subtractions, nine operations for the exponent, a product with the opacity, a
 # minimum, and two comparisons, with the floor and for the loop: 15, beside one exponential, which is about

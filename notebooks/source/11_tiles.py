@@ -74,12 +74,12 @@ plt.show()
 #
 # ## A list for every tile
 #
-# A list for every pixel would be longer than the work itself. Neighbours want nearly the same splats, so
-# they share one: the image is cut into squares, *tiles*, and each splat is entered into the list of every
-# tile that its box of three standard deviations meets (Kerbl et al. 2023). How large should a tile be?
-# Let a box be $b$ pixels wide, and fall anywhere on tiles of width $t$. Along one axis its first pixel
-# falls into a tile, and each of the other $b - 1$ starts a new one with probability $1 / t$. So a box
-# meets
+# A list for every pixel would be longer than the work itself. Neighbours want nearly the same splats, so they share
+# one: the image is cut into squares, [*tiles*](../docs/GLOSSARY.md#tile), and each splat is entered into the list of
+# every tile that its box of three standard deviations meets (Kerbl et al. 2023). Such an entry, one splat in one
+# tile, is a [*pair*](../docs/GLOSSARY.md#pair): what an image costs will be counted in pairs. How large should a tile
+# be? Let a box be $b$ pixels wide, and fall anywhere on tiles of width $t$. Along one axis its first pixel falls into
+# a tile, and each of the other $b - 1$ starts a new one with probability $1 / t$. So a box meets
 #
 # $$n(t) = \left(1 + \frac{b - 1}{t}\right)^2$$
 #
@@ -136,10 +136,10 @@ plt.show()
 #
 # $$\mathrm{begin}_k = \sum_{j < k} \mathrm{count}_j,$$
 #
-# a *prefix sum*. Walk along the splats a second time, near to far, and put each entry at the next free
-# place of its tile. Whoever comes first is nearer. This is a counting sort; it takes time proportional to
-# the number of entries. The alternative that the field began with makes a key of tile and depth for every
-# entry and sorts the keys. Both give the same lists:
+# a [*prefix sum*](../docs/GLOSSARY.md#prefix-sum). Walk along the splats a second time, near to far, and put each
+# entry at the next free place of its tile. Whoever comes first is nearer. This is a counting sort; it takes time
+# proportional to the number of entries. The alternative that the field began with makes a key of tile and depth for
+# every entry and sorts the keys. Both give the same lists:
 
 # %%
 corner = np.floor(cloud.means2d).astype(int)
@@ -275,9 +275,10 @@ plt.show()
 #
 # $$p = \left(\log_2 o + a \, dx^2\right) + dy \left(b \, dx + c \, dy\right),$$
 #
-# the first bracket and $b \, dx$ are two vectors that are made once for a splat and a tile, and each row
-# costs two multiply-adds for $p$. Sixteen floats are one register of AVX-512, two of AVX2 and four of
-# NEON, which is the second merit of tiles of sixteen: a row is a whole number of registers on each.
+# the first bracket and $b \, dx$ are two vectors that are made once for a splat and a tile, and each row costs two
+# multiply-adds for $p$. Sixteen floats, one in each [lane](../docs/GLOSSARY.md#lane), are one register of AVX-512,
+# two of AVX2 and four of NEON, which is the second merit of tiles of sixteen: a row is a whole number of registers on
+# each.
 #
 # The price is that a row is evaluated whole, or not at all. And `exp` of the C library takes one number.
 # But a float *is* a power of two with a fraction attached: split $p = n + f$ with $n$ the nearest integer,

@@ -81,8 +81,8 @@ ax.set(title="what autograd keeps for one image", xlabel="number of splats", yla
 plt.show()
 
 # %% [markdown]
-# It grows with pixels times splats, and almost all of it is for pairs that do not show. A kernel keeps next to
-# nothing: it computes the values again on the way back. One pixel is enough to see how.
+# It grows with pixels times splats, and almost all of it is for pixels that a splat does not reach. A kernel keeps
+# next to nothing: it computes the values again on the way back. One pixel is enough to see how.
 #
 # ## One pixel
 #
@@ -254,8 +254,9 @@ for name, mine, theirs in zip(cloud._fields, hand, reference, strict=False):
 #
 # `atomics` adds them to the splat's own nine numbers, which all its tiles share. The addition is indivisible, so
 # nothing is lost; but float32 addition is not associative, and the order is the order of arrival. `slots` gives each
-# pair nine numbers of its own, those of a splat side by side, added up afterwards in the order of its tiles, whoever
-# wrote them and when. Two threads seldom meet at one splat: what slots buy here is not time, it is the bits.
+# pair a [*slot*](../docs/GLOSSARY.md#slot), nine numbers of its own. The slots of a splat lie side by side and are
+# added up afterwards in the order of its tiles, whoever wrote them and when. Two threads seldom meet at one splat:
+# what slots buy here is not time, it is the bits.
 
 # %%
 print("// Every pair" + (ROOT / "benchmarks/ladder/backward.cpp").read_text().split("// Every pair")[2])

@@ -36,8 +36,8 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
-STEPS, SWEEP = (30, 41) if SHORT else (400, 161)
-print(f"budget: {STEPS} steps, {SWEEP} places{' (reduced)' if SHORT else ''}")
+DESCENT_STEPS, SWEEP = (30, 41) if SHORT else (400, 161)
+print(f"budget: {DESCENT_STEPS} steps, {SWEEP} places{' (reduced)' if SHORT else ''}")
 
 
 def to_screen(one, camera, limit=None):
@@ -162,14 +162,14 @@ def agrees(link, derived, loss_of, x):
     assert derived.shape == x.shape and gap < 1e-10
 
 
-camera, LIMIT = Camera.looking_at([0.4, -0.3, -3], [0, 0, 0], 60, 66, H=48, W=64), 1.3
-W, bounds = camera.R, np.transpose(camera.jacobian_bounds(LIMIT))
+camera, CLAMP = Camera.looking_at([0.4, -0.3, -3], [0, 0, 0], 60, 66, H=48, W=64), 1.3
+W, edges_xy = camera.R, np.transpose(camera.jacobian_bounds(CLAMP))
 near = gaussian([0.3, -0.2, 0.4], [0.5, 0.2, 0.1], [1.2, -0.4, 0.3, 0.7], 0.4, [1, 0.8, 0.6], 0.2)
 aside = near | {"means": np.array([3, -0.2, 0.4]), "log_scales": near["log_scales"] + 0.8}
-inside, clamped = (to_screen(one, camera, LIMIT) for one in (near, aside))
-for x in (inside, clamped):
-    print("x/z, y/z:", *np.round([x.p[:2] / x.p[2], x.ratio, *bounds], 2))
-    assert np.abs(x.p[:2] / x.p[2] - bounds).min() > 0.05 and np.abs(x.unfloored).min() > 0.05
+central, clamped = (to_screen(one, camera, CLAMP) for one in (near, aside))
+for x in (central, clamped):
+    print("x/z, y/z:", *np.round([x.p[:2] / x.p[2], x.ratio, *edges_xy], 2))
+    assert np.abs(x.p[:2] / x.p[2] - edges_xy).min() > 0.05 and np.abs(x.unfloored).min() > 0.05
 
 # %% [markdown]
 # ## The conic
@@ -192,8 +192,8 @@ def conic_backward(conic_bar, conic):
     return -conic @ np.array([[A, B / 2], [B / 2, C]]) @ conic
 
 
-conic_bar, Sigma = rng.normal(size=3), np.linalg.inv(inside.conic)
-Sigma_bar = conic_backward(conic_bar, inside.conic)
+conic_bar, Sigma = rng.normal(size=3), np.linalg.inv(central.conic)
+Sigma_bar = conic_backward(conic_bar, central.conic)
 shares = [1, 0.5, 0.5, 1] * conic_bar[[0, 1, 1, 2]]  # A, half of B, half of B, C
 agrees("Sigma from conic", Sigma_bar, lambda Sigma: shares @ np.linalg.inv(Sigma).ravel(), Sigma)
 
@@ -207,7 +207,7 @@ agrees("Sigma from conic", Sigma_bar, lambda Sigma: shares @ np.linalg.inv(Sigma
 # $$\bar N = 2\, \bar\Sigma N, \qquad \bar M = (J W)^\top \bar N, \qquad \bar J = \bar N\, (W M)^\top .$$
 
 # %%
-x, N_bar = inside, 2 * Sigma_bar @ inside.N
+x, N_bar = central, 2 * Sigma_bar @ central.N
 M_bar, J_bar = (x.J @ W).T @ N_bar, N_bar @ (W @ x.M).T
 agrees("N from Sigma", N_bar, lambda N: (Sigma_bar * (N @ N.T)).sum(), x.N)
 agrees("M from N", M_bar, lambda M: (N_bar * (x.J @ W @ M)).sum(), x.M)
@@ -243,17 +243,17 @@ def mean_backward(u_bar, J_bar, x):
     return np.array([*r_bar / z, -(r_bar @ r + (J_bar * x.J).sum()) / z])
 
 
-def changed(limit=LIMIT, **arrays):
+def changed(limit=CLAMP, **arrays):
     return to_screen(near | arrays, camera, limit)
 
 
 u_bar = rng.normal(size=2)
-for link, x in (("mean from u and J, inside", inside), ("mean from u and J, clamped", clamped)):
+for link, x in (("mean from u and J, inside", central), ("mean from u and J, clamped", clamped)):
     both = W.T @ mean_backward(u_bar, J_bar, x)
     agrees(link, both, lambda m: u_bar @ changed(means=m).u + (J_bar * changed(means=m).J).sum(), x.means)
 
 fig, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
-for limit, style in ((None, "--"), (LIMIT, "-")):
+for limit, style in ((None, "--"), (CLAMP, "-")):
     walk = [changed(limit, means=camera.eye + W.T @ [3 * r, 0.2, 3]) for r in np.linspace(-0.2, 1.2, SWEEP)]
     grads = [2 * np.diag([1, 0]) @ x.N @ (W @ x.M).T for x in walk]  # of J, for L = Sigma_uu
     slopes = [mean_backward(np.zeros(2), grad, x)[0] for grad, x in zip(grads, walk, strict=True)]
@@ -265,10 +265,10 @@ for limit, style in ((None, "--"), (LIMIT, "-")):
 axes[0].set(title="variance of the ellipse along u", xlabel="x/z of the mean", ylabel="variance (px²)")
 axes[1].set(title="its derivative by x; dots: differences", xlabel="x/z of the mean", ylabel="px² per unit")
 for ax in axes:
-    ax.axvline(bounds[1, 0], color="black", linewidth=0.8, label="the clamp")
+    ax.axvline(edges_xy[1, 0], color="black", linewidth=0.8, label="the clamp")
     ax.legend()
 plt.show()
-assert all(slope == 0 for slope, r in zip(slopes, at, strict=True) if r > bounds[1, 0])
+assert all(slope == 0 for slope, r in zip(slopes, at, strict=True) if r > edges_xy[1, 0])
 
 # %% [markdown]
 # Beyond the clamp the ellipse has stopped, and the derivative is zero. It jumps there: the function has a corner.
@@ -302,7 +302,7 @@ def quaternion_backward(R_bar, q):
     return unit_backward(np.einsum("jik,ik->j", [by_w, by_x, by_y, by_z], R_bar), q)
 
 
-x, R_bar = inside, M_bar * inside.s
+x, R_bar = central, M_bar * central.s
 agrees("log-scales from M", (M_bar * x.M).sum(0), lambda v: (M_bar * x.R * np.exp(v)).sum(), x.log_scales)
 quat_bar = quaternion_backward(R_bar, x.quats)
 agrees("quaternion from R", quat_bar, lambda q: (R_bar * quat_to_R(q)).sum(), x.quats)
@@ -312,11 +312,11 @@ plane = np.stack(np.meshgrid(np.linspace(-2, 2, 60), [0], [0], np.linspace(-2, 2
 ring = [r * np.array([np.cos(a), 0, 0, np.sin(a)]) for r in (0.7, 1.3, 1.9) for a in np.arange(0.2, 6.2, 0.6)]
 arrows = np.array([quaternion_backward(R_bar, q) for q in ring])
 fig, ax = plt.subplots(figsize=(5.4, 4.2), layout="constrained")
-turned = np.einsum("ik,abik->ab", R_bar, [[quat_to_R(q) for q in line] for line in plane])
-filled = ax.contourf(plane[..., 0], plane[..., 3], turned, 15, cmap="cividis")
+surface = np.einsum("ik,abik->ab", R_bar, [[quat_to_R(q) for q in line] for line in plane])
+contours = ax.contourf(plane[..., 0], plane[..., 3], surface, 15, cmap="cividis")
 ax.quiver(*np.array(ring)[:, [0, 3]].T, *arrows[:, [0, 3]].T, color="w")
 ax.set(title="L of q = (w, 0, 0, z), and its gradient", xlabel="w", ylabel="z", aspect="equal")
-fig.colorbar(filled, ax=ax, label="L")
+fig.colorbar(contours, ax=ax, label="L")
 plt.show()
 
 # %% [markdown]
@@ -414,9 +414,9 @@ others = [gaussian(*one, 1, [0.5, 0.5, 0.5], 0.3) for one in zip(places, sizes, 
 every = sorted([near, aside, *others], key=lambda one: W[2] @ one["means"])  # by depth
 weights = rng.normal(size=(camera.H, camera.W, 3))
 for title, scene in (("one", [near]), ("clamped", [aside]), ("scene", every)):
-    image, grads = by_hand(scene, camera, weights, LIMIT)
+    image, grads = by_hand(scene, camera, weights, CLAMP)
     for backend, bound in (("torch", 1e-12), ("cpu", 1e-9)):
-        picture, theirs = by_package(scene, camera, weights, LIMIT, backend)
+        picture, theirs = by_package(scene, camera, weights, CLAMP, backend)
         gaps = {key: np.abs(grads[key] - other).max() / np.abs(other).max() for key, other in theirs.items()}
         print(f"{title:>7}, {backend:>5}:", ", ".join(f"{key} {gap:.0e}" for key, gap in gaps.items()))
         assert max(gaps.values()) < bound and np.abs(image - picture).max() < 1e-12
@@ -430,7 +430,7 @@ for title, scene in (("one", [near]), ("clamped", [aside]), ("scene", every)):
 
 # %%
 def descent(one):
-    for _ in range(STEPS):
+    for _ in range(DESCENT_STEPS):
         errors = [paint([to_screen(one, c)], c)[0] - photo for c, photo in zip(pair, photos, strict=True)]
         yield sum((error**2).mean() for error in errors)
         grads = [by_hand([one], c, 2 * e / e.size)[1] for c, e in zip(pair, errors, strict=True)]
@@ -438,10 +438,10 @@ def descent(one):
         assert np.ptp([to_screen(one, c).u[1] for c in pair]) < 1e-12, "the same row in both"
 
 
-for below in range(4):
-    losses = list(descent(guess | {"means": guess["means"] + [0, below, 0]}))
-    print(f"{below} below: loss {losses[0]:.5f} -> {losses[-1]:.5f}")
-assert losses[0] == losses[-1]
+for deeper in range(4):
+    falls = list(descent(guess | {"means": guess["means"] + [0, deeper, 0]}))
+    print(f"{deeper} below: loss {falls[0]:.5f} -> {falls[-1]:.5f}")
+assert falls[0] == falls[-1]
 
 # %% [markdown]
 # At every step both cameras see one thing, and the nearest guess comes close to it. The furthest do not move: their

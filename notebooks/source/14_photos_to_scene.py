@@ -158,7 +158,8 @@ gallery("trained on guessed poses: every photo contradicts the next", shown)
 # length of $t$ is a common factor and cannot be known. So poses can be found from matches, and matches from what does
 # not change between photos: SIFT describes the surroundings of a corner by gradients, at the corner's own scale and
 # angle (Lowe 2004). Then the mapper (Schönberger and Frahm 2016) begins with two photos, triangulates points, adds
-# the photo that sees most of them, and again and again lets least squares move poses, points and the lens together.
+# the photo that sees most of them, and again and again lets least squares move poses, points and the lens together
+# ([bundle adjustment](../docs/GLOSSARY.md#bundle-adjustment)).
 #
 # [gsplat_edu.sfm](../src/gsplat_edu/sfm/reconstruct.py) drives COLMAP through these stages. It is what `gsplat-edu
 # sfm` calls. One thread makes the result the same to the bit in every run.
@@ -258,8 +259,8 @@ plt.show()
 # %% [markdown]
 # ## A second opinion
 #
-# Structure from motion places a shaken photo like any other, since a blurred corner is still at the place of the
-# corner. A scene that trains on it learns the blur. The doctor
+# [Structure from motion](../docs/GLOSSARY.md#structure-from-motion) places a shaken photo like any other, since a
+# blurred corner is still at the place of the corner. A scene that trains on it learns the blur. The doctor
 # ([gsplat_edu.doctor](../src/gsplat_edu/doctor/before.py)) looks for that before any training: it compares the fine
 # detail of each photo, along eight directions, with that of its neighbours, which see the same.
 
@@ -276,12 +277,13 @@ for expected in ((shaken,), None):
 # ## The scene
 #
 # Now the recipe of Kerbl et al. 2023 (`gsplat-edu train --strategy adc`), from the points that were triangulated,
-# every eighth photo held out: the loss is $0.8\,L_1 + 0.2\,(1 - \mathrm{SSIM})$, where SSIM (Wang et al. 2004) is 1 if
-# two photos agree in mean, contrast and pattern around every pixel: $L_1$ alone forgives blur. Harmonics rise by
-# degrees, splats are cloned and split. The field compares the mean peak signal-to-noise ratio of held-out photos,
-# $10 \log_{10}(1/\mathrm{MSE})$ in decibels ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)):
-# 3 dB are half the squared error. Held against the guess, the first line below credits the poses with their points as
-# well: the guess had to begin with random ones.
+# every eighth photo held out: the loss is $0.8\,L_1 + 0.2\,(1 - \mathrm{SSIM})$, where
+# [SSIM](../docs/GLOSSARY.md#ssim) (Wang et al. 2004) is 1 if two photos agree in mean, contrast and pattern around
+# every pixel: $L_1$ alone forgives blur. Harmonics rise by degrees, splats are cloned and split. The field compares
+# the mean peak signal-to-noise ratio of held-out photos, $10 \log_{10}(1/\mathrm{MSE})$ in decibels
+# ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)): 3 dB are half the squared error. Held
+# against the guess, the first line below credits the poses with their points as well: the guess had to begin with
+# random ones.
 
 # %%
 posed = summarize(trained("capture", "small", BRIEFLY, resolution=SIDE_PX)[2].test)["psnr"]

@@ -150,7 +150,7 @@ def test_what_is_kept_for_a_repetition_is_bounded(losable, capture, monkeypatch)
     undisturbed = trainer(capture, densify_every=1000)
     expected, state = undisturbed.run().losses, what_it_is(undisturbed)
     kept = []
-    for name, most in (("MOST_STEPS", 3), ("MOST_PHOTO_BYTES", 2 * 40 * 40 * 3)):
+    for name, most in (("MOST_STEPS", 3), ("REPEATED_PHOTOS", 2 * 40 * 40 * 3)):
         monkeypatch.setattr(webgpu_resident, name, most)
         run = trainer(capture, densify_every=1000)
 

@@ -161,7 +161,10 @@ def test_memory_that_is_shared_counts_together(capture, limit):
         assert apart.max_gaussians >= shared.max_gaussians
     footprint = Footprint(FACTS, 0, 250_000, 3, room=INTEGRATED)
     assert footprint.on_device(100_000, 50 * MIB) - footprint.on_device(100_000, 0) == 50 * MIB
-    assert Footprint(FACTS, 0, 250_000, 3).on_device(100_000, 0) == 0
+    alone = Footprint(FACTS, 0, 250_000, 3)
+    assert alone.on_device(100_000, 0) == 0
+    photos = [each.parts(100_000, 50 * MIB)["photos"] for each in (alone, footprint)]
+    assert photos == [50 * MIB, FACTS.photo_bytes], "photos decoded anew stay for steps to be taken again"
 
 
 def test_photos_keep_to_the_budget_of_the_run(capture, tmp_path):

@@ -39,6 +39,7 @@ ELSEWHERE = {
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
     "landing_scene.py": "tools/build_site.py",
+    "figure_data.py": "tests/repo/test_figures.py",
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
     "make_city.py": "tests/data/test_city.py",
@@ -46,6 +47,7 @@ ELSEWHERE = {
     "neon.sh": "Makefile",
     "sanitize.sh": "Makefile",
     "set_up.sh": "Makefile",
+    "site_figures.py": "tests/repo/test_figures.py",
 }
 """By tool, the file that runs it."""
 

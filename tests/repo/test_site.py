@@ -20,6 +20,7 @@ from chapters import SOURCES, tool
 from slices import SHARD, SHARDS, SOAK
 
 ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "tools"))  # where build_site.py finds its parts
 NOT_PROSE = ("pre", "code", "dt", "math", "script", "style", "title")
 """Tags whose text is not prose, such as programs, signatures and equations."""
 

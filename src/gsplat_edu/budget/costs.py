@@ -19,7 +19,7 @@ from jaxtyping import Float64, Int64
 from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.engine.room import PIXEL_BYTES, Load, Room, kept_photos
+from gsplat_edu.engine.room import PIXEL_BYTES, REPEATED_PHOTOS, Load, Room, kept_photos
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
 from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
@@ -343,6 +343,10 @@ class Footprint:
         # Photos are first read before any Gaussian exists, several at once and at full size.
         reading = int(facts.workers * facts.decoding * facts.full)
         found["images"] = max(found["images"], reading - found["Gaussians"])
+        if (
+            self.room is not None
+        ):  # photos that are decoded anew stay while their steps may have to be taken again
+            found["photos"] += min(facts.photo_bytes - kept, REPEATED_PHOTOS)
         if self.room is not None and self.room.shared:
             found["device"] = self.on_device(gaussians, image_memory)
         return found

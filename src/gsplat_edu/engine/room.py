@@ -16,6 +16,9 @@ ENOUGH = 1 << 28
 PIXEL_BYTES = 4
 """Bytes of a photo's pixel on the device."""
 
+REPEATED_PHOTOS = 1 << 29
+"""Most bytes of photos that the host keeps for the steps to be taken again if the device is lost."""
+
 
 def kept_photos(photo_room: int | None) -> int:
     """Return the bytes of photos that a training keeps on the device.

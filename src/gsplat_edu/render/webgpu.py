@@ -33,7 +33,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians, check_tensor
 
-T = TypeVar("T")
+_Found = TypeVar("_Found")
 
 MOST_LOSSES = 2
 """How often a lost device is replaced before the work is given up."""
@@ -249,7 +249,7 @@ def replace_device(lost: Device, losses: int, what: str, error: DeviceLostError)
     warnings.warn(f"backend 'webgpu': {name} was lost; {what} on a new device", BackendWarning, stacklevel=4)
 
 
-def surviving(action: Callable[[], T]) -> T:
+def surviving(action: Callable[[], _Found]) -> _Found:
     """Return what a function returns; if the device is lost meanwhile, call the function again on a new device.
 
     Raises:

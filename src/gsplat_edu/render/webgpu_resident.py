@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.resident import Resident, Result
-from gsplat_edu.engine.room import kept_photos
+from gsplat_edu.engine.room import REPEATED_PHOTOS, kept_photos
 from gsplat_edu.engine.step import NO_SHELL, Noise, Photo, StepNumbers
 from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import WORD, NoiseNumbers
@@ -21,10 +21,10 @@ from gsplat_edu.render.resident import RunRules, RunState, RunSums, RunTarget
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 
-T = TypeVar("T")
+_Found = TypeVar("_Found")
 
-MOST_STEPS, MOST_PHOTO_BYTES = 500, 1 << 29
-"""Steps, and bytes of their photos, that are kept to be repeated; beyond, the state is read from the device."""
+MOST_STEPS = 500
+"""Steps that are kept to be taken again. Beyond, or beyond `REPEATED_PHOTOS`, the state is read from the device."""
 
 
 class WebgpuRun:
@@ -112,7 +112,7 @@ class WebgpuRun:
         self._do(step)
         self._image = None
         self._photos[id(target.image)] = target.image.nbytes
-        if len(self._done) >= MOST_STEPS or sum(self._photos.values()) > MOST_PHOTO_BYTES:
+        if len(self._done) >= MOST_STEPS or sum(self._photos.values()) > REPEATED_PHOTOS:
             self.read()
         return lambda: self._on_a_device(lambda: _sums(result, numbers, count))
 
@@ -130,7 +130,7 @@ class WebgpuRun:
         self._on_a_device(action)
         self._done.append(action)
 
-    def _on_a_device(self, action: Callable[[], T]) -> T:
+    def _on_a_device(self, action: Callable[[], _Found]) -> _Found:
         """Return what a function returns; if the device is lost meanwhile, do everything again on a new one."""
         lost: DeviceLostError | None = None
         while True:

@@ -1,0 +1,134 @@
+"""Write the data of the site's moving figures: docs/site/static/play/*-data.js and frames.jpg.
+
+    python tools/figure_data.py
+
+Trains chapter 09's sphere with the backend cpu (half a minute). The figures read scripts and pictures instead of JSON,
+because pages that are opened from disk may load these.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from gsplat_edu import Camera, sphere_shell
+from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.gaussian_math import project_cov3d
+from gsplat_edu.scene.gaussians import Gaussians, cov3d_t
+from gsplat_edu.train import Start, Views, course, training
+from gsplat_edu.train.events import DensifyEvent, StepEvent
+from gsplat_edu.train.initialize import random_ball
+from gsplat_edu.train.trainer import Trainer
+
+ROOT = Path(__file__).resolve().parent.parent
+OUT = ROOT / "docs" / "site" / "static" / "play"
+SIZE, ITERATIONS, CAP, SEED = 128, 800, 1600, 9
+"""The budget of chapter 09."""
+
+FRAMES = (0, 5, 10, 20, 30, 40, 50, 60, 80, *range(100, ITERATIONS + 1, 50))
+"""Iterations before which a frame is rendered; the last is the end. The beginning changes fastest."""
+
+DENSIFIED = 300
+"""The densification that is shown: it clones and splits."""
+
+SHELL = 600
+"""Splats of the sphere to turn."""
+
+
+def write(name: str, value: object) -> None:
+    """Write a script that stores a value as `gsplatData[name]`."""
+    text = json.dumps(value, separators=(",", ":"))
+    path = OUT / f"{name}-data.js"
+    path.write_text(f"(window.gsplatData ??= {{}}).{name} = {text};\n", encoding="utf-8")
+    print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
+
+
+def splats_before(gaussians: Gaussians, norms: torch.Tensor, camera: Camera) -> list[list[float]]:
+    """List u, v, xx, xy, yy (px), mean gradient (NDC), largest scale, opacity, and 1 for the near half."""
+    with torch.no_grad():
+        means = gaussians.means.double().numpy()
+        covariances = cov3d_t(gaussians.log_scales.double(), gaussians.quats.double()).numpy()
+        rest = (
+            torch.stack([norms, gaussians.scales.amax(dim=-1), gaussians.opacities], dim=-1).double().numpy()
+        )
+    in_camera = camera.world_to_cam(means)
+    u, v, z = camera.project(in_camera)
+    cov2d = project_cov3d(covariances, in_camera, camera)
+    columns = [u, v, cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1], *rest.T, z < np.linalg.norm(camera.eye)]
+    return [[float(f"{value:.6g}") for value in row] for row in np.stack(columns, axis=-1)]
+
+
+class Diary:
+    """What the figures show of a training; `note` is its callback."""
+
+    def __init__(self, capture: SphereCapture) -> None:
+        self.capture = capture
+        self.frames: list[np.ndarray] = []
+        self.errors: list[float] = []
+        self.losses: list[float] = []
+        self.counts: list[int] = []
+        self.density: dict[str, object] = {}
+
+    def picture(self, gaussians: Gaussians) -> None:
+        """Keep the held-out view as bytes, and its mean absolute error."""
+        with torch.no_grad():
+            image = render(gaussians, self.capture.held_out.camera, backend="cpu").image.numpy()
+        self.frames.append(np.uint8(np.clip(image, 0, 1) * 255 + 0.5))
+        self.errors.append(round(float(np.abs(image - self.capture.held_out.image).mean()), 4))
+
+    def note(self, trainer: Trainer, event: object) -> None:
+        """Keep losses, counts and frames, and what one densification decides on."""
+        if isinstance(event, DensifyEvent) and event.iteration == DENSIFIED:
+            made = {"cloned": event.num_cloned, "children": event.num_split_children}
+            self.density |= made | {"pruned": event.num_pruned, "count": event.num_gaussians}
+        if not isinstance(event, StepEvent):
+            return
+        self.losses.append(round(event.loss, 5))
+        self.counts.append(event.num_gaussians)
+        if event.iteration + 1 in FRAMES:
+            self.picture(trainer.gaussians)
+        if event.iteration == DENSIFIED:  # after the step, before the strategy acts
+            sums = trainer.density.observed()
+            norms = sums["norm_sums"] / sums["times_visible"].clamp(min=1)
+            config = trainer.config
+            self.density |= {
+                "iteration": event.iteration,
+                "splats": splats_before(trainer.gaussians, norms, self.capture.held_out.camera),
+                "threshold": config.adc.grad_threshold,
+                "large": config.adc.percent_dense * trainer.extent,
+                "faint": config.min_opacity,
+                "cap": config.max_gaussians,
+                "size": SIZE,
+            }
+
+
+def main() -> None:
+    """Train, and write the files."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    diary = Diary(sphere_capture(SIZE))
+    generator = torch.Generator().manual_seed(SEED)
+    start = Start(random_ball(400, generator), extent=course.EXTENT, generator=generator)
+    config = course.course_config(ITERATIONS, SEED, CAP)
+    views = Views(diary.capture.train)
+    trainer = training(config, views, load_backend("cpu"), start, callbacks=[diary.note])
+    diary.picture(trainer.gaussians)
+    trainer.run()
+    truth = np.uint8(np.clip(diary.capture.held_out.image, 0, 1) * 255 + 0.5)
+    Image.fromarray(np.concatenate([*diary.frames, truth], axis=1)).save(OUT / "frames.jpg", quality=88)
+    print(f"frames.jpg: {(OUT / 'frames.jpg').stat().st_size / 1e3:.0f} kB")
+    run = {"frames": FRAMES, "errors": diary.errors, "losses": diary.losses, "counts": diary.counts}
+    write("training", run | {"size": SIZE})
+    write("density", diary.density)
+    means, _, _, opacities = sphere_shell(SHELL)
+    shell = {"s_t": 0.06 * (2500 / SHELL) ** 0.5, "s_n": 0.01, "opacity": float(opacities[0])}
+    write("sphere", shell | {"means": np.round(means, 5).tolist()})
+
+
+if __name__ == "__main__":
+    main()

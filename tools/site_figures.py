@@ -1,0 +1,78 @@
+"""Put the moving figures into the pages of chapters, below the pictures that stand for them where scripts are off.
+
+The scripts are in docs/site/static/play, their data from `tools/figure_data.py`. Notebooks do not contain the figures.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+
+class Figure(NamedTuple):
+    """A moving figure.
+
+    Args:
+        chapter: Stem of the notebook.
+        after: Text of the code cell whose picture the figure follows; no other cell contains it.
+        name: Name of the script, and of the figure in it.
+        caption: First line of the figure.
+        data: Whether the figure has a data script.
+    """
+
+    chapter: str
+    after: str
+    name: str
+    caption: str
+    data: bool = True
+
+
+FIGURES = (
+    Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
+    Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
+    Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
+    Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
+)
+
+STATIC = "../_static/play/"
+STILL = "This figure needs JavaScript. The picture above shows the same without motion."
+
+
+def with_figures(chapter: str, notebook: dict[str, Any]) -> None:
+    """Add the figures of a chapter and their scripts.
+
+    Args:
+        chapter: Stem of the notebook.
+        notebook: The notebook; its cells are changed.
+
+    Raises:
+        SystemExit: no cell, or more than one, has the text that a figure follows.
+    """
+    chosen = [figure for figure in FIGURES if figure.chapter == chapter]
+    scripts = ["play.js"] if chosen else []
+    for figure in chosen:
+        cells = notebook["cells"]
+        places = [
+            place
+            for place, cell in enumerate(cells)
+            if cell["cell_type"] == "code" and figure.after in "".join(cell["source"])
+        ]
+        if len(places) != 1:
+            raise SystemExit(
+                f"site_figures.py: {chapter}: {len(places)} code cells contain {figure.after!r}, not 1"
+            )
+        cells.insert(
+            places[0] + 1,
+            _cell(
+                f'<figure class="play" data-play="{figure.name}" data-base="{STATIC}">'
+                f"<figcaption>{figure.caption}</figcaption><noscript>{STILL}</noscript></figure>",
+                f"figure-{figure.name}",
+            ),
+        )
+        scripts += [f"{figure.name}-data.js"] * figure.data + [f"{figure.name}.js"]
+    if scripts:
+        tags = "".join(f'<script src="{STATIC}{script}"></script>' for script in scripts)
+        notebook["cells"].append(_cell(f"<div>{tags}</div>", "figure-scripts"))
+
+
+def _cell(html: str, name: str) -> dict[str, Any]:
+    return {"cell_type": "markdown", "id": name, "metadata": {}, "source": html}
