@@ -147,7 +147,7 @@ def draw_splats(means, R, scales, colors, opacities, camera, floor=ALPHA_MIN, ch
 # - The NumPy renderer stops where hardly any light is left. Here nothing stops.
 #
 # Neither changes a value that matters, but the box does cut: at three standard deviations a splat may
-# still be above the floor of 1/255, and the dense renderer keeps that tail. So the two cannot agree to
+# still be above the floor, `ALPHA_MIN`, and the dense renderer keeps that tail. So the two cannot agree to
 # the last digit, and the check below has to know by how much they may differ. Ask the NumPy renderer for
 # exact extents and no stop, and they must agree to rounding.
 
