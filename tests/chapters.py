@@ -37,10 +37,21 @@ def top_level_names(text: str) -> set[str]:
     return names
 
 
+def taught(module: Path) -> bool:
+    """Return whether a module names a chapter, or a chapter imports from it."""
+    dotted = ".".join(module.relative_to(ROOT / "src").with_suffix("").parts)
+    text = "\n".join(path.read_text() for path in SOURCES)
+    named = re.search(r"^Chapters?: ", module.read_text(), flags=re.MULTILINE)
+    return (
+        bool(named) or re.search(rf"^from {re.escape(dotted)} import ", text, flags=re.MULTILINE) is not None
+    )
+
+
 @functools.cache
 def public_names() -> set[str]:
+    """Collect the names that a reader of the chapters meets in the package."""
     modules = (ROOT / "src" / "gsplat_edu").rglob("*.py")
-    names = {name for module in modules for name in top_level_names(module.read_text())}
+    names = {name for module in modules if taught(module) for name in top_level_names(module.read_text())}
     return {name for name in names if not name.startswith("_")}
 
 

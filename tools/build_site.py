@@ -177,6 +177,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
                 cell["source"] = relinked("".join(cell["source"]), page, stage)
         fold_set_up(notebook)
         with_figures(page.stem, notebook)
+        notebook["cells"].append(_origin(page, len(notebook["cells"])))
         _write(stage / page, json.dumps(notebook))
     for name in modules():
         _write(stage / "reference" / f"{name}.md", _reference(name, documented=name in members))
@@ -185,6 +186,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
     for picture in PICTURES:
         shutil.copyfile(ROOT / picture, stage / "static" / Path(picture).name)
+    importlib.import_module("landing_scene").write_landing(stage / "static")
     (stage / "static" / "tiles.png").write_bytes(_figure(*TILES))
     landing = (stage / "index.md").read_text(encoding="utf-8")
     _write(stage / "index.md", landing + _contents(chapters))
@@ -199,6 +201,34 @@ def fold_set_up(notebook: dict[str, Any]) -> None:
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code" and re.match(r"(import|from) ", "".join(cell["source"])):
             cell["metadata"] = {**cell["metadata"], "tags": ["hide-input"]}
+
+
+@functools.cache
+def built_from(root: Path = ROOT) -> str:
+    """Return the commit of a working tree, with `-dirty` if files differ from it; "unknown" outside git.
+
+    Args:
+        root: The top folder of the working tree. An archive unpacked inside another repository is not of its commits.
+    """
+    found = []
+    for command in (["rev-parse", "--show-toplevel"], ["describe", "--always", "--dirty", "--abbrev=12"]):
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(root), *command], capture_output=True, text=True, check=False
+            )
+        except FileNotFoundError:  # git is not installed
+            return "unknown"
+        if done.returncode:
+            return "unknown"
+        found.append(done.stdout.strip())
+    return found[1] if Path(found[0]).resolve() == root.resolve() else "unknown"
+
+
+def _origin(page: Path, number: int) -> dict[str, Any]:
+    """Return the last cell of a chapter's page: what it was built from."""
+    source = f"notebooks/source/{page.stem}.py"
+    text = f"---\n\nThis page was built from `{source}` at commit `{built_from()}`."
+    return {"cell_type": "markdown", "id": f"cell-{number:02d}", "metadata": {}, "source": text}
 
 
 def _figure(page: str, number: int) -> bytes:

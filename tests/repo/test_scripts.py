@@ -16,8 +16,8 @@ from processes import Program
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchmarks").glob("*/__main__.py"))
-SHARED = {"captures.py", "hardware.py", "traced.py"}
-"""Modules that the benchmarks import."""
+SHARED = {"captures.py", "hardware.py", "kernel_operations.py", "traced.py"}
+"""Modules that the benchmarks and chapters import."""
 
 MADE = {
     f"benchmarks/{name}"
@@ -38,6 +38,7 @@ ELSEWHERE = {
     "build_wheels.py": "tests/repo/test_wheels.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
+    "landing_scene.py": "tools/build_site.py",
     "figure_data.py": "tests/repo/test_figures.py",
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",

@@ -4,9 +4,11 @@ Every page is built, but only the public API and an eighth of the modules, by co
 soak` documents all, which takes twice as long.
 """
 
+import math
 import re
 import subprocess
 import sys
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -14,9 +16,11 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from browsers import chromium
+from chapters import SOURCES, tool
 from slices import SHARD, SHARDS, SOAK
 
 ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "tools"))  # where build_site.py finds its parts
 NOT_PROSE = ("pre", "code", "dt", "math", "script", "style", "title")
 """Tags whose text is not prose, such as programs, signatures and equations."""
 
@@ -64,7 +68,7 @@ def site(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium() as launched:
+    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as launched:
         yield launched
 
 
@@ -119,6 +123,104 @@ def test_the_landing_page_shows_pictures_and_three_ways_in(site):
     shown = re.findall(r'class="toctree-l1[^"]*"><a class="reference internal" href="(.*?)"', text)
     assert not [link for link in shown if "gsplat_edu." in link or re.search(r"decisions/\d", link)]
     assert "docs/decisions/index.html" in shown and "reference/index.html" in shown
+
+
+PATIENCE = 180_000
+"""Milliseconds that a test waits for the scene: a processor that other work keeps busy draws in place of a GPU."""
+
+
+def until(condition):
+    """Wait for a condition. The page's policy forbids the `eval` that the browser's own waiting needs."""
+    ends = time.monotonic() + PATIENCE / 1000
+    while not condition():
+        assert time.monotonic() < ends
+        time.sleep(0.05)
+
+
+def live_scene(tab):
+    """Return the frame of the scene in an open landing page, once it has drawn all splats."""
+    tab.wait_for_selector(".live #scene iframe", timeout=PATIENCE)
+    scene = tab.locator("#scene iframe").element_handle().content_frame()
+    until(lambda: scene.evaluate("Boolean(window.viewer?.isWhole)"))
+    return scene
+
+
+def overflowing(tab):
+    """List the pictures of an open page that are cropped or wider than the window."""
+    return tab.evaluate(
+        """() => [...document.querySelectorAll("article img")].filter(picture => {
+            const { left, right } = picture.getBoundingClientRect();
+            const shape = picture.clientWidth / picture.clientHeight;
+            const whole = getComputedStyle(picture).objectFit === "contain"
+                || Math.abs(shape - picture.naturalWidth / picture.naturalHeight) < 0.02;
+            return !picture.naturalWidth || left < 0 || right > innerWidth || !(whole || picture.closest("#scene"));
+        }).map(picture => picture.src)"""
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_the_landing_page_shows_a_live_scene_that_keys_turn(site, browser, width, height):
+    _, out = site
+    assert (out / "_static" / "scene.html").stat().st_size < 700_000
+    tab, said = browser.new_page(viewport={"width": width, "height": height}), []
+    tab.on("console", lambda message: said.append(message.text))
+    tab.on("pageerror", lambda error: said.append(str(error)))
+    tab.goto((out / "index.html").as_uri())
+    stage = tab.locator("#scene").bounding_box()
+    assert stage["y"] + stage["height"] < height, "the scene is in the first screen"
+    scene = live_scene(tab)
+    pixels = """async () => {
+        const small = { W: 64, H: 27, fx: 74, fy: 74, cx: 32, cy: 13.5 };
+        return [...(await viewer.setCamera({ ...viewer.view.camera, ...small })).pixels];
+    }"""
+    drawn = scene.evaluate(pixels)
+    background = scene.evaluate("viewer.facts.settings.background")
+    differs = [abs(drawn[i] - background[0]) > 0.05 for i in range(0, len(drawn), 3)]
+    assert 0.3 < sum(differs) / len(differs) < 0.95, "houses before a sky"
+    eye, pivot = (scene.evaluate(f"viewer.view.{name}") for name in ("camera.eye", "focus"))
+    tab.locator("#scene").click()
+    for key in ("ArrowRight", "ArrowDown"):
+        tab.keyboard.press(key)
+    until(lambda: math.dist(scene.evaluate("viewer.view.camera.eye"), eye) > 1e-3)
+    moved = scene.evaluate("viewer.view.camera.eye")
+    assert math.dist(moved, pivot) == pytest.approx(math.dist(eye, pivot)), "keys orbit"
+    assert scene.evaluate(pixels) != drawn
+    assert overflowing(tab) == []
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    assert [text for text in said if "GPU stall due to ReadPixels" not in text] == []
+    tab.close()
+
+
+@pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_the_wheel_scrolls_the_landing_page_until_the_scene_is_clicked(site, browser):
+    _, out = site
+    tab = browser.new_page(viewport={"width": 1200, "height": 600})
+    tab.goto((out / "index.html").as_uri())
+    scene = live_scene(tab)
+    before = scene.evaluate("viewer.view.distance")
+    tab.locator("#scene").hover()
+    tab.mouse.wheel(0, 100)
+    tab.wait_for_function("scrollY > 0", timeout=PATIENCE)
+    assert scene.evaluate("viewer.view.distance") == before
+    tab.locator("#scene").click()
+    tab.mouse.wheel(0, 100)
+    until(lambda: scene.evaluate("viewer.view.distance") > before)
+    tab.close()
+
+
+@pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_the_landing_page_without_scripts_shows_the_still_picture(site, browser):
+    _, out = site
+    context = browser.new_context(java_script_enabled=False)
+    tab = context.new_page()
+    tab.goto((out / "index.html").as_uri())
+    assert tab.locator("#scene img").is_visible() and tab.locator("#scene iframe").count() == 0
+    assert not tab.locator(".scripted").is_visible(), "no word about keys"
+    context.close()
 
 
 @pytest.mark.slow
@@ -182,6 +284,44 @@ def test_no_equation_and_no_docstring_is_garbled(site):
         prose = "".join(page.prose)
         assert "$" not in prose and not re.search(r"\\[a-zA-Z]", prose), path
         assert "Return type" not in prose, "signatures have types"
+
+
+@pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_every_chapter_says_which_commit_it_was_built_from(site):
+    _, out = site
+    commit = tool("build_site").built_from()
+    for source in SOURCES:
+        text = re.sub(r"<[^>]+>", "", (out / "notebooks" / f"{source.stem}.html").read_text())
+        assert f"This page was built from notebooks/source/{source.name} at commit {commit}." in text
+
+
+def test_the_commit_of_a_working_tree_and_of_an_archive(tmp_path, monkeypatch):
+    built_from = tool("build_site").built_from
+    assert built_from(tmp_path) == "unknown"
+
+    def git(*words):
+        who = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(
+            ["git", "-C", tmp_path, *who, *words], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    git("init", "-q")
+    (tmp_path / "chapter").write_text("one")
+    git("add", "chapter")
+    git("commit", "-q", "-m", "one")
+    commit = git("rev-parse", "HEAD")[:12]
+    built_from.cache_clear()
+    assert built_from(tmp_path) == commit
+    (tmp_path / "archive").mkdir()
+    assert built_from(tmp_path / "archive") == "unknown", "of no commit of the repository around it"
+    (tmp_path / "chapter").write_text("two")
+    built_from.cache_clear()
+    assert built_from(tmp_path) == f"{commit}-dirty"
+    built_from.cache_clear()
+    monkeypatch.setenv("PATH", "")
+    assert built_from(tmp_path) == "unknown", "without git"
 
 
 def test_a_folder_that_is_not_a_site_is_not_overwritten(tmp_path):

@@ -45,20 +45,28 @@ def controlled(hot, config=CONFIG):
     return control, gaussians, optimizer
 
 
-def test_small_gaussians_are_cloned_large_ones_split_and_faint_ones_pruned():
-    control, gaussians, optimizer = controlled(hot=[1, 1, 0, 1])
+@pytest.mark.parametrize(
+    ("over_cap", "rows"),
+    [
+        ("cut", {"survivors": [0, 1], "clone": [2], "children": [3, 4]}),
+        ("strongest", {"survivors": [0, 4], "clone": [1], "children": [2, 3]}),  # sorted in space
+    ],
+)
+def test_small_gaussians_are_cloned_large_ones_split_and_faint_ones_pruned(over_cap, rows):
+    config = dataclasses.replace(CONFIG, adc=dataclasses.replace(CONFIG.adc, over_cap=over_cap))
+    control, gaussians, optimizer = controlled([1, 1, 0, 1], config)
     changed, (event,) = control.update(100, gaussians, optimizer)
     assert dataclasses.astuple(event) == (100, 1, 2, 1, 5)
-    # sorted in space: Gaussian 0 and its clone, two children of 1, Gaussian 2
-    assert changed.sh0[:, 0, 0].tolist() == [0, 0, 1, 1, 2]
-    torch.testing.assert_close(changed.means[[0, 1, 4]], gaussians.means[[0, 0, 2]])
-    expected = torch.tensor([SMALL, SMALL, LARGE - math.log(1.6), LARGE - math.log(1.6), LARGE])
-    torch.testing.assert_close(changed.log_scales[:, 0], expected.double())
-    offsets = changed.means[2:4] - gaussians.means[1]
+    survivors, clone, children = rows.values()
+    assert changed.sh0[[*survivors, *clone, *children], 0, 0].tolist() == [0, 2, 0, 1, 1]
+    torch.testing.assert_close(changed.means[[*survivors, *clone]], gaussians.means[[0, 2, 0]])
+    expected = torch.tensor([SMALL, LARGE, SMALL, LARGE - math.log(1.6), LARGE - math.log(1.6)])
+    torch.testing.assert_close(changed.log_scales[[*survivors, *clone, *children], 0], expected.double())
+    offsets = changed.means[children] - gaussians.means[1]
     assert (offsets != 0).all() and (offsets.abs() < 5 * 0.2).all() and (offsets[0] != offsets[1]).all()
     moments = torch.tensor([[1.0, 2, 3], [7, 8, 9]]).double()
-    torch.testing.assert_close(optimizer.first["means"][[0, 4]], moments)
-    assert (optimizer.first["means"][1:4] == 0).all()
+    torch.testing.assert_close(optimizer.first["means"][survivors], moments)
+    assert (optimizer.first["means"][[*clone, *children]] == 0).all()
     assert all(t.requires_grad and t.is_leaf for t in changed.tensors().values())
     assert len(control.norm_sums) == 5 and (control.norm_sums == 0).all(), "the sums of gradients are reset"
 
@@ -87,7 +95,7 @@ def test_the_cap_drops_the_last_gaussians(cap):
     control, gaussians, optimizer = controlled([1, 1, 0, 1], dataclasses.replace(CONFIG, max_gaussians=cap))
     changed, (event,) = control.update(100, gaussians, optimizer)
     assert event.num_gaussians == len(changed) == cap
-    assert sorted(changed.sh0[:, 0, 0].tolist()) == sorted([0, 2, 0, 1, 1][:cap])
+    assert changed.sh0[:, 0, 0].tolist() == [0, 2, 0, 1, 1][:cap]
     assert len(optimizer.first["means"]) == cap
 
 

@@ -465,3 +465,24 @@ def test_a_program_sets_the_camera_until_somebody_moves(tour, camera):
     assert (tour.camera().W, tour.camera().H) == (70, 50)
     drag(tour, 5, 0)
     assert (tour.camera().W, tour.camera().H) == SIZE
+
+
+def orbits(seen, *keys):
+    """Press keys; return whether the camera moved on a sphere around the pivot."""
+    eye, pivot = seen.camera().eye, np.array(seen.tab.evaluate("viewer.view.focus"))
+    for key in keys:
+        seen.tab.keyboard.press(key)
+    moved = seen.camera().eye
+    same = np.linalg.norm(moved - pivot) == pytest.approx(np.linalg.norm(eye - pivot))
+    return same and np.linalg.norm(moved - eye) > 0.01 * np.linalg.norm(eye - pivot)
+
+
+def test_arrows_orbit_with_shift_and_without_cameras_to_step_through(show, random_gaussians, three_views):
+    alone = show(random_gaussians(30))
+    assert orbits(alone, "ArrowRight") and orbits(alone, "ArrowDown") and orbits(alone, "Shift+ArrowLeft")
+    seen = show(random_gaussians(30), three_views)
+    assert orbits(seen, "Shift+ArrowRight") and orbits(seen, "ArrowUp")
+    seen.tab.keyboard.press("ArrowRight")
+    assert any(stands_at(seen, camera) for _, camera in three_views), "as before: the next camera"
+    seen.tab.focus("#degree")
+    assert not orbits(seen, "ArrowDown"), "the panel keeps its keys"

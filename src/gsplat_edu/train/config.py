@@ -97,7 +97,7 @@ class AdcConfig:
         _one_of(OVER_CAP),
         'Which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with the largest'
         ' gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors, clones,'
-        " children; the parent of dropped children is removed too (the course).",
+        " children, which the Gaussians then keep; the parent of dropped children is removed too (the course).",
     )
     densify_stop: int = _number(
         15_000, _whole(0), "Densification ends before this iteration.", "2023", milestone=True

@@ -24,7 +24,9 @@ training does and, in brackets, what the paper or its code does.
     camera. (Over those in which it also touches the image.)
 13. Means nearer than 0.05 are culled (0.2), and the Jacobian of the projection is not clamped (at 1.3 times
     the half field of view).
-14. Images have one size throughout. (The first iterations run at a lower resolution.)
+14. Gaussians stay in the order in which they were made, so that the chapter's own loop draws the same children.
+    (The paper's code does not sort either; every other training of this package sorts along a Morton curve.)
+15. Images have one size throughout. (The first iterations run at a lower resolution.)
 """
 
 from __future__ import annotations

@@ -129,7 +129,14 @@ class AdaptiveDensityControl:
         clones = gaussians.map(lambda tensor: tensor[clone])
         parents = gaussians.map(lambda tensor: tensor[split])
         children = [split_children(parents, config.adc.split_shrink, self.generator) for _ in range(2)]
-        replaced = replace(gaussians, optimizer, keep & ~split, [clones, *children], config.max_gaussians)
+        replaced = replace(
+            gaussians,
+            optimizer,
+            keep & ~split,
+            [clones, *children],
+            config.max_gaussians,
+            in_space=config.adc.over_cap != "cut",
+        )
         self._forget(replaced)
         counts = len(clones), 2 * len(parents), int((~keep).sum())
         return replaced, DensifyEvent(iteration, *counts, num_gaussians=len(replaced))

@@ -75,6 +75,7 @@ def replace(
     keep: Bool[Tensor, " N"],
     newborn: list[Gaussians],
     cap: int | None = None,
+    in_space: bool = True,
 ) -> Gaussians:
     """Keep some Gaussians, add others, drop those over the cap, and sort the rest along a Morton curve.
 
@@ -86,6 +87,7 @@ def replace(
         keep: (N,) true for the survivors.
         newborn: Gaussians to add; the last ones are the first to be dropped.
         cap: Largest number of Gaussians afterwards; None for no cap.
+        in_space: Sort; otherwise survivors come first, then the new ones in their order.
 
     Returns:
         The new Gaussians, leaves that collect gradients.
@@ -94,7 +96,8 @@ def replace(
     survivors = torch.nonzero(keep)[:, 0]
     added = torch.arange(len(gaussians), sum(len(part["means"]) for part in everyone), device=keep.device)
     chosen: Int64[Tensor, " M"] = torch.cat([survivors, added])[:cap]
-    chosen = chosen[_order(torch.cat([part["means"] for part in everyone])[chosen])]
+    if in_space:
+        chosen = chosen[_order(torch.cat([part["means"] for part in everyone])[chosen])]
     replaced = {
         name: torch.cat([part[name] for part in everyone]).index_select(0, chosen) for name in everyone[0]
     }

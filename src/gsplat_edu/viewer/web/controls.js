@@ -20,12 +20,22 @@ const STEPS = {
   KeyE: [0, -1, 0],
 };
 
+// Orbits to the right and down: arrows with Shift, and without it where a page has no other use for the arrow.
+const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+const TURN = 0.8; // radians per second
+const NUDGE = 0.03; // radians at once, so that a short press is seen
+
+// In a document that shows the page as a figure (scene.html#embedded), wheel and vertical drags scroll that document
+// until the canvas has the focus.
+const EMBEDDED = location.hash === "#embedded";
+if (EMBEDDED) document.documentElement.classList.add("embedded");
+
 class Controls {
   // actions: moved() after every move, awake() when a held key starts to move, shown() for the camera on the screen,
   // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by), saveView(),
-  // playPath().
-  constructor(canvas, view, actions) {
-    Object.assign(this, { canvas, view, actions, flying: false, pointers: new Map(), held: new Set(), hurried: false });
+  // playPath(). `cameras` is how many cameras the horizontal arrows step through.
+  constructor(canvas, view, actions, cameras = 0) {
+    Object.assign(this, { canvas, view, actions, cameras, flying: false, pointers: new Map(), held: new Set(), hurried: false });
     this.lastTap = null;
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
@@ -94,6 +104,7 @@ class Controls {
   }
 
   wheel(event) {
+    if (EMBEDDED && document.activeElement !== this.canvas) return;
     event.preventDefault();
     const units = [1, LINE, this.canvas.clientHeight][event.deltaMode] * (event.ctrlKey ? PINCH : 1);
     this.zoom(Math.exp(WHEEL * units * event.deltaY));
@@ -121,6 +132,10 @@ class Controls {
     if (event.code in STEPS) {
       this.held.add(event.code);
       this.actions.awake();
+    } else if (this.turnsBy(event)) {
+      if (!event.repeat) this.orbit(event.code, NUDGE);
+      this.held.add(event.code);
+      this.actions.moved();
     } else if (action) action();
     else return;
     event.preventDefault();
@@ -131,10 +146,25 @@ class Controls {
     this.held.delete(event.code);
   }
 
+  // In the panel, arrows scroll lists and change numbers.
+  turnsBy({ code, shiftKey, target }) {
+    if (target !== this.canvas && target !== document.body) return false;
+    return code in TURNS && (shiftKey || !TURNS[code][0] || !this.cameras);
+  }
+
+  orbit(code, angle) {
+    const [right, down] = TURNS[code].map((sign) => sign * angle);
+    if (this.flying) this.view.look(right, down);
+    else this.view.orbit(right, down);
+  }
+
   // Moves according to the held keys; returns whether any is held.
   advance(seconds) {
     const length = PACE * this.view.pace * seconds * (this.hurried ? HURRY : 1);
-    for (const code of this.held) this.view.move(STEPS[code].map((step) => step * length));
+    for (const code of this.held) {
+      if (code in TURNS) this.orbit(code, TURN * seconds);
+      else this.view.move(STEPS[code].map((step) => step * length));
+    }
     return this.held.size > 0;
   }
 }

@@ -31,7 +31,7 @@ class Viewer {
     this.panel = new Panel(facts, actions);
     this.keyframes = new Keyframes(facts, actions);
     this.journey = null; // the curve and the time it began, while the camera path is played
-    this.controls = new Controls(this.canvas, this.view, actions);
+    this.controls = new Controls(this.canvas, this.view, actions, facts.cameras.length);
     this.panel.mark(this.cameraIndex);
     this.levels?.attach(this.renderer, this.sorter);
     addEventListener("resize", () => this.refresh());
