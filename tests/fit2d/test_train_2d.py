@@ -116,7 +116,7 @@ def test_transparent_and_gray_pictures_are_fitted(main, tmp_path, capsys):
         (["--splats", "0"], "--splats: is 0, but has to be a whole number from 1"),
         (["--iters", "-4"], "--iters: is -4, but has to be a whole number from 1"),
         (["--size", "1000000"], "--size: is 1000000, but has to be a whole number from 1"),
-        (["--seed", "-1"], "--seed: is -1, but has to be a whole number from 0"),
+        (["--seed", "-1"], "--seed: is -1, but has to be a whole number of at least 0"),
         (["--out", "picture.jpg"], "--out: 'picture.jpg' must end in .png"),
         (["--out", "text.png/x.png"], "--out: cannot write text.png/x.png"),
         (["--image", "good.png", "--out", "good.png"], "--out: good.png is the picture itself"),
