@@ -21,6 +21,7 @@ from scipy.optimize import nnls
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.engine.room import PIXEL_BYTES, REPEATED_PHOTOS, Load, Room, kept_photos
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
+from gsplat_edu.scene.sh import num_coefficients
 from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
@@ -229,7 +230,7 @@ def exchanged_gaussians(config: TrainConfig, counts: Int64[np.ndarray, " iterati
 
 def harmonics_of(sh_degree: int) -> int:
     """Return the harmonics of a Gaussian besides the first."""
-    return (sh_degree + 1) ** 2 - 1
+    return num_coefficients(sh_degree) - 1
 
 
 def pixel_share(config: TrainConfig) -> float:

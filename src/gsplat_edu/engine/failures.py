@@ -1,4 +1,4 @@
-"""What wgpu raises becomes one line that names the adapter and what to do; a lost device is told apart."""
+"""Turn errors of wgpu into one line that names the adapter and the remedy, and recognise a lost device."""
 
 from __future__ import annotations
 

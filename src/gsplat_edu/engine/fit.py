@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.engine.passes import WORD, Program, Size
+from gsplat_edu.scene.sh import num_coefficients
 
-HARMONICS = (0, 9, 24, 45)
+HARMONICS = tuple(3 * (num_coefficients(degree) - 1) for degree in range(SH_MAX_DEGREE + 1))
 """Numbers of a Gaussian's higher harmonics, by degree."""
 
 GAUSSIANS, REST = "gaussians", "rest"
