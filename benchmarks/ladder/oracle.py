@@ -46,7 +46,8 @@ def tolerance(
     """
     y, x = np.mgrid[: splats.H, : splats.W]
     T, T_error = np.ones((2, splats.H, splats.W)) * [[[1.0]], [[0.0]]]
-    image, image_error, drawn = np.zeros((splats.H, splats.W, 3)), np.zeros((splats.H, splats.W, 3)), 0
+    image, image_error = np.zeros((2, splats.H, splats.W, 3))
+    drawn = np.zeros((splats.H, splats.W), int)
     for i in range(splats.count):
         (u, v), (A, B, C) = splats.means2d[i].astype(float), splats.conics[i].astype(float)
         dx, dy = x - u, y - v

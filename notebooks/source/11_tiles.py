@@ -400,7 +400,7 @@ print(text[text.index("fn scan_threads") : text.index("@compute")])
 
 # %% [markdown]
 # Between workgroups there is no barrier, and none may wait for another, which perhaps has not begun. So a longer sum
-# takes three passes: each workgroup adds up a block of 1024 counts, one workgroup scans the blocks' sums, and each
+# takes three passes: each workgroup adds up a block of counts, one workgroup scans the blocks' sums, and each
 # workgroup scans its block from there. "The next free place" of a list would again be an order of arrival. Instead each
 # splat writes its pairs into its own places, and a stable sort by tile brings them together, near ones first.
 #

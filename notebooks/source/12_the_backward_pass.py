@@ -269,11 +269,11 @@ assert len(shared) == 3 and len(slotted) == 1
 # %% [markdown]
 # ## The same on a GPU
 #
-# WGSL has no atomic addition of floats. [The engine's
-# kernel](../src/gsplat_edu/engine/composite_backward.wgsl) needs none. A workgroup takes a tile, and now an
-# [invocation](../docs/GLOSSARY.md#invocation) owns a splat, whose sums stay in its registers. $T$ and $R$ of the pixels
-# lie in [workgroup memory](../docs/GLOSSARY.md#workgroup-memory). A pixel has to meet its splats near to far, so they
-# come one behind the other: at turn $i$, invocation $t$ takes pixel $i - t$, which invocation $t - 1$ has just left.
+# WGSL has no atomic addition of floats, and the engine's kernel, `engine/composite_backward.wgsl`, needs none. A
+# workgroup takes a tile, and now an [invocation](../docs/GLOSSARY.md#invocation) owns a splat, whose sums stay in its
+# registers. $T$ and $R$ of the pixels lie in [workgroup memory](../docs/GLOSSARY.md#workgroup-memory). A pixel has to
+# meet its splats near to far, so they come one behind the other: at turn $i$, invocation $t$ takes pixel $i - t$,
+# which invocation $t - 1$ has just left.
 
 # %%
 text = (ROOT / "src/gsplat_edu/engine/composite_backward.wgsl").read_text()

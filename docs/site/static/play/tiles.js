@@ -118,7 +118,7 @@ gsplatPlay.figures.tiles = function (place) {
         if (!gpu) return "…";
         if (!gpu.tiles) return gpu.reason;
         return `GPU: ${gpu.passes} passes, ${gpu.groups} workgroups; ` +
-            `${gpu.same ? "the same lists as" : "other lists than"} JavaScript; the image differs from its float64 by ` +
+            `${gpu.same ? "the same lists as" : "other lists than"} JavaScript; the image differs from float64 by ` +
             `${gpu.gap.toExponential(0)} at most`;
     }
 
