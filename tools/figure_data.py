@@ -1,6 +1,7 @@
 """Write the data of the site's moving figures: docs/site/static/play/*-data.js and frames.jpg.
 
     python tools/figure_data.py
+    python tools/figure_data.py --kernels    only those of the figures that run WGSL kernels
 
 Trains chapter 09's sphere with the backend cpu (half a minute). The figures read scripts and pictures instead of JSON,
 because pages that are opened from disk may load these.
@@ -8,7 +9,9 @@ because pages that are opened from disk may load these.
 
 from __future__ import annotations
 
+import argparse
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from PIL import Image
 
 from gsplat_edu import Camera, sphere_shell
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
+from gsplat_edu.engine.passes import Program, manifest
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.gaussian_math import project_cov3d
@@ -27,6 +31,9 @@ from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "benchmarks"))
+from ladder import gpu  # noqa: E402
+
 OUT = ROOT / "docs" / "site" / "static" / "play"
 SIZE, ITERATIONS, CAP, SEED = 128, 800, 1600, 9
 """The budget of chapter 09."""
@@ -108,9 +115,28 @@ class Diary:
             }
 
 
+def kernels() -> dict[str, object]:
+    """Return the programs of the figures that run WGSL kernels, by the figure's name: shaders, buffers and passes."""
+
+    def without(program: Program, *parts: str) -> Program:
+        kept = {name: passes for name, passes in program.parts.items() if name not in parts}
+        used = {name for passes in kept.values() for one in passes for name in (*one.reads, *one.writes)}
+        return Program(tuple(buffer for buffer in program.buffers if buffer.name in used | {"live"}), kept)
+
+    tiles = gpu.tiles_program(24)  # figures of 96 x 64 px
+    programs = {"naive": gpu.naive_program(), "tiles": without(tiles, "backward"), "slots": tiles}
+    return {name: {"program": manifest(program, gpu.source)} for name, program in programs.items()}
+
+
 def main() -> None:
     """Train, and write the files."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kernels", action="store_true", help="write only the programs of WGSL kernels")
     OUT.mkdir(parents=True, exist_ok=True)
+    for name, value in kernels().items():
+        write(name, value)
+    if parser.parse_args().kernels:
+        return
     diary = Diary(sphere_capture(SIZE))
     generator = torch.Generator().manual_seed(SEED)
     start = Start(random_ball(400, generator), extent=course.EXTENT, generator=generator)

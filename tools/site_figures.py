@@ -17,6 +17,7 @@ class Figure(NamedTuple):
         name: Name of the script, and of the figure in it.
         caption: First line of the figure.
         data: Whether the figure has a data script.
+        shared: Scripts that it shares with figures of other chapters, in their order.
     """
 
     chapter: str
@@ -24,13 +25,20 @@ class Figure(NamedTuple):
     name: str
     caption: str
     data: bool = True
+    shared: tuple[str, ...] = ()
 
+
+GPU = ("gpu.js", "screen.js")
+"""Scripts of the figures that run the package's kernels."""
 
 FIGURES = (
     Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
     Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
     Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
+    Figure("10_the_naive_kernel", '"the kernel, float32"', "naive", "Run the naive kernel", shared=GPU),
+    Figure("11_tiles", 'title=f"tiles met:', "tiles", "Drag splats over tiles", shared=GPU),
+    Figure("12_the_backward_pass", "a splat adds up its column", "slots", "Who writes where", shared=GPU),
 )
 
 STATIC = "../_static/play/"
@@ -49,6 +57,7 @@ def with_figures(chapter: str, notebook: dict[str, Any]) -> None:
     """
     chosen = [figure for figure in FIGURES if figure.chapter == chapter]
     scripts = ["play.js"] if chosen else []
+    scripts += dict.fromkeys(script for figure in chosen for script in figure.shared)
     for figure in chosen:
         cells = notebook["cells"]
         places = [

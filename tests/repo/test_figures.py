@@ -9,36 +9,17 @@ import pytest
 
 from browsers import chromium
 from chapters import ROOT, tool
+from figure_pages import NO_ADAPTER, canvas_box, drag, read_data, state, swipe, told, write_pages
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
 
-STATIC = ROOT / "docs" / "site" / "static"
 FIGURES = re.findall(r'Figure\("(\w+)", .*, "(\w+)", "', (ROOT / "tools" / "site_figures.py").read_text())
 CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
 
 
-def data(name):
-    """Read the data of a figure as the page does: a script with one JSON value."""
-    text = (STATIC / "play" / f"{name}-data.js").read_text()
-    return json.loads(text.split(" = ", 1)[1].rstrip(";\n"))
-
-
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Pages with nothing but the cells that `with_figures` adds, one for each chapter."""
-    out = tmp_path_factory.mktemp("figures")
-    (out / "notebooks").mkdir()
-    (out / "_static").symlink_to(STATIC)
-    for chapter in CHAPTERS:
-        notebook = json.loads((ROOT / "notebooks" / f"{chapter}.ipynb").read_text())
-        before = len(notebook["cells"])
-        tool("site_figures").with_figures(chapter, notebook)
-        added = [cell["source"] for cell in notebook["cells"] if cell["id"].startswith("figure-")]
-        assert len(added) == len(notebook["cells"]) - before
-        head = '<!doctype html><meta name="viewport" content="width=device-width">'
-        head += '<link rel="stylesheet" href="../_static/site.css">'
-        head += "<style>body { margin: 0; --color-brand-primary: #2962ff; }</style>"
-        (out / "notebooks" / f"{chapter}.html").write_text(head + "\n".join(added))
-    return out / "notebooks"
+    """Pages with nothing but the figures, one for each chapter."""
+    return write_pages(tmp_path_factory.mktemp("figures"), CHAPTERS)
 
 
 @pytest.fixture(scope="module")
@@ -64,43 +45,7 @@ def opened(browser, pages):
     yield opening
     for context in contexts:
         context.close()
-    assert messages == []
-
-
-def state(page, name):
-    return page.evaluate(f"gsplatPlay.live.{name}.state")
-
-
-def told(page, name):
-    return page.locator(f"[data-play={name}] output").inner_text()
-
-
-def canvas_box(page, name):
-    canvas = page.locator(f"[data-play={name}] canvas")
-    canvas.scroll_into_view_if_needed()
-    return canvas, canvas.bounding_box()
-
-
-def drag(page, start, end):
-    page.mouse.move(*start)
-    page.mouse.down()
-    page.mouse.move(*end, steps=4)
-    page.mouse.up()
-
-
-def swipe(page, start, end):
-    """Drag with a finger."""
-    touch = page.context.new_cdp_session(page)
-
-    def send(kind, *points):
-        touch.send(
-            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": y} for x, y in points]}
-        )
-
-    send("touchStart", start)
-    for share in (0.25, 0.5, 0.75, 1.0):
-        send("touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
-    send("touchEnd")
+    assert [text for text in messages if text != NO_ADAPTER] == []
 
 
 def test_a_splat_is_computed_like_the_chapter(opened):
@@ -126,7 +71,7 @@ def test_a_splat_is_computed_like_the_chapter(opened):
 
 
 def test_the_sphere_is_composited_like_the_reference(opened):
-    page, shell = opened("05_sort_and_composite"), data("sphere")
+    page, shell = opened("05_sort_and_composite"), read_data("sphere")
     count, size = len(shell["means"]), 48
     means, _, _, opacities = sphere_shell(count)
     assert np.allclose(shell["means"], means, rtol=0, atol=1e-5)
@@ -150,7 +95,7 @@ def test_the_sphere_is_composited_like_the_reference(opened):
 
 
 def test_fates_are_those_of_the_training(opened):
-    page, recorded = opened("09_train_in_3d"), data("density")
+    page, recorded = opened("09_train_in_3d"), read_data("density")
     fates = page.evaluate("gsplatPlay.fates(gsplatData.density, gsplatData.density.threshold)")
     assert fates["counts"]["cloned"] == recorded["cloned"]
     assert 2 * fates["counts"]["split"] == recorded["children"]
@@ -164,9 +109,10 @@ def test_fates_are_those_of_the_training(opened):
 
 
 def test_the_training_on_record_is_that_of_the_chapter():
-    record, recipe = data("training"), tool("figure_data")
+    record, recipe = read_data("training"), tool("figure_data")
     assert record["frames"] == list(recipe.FRAMES) and record["size"] == recipe.SIZE
-    assert data("density")["iteration"] == recipe.DENSIFIED and len(data("sphere")["means"]) == recipe.SHELL
+    assert read_data("density")["iteration"] == recipe.DENSIFIED
+    assert len(read_data("sphere")["means"]) == recipe.SHELL
     notebook = (ROOT / "notebooks" / "09_train_in_3d.ipynb").read_text()
     printed = re.findall(r"iter +(\d+)  L1 ([\d.]+)  K (\d+)", notebook)
     assert len(printed) == 8
