@@ -1,22 +1,28 @@
 """Write the data of the site's moving figures: docs/site/static/play/*-data.js and frames.jpg.
 
-    python tools/figure_data.py
+    python tools/figure_data.py [--only fit]
 
-Trains chapter 09's sphere with the backend cpu (half a minute). The figures read scripts and pictures instead of JSON,
-because pages that are opened from disk may load these.
+Trains chapter 09's sphere with the backend cpu (half a minute), unless only the fit's data are asked for. The figures
+read scripts and pictures instead of JSON, because pages that are opened from disk may load these.
 """
 
 from __future__ import annotations
 
+import argparse
+import base64
 import json
 from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.cbook import get_sample_data
 from PIL import Image
 
 from gsplat_edu import Camera, sphere_shell
+from gsplat_edu.data.images import decode
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
+from gsplat_edu.fit2d.fit import shrunk_photo
+from gsplat_edu.fit2d.splats import random_splats_2d
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.gaussian_math import project_cov3d
@@ -39,6 +45,9 @@ DENSIFIED = 300
 
 SHELL = 600
 """Splats of the sphere to turn."""
+
+FIT_SIZE, FIT_SPLATS, FIT_SEED = 56, 90, 8
+"""Longer side of chapter 08's photo in px, its splats, and the seed of the chapter."""
 
 
 def write(name: str, value: object) -> None:
@@ -108,9 +117,26 @@ class Diary:
             }
 
 
+def fit_data() -> dict[str, object]:
+    """Return chapter 08's photo as bytes and its start: rows u, v, log scales, angle, r, g, b, logit."""
+    # Grace Hopper, a portrait by the US Navy, in the public domain. It comes with matplotlib.
+    photo = shrunk_photo(decode(Path(get_sample_data("grace_hopper.jpg", asfileobj=False)))[0], FIT_SIZE)
+    tall, wide, _ = photo.shape
+    start = random_splats_2d(FIT_SPLATS, tall, wide, np.random.default_rng(FIT_SEED))
+    rows = np.concatenate([array.reshape(FIT_SPLATS, -1) for array in start.arrays().values()], axis=1)
+    pixels = base64.b64encode(np.uint8(np.clip(photo, 0, 1) * 255 + 0.5).tobytes()).decode()
+    return {"wide": wide, "tall": tall, "pixels": pixels, "start": np.round(rows, 4).tolist()}
+
+
 def main() -> None:
     """Train, and write the files."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=["fit"], help="write only the data that need no training")
+    only = parser.parse_args().only
     OUT.mkdir(parents=True, exist_ok=True)
+    write("fit", fit_data())
+    if only:
+        return
     diary = Diary(sphere_capture(SIZE))
     generator = torch.Generator().manual_seed(SEED)
     start = Start(random_ball(400, generator), extent=course.EXTENT, generator=generator)

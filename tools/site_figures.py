@@ -28,7 +28,12 @@ class Figure(NamedTuple):
 
 FIGURES = (
     Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
+    Figure("03_gaussians_in_3d", '"then turned: R S"', "ellipsoid", "Turn a Gaussian", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
+    Figure(
+        "06_spherical_harmonics", 'title="gloss of one splat"', "harmonics", "Drag a coefficient", data=False
+    ),
+    Figure("08_fit_an_image", '"its ellipses"', "fit", "Fit the splats, step by step"),
     Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
     Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
 )
@@ -48,7 +53,7 @@ def with_figures(chapter: str, notebook: dict[str, Any]) -> None:
         SystemExit: no cell, or more than one, has the text that a figure follows.
     """
     chosen = [figure for figure in FIGURES if figure.chapter == chapter]
-    scripts = ["play.js"] if chosen else []
+    scripts = ["play.js", "algebra.js"] if chosen else []
     for figure in chosen:
         cells = notebook["cells"]
         places = [

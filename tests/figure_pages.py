@@ -1,0 +1,63 @@
+"""What the tests of the site's moving figures share: data, gestures, and functions of chapters."""
+
+import ast
+import json
+import re
+
+from chapters import ROOT
+
+STATIC = ROOT / "docs" / "site" / "static"
+FIGURES = re.findall(r'Figure\("(\w+)", .*, "(\w+)", "', (ROOT / "tools" / "site_figures.py").read_text())
+CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
+
+
+def data(name):
+    """Read the data of a figure as the page does: a script with one JSON value."""
+    text = (STATIC / "play" / f"{name}-data.js").read_text()
+    return json.loads(text.split(" = ", 1)[1].rstrip(";\n"))
+
+
+def state(page, name):
+    return page.evaluate(f"gsplatPlay.live.{name}.state")
+
+
+def told(page, name):
+    return page.locator(f"[data-play={name}] output").inner_text()
+
+
+def canvas_box(page, name):
+    canvas = page.locator(f"[data-play={name}] canvas")
+    canvas.scroll_into_view_if_needed()
+    return canvas, canvas.bounding_box()
+
+
+def drag(page, start, end):
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=4)
+    page.mouse.up()
+
+
+def swipe(page, start, end):
+    """Drag with a finger."""
+    touch = page.context.new_cdp_session(page)
+
+    def send(kind, *points):
+        touch.send(
+            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": y} for x, y in points]}
+        )
+
+    send("touchStart", start)
+    for share in (0.25, 0.5, 0.75, 1.0):
+        send("touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
+    send("touchEnd")
+
+
+def chapter_functions(chapter, names, **given):
+    """Execute functions of a chapter, by name, without the rest of the chapter."""
+    tree = ast.parse((ROOT / "notebooks" / "source" / f"{chapter}.py").read_text())
+    chosen = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name in names]
+    assert len(chosen) == len(names)
+    space = dict(given)
+    exec(compile(ast.Module(chosen, []), chapter, "exec"), space)
+    return [space[name] for name in names]
