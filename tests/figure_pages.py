@@ -2,12 +2,11 @@
 
 import ast
 import json
-import re
 
-from chapters import ROOT
+from chapters import ROOT, tool
 
 STATIC = ROOT / "docs" / "site" / "static"
-FIGURES = re.findall(r'Figure\("(\w+)", .*, "(\w+)", "', (ROOT / "tools" / "site_figures.py").read_text())
+FIGURES = [(figure.chapter, figure.name) for figure in tool("site_figures").FIGURES]
 CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
 
 

@@ -30,12 +30,17 @@ FIGURES = (
     Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
     Figure("03_gaussians_in_3d", '"then turned: R S"', "ellipsoid", "Turn a Gaussian", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
-    Figure(
-        "06_spherical_harmonics", 'title="gloss of one splat"', "harmonics", "Drag a coefficient", data=False
-    ),
+    Figure("06_spherical_harmonics", "gloss of one splat", "harmonics", "Drag a coefficient", data=False),
     Figure("08_fit_an_image", '"its ellipses"', "fit", "Fit the splats, step by step"),
     Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
     Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
+    Figure(
+        "13_back_to_the_parameters",
+        "L of q = (w, 0, 0, z)",
+        "chain",
+        "Drag a number of a Gaussian",
+        data=False,
+    ),
 )
 
 STATIC = "../_static/play/"

@@ -3,12 +3,16 @@
 import base64
 
 import numpy as np
+import torch
 
 from chapters import tool
-from figure_pages import canvas_box, data, state, told
+from figure_pages import canvas_box, data, drag, state, swipe, told
+from gsplat_edu import Camera
 from gsplat_edu.fit2d.fit import Fit2DSettings, fit_2d
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
 from gsplat_edu.fit2d.splats import Splats2D, render_2d
+from gsplat_edu.render.api import render
+from gsplat_edu.scene.gaussians import Gaussians
 
 WIDTHS = {"means": 2, "log_scales": 2, "angles": 1, "colors": 3, "logit_opacities": 1}
 
@@ -96,3 +100,79 @@ def test_the_fit_follows_buttons_keys_and_touch(opened):
     plain = np.array(page.evaluate("gsplatPlay.live.fit.splats()"))
     assert np.abs(plain[:, :2] - start[:, :2]).mean() < 0.2  # Adam's ten steps move a centre by pixels
     assert state(page, "fit")["losses"][-1] < state(page, "fit")["losses"][0]
+
+
+def test_the_chain_is_that_of_autograd(opened):
+    page, rng = opened("13_back_to_the_parameters"), np.random.default_rng(13)
+    floored = 0
+    for _ in range(25):
+        x = rng.choice([-0.5, 0.5])
+        one = {
+            "means": rng.uniform([-1, -0.7, -1], [1, 0.7, 1.5]),
+            "log_scales": rng.uniform(-2.5, 0, 3),
+            "quats": rng.normal(size=4),
+            "logit": rng.uniform(-2, 5, 1),
+            "sh": rng.uniform(-2.5, 2, 3),
+        }
+        photo = rng.uniform(size=(48, 64, 3))
+        found = page.evaluate(
+            "([one, x, photo]) => gsplatPlay.chain(one, gsplatPlay.beside(x), photo)",
+            [{name: array.tolist() for name, array in one.items()}, float(x), photo.ravel().tolist()],
+        )
+        leaves = {name: torch.tensor(array[None], dtype=torch.float64) for name, array in one.items()}
+        gaussians = Gaussians(
+            means=leaves["means"],
+            quats=leaves["quats"],
+            log_scales=leaves["log_scales"],
+            logit_opacities=leaves["logit"][:, 0],
+            sh0=leaves["sh"][:, None],
+            sh_rest=torch.zeros(1, 0, 3, dtype=torch.float64),
+        ).trainable()
+        camera = Camera.looking_at([x, 0, -3], [x, 0, 0], 60, 60, H=48, W=64)
+        error = ((render(gaussians, camera, backend="torch").image - torch.tensor(photo)) ** 2).mean()
+        error.backward()
+        slopes = {name: tensor.grad.numpy().ravel() for name, tensor in gaussians.tensors().items()}
+        assert np.isclose(found["error"], error.item(), rtol=1e-12)
+        names = {
+            "means": "means",
+            "log_scales": "log_scales",
+            "quats": "quats",
+            "logit": "logit_opacities",
+            "sh": "sh0",
+        }
+        for mine, theirs in names.items():
+            # the chapter's bound for the same arithmetic in another order
+            largest = np.abs(slopes[theirs]).max()
+            assert np.allclose(found["slopes"][mine], slopes[theirs], rtol=0, atol=1e-11 * largest + 1e-16), (
+                mine
+            )
+        floored += sum(value == 0 for value in found["slopes"]["sh"])
+    assert floored > 3  # colours at the floor do not move
+
+
+def test_the_number_follows_mouse_finger_keys_and_buttons(opened):
+    page = opened("13_back_to_the_parameters")
+    canvas, box = canvas_box(page, "chain")
+    y, words = box["y"] + box["height"] - 40, told(page, "chain")
+    drag(page, (box["x"] + 100, y), (box["x"] + 0.75 * box["width"], y))
+    assert np.isclose(state(page, "chain")["one"]["means"][0], 0.75, atol=0.01)
+    assert told(page, "chain") != words
+    swipe(page, (box["x"] + 100, y), (box["x"] + 0.6 * box["width"], y))
+    assert np.isclose(state(page, "chain")["one"]["means"][0], 0.3, atol=0.01)
+    canvas.focus()
+    page.keyboard.press("ArrowRight")
+    assert np.isclose(state(page, "chain")["one"]["means"][0], 0.33, atol=0.01)
+    page.keyboard.press("ArrowDown")
+    assert state(page, "chain")["chosen"] == 1
+    page.locator("[data-play=chain] select").select_option("quaternion x")
+    assert state(page, "chain")["chosen"] == 7 and told(page, "chain").startswith("quaternion x = 0.400")
+    for chosen in range(14):
+        page.evaluate("chosen => gsplatPlay.live.chain.change({ chosen })", chosen)
+        lines = told(page, "chain").replace("\u2212", "-").splitlines()
+        chain, differences = (float(line.split()[-1]) for line in lines[1:])
+        # ten decimals are shown; the chapter's bound on a difference is 1e-10 of the largest slope
+        assert abs(chain - differences) < 3e-10, lines[0]
+    before = float(lines[0].split()[-1])
+    page.get_by_role("button", name="20 steps downhill").tap()
+    lines = told(page, "chain").splitlines()
+    assert float(lines[0].split()[-1]) < before
