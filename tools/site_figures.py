@@ -27,8 +27,10 @@ class Figure(NamedTuple):
 
 
 FIGURES = (
+    Figure("01_points", "distances = (8.0, 4.0, 2.0)", "points", "Walk around the points", data=False),
     Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
     Figure("03_gaussians_in_3d", '"then turned: R S"', "ellipsoid", "Turn a Gaussian", data=False),
+    Figure("04_splatting", "the axes zoom in", "tangent", "Drag a Gaussian", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
     Figure("06_spherical_harmonics", "gloss of one splat", "harmonics", "Drag a coefficient", data=False),
     Figure("08_fit_an_image", '"its ellipses"', "fit", "Fit the splats, step by step"),

@@ -58,12 +58,13 @@ Object.assign(gsplatPlay, {
         context.stroke();
     },
 
-    /** Pseudo-random numbers in (0, 1), the same on every page: a linear congruential generator. */
+    /** Pseudo-random numbers in (0, 1), the same on every page: a linear congruential generator whose bits are then mixed. */
     uniforms(count, seed) {
         let now = seed >>> 0;
         return Array.from({ length: count }, () => {
             now = (Math.imul(1664525, now) + 1013904223) >>> 0;
-            return (now + 0.5) / 2 ** 32;
+            const mixed = Math.imul(now ^ (now >>> 16), 0x85ebca6b);
+            return ((Math.imul(mixed ^ (mixed >>> 13), 0xc2b2ae35) >>> 0) + 0.5) / 2 ** 32;
         });
     },
 
