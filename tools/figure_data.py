@@ -1,9 +1,9 @@
 """Write the data of the site's moving figures: docs/site/static/play/*-data.js and frames.jpg.
 
-    python tools/figure_data.py [--only fit]
+    python tools/figure_data.py [--only fit | --only scene]
 
-Trains chapter 09's sphere with the backend cpu (half a minute), unless only the fit's data are asked for. The figures
-read scripts and pictures instead of JSON, because pages that are opened from disk may load these.
+Trains the sphere of chapters 07 and 09 with the backend cpu (half a minute), except for the fit of chapter 08. The
+figures read scripts and pictures instead of JSON, because pages that are opened from disk may load these.
 """
 
 from __future__ import annotations
@@ -128,14 +128,33 @@ def fit_data() -> dict[str, object]:
     return {"wide": wide, "tall": tall, "pixels": pixels, "start": np.round(rows, 4).tolist()}
 
 
+def scene_data(gaussians: Gaussians) -> dict[str, object]:
+    """Return raw values as whole numbers: the means of 16 bits, then log scales, quaternions, sh0 and logit of 8 bits.
+
+    A value is its column's low end plus the number times the column's step. Rows follow one another, in base64.
+    """
+    raw = {name: values.detach().double().numpy() for name, values in gaussians.tensors().items()}
+    rest = ("log_scales", "quats", "sh0", "logit_opacities")
+    narrow = np.concatenate([raw[name].reshape(len(gaussians), -1) for name in rest], axis=1)
+    stored: dict[str, object] = {"count": len(gaussians)}
+    for name, values, kind in (("wide", raw["means"], "<u2"), ("narrow", narrow, "<u1")):
+        low = values.min(axis=0)
+        step = np.ptp(values, axis=0) / np.iinfo(kind).max
+        numbers = np.rint((values - low) / step).astype(kind)
+        stored[name] = base64.b64encode(numbers.tobytes()).decode()
+        stored[f"{name}_columns"] = np.stack([low, step], axis=-1).tolist()
+    return stored
+
+
 def main() -> None:
     """Train, and write the files."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=["fit"], help="write only the data that need no training")
+    parser.add_argument("--only", choices=["fit", "scene"], help="write only the data of this figure")
     only = parser.parse_args().only
     OUT.mkdir(parents=True, exist_ok=True)
-    write("fit", fit_data())
-    if only:
+    if only != "scene":
+        write("fit", fit_data())
+    if only == "fit":
         return
     diary = Diary(sphere_capture(SIZE))
     generator = torch.Generator().manual_seed(SEED)
@@ -145,6 +164,9 @@ def main() -> None:
     trainer = training(config, views, load_backend("cpu"), start, callbacks=[diary.note])
     diary.picture(trainer.gaussians)
     trainer.run()
+    write("scene", scene_data(trainer.gaussians))
+    if only:
+        return
     truth = np.uint8(np.clip(diary.capture.held_out.image, 0, 1) * 255 + 0.5)
     Image.fromarray(np.concatenate([*diary.frames, truth], axis=1)).save(OUT / "frames.jpg", quality=88)
     print(f"frames.jpg: {(OUT / 'frames.jpg').stat().st_size / 1e3:.0f} kB")

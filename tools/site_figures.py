@@ -33,6 +33,7 @@ FIGURES = (
     Figure("04_splatting", "the axes zoom in", "tangent", "Drag a Gaussian", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
     Figure("06_spherical_harmonics", "gloss of one splat", "harmonics", "Drag a coefficient", data=False),
+    Figure("07_a_trained_scene", '"nothing forgotten": complete', "scene", "Forget a function"),
     Figure("08_fit_an_image", '"its ellipses"', "fit", "Fit the splats, step by step"),
     Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
     Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
