@@ -1,5 +1,6 @@
-"""Pages with nothing but the moving figures of chapters, for tests in a browser."""
+"""What the tests of the site's moving figures share: pages, data, gestures, and functions of chapters."""
 
+import ast
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 from chapters import ROOT, tool
 
 STATIC = ROOT / "docs" / "site" / "static"
+FIGURES = [(figure.chapter, figure.name) for figure in tool("site_figures").FIGURES]
+CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
 HEAD = (
     '<!doctype html><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     '<link rel="stylesheet" href="../_static/site.css">'
@@ -76,3 +79,13 @@ def swipe(page, start, end):
     for share in (0.25, 0.5, 0.75, 1.0):
         send("touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
     send("touchEnd")
+
+
+def chapter_functions(chapter, names, **given):
+    """Execute functions of a chapter, by name, without the rest of the chapter."""
+    tree = ast.parse((ROOT / "notebooks" / "source" / f"{chapter}.py").read_text())
+    chosen = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name in names]
+    assert len(chosen) == len(names)
+    space = dict(given)
+    exec(compile(ast.Module(chosen, []), chapter, "exec"), space)
+    return [space[name] for name in names]

@@ -32,13 +32,26 @@ GPU = ("gpu.js", "screen.js")
 """Scripts of the figures that run the package's kernels."""
 
 FIGURES = (
+    Figure("01_points", "distances = (8.0, 4.0, 2.0)", "points", "Walk around the points", data=False),
     Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
+    Figure("03_gaussians_in_3d", '"then turned: R S"', "ellipsoid", "Turn a Gaussian", data=False),
+    Figure("04_splatting", "the axes zoom in", "tangent", "Drag a Gaussian", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
+    Figure("06_spherical_harmonics", "gloss of one splat", "harmonics", "Drag a coefficient", data=False),
+    Figure("07_a_trained_scene", '"nothing forgotten": complete', "scene", "Forget a function"),
+    Figure("08_fit_an_image", '"its ellipses"', "fit", "Fit the splats, step by step"),
     Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
     Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
     Figure("10_the_naive_kernel", '"the kernel, float32"', "naive", "Run the naive kernel", shared=GPU),
     Figure("11_tiles", 'title=f"tiles met:', "tiles", "Drag splats over tiles", shared=GPU),
     Figure("12_the_backward_pass", "a splat adds up its column", "slots", "Who writes where", shared=GPU),
+    Figure(
+        "13_back_to_the_parameters",
+        "L of q = (w, 0, 0, z)",
+        "chain",
+        "Drag a number of a Gaussian",
+        data=False,
+    ),
 )
 
 STATIC = "../_static/play/"
@@ -56,7 +69,7 @@ def with_figures(chapter: str, notebook: dict[str, Any]) -> None:
         SystemExit: no cell, or more than one, has the text that a figure follows.
     """
     chosen = [figure for figure in FIGURES if figure.chapter == chapter]
-    scripts = ["play.js"] if chosen else []
+    scripts = ["play.js", "algebra.js"] if chosen else []
     scripts += dict.fromkeys(script for figure in chosen for script in figure.shared)
     for figure in chosen:
         cells = notebook["cells"]

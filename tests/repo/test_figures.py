@@ -7,45 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from browsers import chromium
 from chapters import ROOT, tool
-from figure_pages import NO_ADAPTER, canvas_box, drag, read_data, state, swipe, told, write_pages
+from figure_pages import CHAPTERS, FIGURES, canvas_box, drag, read_data, state, swipe, told
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
-
-FIGURES = re.findall(r'Figure\("(\w+)", .*, "(\w+)", "', (ROOT / "tools" / "site_figures.py").read_text())
-CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
-
-
-@pytest.fixture(scope="module")
-def pages(tmp_path_factory):
-    """Pages with nothing but the figures, one for each chapter."""
-    return write_pages(tmp_path_factory.mktemp("figures"), CHAPTERS)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as launched:
-        yield launched
-
-
-@pytest.fixture
-def opened(browser, pages):
-    """Open a chapter's page on a phone with a touch screen; a message in the console fails the test."""
-    messages, contexts = [], []
-
-    def opening(chapter, **settings):
-        context = browser.new_context(viewport={"width": 390, "height": 800}, has_touch=True, **settings)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("console", lambda message: messages.append(message.text))
-        page.on("pageerror", lambda error: messages.append(str(error)))
-        page.goto((pages / f"{chapter}.html").as_uri())
-        return page
-
-    yield opening
-    for context in contexts:
-        context.close()
-    assert [text for text in messages if text != NO_ADAPTER] == []
 
 
 def test_a_splat_is_computed_like_the_chapter(opened):

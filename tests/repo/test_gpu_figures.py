@@ -84,7 +84,7 @@ def array_of(page, expression):
 
 def test_kernels_of_the_site_are_those_of_the_package():
     for name, value in tool("figure_data").kernels().items():
-        assert read_data(name) == json.loads(json.dumps(value)), "run tools/figure_data.py --kernels"
+        assert read_data(name) == json.loads(json.dumps(value)), "run tools/figure_data.py --only kernels"
         for module, text in read_data(name)["program"]["modules"].items():
             assert text == gpu.source(module)
 
