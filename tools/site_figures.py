@@ -31,6 +31,7 @@ FIGURES = (
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
     Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
     Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
+    Figure("14_photos_to_scene", "held_out = sorted(", "wipe", "Wipe between photo and render"),
 )
 
 STATIC = "../_static/play/"
