@@ -9,14 +9,18 @@ shows the scene that the chapter shows.
 from __future__ import annotations
 
 import json
+import sys
 import tempfile
 from pathlib import Path
 
 import nbformat
 import numpy as np
-from build_notebooks import ROOT, SOURCES, assembled
 from nbclient import NotebookClient
 from PIL import Image
+
+sys.path.append(str(Path(__file__).resolve().parent))
+
+from build_notebooks import ROOT, SOURCES, assembled
 
 OUT = ROOT / "docs" / "site" / "static" / "play"
 CHAPTER = SOURCES / "14_photos_to_scene.py"

@@ -21,23 +21,21 @@
 #
 # The photos of this page show a house in a garden ([gsplat_edu.data.garden](../src/gsplat_edu/data/garden.py)). A ray
 # tracer takes them of solid walls, roofs and tree crowns, so no set of splats can match them exactly. The window panes
-# mirror the sky, and the sky is infinitely far away, as outdoors. The true cameras are put away until there is
-# something to compare with them.
+# mirror the sky, and the sky is infinitely far away, as outdoors.
 
 # %%
 import itertools
 import json
 import os
 import shutil
-import sqlite3
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+import pycolmap
 import torch
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
@@ -103,27 +101,36 @@ def gallery(title, images, rows=1, height=2.8):
 gallery("the first ten photos: no pose, no focal length", {n: photos[n] for n in names[:10]}, 2, 4.4)
 
 # %% [markdown]
-# The obvious thing is to guess. The walk was about a circle, the steps were about even, the phone was held about so
-# high, and the lens is known. The guess becomes a capture with random points where the house must be, and
-# [gsplat_edu.runs.training](../src/gsplat_edu/runs/training.py) trains on it: what `gsplat-edu train` calls.
+# The obvious thing is to guess: a circle, even steps, one height, and the lens is known. The guess becomes a capture
+# with random points around the house. [gsplat_edu.runs.training](../src/gsplat_edu/runs/training.py) trains on it, as
+# `gsplat-edu train` does.
 
 
 # %%
 def trained(data, out, iterations, strategy="adc", appearance="none", sky="none", **reading):
     config = recipe(iterations, strategy=strategy, appearance=appearance, sky=sky, max_gaussians=20_000)
     options = RunOptions(WORK / data, WORK / out, config, DataSettings(**reading), eval_every=0, save_every=0)
-    before = time.perf_counter()
     job = CaptureRun(options)
-    loaded = time.perf_counter() - before
     job.train()
-    before = time.perf_counter()
-    scores = job.finish()
-    return job, {"reading": loaded, "training": job.seconds, "judging": time.perf_counter() - before}, scores
+    return job, job.seconds, job.finish()
 
 
 def picture(job, camera):
     with torch.no_grad():
         return to_bytes(job.options.renderer(job.trainer.gaussians, camera).image)
+
+
+def compare(rows):
+    """Draw photo, render and error for each name, photo and render."""
+    fig, axes = plt.subplots(len(rows), 3, squeeze=False, figsize=(13, 3.3 * len(rows)), layout="constrained")
+    for row, (name, photo, image) in zip(axes, rows, strict=True):
+        apart = np.abs(image.astype(float) - photo).mean(axis=2) / 255
+        titles = f"photo, {name}", f"render, {psnr(image / 255, photo):.2f} dB", "error"
+        for ax, title, pixels in zip(row, titles, (photo, image, apart), strict=True):
+            mesh = ax.imshow(pixels, cmap="magma", vmin=0, vmax=0.25)
+            ax.set(title=title, xticks=[], yticks=[])
+        fig.colorbar(mesh, ax=row[2], label="absolute error, mean of the channels")
+    plt.show()
 
 
 even = 2 * np.pi * np.arange(COUNT) / COUNT
@@ -135,14 +142,11 @@ SIDE_PX = 160
 mush, _, scores = trained("guess", "mush", BRIEFLY, resolution=SIDE_PX)
 mushy, seen = (summarize(part)["psnr"] for part in (scores.test, scores.train))
 print(f"guessed poses, {BRIEFLY} iterations at {SIDE_PX} px: {mushy:.2f} dB held out, {seen:.2f} dB seen")
-shown = {}
-for v in mush.dataset.test[:2]:
-    shown |= {f"render, {v.name}": picture(mush, v.camera), f"photo, {v.name}": v.image}
-gallery("trained on guessed poses: every photo contradicts the next", shown)
+compare([(v.name, v.image, picture(mush, v.camera)) for v in mush.dataset.test[:2]])
 
 # %% [markdown]
-# A few degrees around the house move its corners by many pixels, and each photo is off by another amount. The cameras
-# have to be found, and the only thing to find them with is the photos.
+# Every photo contradicts the next: a few degrees around the house move its corners by many pixels. The cameras have to
+# be found, and the photos are all there is to find them with.
 #
 # ## What two photos say about each other
 #
@@ -170,26 +174,18 @@ found = {view.name: view.camera for view in found_set.train}
 one, two, focal = *names[:2], truth[names[0]].fx
 print(f"{len(found)} of {COUNT} posed; focal length {found[one].fx:.2f} px, in truth {focal:.2f} px")
 assert len(found) >= COUNT - 1
-# What the stages saw is kept in a database: the features of each photo, and the matches of two.
-reader = sqlite3.connect(f"{(WORK / 'capture/sfm/database.db').as_uri()}?mode=ro", uri=True)
+database = pycolmap.Database.open(WORK / "capture/sfm/database.db")
 number = {name: i + 1 for i, name in enumerate(names)}
-
-
-def matrix_from(dtype, table, key, value):
-    query = f"SELECT rows, cols, data FROM {table} WHERE {key} = ?"
-    rows, cols, data = reader.execute(query, (value,)).fetchone()
-    return np.frombuffer(data or b"", dtype).reshape(rows, cols)
 
 
 def matched(*pair):
     """Return where two photos match, px; COLMAP has the first pixel's centre at (0.5, 0.5)."""
-    i, j = (number[name] for name in pair)
-    chosen = matrix_from(np.uint32, "two_view_geometries", "pair_id", (2**31 - 1) * i + j).T
-    points = (matrix_from(np.float32, "keypoints", "image_id", k) for k in (i, j))
+    chosen = database.read_two_view_geometry(*(number[name] for name in pair)).inlier_matches.T
+    points = (database.read_keypoints(number[name]) for name in pair)
     return [xy[rows, :2] - 0.5 for xy, rows in zip(points, chosen, strict=True)]
 
 
-points, (a, b) = matrix_from(np.float32, "keypoints", "image_id", number[one]), matched(one, two)
+points, (a, b) = database.read_keypoints(number[one]), matched(one, two)
 fig, axes = plt.subplots(1, 2, figsize=(13, 3.4), layout="constrained", width_ratios=[1, 2])
 axes[0].imshow(photos[one])
 widths = np.hypot(points[::4, 2], points[::4, 4])
@@ -220,8 +216,8 @@ def line_distances(cameras):
 
 
 off = {what: line_distances(c) for what, c in (("guess", guess), ("found", found), ("truth", truth))}
-for what, distances in off.items():
-    print(f"{what}: half of {len(distances)} matches lie within {np.median(distances):.2f} px of their line")
+for what, far in off.items():
+    print(f"{what}: half of {len(far)} matches lie within {np.median(far):.2f} px of their line")
 assert np.median(off["found"]) < 1 < np.median(off["guess"])
 
 # %% [markdown]
@@ -275,12 +271,12 @@ for expected in ((shaken,), None):
 # %% [markdown]
 # ## The scene
 #
-# Now the recipe of Kerbl et al. 2023 (`gsplat-edu train --strategy adc`), from the points that were triangulated,
-# every eighth photo held out: the loss is $0.8\,L_1 + 0.2\,(1 - \mathrm{SSIM})$, where
-# [SSIM](../docs/GLOSSARY.md#ssim) (Wang et al. 2004) is 1 if two photos agree in mean, contrast and pattern around
-# every pixel: $L_1$ alone forgives blur. The field compares the mean peak signal-to-noise ratio of held-out photos,
-# $10 \log_{10}(1/\mathrm{MSE})$ in decibels ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)):
-# 3 dB are half the squared error. The first line below compares with the guess, which had to begin with random points.
+# Now the recipe of Kerbl et al. 2023 (`gsplat-edu train --strategy adc`), every eighth photo held out. The loss is
+# $0.8\,L_1 + 0.2\,(1 - \mathrm{SSIM})$, where [SSIM](../docs/GLOSSARY.md#ssim) (Wang et al. 2004) is 1 if two photos
+# agree in mean, contrast and pattern around every pixel: $L_1$ alone forgives blur. The field compares the mean peak
+# signal-to-noise ratio of held-out photos, $10 \log_{10}(1/\mathrm{MSE})$ in decibels
+# ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)): 3 dB are half the squared error. The first
+# line below compares with the guess, which had to begin with random points.
 
 # %%
 posed = summarize(trained("capture", "small", BRIEFLY, resolution=SIDE_PX)[2].test)["psnr"]
@@ -288,53 +284,38 @@ print(f"{BRIEFLY} iterations at {SIDE_PX} px: {posed:.2f} dB held out, on guesse
 assert posed > mushy + 1
 final, seconds, scores = trained("capture", "scene", ITERATIONS)
 test, train = summarize(scores.test), summarize(scores.train)
-print(f"{ITERATIONS} iterations, {len(final.trainer.gaussians)} Gaussians, {seconds['training']:.0f} s")
-print(
-    f"{len(scores.test)} held out: PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.3f}; seen: PSNR {train['psnr']:.2f} dB"
-)
+print(f"{ITERATIONS} iterations, {len(final.trainer.gaussians)} Gaussians, {seconds:.0f} s")
+print(f"{len(scores.test)} held out: PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.3f};", end=" ")
+print(f"seen: PSNR {train['psnr']:.2f} dB")
 assert test["psnr"] > (17 if SHORT else 22)
-
-
-def compare(rows):
-    """Draw photo, render and error for each name, photo and render."""
-    fig, axes = plt.subplots(len(rows), 3, squeeze=False, figsize=(13, 3.3 * len(rows)), layout="constrained")
-    for row, (name, photo, image) in zip(axes, rows, strict=True):
-        apart = np.abs(image.astype(float) - photo).mean(axis=2) / 255
-        titles = f"photo, {name}", f"render, {psnr(image / 255, photo):.2f} dB", "error"
-        for ax, title, pixels in zip(row, titles, (photo, image, apart), strict=True):
-            mesh = ax.imshow(pixels, cmap="magma", vmin=0, vmax=0.25)
-            ax.set(title=title, xticks=[], yticks=[])
-        fig.colorbar(mesh, ax=row[2], label="absolute error, mean of the channels")
-    plt.show()
-
 
 held_out = sorted(final.dataset.test, key=lambda v: psnr(picture(final, v.camera) / 255, v.image))
 view, worst = held_out[len(held_out) // 2], held_out[0]
+print("; ".join(f"{v.name} {psnr(picture(final, v.camera) / 255, v.image):.2f} dB" for v in held_out))
 compare([(v.name, v.image, picture(final, v.camera)) for v in (view, worst)])
 
 # %% [markdown]
-# The first row is the median of the held-out photos, the second is the worst. The house is there with its tiles and
-# bars; the errors are thin lines along edges. What went wrong is the sky: the recipe begins with points that were
-# triangulated, and at infinity there are none. The doctor has seen it, and advises `--sky shell`: far splats that are
-# there from the start, coloured by the photos.
+# The first row is the median of the held-out photos, the second is the worst. The house is right, and the sky is what
+# went wrong. The recipe begins with the triangulated points, and at infinity there are none: training puts splats near
+# the cameras instead, which cover the sky in one photo and the lawn in the next. The doctor has seen it, and advises
+# `--sky shell`: far splats from the start, coloured by the photos.
 #
-# Those were the steps of 2023. `gsplat-edu train` takes others unless asked: photos of a quarter of their width at
-# first, where a step is cheap and only coarse structure is to be learned; splits of the splats with the largest
-# gradients, up to a planned number; a small weight on opacity, so that what no photo needs fades; rates twice as high,
-# which fall to the end. [RECIPE.md](../docs/RECIPE.md) says where each piece comes from. It also looks for sky and
-# chooses `--sky` by itself. A third of the steps will do:
+# Those were the steps of 2023. `gsplat-edu train` takes others unless asked: small photos at first, splits of the
+# splats with the largest gradients up to a planned number, a small weight on opacity, so that what no photo needs
+# fades, and rates twice as high, which fall to the end ([RECIPE.md](../docs/RECIPE.md) says where each piece comes
+# from). It also looks for sky and chooses `--sky` by itself. A third of the steps will do:
 
 # %%
 steps = ITERATIONS if SHORT else ITERATIONS // 3
 quick, spent, better = trained("capture", "quick", steps, "fast", sky="shell")
-faster, share = summarize(better.test)["psnr"], spent["training"] / seconds["training"]
-print(f"{steps} iterations, {share:.2f} of the time: {faster:.2f} dB held out,", end=" ")
-print(f"{len(quick.trainer.gaussians)} Gaussians")
+faster, share = summarize(better.test)["psnr"], spent / seconds
+print(f"{steps} iterations, {share:.2f} of the time: {faster:.2f} dB held out")
 assert faster > test["psnr"] - 1
 # The true cameras say what each held-out pixel shows.
 shows = np.stack([photograph_garden(truth[v.name]).material for v in held_out])
-pair = [np.stack([picture(job, v.camera) / 255 - v.image / 255 for v in held_out]) for job in (final, quick)]
-squares = [(apart**2).mean(axis=-1) for apart in pair]
+shot = np.stack([v.image for v in held_out]) / 255
+drawn = (np.stack([picture(job, v.camera) for v in held_out]) / 255 for job in (final, quick))
+squares = [((renders - shot) ** 2).mean(axis=-1) for renders in drawn]
 for k, what in enumerate(MATERIALS):
     old, new = (-10 * np.log10(square[shows == k].mean()) for square in squares)
     part = 100 * squares[0][shows == k].sum() / squares[0].sum()
@@ -345,8 +326,8 @@ compare([(worst.name, worst.image, picture(quick, worst.camera))])
 # ## When the phone decides
 #
 # These photos agree about the colour of every wall. Those of a phone left on automatic do not: it sets exposure and
-# white balance anew for each photo. Here every photo is made 0.8 stops brighter or darker, and its red and blue
-# change a little. A stop doubles the light, and a pixel's value is about the light to the power of 1/2.2.
+# white balance anew for each photo. Here every third photo is made 0.8 stops darker, the others as much brighter, and
+# red and blue change a little. A stop doubles the light, and a pixel's value is about the light to the power of 1/2.2.
 #
 # > **Predict.** A scene is trained on these photos as if they agreed. Where do you look for the damage first: at the
 # > edges of the roof, in the texture of grass and bricks, or where large surfaces are plain?
@@ -354,56 +335,52 @@ compare([(worst.name, worst.image, picture(quick, worst.camera))])
 # %%
 shutil.copytree(WORK / "capture", WORK / "automatic")
 planted = {}
-for path in sorted((WORK / "automatic/images").iterdir()):
-    light = rng.choice([-0.8, 0.8]) + rng.uniform(-0.2, 0.2, 3) * (1, 0, 1)  # stops of blue, green and red
+for k, path in enumerate(sorted((WORK / "automatic/images").iterdir())):
+    light = (0.8 if k % 3 else -0.8) + rng.uniform(-0.2, 0.2, 3) * (1, 0, 1)  # stops of blue, green and red
     changed = np.clip(np.round(cv2.imread(str(path)) * 2 ** (light / 2.2)), 0, 255).astype(np.uint8)
     cv2.imwrite(str(path), changed)
     planted[f"{path.name}, {light[1]:+.1f} stops"] = changed[..., ::-1]
 gallery("four neighbours, as the phone exposes them", dict(list(planted.items())[:4]), height=2.9)
 
-wavering = {}
-for appearance in ("none", "exposure"):
-    job, _, scores = trained("automatic", appearance, ITERATIONS // 3, "fast", appearance, "shell")
-    wavering[appearance] = job, summarize(scores.test)["psnr_fitted"]
-    print(f"appearance {appearance}: {wavering[appearance][1]:.2f} dB held out, exposure fitted")
-assert wavering["exposure"][1] > wavering["none"][1]
+wavering, fitted = {}, {}
+for name in ("none", "exposure"):
+    wavering[name], _, scores = trained("automatic", name, ITERATIONS // 3, "fast", name, "shell")
+    fitted[name] = summarize(scores.test)["psnr_fitted"]
+    print(f"appearance {name}: {fitted[name]:.2f} dB held out, exposure fitted")
+assert fitted["exposure"] > fitted["none"]
 
 
 def balanced(name, v):
-    """Render a view with one gain per channel, because a scene's exposure is its own."""
-    image = np.maximum(picture(wavering[name][0], v.camera), 1) / 255
-    return to_bytes(image * np.median(v.image / 255 / image, axis=(0, 1)))
+    """Render a view with one gain per channel, because a scene's exposure is its own; return the PSNR, too."""
+    image = np.maximum(picture(wavering[name], v.camera), 1) / 255
+    image = to_bytes(image * np.median(v.image / 255 / image, axis=(0, 1)))
+    return psnr(image / 255, v.image), image
 
 
-def gained(v):
-    return np.subtract(*(psnr(balanced(name, v) / 255, v.image) for name in ("exposure", "none")))
-
-
-v = max(held_out, key=gained)
-compare([(f"{v.name} ({name})", v.image, balanced(name, v)) for name in wavering])
+v = max(held_out, key=lambda v: balanced("exposure", v)[0] - balanced("none", v)[0])
+compare([(f"{v.name} ({name})", v.image, balanced(name, v)[1]) for name in wavering])
 
 # %% [markdown]
-# EXPOSURE_PROSE With
+# The plain surfaces show it best: without a correction, sky and lawn have lighter and darker patches. With
 # `--appearance exposure`, each photo has one gain per channel, measured whenever it is drawn: the median of photo
 # over render. The render is multiplied by it before the loss compares the two, so that the scene need not change its
 # colour with the viewpoint. The gains of all photos have the geometric mean 1: otherwise a scene half as bright with
-# gains twice as large would be as good.
-#
-# A held-out photo has no gain. It is measured on the left half, and the right half is scored: that is "exposure
-# fitted". `gsplat-edu train` looks at the photos and chooses by itself. Other faults have their own remedies:
-# `--refine` for poses that are a little off, `--transients` for passers-by, `--sky` for what is at infinity, and
-# `gsplat-edu clean` for floaters. [GUIDE.md](../docs/GUIDE.md) shows what they do.
+# gains twice as large would be as good. The gain of a held-out photo is measured on its left half, and the right half
+# is scored: that is "exposure fitted". `gsplat-edu train` looks at the photos and chooses by itself. Other faults have
+# their own remedies: `--refine` for poses that are a little off, `--transients` for passers-by, and `gsplat-edu clean`
+# for floaters. [GUIDE.md](../docs/GUIDE.md) shows what they do.
 #
 # ## Where the time went
 #
 # Poses are paid for once; training is what a budget decides. `benchmarks/train_step.py` takes its iteration apart, here
-# on the trained scene: each row is a median of its own, so on a busy machine they need not add up to the whole.
+# on the trained scene. Of some rounds the fastest is shown; its rows are medians, so they need not add up.
 
 # %%
 done = json.loads((WORK / "capture/sfm/stages.json").read_text())["stages"]
 table = {name: done[name]["facts"]["seconds"] for name in ("features", "matches", "mapping")}
-table |= {"undistortion": done["capture"]["facts"]["seconds"]} | seconds
-iteration = measure(final.trainer.gaussians, [view], 10 if SHORT else 40)
+table |= {"undistortion": done["capture"]["facts"]["seconds"], "training": seconds}
+rounds = [measure(final.trainer.gaussians, [view], 8) for _ in range(2 if SHORT else 8)]
+iteration = min(rounds, key=lambda parts: parts["iteration"])
 pairs = round(iteration.pop("pairs"))
 for unit, parts, whole in (("s ", table, sum(table.values())), ("ms", iteration, iteration["iteration"])):
     for name, value in parts.items():
@@ -414,10 +391,9 @@ for unit, parts, whole in (("s ", table, sum(table.values())), ("ms", iteration,
 #
 # A kernel that is bound by arithmetic is no faster than its operations over the machine's rate of them. At how many
 # pixels a splat is above the floor is counted by the rung `tight` of [chapter 11](11_tiles.ipynb). What one of them
-# costs is counted in the C++ by `benchmarks/kernel_operations.py`: additions, multiplications, both fused, minima,
-# comparisons and selections in the innermost loops of `native/composite.cpp` and `native/composite_backward.cpp`. Each
-# is one vector instruction, for as many pixels as a vector has lanes; loads and stores are left out. The rate is that
-# of independent fused multiply-adds, measured.
+# costs is counted by `benchmarks/kernel_operations.py` in the source of the innermost loops: additions, products, both
+# fused, minima, comparisons and selections. Each is one vector instruction, for as many pixels as a vector has lanes;
+# loads and stores are left out. The rate is that of independent fused multiply-adds, measured.
 
 # %%
 g = final.trainer.gaussians
@@ -443,7 +419,7 @@ for name in ("composite", "composite_backward"):
 # ## The next failure
 #
 # There is no next chapter, but failures remain. The first is in every scene: it is right where a camera stood. Here
-# is a view from higher up than any photo.
+# is a view from higher up than any photo. The fog is the sky of the photos, seen from behind.
 
 # %%
 above = garden_camera(0.4, 1.0, frame_size)
@@ -464,8 +440,7 @@ shutil.rmtree(WORK)
 # The others are of one kind: the model absorbs what it has no parameters for into the parameters it has.
 #
 # - **What moves, what mirrors.** A scene has one state: people become fog, a reflection a room behind the wall.
-# - **Light.** Exposure has its gain, but a cloud or a lamp that is switched on changes each wall in its own way. The
-#   colour that depends on the direction takes up the difference.
+# - **Light.** A cloud or a lamp that is switched on changes each wall in its own way, which one gain cannot follow.
 # - **Scenes larger than memory.** All Gaussians are held at once, in the bytes printed above.
 #
 # With photos of your own: `gsplat-edu sfm PHOTOS CAPTURE` finds the poses, `gsplat-edu doctor CAPTURE` says what is

@@ -319,7 +319,7 @@ def test_the_photos_to_wipe_are_those_of_the_chapter():
 
 def test_the_line_follows_mouse_finger_and_keys(opened):
     page = opened("14_photos_to_scene")
-    canvas, box = canvas_box(page, "wipe")
+    _, box = canvas_box(page, "wipe")
 
     def at(share):
         return box["x"] + share * box["width"], box["y"] + box["height"] / 2
