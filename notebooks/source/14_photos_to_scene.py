@@ -290,9 +290,9 @@ print(f"seen: PSNR {train['psnr']:.2f} dB")
 assert test["psnr"] > (17 if SHORT else 22)
 
 held_out = sorted(final.dataset.test, key=lambda v: psnr(picture(final, v.camera) / 255, v.image))
-view, worst = held_out[len(held_out) // 2], held_out[0]
+view, poorest = held_out[len(held_out) // 2], held_out[0]
 print("; ".join(f"{v.name} {psnr(picture(final, v.camera) / 255, v.image):.2f} dB" for v in held_out))
-compare([(v.name, v.image, picture(final, v.camera)) for v in (view, worst)])
+compare([(v.name, v.image, picture(final, v.camera)) for v in (view, poorest)])
 
 # %% [markdown]
 # The first row is the median of the held-out photos, the second is the worst. The house is right, and the sky is what
@@ -320,7 +320,7 @@ for k, what in enumerate(MATERIALS):
     old, new = (-10 * np.log10(square[shows == k].mean()) for square in squares)
     part = 100 * squares[0][shows == k].sum() / squares[0].sum()
     print(f"{what:8} {old:6.2f} dB, {part:5.1f} % of the error; with the fast recipe {new:6.2f} dB")
-compare([(worst.name, worst.image, picture(quick, worst.camera))])
+compare([(poorest.name, poorest.image, picture(quick, poorest.camera))])
 
 # %% [markdown]
 # ## When the phone decides
