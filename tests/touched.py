@@ -42,6 +42,7 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "docs/GLOSSARY.md": ("repo/test_glossary.py",),
     "notebooks/exercises": ("repo/test_exercises.py",),
     "tools/site_figures.py": FIGURES,
+    "tools/figure_photos.py": FIGURES,
     "tools/build_site.py": ("repo/test_site.py",),
     "tools/landing_scene.py": ("repo/test_site.py",),
     "tools/build_notebooks.py": ("repo/test_notebooks.py",),

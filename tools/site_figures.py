@@ -1,6 +1,7 @@
 """Put the moving figures into the pages of chapters, below the pictures that stand for them where scripts are off.
 
-The scripts are in docs/site/static/play, their data from `tools/figure_data.py`. Notebooks do not contain the figures.
+The scripts are in docs/site/static/play, their data from `tools/figure_data.py` and `tools/figure_photos.py`. Notebooks
+do not contain the figures.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ FIGURES = (
         "Drag a number of a Gaussian",
         data=False,
     ),
+    Figure("14_photos_to_scene", "held_out = sorted(", "wipe", "Wipe between photo and render"),
 )
 
 STATIC = "../_static/play/"

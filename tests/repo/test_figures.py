@@ -1,14 +1,16 @@
 """The moving figures of the site: they compute with the course's formulas and follow mouse, keys and touch."""
 
+import io
 import itertools
 import json
 import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from chapters import ROOT, tool
-from figure_pages import CHAPTERS, FIGURES, canvas_box, drag, read_data, state, swipe, told
+from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, drag, read_data, state, swipe, told
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
 
 
@@ -194,10 +196,69 @@ def test_a_figure_follows_a_picture_of_its_chapter():
         for above, cell in itertools.pairwise(notebook["cells"]):
             if cell["id"].startswith("figure-") and cell["id"] != "figure-scripts":
                 kinds = {kind for output in above["outputs"] for kind in output.get("data", {})}
-                assert "image/png" in kinds, cell["id"]
+                assert kinds & {"image/png", "image/jpeg"}, cell["id"]
 
 
 def test_a_figure_without_its_cell_stops_the_build():
     notebook = {"cells": [{"cell_type": "code", "source": "1 + 1"}]}
     with pytest.raises(SystemExit, match="0 code cells contain"):
         tool("site_figures").with_figures("02_gaussians_in_2d", notebook)
+
+
+def test_the_photos_to_wipe_are_those_of_the_chapter():
+    recipe, record = tool("figure_photos"), read_data("wipe")
+    width, height = record["width"], record["height"]
+    assert (width, height) == recipe.SIZE and record["brightest"] == recipe.BRIGHTEST
+    path = STATIC / "play" / "wipe.jpg"
+    assert path.stat().st_size <= recipe.LARGEST
+    notebook = (ROOT / "notebooks" / "14_photos_to_scene.ipynb").read_text()
+    assert len(record["views"]) == recipe.VIEWS
+    for view in record["views"]:
+        assert f"{view['name']} {view['psnr']:.2f} dB" in notebook
+    with Image.open(path) as opened_strip:
+        strip = np.asarray(opened_strip.convert("RGB"), dtype=float)
+    assert strip.shape == (3 * height, len(record["views"]) * width, 3)
+    photos, renders, errors = strip.reshape(3, height, -1, 3)
+    again = np.minimum(np.abs(photos - renders).mean(axis=-1) / 255 / record["brightest"], 1)
+    # Shrinking averages the pixels' errors but not their signs, and JPEG adds noise: only large parts agree.
+    coarse = [
+        image.reshape(height // 30, 30, -1, 30).mean(axis=(1, 3))
+        for image in (again, errors.mean(axis=-1) / 255)
+    ]
+    assert np.corrcoef(*map(np.ravel, coarse))[0, 1] > 0.9
+
+
+def test_the_line_follows_mouse_finger_and_keys(opened):
+    page = opened("14_photos_to_scene")
+    _, box = canvas_box(page, "wipe")
+
+    def at(share):
+        return box["x"] + share * box["width"], box["y"] + box["height"] / 2
+
+    def shown():
+        """Return what is drawn around the middle of the canvas."""
+        size = {"width": 0.2 * box["width"], "height": 60}
+        taken = page.screenshot(clip={"x": at(0.5)[0], "y": at(0.5)[1] - 30, **size})
+        with Image.open(io.BytesIO(taken)) as image:
+            return np.asarray(image.convert("RGB"), dtype=float)
+
+    drag(page, at(0.5), at(0.2))
+    assert np.isclose(state(page, "wipe")["share"], 0.2, rtol=0, atol=0.02)
+    swipe(page, at(0.2), at(0.8))
+    assert np.isclose(state(page, "wipe")["share"], 0.8, rtol=0, atol=0.02)
+    photo, words = shown(), told(page, "wipe")
+    slider = page.locator("[data-play=wipe] input[type=range]").first
+    slider.focus()
+    page.keyboard.press("Home")
+    assert state(page, "wipe")["share"] == 0 and told(page, "wipe") != words
+    assert slider.get_attribute("aria-valuetext") == told(page, "wipe")
+    render = shown()
+    assert 1 < np.abs(render - photo).mean() < 30, "the render is close to the photo, but not the same"
+    page.get_by_label("error instead of the render").tap()
+    assert state(page, "wipe")["error"] and told(page, "wipe").endswith("error")
+    error = shown()
+    assert error.mean() < min(photo.mean(), render.mean()) - 20, "most of the error is dark"
+    page.locator("[data-play=wipe] input[type=range]").nth(1).focus()
+    page.keyboard.press("End")
+    assert state(page, "wipe")["view"] == len(read_data("wipe")["views"]) - 1
+    assert np.abs(shown() - error).mean() > 1 and read_data("wipe")["views"][-1]["name"] in told(page, "wipe")
