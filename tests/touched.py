@@ -25,6 +25,8 @@ from pathlib import Path, PurePosixPath
 
 FEW = 6
 
+FIGURES = tuple(f"repo/test_figures{of}.py" for of in ("", "_colour", "_geometry", "_gradients"))
+
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     "src/gsplat_edu/render": ("native", "parity", "gradients"),
     "src/gsplat_edu/render/triton": ("gpu",),
@@ -36,10 +38,11 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "benchmarks/kernel_operations.py": ("native/test_operations.py",),
     "conformance": ("conformance", "gpu/test_conformance.py"),
     "docs": ("repo/test_site.py",),
-    "docs/site/static": ("repo/test_figures.py",),
+    "docs/site/static": FIGURES,
     "docs/GLOSSARY.md": ("repo/test_glossary.py",),
     "notebooks/exercises": ("repo/test_exercises.py",),
-    "tools/site_figures.py": ("repo/test_figures.py",),
+    "tools/site_figures.py": FIGURES,
+    "tools/figure_photos.py": FIGURES,
     "tools/build_site.py": ("repo/test_site.py",),
     "tools/landing_scene.py": ("repo/test_site.py",),
     "tools/build_notebooks.py": ("repo/test_notebooks.py",),

@@ -1,22 +1,30 @@
 """Write the data of the site's moving figures: docs/site/static/play/*-data.js and frames.jpg.
 
-    python tools/figure_data.py
+    python tools/figure_data.py [--only kernels | --only fit | --only scene]
 
-Trains chapter 09's sphere with the backend cpu (half a minute). The figures read scripts and pictures instead of JSON,
-because pages that are opened from disk may load these.
+Trains the sphere of chapters 07 and 09 with the backend cpu (half a minute), except for the fit of chapter 08. The
+figures read scripts and pictures instead of JSON, because pages that are opened from disk may load these.
 """
 
 from __future__ import annotations
 
+import argparse
+import base64
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.cbook import get_sample_data
 from PIL import Image
 
 from gsplat_edu import Camera, sphere_shell
+from gsplat_edu.data.images import decode
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
+from gsplat_edu.engine.passes import Program, manifest
+from gsplat_edu.fit2d.fit import shrunk_photo
+from gsplat_edu.fit2d.splats import random_splats_2d
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.gaussian_math import project_cov3d
@@ -27,6 +35,9 @@ from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "benchmarks"))
+from ladder import gpu  # noqa: E402
+
 OUT = ROOT / "docs" / "site" / "static" / "play"
 SIZE, ITERATIONS, CAP, SEED = 128, 800, 1600, 9
 """The budget of chapter 09."""
@@ -39,6 +50,9 @@ DENSIFIED = 300
 
 SHELL = 600
 """Splats of the sphere to turn."""
+
+FIT_SIZE, FIT_SPLATS, FIT_SEED = 56, 90, 8
+"""Longer side of chapter 08's photo in px, its splats, and the seed of the chapter."""
 
 
 def write(name: str, value: object) -> None:
@@ -108,9 +122,61 @@ class Diary:
             }
 
 
+def kernels() -> dict[str, object]:
+    """Return the programs of the figures that run WGSL kernels, by the figure's name: shaders, buffers and passes."""
+
+    def without(program: Program, *parts: str) -> Program:
+        kept = {name: passes for name, passes in program.parts.items() if name not in parts}
+        used = {name for passes in kept.values() for one in passes for name in (*one.reads, *one.writes)}
+        return Program(tuple(buffer for buffer in program.buffers if buffer.name in used | {"live"}), kept)
+
+    tiles = gpu.tiles_program(24)  # figures of 96 x 64 px
+    programs = {"naive": gpu.naive_program(), "tiles": without(tiles, "backward"), "slots": tiles}
+    return {name: {"program": manifest(program, gpu.source)} for name, program in programs.items()}
+
+
+def fit_data() -> dict[str, object]:
+    """Return chapter 08's photo as bytes and its start: rows u, v, log scales, angle, r, g, b, logit."""
+    # Grace Hopper, a portrait by the US Navy, in the public domain. It comes with matplotlib.
+    photo = shrunk_photo(decode(Path(get_sample_data("grace_hopper.jpg", asfileobj=False)))[0], FIT_SIZE)
+    tall, wide, _ = photo.shape
+    start = random_splats_2d(FIT_SPLATS, tall, wide, np.random.default_rng(FIT_SEED))
+    rows = np.concatenate([array.reshape(FIT_SPLATS, -1) for array in start.arrays().values()], axis=1)
+    pixels = base64.b64encode(np.uint8(np.clip(photo, 0, 1) * 255 + 0.5).tobytes()).decode()
+    return {"wide": wide, "tall": tall, "pixels": pixels, "start": np.round(rows, 4).tolist()}
+
+
+def scene_data(gaussians: Gaussians) -> dict[str, object]:
+    """Return raw values as whole numbers: the means of 16 bits, then log scales, quaternions, sh0 and logit of 8 bits.
+
+    A value is its column's low end plus the number times the column's step. Rows follow one another, in base64.
+    """
+    raw = {name: values.detach().double().numpy() for name, values in gaussians.tensors().items()}
+    rest = ("log_scales", "quats", "sh0", "logit_opacities")
+    narrow = np.concatenate([raw[name].reshape(len(gaussians), -1) for name in rest], axis=1)
+    stored: dict[str, object] = {"count": len(gaussians)}
+    for name, values, kind in (("wide", raw["means"], "<u2"), ("narrow", narrow, "<u1")):
+        low = values.min(axis=0)
+        step = np.ptp(values, axis=0) / np.iinfo(kind).max
+        numbers = np.rint((values - low) / step).astype(kind)
+        stored[name] = base64.b64encode(numbers.tobytes()).decode()
+        stored[f"{name}_columns"] = np.stack([low, step], axis=-1).tolist()
+    return stored
+
+
 def main() -> None:
     """Train, and write the files."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", choices=["kernels", "fit", "scene"], help="write only these data")
+    only = parser.parse_args().only
     OUT.mkdir(parents=True, exist_ok=True)
+    if only in (None, "kernels"):
+        for name, value in kernels().items():
+            write(name, value)
+    if only in (None, "fit"):
+        write("fit", fit_data())
+    if only in ("kernels", "fit"):
+        return
     diary = Diary(sphere_capture(SIZE))
     generator = torch.Generator().manual_seed(SEED)
     start = Start(random_ball(400, generator), extent=course.EXTENT, generator=generator)
@@ -119,6 +185,9 @@ def main() -> None:
     trainer = training(config, views, load_backend("cpu"), start, callbacks=[diary.note])
     diary.picture(trainer.gaussians)
     trainer.run()
+    write("scene", scene_data(trainer.gaussians))
+    if only:
+        return
     truth = np.uint8(np.clip(diary.capture.held_out.image, 0, 1) * 255 + 0.5)
     Image.fromarray(np.concatenate([*diary.frames, truth], axis=1)).save(OUT / "frames.jpg", quality=88)
     print(f"frames.jpg: {(OUT / 'frames.jpg').stat().st_size / 1e3:.0f} kB")

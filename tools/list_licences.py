@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "LICENCES.md"
-EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu")
+EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu", "mesh")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {
@@ -54,7 +54,7 @@ NOTES = {
 }
 """What the metadata of a package do not say about its wheels."""
 
-TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause"}
+TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause", "xatlas": "MIT"}
 """Packages whose metadata contain the text of their licence, but not its SPDX name."""
 
 CLASSIFIERS = {

@@ -1,6 +1,7 @@
 """Put the moving figures into the pages of chapters, below the pictures that stand for them where scripts are off.
 
-The scripts are in docs/site/static/play, their data from `tools/figure_data.py`. Notebooks do not contain the figures.
+The scripts are in docs/site/static/play, their data from `tools/figure_data.py` and `tools/figure_photos.py`. Notebooks
+do not contain the figures.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ class Figure(NamedTuple):
         name: Name of the script, and of the figure in it.
         caption: First line of the figure.
         data: Whether the figure has a data script.
+        shared: Scripts that it shares with figures of other chapters, in their order.
     """
 
     chapter: str
@@ -24,13 +26,34 @@ class Figure(NamedTuple):
     name: str
     caption: str
     data: bool = True
+    shared: tuple[str, ...] = ()
 
+
+GPU = ("gpu.js", "screen.js")
+"""Scripts of the figures that run the package's kernels."""
 
 FIGURES = (
+    Figure("01_points", "distances = (8.0, 4.0, 2.0)", "points", "Walk around the points", data=False),
     Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
+    Figure("03_gaussians_in_3d", '"then turned: R S"', "ellipsoid", "Turn a Gaussian", data=False),
+    Figure("04_splatting", "the axes zoom in", "tangent", "Drag a Gaussian", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
+    Figure("06_spherical_harmonics", "gloss of one splat", "harmonics", "Drag a coefficient", data=False),
+    Figure("07_a_trained_scene", '"nothing forgotten": complete', "scene", "Forget a function"),
+    Figure("08_fit_an_image", '"its ellipses"', "fit", "Fit the splats, step by step"),
     Figure("09_train_in_3d", "no step of the training saw this view", "training", "Go through the training"),
     Figure("09_train_in_3d", 'title="training loss"', "density", "Move the threshold of densification"),
+    Figure("10_the_naive_kernel", '"the kernel, float32"', "naive", "Run the naive kernel", shared=GPU),
+    Figure("11_tiles", 'title=f"tiles met:', "tiles", "Drag splats over tiles", shared=GPU),
+    Figure("12_the_backward_pass", "a splat adds up its column", "slots", "Who writes where", shared=GPU),
+    Figure(
+        "13_back_to_the_parameters",
+        "L of q = (w, 0, 0, z)",
+        "chain",
+        "Drag a number of a Gaussian",
+        data=False,
+    ),
+    Figure("14_photos_to_scene", "held_out = sorted(", "wipe", "Wipe between photo and render"),
 )
 
 STATIC = "../_static/play/"
@@ -48,7 +71,8 @@ def with_figures(chapter: str, notebook: dict[str, Any]) -> None:
         SystemExit: no cell, or more than one, has the text that a figure follows.
     """
     chosen = [figure for figure in FIGURES if figure.chapter == chapter]
-    scripts = ["play.js"] if chosen else []
+    scripts = ["play.js", "algebra.js"] if chosen else []
+    scripts += dict.fromkeys(script for figure in chosen for script in figure.shared)
     for figure in chosen:
         cells = notebook["cells"]
         places = [

@@ -17,7 +17,19 @@ def oracle(splats: Splats, extent: Extent = "exact", stop: Stop = "none") -> tup
     return render_gaussians(*splats.flat(), extent=extent, stop=stop)
 
 
-def tolerance(splats: Splats, conics_again: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def alpha_error(size: np.ndarray, wgsl: bool = False, more_per_term: float = 0) -> np.ndarray:
+    """Return d, the bound on the relative error of alpha in `tolerance`, for exponents whose terms have this size S.
+
+    A WGSL kernel may compute the exponent as s² + t² from rounded coefficients, and its exp2 may err by 3 + 2 |p| units
+    in the last place: there d = e (26 S + 62), |p| being at most 8 above the floor.
+    """
+    per_term, once = (26, 62) if wgsl else (10, 24)
+    return ROUNDING * ((per_term + more_per_term) * size + once)
+
+
+def tolerance(
+    splats: Splats, conics_again: bool = False, wgsl: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Bound how far a float32 kernel may be from `oracle`, per pixel, for image (H, W, 3) and transmittance (H, W).
 
     Let e = 2^-24, and let S = (A dx² + C dy²) / 2 + |B dx dy| be the size of the exponent's terms, which may cancel.
@@ -30,18 +42,19 @@ def tolerance(splats: Splats, conics_again: bool = False) -> tuple[np.ndarray, n
     Args:
         splats: The splats that are drawn.
         conics_again: The kernel was given covariances and inverts them in float32, where the determinant cancels.
+        wgsl: The kernel is one of `ladder.gpu`.
     """
     y, x = np.mgrid[: splats.H, : splats.W]
     T, T_error = np.ones((2, splats.H, splats.W)) * [[[1.0]], [[0.0]]]
-    image, image_error, drawn = np.zeros((splats.H, splats.W, 3)), np.zeros((splats.H, splats.W, 3)), 0
+    image, image_error = np.zeros((2, splats.H, splats.W, 3))
+    drawn = np.zeros((splats.H, splats.W), int)
     for i in range(splats.count):
         (u, v), (A, B, C) = splats.means2d[i].astype(float), splats.conics[i].astype(float)
         dx, dy = x - u, y - v
         square, cross = 0.5 * (A * dx * dx + C * dy * dy), B * dx * dy
         cancels = (A * C + B * B) / (A * C - B * B)
-        per_term = 10 + (16 * cancels if conics_again else 0)
         alpha = np.minimum(ALPHA_MAX, splats.opacities[i] * np.exp(-square - cross))
-        error = ROUNDING * (per_term * (square + np.abs(cross)) + 24)
+        error = alpha_error(square + np.abs(cross), wgsl, 16 * cancels if conics_again else 0)
         error = np.where(np.abs(alpha - ALPHA_MIN) <= error * ALPHA_MIN, 1.0, error)
         alpha = np.where((alpha >= ALPHA_MIN) | (error == 1.0), alpha, 0.0)
         w = (T * alpha)[..., None] * np.abs(splats.colors[i])

@@ -38,7 +38,7 @@ from gsplat_edu.render.torch_reference import render_t
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
 sys.path.insert(0, str(ROOT / "benchmarks"))
-from ladder import forward, oracle, splats
+from ladder import forward, gpu, oracle, splats
 
 # GSPLAT_EDU_BUDGET=reduced: a quarter of the pixels, fewer splats where time is measured.
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
@@ -292,6 +292,36 @@ else:
     print(f"{small.count} splats, {small.pixels} pixels in {1e3 * block_seconds:.1f} ms")
     print(f"against the reference: at most {np.abs(block_image - expected).max():.1e}")
     assert (np.abs(block_image - expected) <= bound).all() and (np.abs(block_t - expected_t) <= bound_t).all()
+
+# %% [markdown]
+# ## The same kernel in WGSL
+#
+# WGSL is the shading language of WebGPU: browsers run it, and so does Python with the package wgpu. The package's
+# backend `webgpu` is written in it. An [*invocation*](../docs/GLOSSARY.md#invocation), one run of the kernel with its
+# own registers, is one pixel. Invocations start in groups, here of 64, and a group runs on one core of the GPU: a
+# [*workgroup*](../docs/GLOSSARY.md#workgroup). This kernel needs nothing from its neighbours, so the 64 is arbitrary.
+
+# %%
+print((LADDER / "naive.wgsl").read_text())
+
+# %% [markdown]
+# It is the C++ without the two outer loops, `continue` included. Yet here `continue` saves nothing unless all agree.
+# The core executes a workgroup as [*subgroups*](../docs/GLOSSARY.md#subgroup) of, say, 32 invocations, which CUDA calls
+# warps. All of a subgroup take the same instruction at the same time. While one of them blends, the other 31 wait.
+#
+# Its exponential may err more than that of C: WGSL allows $3 + 2|x|$ units in the last place, each of them two
+# $\epsilon$. `tolerance(..., wgsl=True)` has room for it.
+
+# %%
+if not gpu.available():
+    print(gpu.where(), "- so the kernel above did not run")
+else:
+    on_gpu, gpu_t = gpu.naive(cloud)
+    bound, bound_t = oracle.tolerance(cloud, wgsl=True)
+    expected, expected_t = oracle.oracle(cloud)
+    print(f"ran on {gpu.where()}: {cloud.pixels} invocations in {-(-cloud.pixels // 64)} workgroups")
+    print(f"against the reference: at most {np.abs(on_gpu - expected).max():.1e}")
+    assert (np.abs(on_gpu - expected) <= bound).all() and (np.abs(gpu_t - expected_t) <= bound_t).all()
 
 # %% [markdown]
 # ## The law of the naive kernel

@@ -31,11 +31,12 @@ from matplotlib.patches import Ellipse, Rectangle
 from gsplat_edu import _native, sphere_shell
 from gsplat_edu.base.constants import ALPHA_MIN, DILATION, T_STOP, TILE
 from gsplat_edu.data.synthetic import sphere_cameras
+from gsplat_edu.engine.passes import LIMITS
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
 LADDER = ROOT / "benchmarks" / "ladder"
 sys.path.insert(0, str(ROOT / "benchmarks"))
-from ladder import forward, oracle, splats
+from ladder import forward, gpu, oracle, splats
 
 # GSPLAT_EDU_BUDGET=reduced: fewer splats where time is measured.
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
@@ -382,6 +383,51 @@ print(f"evaluations that mattered, of those in a row of sixteen: {100 * did.matt
 # Thirty-six bytes for more than a hundred instructions: it is not the bandwidth of memory that binds. But
 # many more independent multiply-adds fit into the same time. The difference is waiting: each step of a
 # row needs the one before, and a list jumps about in memory. The package waits and computes less; that is its lead.
+#
+# ## The same on a GPU
+#
+# A GPU takes the same steps, and each has to be spread over thousands of invocations. Counting is easy: one
+# [invocation](../docs/GLOSSARY.md#invocation) counts the tiles of one splat. In a prefix sum every number needs all the
+# numbers before it. Inside a workgroup that can be arranged. Its invocations share [*workgroup
+# memory*](../docs/GLOSSARY.md#workgroup-memory), a few kilobytes beside the arithmetic, and a
+# [*barrier*](../docs/GLOSSARY.md#barrier) is a line that none of them crosses before all have reached it. With 256
+# invocations, eight rounds do it. In each, an invocation adds the number 1, 2, 4, ... places before its own:
+
+# %%
+ENGINE = ROOT / "src" / "gsplat_edu" / "engine"
+text = (ENGINE / "scan.wgsl").read_text()
+print(text[text.index("fn scan_threads") : text.index("@compute")])
+
+# %% [markdown]
+# Between workgroups there is no barrier, and none may wait for another, which perhaps has not begun. So a longer sum
+# takes three passes: each workgroup adds up a block of counts, one workgroup scans the blocks' sums, and each
+# workgroup scans its block from there. "The next free place" of a list would again be an order of arrival. Instead each
+# splat writes its pairs into its own places, and a stable sort by tile brings them together, near ones first.
+#
+# Then a workgroup takes a tile, and an invocation a pixel. All 256 pixels want the same splats, so they fetch 64 of
+# them at a time into workgroup memory, and memory is read once for each tile instead of once for each pixel:
+
+# %%
+text = (ENGINE / "composite.wgsl").read_text()
+print(text[text.index("fn load_splat") : text.index("    if (lane == 0u) {\n        done")])
+
+if not gpu.available():
+    print(gpu.where(), "- so the kernels above did not run")
+else:
+    drawn = gpu.Tiled(odd)
+    expected, _ = oracle.oracle(odd, stop="tile")
+    share = (np.abs(drawn.image - expected) / (oracle.tolerance(odd, wgsl=True)[0] + 1e-30)).max()
+    print(f"ran on {gpu.where()}: {len(drawn.lists.splat)} pairs in {len(drawn.lists.begin) - 1} tiles")
+    print(f"against the reference: largest difference {share:.3f} of its pixel's tolerance")
+    near_to_far = [(np.diff(part) > 0).all() for part in np.split(drawn.lists.splat, drawn.lists.begin[1:-1])]
+    assert share <= 1 and all(near_to_far)
+print(f"bytes of a batch of 64 splats {64 * 48}, promised {LIMITS['max-compute-workgroup-storage-size']}")
+
+# %% [markdown]
+# Why not a larger batch? A core of a GPU hides the wait for memory by having other work at hand: while one
+# [subgroup](../docs/GLOSSARY.md#subgroup) waits, another computes. The share of the subgroups that a core has room for
+# and really holds is its [*occupancy*](../docs/GLOSSARY.md#occupancy). Registers and workgroup memory are divided among
+# them, so a workgroup that takes twice the memory may leave half as many to switch to.
 #
 # ## The next failure
 #

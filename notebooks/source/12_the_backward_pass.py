@@ -29,7 +29,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, T_STOP
+from gsplat_edu.base.constants import ALPHA_MAX, T_STOP
 from gsplat_edu.data.synthetic import sphere_cameras, sphere_capture
 from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
@@ -42,33 +42,17 @@ from gsplat_edu.train.optimizer import Adam
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
 sys.path.append(str(ROOT / "benchmarks"))
-from ladder import backward, forward, splats
+
+from ladder import backward, forward, gpu, oracle, splats, tape
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 SIZE, CAP, ITERATIONS = (64, 800, 300) if SHORT else (128, 1600, 800)
 print(f"budget: {ITERATIONS} iterations, {SIZE} px, at most {CAP} splats{' (reduced)' if SHORT else ''}")
 DENSE, KERNELS = (functools.partial(render, backend=name) for name in ("torch", "cpu"))
 camera = sphere_cameras(SIZE)[8]
-
-
-def kept_bytes(count):
-    kept, cloud = {}, random_ball(count, torch.Generator().manual_seed(12)).trainable()
-
-    def note(tensor):
-        storage = tensor.untyped_storage()
-        kept[storage.data_ptr()] = storage.nbytes()
-        return tensor
-
-    start = time.perf_counter()
-    with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        loss = DENSE(cloud, camera).image.abs().mean()
-    middle = time.perf_counter()
-    loss.backward()
-    return sum(kept.values()), middle - start, time.perf_counter() - middle
-
-
 numbers = [50, 100, 200, 400] + ([] if SHORT else [800])
-measured = [kept_bytes(n) for n in numbers]
+clouds = [random_ball(n, torch.Generator().manual_seed(12)).trainable() for n in numbers]
+measured = [tape.kept_bytes(lambda c=c: DENSE(c, camera).image.abs().mean()) for c in clouds]
 for n, (kept, there, back) in zip(numbers, measured, strict=True):
     print(f"{n:5d} splats: {kept / 1e6:7.1f} MB kept, {1e3 * there:7.1f} ms there, {1e3 * back:7.1f} ms back")
 each = measured[-1][0] / (numbers[-1] * SIZE * SIZE)
@@ -201,20 +185,10 @@ assert largest < 1
 
 
 # %%
-def dense_image(means2d, conics, colors, opacities, H, W):
-    y, x = torch.meshgrid(torch.arange(H).double(), torch.arange(W).double(), indexing="ij")
-    dx, dy = x - means2d[:, 0, None, None], y - means2d[:, 1, None, None]
-    A, B, C = conics[..., None, None].unbind(1)
-    alphas = opacities[:, None, None] * torch.exp(-0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy)
-    alphas = torch.where(alphas < ALPHA_MIN, 0.0, torch.clamp(alphas, max=ALPHA_MAX))
-    T = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), dim=0)
-    return torch.einsum("nhw,nc->hwc", T[:-1] * alphas, colors), (alphas, T[:-1], dx, dy)
-
-
 def by_moments(leaves, g, H, W):
     """The gradients again, by hand: R for all pixels at once, then moments, the factors dx last."""
     with torch.no_grad():
-        image, (alphas, T, dx, dy) = dense_image(*leaves, H, W)
+        image, (alphas, T, dx, dy) = tape.dense_image(*leaves, H, W)
         (A, B, C), (colors, opacities) = leaves[1].unbind(1), leaves[2:]
         cg = torch.einsum("nc,hwc->nhw", colors, g)
         R = (g * image).sum(-1) - torch.cumsum(T * alphas * cg, dim=0)
@@ -227,17 +201,10 @@ def by_moments(leaves, g, H, W):
         return means, conics, torch.einsum("nhw,hwc->nc", T * alphas, g), m / opacities
 
 
-def autograd_gradients(cloud, g):
-    leaves = [torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in cloud[:4]]
-    image, (alphas, T, _, _) = dense_image(*leaves, cloud.H, cloud.W)
-    (image * g).sum().backward()
-    return leaves, [leaf.grad for leaf in leaves], alphas.detach(), T.detach()
-
-
-cloud = splats.scene(300, 48, seed=4)
+cloud = splats.scene(300, 48, seed=5)
 cloud.opacities[::3] = 1  # some alphas are clamped
 g = torch.tensor(rng.normal(size=(48, 48, 3)).astype(np.float32)).double()
-leaves, reference, alphas, T = autograd_gradients(cloud, g)
+leaves, reference, alphas, T = tape.autograd_gradients(cloud, g)
 hand = by_moments(leaves, g, cloud.H, cloud.W)
 print(f"{(alphas == ALPHA_MAX).sum()} alphas are clamped, {(alphas == 0).sum()} below the floor")
 assert (alphas == ALPHA_MAX).any() and (alphas == 0).any()
@@ -259,6 +226,17 @@ for name, mine, theirs in zip(cloud._fields, hand, reference, strict=False):
 # what slots buy here is not time, it is the bits.
 
 # %%
+met = (alphas.reshape(-1, 3, 16, 3, 16).amax((2, 4)) > 0).reshape(-1, 9)
+number = np.where(met, np.cumsum(met).reshape(met.shape) - 1, np.nan)[:60]
+fig, ax = plt.subplots(figsize=(11, 2.4), layout="constrained")
+shown = ax.imshow(number.T, aspect="auto", interpolation="nearest")
+fig.colorbar(shown, ax=ax, label="slot")
+ax.set(
+    title="a tile writes to its row, a splat adds up its column", xlabel="splat, near to far", ylabel="tile"
+)
+plt.show()
+
+# %%
 print("// Every pair" + (ROOT / "benchmarks/ladder/backward.cpp").read_text().split("// Every pair")[2])
 
 # Both have to be right: within the rounding of R, n layers, and once more for the sums.
@@ -272,21 +250,46 @@ for name, rung in backward.RUNGS.items():
     print(f"{name:8} sum h: worst error {share:.4f} of what rounding may do")
     assert share < 1
 
-cloud = splats.scene(*((2000, 128) if SHORT else (20_000, 512)), seed=12)
-image = forward.tight(cloud).image
-g = rng.normal(size=image.shape).astype(np.float32)
+many = splats.scene(*((2000, 128) if SHORT else (20_000, 512)), seed=12)
+image = forward.tight(many).image
+slope = rng.normal(size=image.shape).astype(np.float32)
 for name in backward.RUNGS:
-    one, two = (1e3 * backward.seconds(name, cloud, image, g, threads) for threads in (1, 2))
-    print(f"{name:8} {cloud.count} splats: {one:.1f} ms on one thread, {two:.1f} ms on two")
-arrivals = {backward.atomics(cloud, image, g, threads=2).bits() for _ in range(20)}
+    one, two = (1e3 * backward.seconds(name, many, image, slope, threads) for threads in (1, 2))
+    print(f"{name:8} {many.count} splats: {one:.1f} ms on one thread, {two:.1f} ms on two")
+arrivals = {backward.atomics(many, image, slope, threads=2).bits() for _ in range(20)}
 print(f"atomics, two threads, 20 runs: {len(arrivals)} different results")
 # That is luck, and not asserted. That three fixed orders of the same additions differ is not luck.
-orders = [np.roll(np.arange(backward.num_tiles(cloud)), shift) for shift in (0, 7, 20)]
-shared = {backward.atomics(cloud, image, g, 1, order).bits() for order in orders}
+orders = [np.roll(np.arange(backward.num_tiles(many)), shift) for shift in (0, 7, 20)]
+shared = {backward.atomics(many, image, slope, 1, order).bits() for order in orders}
 print(f"atomics, one thread, three fixed orders of the tiles: {len(shared)} different results")
-slotted = {backward.slots(cloud, image, g, n, order).bits() for n in (1, 2, 3) for order in orders}
+slotted = {backward.slots(many, image, slope, n, order).bits() for n in (1, 2, 3) for order in orders}
 print(f"slots, these orders and 1, 2 and 3 threads: {len(slotted)} result")
 assert len(shared) == 3 and len(slotted) == 1
+
+# %% [markdown]
+# ## The same on a GPU
+#
+# WGSL has no atomic addition of floats, and the engine's kernel, `engine/composite_backward.wgsl`, needs none. A
+# workgroup takes a tile, and now an [invocation](../docs/GLOSSARY.md#invocation) owns a splat, whose sums stay in its
+# registers. $T$ and $R$ of the pixels lie in [workgroup memory](../docs/GLOSSARY.md#workgroup-memory). A pixel has to
+# meet its splats near to far, so they come one behind the other: at turn $i$, invocation $t$ takes pixel $i - t$,
+# which invocation $t - 1$ has just left.
+
+# %%
+text = (ROOT / "src/gsplat_edu/engine/composite_backward.wgsl").read_text()
+print(text[text.index("        var sums = Sums") : text.index("    for (var k = stop")].strip("\n"))
+print((ROOT / "benchmarks/ladder/add_slots.wgsl").read_text().split("\n\n", 2)[2])
+
+if not gpu.available():
+    print(gpu.where(), "- so the kernels above did not run")
+else:
+    slot_sums = gpu.Tiled(cloud).backward(g.numpy())[1]
+    found = torch.tensor(slot_sums[:, 4] / cloud.opacities)
+    # Here an alpha may be off by d instead of eps; none in this scene is that near to the floor or the clamp.
+    loose = bound * oracle.alpha_error(np.log(255), wgsl=True) / 2.0**-23
+    share = float(((found - reference[3]).abs() * leaves[3].detach() / loose).max())
+    print(f"ran on {gpu.where()}: sum h, worst error {share:.4f} of what rounding may do")
+    assert share < 1 and slot_sums.tobytes() == gpu.Tiled(cloud).backward(g.numpy())[1].tobytes()
 
 # %% [markdown]
 # ## The package's
@@ -367,8 +370,7 @@ plt.show()
 #
 # ## The same training, again
 #
-# The run of chapter 09, capture, cloud, seed, schedule and all. Only the renderer differs. Everything runs on one
-# thread.
+# The run of chapter 09, capture, cloud, seed, schedule and all, on one thread. Only the renderer differs.
 
 # %%
 torch.set_num_threads(1)

@@ -1,106 +1,17 @@
 """The moving figures of the site: they compute with the course's formulas and follow mouse, keys and touch."""
 
+import io
 import itertools
 import json
 import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from browsers import chromium
 from chapters import ROOT, tool
+from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, drag, read_data, state, swipe, told
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
-
-STATIC = ROOT / "docs" / "site" / "static"
-FIGURES = re.findall(r'Figure\("(\w+)", .*, "(\w+)", "', (ROOT / "tools" / "site_figures.py").read_text())
-CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
-
-
-def data(name):
-    """Read the data of a figure as the page does: a script with one JSON value."""
-    text = (STATIC / "play" / f"{name}-data.js").read_text()
-    return json.loads(text.split(" = ", 1)[1].rstrip(";\n"))
-
-
-@pytest.fixture(scope="module")
-def pages(tmp_path_factory):
-    """Pages with nothing but the cells that `with_figures` adds, one for each chapter."""
-    out = tmp_path_factory.mktemp("figures")
-    (out / "notebooks").mkdir()
-    (out / "_static").symlink_to(STATIC)
-    for chapter in CHAPTERS:
-        notebook = json.loads((ROOT / "notebooks" / f"{chapter}.ipynb").read_text())
-        before = len(notebook["cells"])
-        tool("site_figures").with_figures(chapter, notebook)
-        added = [cell["source"] for cell in notebook["cells"] if cell["id"].startswith("figure-")]
-        assert len(added) == len(notebook["cells"]) - before
-        head = '<!doctype html><meta name="viewport" content="width=device-width">'
-        head += '<link rel="stylesheet" href="../_static/site.css">'
-        head += "<style>body { margin: 0; --color-brand-primary: #2962ff; }</style>"
-        (out / "notebooks" / f"{chapter}.html").write_text(head + "\n".join(added))
-    return out / "notebooks"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as launched:
-        yield launched
-
-
-@pytest.fixture
-def opened(browser, pages):
-    """Open a chapter's page on a phone with a touch screen; a message in the console fails the test."""
-    messages, contexts = [], []
-
-    def opening(chapter, **settings):
-        context = browser.new_context(viewport={"width": 390, "height": 800}, has_touch=True, **settings)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("console", lambda message: messages.append(message.text))
-        page.on("pageerror", lambda error: messages.append(str(error)))
-        page.goto((pages / f"{chapter}.html").as_uri())
-        return page
-
-    yield opening
-    for context in contexts:
-        context.close()
-    assert messages == []
-
-
-def state(page, name):
-    return page.evaluate(f"gsplatPlay.live.{name}.state")
-
-
-def told(page, name):
-    return page.locator(f"[data-play={name}] output").inner_text()
-
-
-def canvas_box(page, name):
-    canvas = page.locator(f"[data-play={name}] canvas")
-    canvas.scroll_into_view_if_needed()
-    return canvas, canvas.bounding_box()
-
-
-def drag(page, start, end):
-    page.mouse.move(*start)
-    page.mouse.down()
-    page.mouse.move(*end, steps=4)
-    page.mouse.up()
-
-
-def swipe(page, start, end):
-    """Drag with a finger."""
-    touch = page.context.new_cdp_session(page)
-
-    def send(kind, *points):
-        touch.send(
-            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": y} for x, y in points]}
-        )
-
-    send("touchStart", start)
-    for share in (0.25, 0.5, 0.75, 1.0):
-        send("touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
-    send("touchEnd")
 
 
 def test_a_splat_is_computed_like_the_chapter(opened):
@@ -126,7 +37,7 @@ def test_a_splat_is_computed_like_the_chapter(opened):
 
 
 def test_the_sphere_is_composited_like_the_reference(opened):
-    page, shell = opened("05_sort_and_composite"), data("sphere")
+    page, shell = opened("05_sort_and_composite"), read_data("sphere")
     count, size = len(shell["means"]), 48
     means, _, _, opacities = sphere_shell(count)
     assert np.allclose(shell["means"], means, rtol=0, atol=1e-5)
@@ -150,7 +61,7 @@ def test_the_sphere_is_composited_like_the_reference(opened):
 
 
 def test_fates_are_those_of_the_training(opened):
-    page, recorded = opened("09_train_in_3d"), data("density")
+    page, recorded = opened("09_train_in_3d"), read_data("density")
     fates = page.evaluate("gsplatPlay.fates(gsplatData.density, gsplatData.density.threshold)")
     assert fates["counts"]["cloned"] == recorded["cloned"]
     assert 2 * fates["counts"]["split"] == recorded["children"]
@@ -164,9 +75,10 @@ def test_fates_are_those_of_the_training(opened):
 
 
 def test_the_training_on_record_is_that_of_the_chapter():
-    record, recipe = data("training"), tool("figure_data")
+    record, recipe = read_data("training"), tool("figure_data")
     assert record["frames"] == list(recipe.FRAMES) and record["size"] == recipe.SIZE
-    assert data("density")["iteration"] == recipe.DENSIFIED and len(data("sphere")["means"]) == recipe.SHELL
+    assert read_data("density")["iteration"] == recipe.DENSIFIED
+    assert len(read_data("sphere")["means"]) == recipe.SHELL
     notebook = (ROOT / "notebooks" / "09_train_in_3d.ipynb").read_text()
     printed = re.findall(r"iter +(\d+)  L1 ([\d.]+)  K (\d+)", notebook)
     assert len(printed) == 8
@@ -284,10 +196,69 @@ def test_a_figure_follows_a_picture_of_its_chapter():
         for above, cell in itertools.pairwise(notebook["cells"]):
             if cell["id"].startswith("figure-") and cell["id"] != "figure-scripts":
                 kinds = {kind for output in above["outputs"] for kind in output.get("data", {})}
-                assert "image/png" in kinds, cell["id"]
+                assert kinds & {"image/png", "image/jpeg"}, cell["id"]
 
 
 def test_a_figure_without_its_cell_stops_the_build():
     notebook = {"cells": [{"cell_type": "code", "source": "1 + 1"}]}
     with pytest.raises(SystemExit, match="0 code cells contain"):
         tool("site_figures").with_figures("02_gaussians_in_2d", notebook)
+
+
+def test_the_photos_to_wipe_are_those_of_the_chapter():
+    recipe, record = tool("figure_photos"), read_data("wipe")
+    width, height = record["width"], record["height"]
+    assert (width, height) == recipe.SIZE and record["brightest"] == recipe.BRIGHTEST
+    path = STATIC / "play" / "wipe.jpg"
+    assert path.stat().st_size <= recipe.LARGEST
+    notebook = (ROOT / "notebooks" / "14_photos_to_scene.ipynb").read_text()
+    assert len(record["views"]) == recipe.VIEWS
+    for view in record["views"]:
+        assert f"{view['name']} {view['psnr']:.2f} dB" in notebook
+    with Image.open(path) as opened_strip:
+        strip = np.asarray(opened_strip.convert("RGB"), dtype=float)
+    assert strip.shape == (3 * height, len(record["views"]) * width, 3)
+    photos, renders, errors = strip.reshape(3, height, -1, 3)
+    again = np.minimum(np.abs(photos - renders).mean(axis=-1) / 255 / record["brightest"], 1)
+    # Shrinking averages the pixels' errors but not their signs, and JPEG adds noise: only large parts agree.
+    coarse = [
+        image.reshape(height // 30, 30, -1, 30).mean(axis=(1, 3))
+        for image in (again, errors.mean(axis=-1) / 255)
+    ]
+    assert np.corrcoef(*map(np.ravel, coarse))[0, 1] > 0.9
+
+
+def test_the_line_follows_mouse_finger_and_keys(opened):
+    page = opened("14_photos_to_scene")
+    _, box = canvas_box(page, "wipe")
+
+    def at(share):
+        return box["x"] + share * box["width"], box["y"] + box["height"] / 2
+
+    def shown():
+        """Return what is drawn around the middle of the canvas."""
+        size = {"width": 0.2 * box["width"], "height": 60}
+        taken = page.screenshot(clip={"x": at(0.5)[0], "y": at(0.5)[1] - 30, **size})
+        with Image.open(io.BytesIO(taken)) as image:
+            return np.asarray(image.convert("RGB"), dtype=float)
+
+    drag(page, at(0.5), at(0.2))
+    assert np.isclose(state(page, "wipe")["share"], 0.2, rtol=0, atol=0.02)
+    swipe(page, at(0.2), at(0.8))
+    assert np.isclose(state(page, "wipe")["share"], 0.8, rtol=0, atol=0.02)
+    photo, words = shown(), told(page, "wipe")
+    slider = page.locator("[data-play=wipe] input[type=range]").first
+    slider.focus()
+    page.keyboard.press("Home")
+    assert state(page, "wipe")["share"] == 0 and told(page, "wipe") != words
+    assert slider.get_attribute("aria-valuetext") == told(page, "wipe")
+    render = shown()
+    assert 1 < np.abs(render - photo).mean() < 30, "the render is close to the photo, but not the same"
+    page.get_by_label("error instead of the render").tap()
+    assert state(page, "wipe")["error"] and told(page, "wipe").endswith("error")
+    error = shown()
+    assert error.mean() < min(photo.mean(), render.mean()) - 20, "most of the error is dark"
+    page.locator("[data-play=wipe] input[type=range]").nth(1).focus()
+    page.keyboard.press("End")
+    assert state(page, "wipe")["view"] == len(read_data("wipe")["views"]) - 1
+    assert np.abs(shown() - error).mean() > 1 and read_data("wipe")["views"][-1]["name"] in told(page, "wipe")

@@ -40,6 +40,7 @@ ELSEWHERE = {
     "check_objects.py": "tools/sanitize.sh",
     "landing_scene.py": "tools/build_site.py",
     "figure_data.py": "tests/repo/test_figures.py",
+    "figure_photos.py": "tests/repo/test_figures.py",
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
     "make_city.py": "tests/data/test_city.py",

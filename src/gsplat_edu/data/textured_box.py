@@ -1,7 +1,7 @@
 """Photos with known cameras of a textured box on a floor, with enough texture for feature matching.
 
 Six textured rectangles are drawn with OpenCV homographies instead of this package's renderer, so training on them is an
-independent test. Structure from motion is tested on these photos, and chapter 14 starts with them.
+independent test. Structure from motion is tested on these photos. Chapter 14 compares cameras by `align_cameras`.
 
 Chapter: 14_photos_to_scene.
 """

@@ -15,7 +15,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ class Device:
         limits: What it is asked for, by the names of `LIMITS`; None for all that the adapter has.
         most_groups: Workgroups in one dimension; more continue in the second.
         pace: How long its submissions may take.
+        source: Returns the WGSL of a module by its name; None for `passes.module_source`.
 
     Raises:
         BackendUnavailableError: it does not start.
@@ -59,6 +60,7 @@ class Device:
         limits: Mapping[str, int] | None = None,
         most_groups: int | None = None,
         pace: Pace | None = None,
+        source: Callable[[str], str] | None = None,
     ) -> None:
         listen()
         self.name, chosen = listed_adapters()[adapter]
@@ -71,6 +73,7 @@ class Device:
         self.limits: Mapping[str, int] = wanted
         self.most_groups = most_groups or wanted["max-compute-workgroups-per-dimension"]
         self.pace = pace or Pace()
+        self._source = source
         self.lock = threading.RLock()
         self.sent, self.received, self.answered = 0, 0, 0.0
         self.recording = self.submitting = 0.0
@@ -93,7 +96,7 @@ class Device:
             raise BackendUnavailableError(
                 f"backend 'webgpu': {self.name.name} is gone; restart the computer, or use the backend cpu"
             )
-        return Device(adapters().index(self.name), self.limits, self.most_groups, self.pace)
+        return Device(adapters().index(self.name), self.limits, self.most_groups, self.pace, self._source)
 
     def is_lost(self) -> bool:
         """Return whether the system has reset the device or taken it away."""
@@ -200,7 +203,8 @@ class Device:
     def _compiled(self, one: Pass) -> tuple[Any, Any]:
         if one.module not in self._modules:
             with one_line(f"{self.name.name} refuses the shader {one.module}", self):
-                self._modules[one.module] = self.device.create_shader_module(code=module_source(one.module))
+                code = (self._source or module_source)(one.module)
+                self._modules[one.module] = self.device.create_shader_module(code=code)
         kinds = ["read-only-storage"] * len(one.reads) + ["storage"] * len(one.writes)
         storage = self.device.create_bind_group_layout(
             entries=[_entry(binding, {"type": kind}) for binding, kind in enumerate(kinds)]

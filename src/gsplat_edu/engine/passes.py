@@ -7,7 +7,7 @@ dimension.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -168,15 +168,19 @@ def module_source(module: str) -> str:
     return "\n".join((FOLDER / f"{name}.wgsl").read_text(encoding="utf-8") for name in MODULES[module])
 
 
-def manifest(program: Program) -> dict[str, object]:
+def manifest(program: Program, source: Callable[[str], str] = module_source) -> dict[str, object]:
     """Return a program as JSON for a host in another language: the shaders' text, buffers and passes.
 
     A size is {count, words, per}, as in `Size`; a pass has the fields of `Pass`.
+
+    Args:
+        program: The program.
+        source: Returns the WGSL of a module by its name.
     """
     parts = {part: [asdict(one) for one in passes] for part, passes in program.parts.items()}
     modules = sorted({one.module for one in program.passes()})
     return {
-        "modules": {name: module_source(name) for name in modules},
+        "modules": {name: source(name) for name in modules},
         "buffers": [asdict(buffer) for buffer in program.buffers],
         "parts": parts,
         "block": BLOCK,

@@ -1,16 +1,6 @@
 // Chapter 05: turn the sphere of splats. The formulas of chapters 02 to 05, in the same order, for a few hundred splats.
 "use strict";
 
-/** An orbit camera: eye, and the rows (right, down, forward) of its rotation. */
-gsplatPlay.orbit = function (azimuth, elevation, size, fx, radius = 3) {
-    const forward = [
-        -Math.cos(elevation) * Math.sin(azimuth), -Math.sin(elevation), Math.cos(elevation) * Math.cos(azimuth),
-    ];
-    const right = [Math.cos(azimuth), 0, Math.sin(azimuth)];
-    const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-    return { eye: forward.map((value) => -radius * value), R: [right, cross(forward, right), forward], size, fx };
-};
-
 /** Project a flat disk on the unit sphere: Sigma = s_t² I + (s_n² - s_t²) n n', Sigma2d = J W Sigma W' J' + 0.3 I. */
 gsplatPlay.projected = function (mean, shell, camera) {
     const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
