@@ -169,8 +169,7 @@ void normals_backward(const NormalArgs<T> &args, int64_t block) {
         for (int k = 0; k < 3; ++k) g[k] = normal.sign * args.grad[3 * i + k];
         if (normal.held) axis_backward(normal.axis, normal.q, g, of_unit);
         for (int k = 0; k < 4; ++k) along += normal.q[k] * of_unit[k];
-        for (int k = 0; k < 4; ++k)
-            args.grad_quats[4 * i + k] = normal.held ? (of_unit[k] - normal.q[k] * along) * normal.inverse : T(0);
+        for (int k = 0; k < 4; ++k) args.grad_quats[4 * i + k] = normal.held ? (of_unit[k] - normal.q[k] * along) * normal.inverse : T(0);
     }
 }
 

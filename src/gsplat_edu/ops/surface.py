@@ -17,8 +17,8 @@ from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 from gsplat_edu.scene.camera import Camera
 
 GRAZE = 0.02
-"""Smallest |cos| between a plane's normal and the ray for which the plane has a depth: 88.9 degrees. Nearer to edge-on, the
-depth's error grows without bound."""
+"""Smallest |cos| between a plane's normal and the ray for which the plane has a depth: 88.9 degrees. Nearer to edge-on,
+the depth's error grows without bound."""
 
 JUMP = 0.05
 """Largest difference of depth within a pixel's four neighbours, as a fraction of the nearest: beyond it, they lie on
@@ -46,9 +46,7 @@ def planar_depth(planes: Float[Tensor, "H W 4"], rays: Float[Tensor, "H W 3"]) -
     return torch.where(held, distance / torch.where(held, slope, 1.0), 0.0)
 
 
-def normals_of_depth(
-    depth: Float[Tensor, "H W"], rays: Float[Tensor, "H W 3"]
-) -> Float[Tensor, "H W 3"]:
+def normals_of_depth(depth: Float[Tensor, "H W"], rays: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     """Return the normals of a depth map by central differences, towards the camera.
 
     m = ty x tx,  tx = P(u + 1) - P(u - 1),  ty = P(v + 1) - P(v - 1),  P = z r
@@ -85,8 +83,8 @@ def normal_error(
     """Return how far composited normals are from those of the mean depth: weight mean_pixels a (a - N . m).
 
     m is the normal of `normals_of_depth` of the mean depth, sum w z / a; pixels without one add 0. The factors a are
-    constants. Where an opaque surface consists of splats that lie in it, the value is 0; splats of a pixel that disagree
-    shorten N and raise it.
+    constants. The value is 0 where the splats of an opaque surface lie in it; splats of a pixel that disagree shorten N
+    and raise it.
 
     Args:
         normals: (H, W, 3) composited `gsplat_edu.render.planes.facing_normals`.
@@ -96,7 +94,7 @@ def normal_error(
         weight: Factor of the value.
 
     Returns:
-        () scalar, differentiable in normals, depth and alpha; on the CPU identical to the bit for any number of threads.
+        () scalar, differentiable in normals, depth and alpha; the same bits for any number of threads on the CPU.
 
     Raises:
         ShapeError: the sizes differ.

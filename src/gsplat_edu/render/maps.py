@@ -41,8 +41,8 @@ def render_maps(
             "depth": (H, W) the same divided by alpha, 0 where nothing is. Differentiable.
             "median-depth": (H, W) depth of the Gaussian at which the transmittance falls below one half, world units,
             0 where it does not. It has no gradient.
-            "planar-depth": (H, W) depth of the composited plane, world units: exact where all Gaussians of a pixel lie in
-            one plane; 0 where nothing is, or where the plane is seen edge-on. Differentiable.
+            "planar-depth": (H, W) depth of the composited plane, world units: exact where all Gaussians of a pixel lie
+            in one plane; 0 where nothing is, or where the plane is seen edge-on. Differentiable.
             "normal": (H, W, 3) composited `facing_normals` of unit length, world axes, 0 where nothing is.
             Differentiable; see there what is constant.
             "distortion": (H, W) how far the Gaussians of a pixel lie apart in depth, world units squared.
@@ -72,7 +72,11 @@ def render_maps(
     if "distortion" in names:
         parts.append(distortion_features(gaussians, one))
     view = render(
-        gaussians, one, settings=settings, features=torch.cat(parts, dim=1) if parts else None, backend=backend
+        gaussians,
+        one,
+        settings=settings,
+        features=torch.cat(parts, dim=1) if parts else None,
+        backend=backend,
     )
     return {name: _map(view, one, name) for name in names}, view
 

@@ -1,9 +1,10 @@
-"""Gaussians as planes: each Gaussian's normal and distance, and features that composite to planar depth and distortion.
+"""Gaussians as planes: normals and distances, and features that composite to planar depth and distortion.
 
-A Gaussian is taken for the plane  n . (x - mean) = 0  through its mean, with its shortest axis n. A ray r of camera depth 1
-from the eye meets it at the depth  d / (n . r),  d = n . (mean - eye). With the weights w of a pixel,
+A Gaussian stands for the plane  n . (x - mean) = 0  through its mean, whose normal n is its shortest axis. A ray r of
+camera depth 1 from the eye meets it at the depth  d / (n . r),  d = n . (mean - eye). With the weights w of a pixel,
 
-    planar depth = sum w d / (sum w n . r),   distortion = sum_{i<j} w_i w_j (z_i - z_j)² = A sum w z² - (sum w z)²,  A = sum w
+    planar depth = sum w d / (sum w n . r)
+    distortion = sum_{i<j} w_i w_j (z_i - z_j)² = A sum w z² - (sum w z)²,   A = sum w
 
 Planar depth is exact where all Gaussians of a pixel lie in one plane, however oblique; the depth of the means is not.
 Source: Chen et al. 2024 (PGSR), section 4.1; Huang et al. 2024 (2DGS), eq. 13.

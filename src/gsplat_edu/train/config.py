@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Any
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError
@@ -27,10 +27,9 @@ from gsplat_edu.train.checks import (
     accept_not_negative as _not_negative,
     accept_opacity as _opacity,
     accept_positive as _positive,
-    accept_share as _share,
     accept_whole as _whole,
 )
-from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Check, Setting as Setting
+from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Setting as Setting
 from gsplat_edu.train.strategy_config import AdcConfig, FastConfig, McmcConfig, documented, number
 from gsplat_edu.train.tempo import Tempo, accept_tempo as _tempo
 
@@ -70,6 +69,7 @@ DEFAULT_STRATEGY = "fast"
 
 FAST_FROM_SCENE = {"fast_start_factor": 1.0}
 """Further default of a fast run that starts from a scene: small photos would undo its detail."""
+
 
 @documented
 @dataclass(frozen=True)
@@ -220,24 +220,24 @@ class TrainConfig:
         False, _flag, "Learn a surface: normals agree with the depth, and Gaussians are flat."
     )
     surface_start: int = number(
-        15_000,
+        9_000,
         _whole(0),
-        "Iteration from which `surface` compares normals with the depth.",
-        "GOF, RaDe-GS",
+        "Iteration from which `surface` learns from normals and flatness.",
+        "ours",
         milestone=True,
     )
     surface_every: int = number(
-        2, _whole(1), "`surface` compares in every n-th step, with n times the weight.", "ours"
+        4, _whole(1), "`surface` acts in every n-th step, with n times its weights.", "ours"
     )
     normal_weight: float = number(
-        0.05, _not_negative, "Weight of the normals' distance from those of the planar depth.", "2DGS"
+        0.04, _not_negative, "Weight of the distance between normals and those of the depth.", "2DGS"
     )
     flat_weight: float = number(
-        100.0, _not_negative, "Weight of the mean smallest scale, as a fraction of the extent.", "PGSR"
+        0.01, _not_negative, "Weight of the mean smallest scale, as a fraction of the extent.", "ours"
     )
-    adc: AdcConfig = AdcConfig()
-    mcmc: McmcConfig = McmcConfig()
-    fast: FastConfig = FastConfig()
+    adc: AdcConfig = dataclasses.field(default=AdcConfig())
+    mcmc: McmcConfig = dataclasses.field(default=McmcConfig())
+    fast: FastConfig = dataclasses.field(default=FastConfig())
 
     def __post_init__(self) -> None:
         """Check the ranges."""

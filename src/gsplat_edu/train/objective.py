@@ -19,14 +19,11 @@ from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.losses import LossKernel, photo_loss
-from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.scene.camera import Camera
-from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
-from gsplat_edu.train.feed import Draw, Target
-from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm
+from gsplat_edu.train.rendered import Rendered as Rendered
+from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
 
 FEW_VISIBLE = 0.25
 """Regularise only the visible Gaussians if they are fewer than this fraction of all. Views of one subject show at least
@@ -36,29 +33,6 @@ a third of the start's Gaussians, views of an aerial capture of a city a tenth
 OUTSIDE_WEIGHT = 0.3
 """Weight of the mean alpha outside the masks of an object. 0.1 leaves 1.4 times the alpha outside, 3 costs 1.3 dB
 inside (benchmarks/RESULTS.md)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rendered:
-    """The render of one view of a step: the input of an objective's terms.
-
-    Args:
-        gaussians: The rendered Gaussians, raw parameters.
-        draw: The view and its index.
-        output: The render: image, transmittance, and depth if the settings ask for it.
-        image: (H, W, 3) the output of the view model, which is compared with the photo.
-        target: The photo over the step's background, and its mask.
-        iteration: Counted from 0.
-        camera: The camera of the render: the view's, or where a view model moved it. None means the view's.
-    """
-
-    gaussians: Gaussians
-    draw: Draw
-    output: RenderOutput
-    image: Float[Tensor, "H W 3"]
-    target: Target
-    iteration: int
-    camera: Camera | None = None
 
 
 @runtime_checkable
@@ -163,9 +137,9 @@ def make_objective(
     if config.outside_masks == "empty":
         terms["outside"] = EmptyOutside(OUTSIDE_WEIGHT)
     if config.surface:
-        start, every, batch = config.surface_start, config.surface_every, config.batch
-        terms[NORMAL] = NormalTerm(config.normal_weight, start, every, batch)
-        terms[FLAT] = FlatTerm(config.flat_weight, extent, shell)
+        turns = Turns(config.surface_start, config.surface_every, config.batch)
+        terms[NORMAL] = NormalTerm(config.normal_weight, turns)
+        terms[FLAT] = FlatTerm(config.flat_weight, extent, turns, shell)
     return Objective(terms)
 
 

@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 from gsplat_edu.train.checks import (
     accept_at_least_1 as _at_least_1,
-    accept_fraction as _fraction,
     accept_name_of as _one_of,
     accept_not_negative as _not_negative,
     accept_opacity as _opacity,
@@ -155,4 +154,3 @@ class FastConfig:
     decay: float = number(
         0.1, _share, "Factor on these rates once the means' rate is final; log-linear between.", "ours"
     )
-

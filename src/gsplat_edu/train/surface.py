@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,12 +14,29 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.surface import normal_error
 from gsplat_edu.train.far import Shell
-
-if TYPE_CHECKING:
-    from gsplat_edu.train.objective import Rendered
+from gsplat_edu.train.rendered import Rendered
 
 NORMAL, FLAT = "normal", "flat"
 """Names of the terms."""
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Which steps evaluate the terms of a surface.
+
+    Args:
+        start: First iteration.
+        every: Steps from one evaluation to the next; values are multiplied by it, and 0 in the other steps.
+        batch: Iterations of a step.
+    """
+
+    start: int
+    every: int = 1
+    batch: int = 1
+
+    def due(self, iteration: int) -> bool:
+        """Whether the step of this iteration evaluates them."""
+        return iteration >= self.start and (iteration // self.batch) % self.every == 0
 
 
 @dataclass(frozen=True)
@@ -28,19 +45,15 @@ class NormalTerm:
 
     Args:
         weight: Factor of the value, on the average of all steps.
-        start: First iteration of a comparison.
-        every: Steps between comparisons; the value is multiplied by it, and 0 in the other steps.
-        batch: Iterations of a step.
+        turns: The steps that compare them.
     """
 
     weight: float
-    start: int
-    every: int = 1
-    batch: int = 1
+    turns: Turns
 
     def needs_normals(self, iteration: int) -> bool:
-        """Whether the step of this iteration compares, and needs the depth and `facing_normals` composited."""
-        return iteration >= self.start and (iteration // self.batch) % self.every == 0
+        """Whether the step of this iteration needs the depth, and `facing_normals` composited."""
+        return self.turns.due(iteration)
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight every mean a (a - N . m).
@@ -49,11 +62,13 @@ class NormalTerm:
             ArgumentError: the normals or the depth were not rendered.
         """
         output = rendered.output
-        if not self.needs_normals(rendered.iteration):
+        if not self.turns.due(rendered.iteration):
             return output.image.new_zeros(())
         if output.features is None or output.depth is None:
-            raise ArgumentError("normal: needs the depth, and `facing_normals` composited as `output.features`")
-        camera, weight = rendered.camera or rendered.draw.view.camera, self.weight * self.every
+            raise ArgumentError(
+                "normal: needs the depth, and `facing_normals` composited as `output.features`"
+            )
+        camera, weight = rendered.camera or rendered.draw.view.camera, self.weight * self.turns.every
         return normal_error(output.features, output.depth, output.alpha, camera, weight)
 
 
@@ -62,22 +77,27 @@ class FlatTerm:
     """Makes the visible Gaussians flat.
 
     Args:
-        weight: Factor of the value.
+        weight: Factor of the value, on the average of all steps.
         extent: Size of the scene, world units.
+        turns: The steps that flatten.
         shell: Where far splats lie, which are left as they are; None if there are none.
     """
 
     weight: float
     extent: float
+    turns: Turns
     shell: Shell | None = None
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
-        """Return weight mean_visible(smallest scale) / extent."""
+        """Return weight every mean_visible(smallest scale) / extent."""
         logs, visible = rendered.gaussians.log_scales, rendered.output.visible
+        if not self.turns.due(rendered.iteration):
+            return logs.new_zeros(())
         if self.shell is not None:
             far = self.shell.holds(rendered.gaussians.means.detach().index_select(0, visible))
             visible = visible[~far]
-        value: Tensor = _MeanSmallest.apply(logs, visible, self.weight / self.extent)  # type: ignore[no-untyped-call]
+        weight = self.weight * self.turns.every / self.extent
+        value: Tensor = _MeanSmallest.apply(logs, visible, weight)  # type: ignore[no-untyped-call]
         return value
 
 
