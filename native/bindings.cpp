@@ -15,6 +15,7 @@
 #include <utility>
 #include <vector>
 
+#include "bindings_surface.h"
 #include "buffers.h"
 #include "dispatch.h"
 #include "loss.h"
@@ -431,6 +432,7 @@ NB_MODULE(_native, m) {
     m.def("recolor_backward_f64", &recolor_backward<double>);
     m.def("loss_f32", &loss_of<float>);
     m.def("loss_f64", &loss_of<double>);
+    bind_surface(m);
     m.def("ask_before_large_blocks", [](const nb::object &function) {
         free_memory_function = function.inc_ref().ptr();
         ask_before_large_blocks(&free_memory);

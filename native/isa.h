@@ -16,6 +16,11 @@ template <class T> void loss(const LossArgs<T> &, int64_t task, T *scratch);
 template <class T> void noise(const NoiseArgs<T> &, int64_t begin, int64_t end);
 template <class T> void recolor(const RecolorArgs<T> &, int64_t task);
 template <class T> void recolor_backward(const RecolorArgs<T> &, int64_t task);
+template <class T> void surface_depths(const SurfaceArgs<T> &, int64_t row);
+template <class T> void surface_tangents(const SurfaceArgs<T> &, int64_t row);
+template <class T> void surface_gradient(const SurfaceArgs<T> &, int64_t row);
+template <class T> void normals(const NormalArgs<T> &, int64_t block);
+template <class T> void normals_backward(const NormalArgs<T> &, int64_t block);
 template <class T> void adam(const AdamArgs<T> &, int64_t begin, int64_t end);
 template <class T> void adam_backward(const AdamBackwardArgs<T> &, int64_t block, T *scratch);
 

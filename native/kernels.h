@@ -261,6 +261,29 @@ struct LossArgs {
     static constexpr int64_t SCRATCH = 2 * 3 * SSIM_BLOCK * (SSIM_STRIP + 2 * SSIM_EDGE);
 };
 
+// The normals of Gaussians, and the gradient of the quaternions for theirs.
+template <class T>
+struct NormalArgs {
+    const T *means, *quats, *log_scales;               // n 3, n 4, n 3
+    int64_t n;
+    double eye[3];
+    T *out;                                            // n 3
+    const T *grad;                                     // n 3, only in the backward pass
+    T *grad_quats;                                     // n 4, only in the backward pass
+};
+
+// How far composited normals are from those of the depth; surface.cpp has the formulas.
+template <class T>
+struct SurfaceArgs {
+    const T *normals, *depth, *alpha;                  // H W 3 in world axes; H W: sum w z; H W
+    int32_t H, W;
+    double R[9], fx, fy, cx, cy;                       // world to camera, row by row
+    double scale, jump;                                // factor of the loss, largest jump of the depth
+    T *depths, *tangents;                              // scratch: H W, H W 6
+    T *grad_normals, *grad_depth, *grad_alpha;         // as their primals
+    double *sums;                                      // H: the loss of each row
+};
+
 constexpr int64_t BLOCK = 256;                         // Gaussians per task
 
 // The kernels of one instruction set and scalar type.
@@ -278,6 +301,11 @@ struct Kernels {
     void (*noise)(const NoiseArgs<T> &, int64_t begin, int64_t end);
     void (*recolor)(const RecolorArgs<T> &, int64_t task);
     void (*recolor_backward)(const RecolorArgs<T> &, int64_t task);
+    void (*surface_depths)(const SurfaceArgs<T> &, int64_t row);
+    void (*surface_tangents)(const SurfaceArgs<T> &, int64_t row);
+    void (*surface_gradient)(const SurfaceArgs<T> &, int64_t row);
+    void (*normals)(const NormalArgs<T> &, int64_t block);
+    void (*normals_backward)(const NormalArgs<T> &, int64_t block);
     int64_t rows_bytes;                                // of a batch, in CompositeArgs::rows; 0 if none are kept
 };
 

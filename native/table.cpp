@@ -23,6 +23,11 @@ static constexpr Kernels<T> kernels() {
             noise<T>,
             recolor<T>,
             recolor_backward<T>,
+            surface_depths<T>,
+            surface_tangents<T>,
+            surface_gradient<T>,
+            normals<T>,
+            normals_backward<T>,
             KEEPS_ROWS ? int64_t(sizeof(KeptRows<T>)) : 0};
 }
 

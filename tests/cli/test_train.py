@@ -17,7 +17,7 @@ from gsplat_edu.runs.identity import check_options
 from gsplat_edu.runs.training import document
 from gsplat_edu.train.config import SETTINGS, TrainConfig, recipe
 from gsplat_edu.train.length import QUALITIES
-from gsplat_edu.train.setting import COURSE_ONLY
+from gsplat_edu.train.setting import COURSE_ONLY, FOR_SURFACE
 
 
 def parsed(words):
@@ -131,6 +131,8 @@ def test_config_json_has_flat_names(tmp_path):
         "lens_rate",
         "transients",
         "outside_masks",
+        "surface",
+        *FOR_SURFACE,
     }
     assert {name: value for name, value in found["train"].items() if name not in newer} == flat
     folder = RunFolder(tmp_path)
@@ -141,7 +143,8 @@ def test_config_json_has_flat_names(tmp_path):
         check_options(folder, found)
     config = TrainConfig().changed(**flat | {"background": tuple(flat["background"])})
     now = options(*words.split()).config
-    assert dataclasses.replace(config, fast=now.fast) == now and config.mcmc.growth == 1.1
+    newer = {"fast": now.fast, "surface_start": now.surface_start}
+    assert dataclasses.replace(config, **newer) == now and config.mcmc.growth == 1.1
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.render.maps import facing_normals, render_maps
+from gsplat_edu.render.maps import render_maps
+from gsplat_edu.render.planes import facing_normals
 from gsplat_edu.render.settings import RenderSettings
 from native_scenes import assert_smooth, smooth_scene
 
-NAMES = ("alpha", "depth", "expected-depth", "normal")
+NAMES = ("alpha", "depth", "expected-depth", "planar-depth", "normal", "distortion")
 
 
 def check(name, backend):

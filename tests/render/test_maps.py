@@ -8,7 +8,8 @@ import torch
 
 from gsplat_edu import ArgumentError, build_cov3d_batch, quat_to_R_batch, render_gaussians
 from gsplat_edu.render.api import render
-from gsplat_edu.render.maps import facing_normals, render_maps
+from gsplat_edu.render.maps import render_maps
+from gsplat_edu.render.planes import facing_normals
 from gsplat_edu.render.settings import MAPS, RenderSettings
 from native_scenes import SCENES, random, smooth_scene
 

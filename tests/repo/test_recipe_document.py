@@ -58,6 +58,7 @@ def test_every_field_is_a_setting_with_a_meaning():
 def test_milestones_and_settings_of_one_strategy():
     """Milestones are the settings given in iterations out of 30,000. Intervals are not milestones."""
     assert set(MILESTONES) == {
+        "surface_start",
         *("means_rate_iterations", "sh_every", "densify_start", "densify_stop", "reset_every", "mcmc_stop"),
         *("fast_full_size", "fast_stop", "fast_decay_start"),
     }

@@ -62,6 +62,10 @@ LATER = 150 * 2**20
 """Growth of the process once it trains and evaluates, bytes, for any scene: code, threads, allocator arenas."""
 
 
+SURFACE_TIME = 3.0
+"""Further time of a step that learns from normals and flatness, in times of a plain one (benchmarks/RESULTS.md)."""
+
+
 Amount = TypeVar("Amount", float, np.ndarray)
 """A number, or an array with one number for each iteration."""
 
@@ -239,6 +243,13 @@ def pixel_share(config: TrainConfig) -> float:
     return float(np.mean([photo_factor(config, iteration) ** -2 for iteration in some]))
 
 
+def surface_factors(config: TrainConfig) -> Float64[np.ndarray, " iterations"]:
+    """Return the time of each iteration as a multiple of its time without `surface`, averaged over `surface_every`."""
+    more = SURFACE_TIME / config.surface_every if config.surface else 0.0
+    late = np.arange(config.iterations) >= config.surface_start
+    return np.where(late, 1.0 + more, 1.0)
+
+
 def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.ndarray, " iterations"]:
     """Return the expected seconds of every iteration.
 
@@ -249,7 +260,8 @@ def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.
     """
     counts = expected_counts(config, facts.points, facts.pixels)
     factors = np.array([photo_factor(config, iteration) for iteration in range(config.iterations)])
-    return np.array(speed.seconds(counts.astype(np.float64), facts.pixels / factors**2))
+    seconds = speed.seconds(counts.astype(np.float64), facts.pixels / factors**2)
+    return np.array(seconds * surface_factors(config))
 
 
 def reduced_bytes(config: TrainConfig, facts: Facts) -> int:

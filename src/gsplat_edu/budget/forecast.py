@@ -15,6 +15,7 @@ from gsplat_edu.budget.costs import (
     expected_counts,
     pixel_share,
     reduced_bytes,
+    surface_factors,
 )
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings
@@ -112,11 +113,13 @@ def predict(
     speed, last = measured.speed, config.iterations - 1
     missing = 1.0 - min(image_memory / max(facts.photo_bytes, 1), 1.0)
     reading_again = measured.read * missing / torch.get_num_threads()
-    each = speed.seconds(float(counts.mean()), facts.pixels * pixel_share(config)) + reading_again
+    longer = surface_factors(config)
+    plain = speed.seconds(float(counts.mean()), facts.pixels * pixel_share(config))
+    each = plain * float(longer.mean()) + reading_again
 
     def step(iteration: int) -> float:
         pixels = facts.pixels / photo_factor(config, iteration) ** 2
-        return speed.seconds(float(counts[iteration]), pixels) + reading_again
+        return speed.seconds(float(counts[iteration]), pixels) * float(longer[iteration]) + reading_again
 
     process = measured.process + reduced_bytes(config, facts)
     room, most = measured.room, int(counts.max())

@@ -133,6 +133,7 @@ def _without_changes(config: TrainConfig, steps: int, gaussians: int) -> TrainCo
         fast_start_factor=1.0,
         fast_stop=steps + 1,
         max_gaussians=max(gaussians, config.max_gaussians or 0),
+        surface=False,  # `costs.surface_factors` adds its time
         **dict.fromkeys(("refine", "appearance", "transients", "sky"), "none"),
     )
 

@@ -215,7 +215,11 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
     for flag, values in named.items():
         if None not in values:
             words += [flag, *(f"{value:g}" if isinstance(value, float) else str(value) for value in values)]
-    flags = {"--antialiased": "antialiased", "--random-background": "random_background"}
+    flags = {
+        "--antialiased": "antialiased",
+        "--random-background": "random_background",
+        "--surface": "surface",
+    }
     return (*words, *(flag for flag, key in flags.items() if train.get(key)))
 
 

@@ -42,7 +42,7 @@ PLAIN_BLOCKS = " .:-=+*#@"
 
 HIGHLIGHTS = {
     "data": ("path", "resolution", "test_every", "points"),
-    "train": ("strategy", "max_gaussians", "ssim_weight", "seed"),
+    "train": ("strategy", "max_gaussians", "ssim_weight", "surface", "seed"),
     "render": ("sh_degree", "background", "antialiased", "jacobian_limit"),
 }
 """Settings of a run to show, by section of config.json; None values are skipped. report.html shows all settings."""

@@ -1,6 +1,7 @@
-"""Maps of a scene: accumulated alpha, depths and normals, each from one render.
+"""Maps of a scene: accumulated alpha, depths, normals and distortion, from one render.
 
-alpha = 1 - T, expected-depth = sum w z, depth = sum w z / alpha, normal = sum w n / |sum w n|
+alpha = 1 - T, expected-depth = sum w z, depth = sum w z / alpha, planar-depth = sum w d / (sum w n . r),
+normal = sum w n / |sum w n|, distortion = sum_{i<j} w_i w_j (z_i - z_j)²; `gsplat_edu.render.planes` defines d, n and r
 """
 
 from __future__ import annotations
@@ -13,35 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.ops.surface import planar_depth
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.planes import PLANE_CHANNELS, distortion_features, facing_normals, plane_features
 from gsplat_edu.render.settings import MAPS, RenderSettings
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
-from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
-
-
-def facing_normals(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 3"]:
-    """Return each Gaussian's shortest axis, turned towards the camera. For a sphere it is one of three arbitrary ones.
-
-    Args:
-        gaussians: N Gaussians.
-        camera: A `Camera` or any object with its members.
-
-    Returns:
-        (N, 3) unit vectors in world axes; zero for a Gaussian whose rotation is undefined.
-
-    Raises:
-        ArgumentError: `camera` is invalid.
-
-    Differentiable in: quats. Which axis is the shortest, and its sign, are constants.
-    """
-    eye = torch.tensor(as_camera("camera", camera).eye).to(gaussians.means)
-    shortest = gaussians.log_scales.detach().argmin(dim=-1)
-    rotations = unchecked_rotations(gaussians.quats)
-    axes = rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
-    axes = axes.where(axes.detach().isfinite(), 0.0)
-    away = ((gaussians.means - eye) * axes).sum(dim=-1, keepdim=True).detach() > 0
-    return torch.where(away, -axes, axes)
+from gsplat_edu.scene.gaussians import Gaussians
 
 
 def render_maps(
@@ -62,8 +41,12 @@ def render_maps(
             "depth": (H, W) the same divided by alpha, 0 where nothing is. Differentiable.
             "median-depth": (H, W) depth of the Gaussian at which the transmittance falls below one half, world units,
             0 where it does not. It has no gradient.
+            "planar-depth": (H, W) depth of the composited plane, world units: exact where all Gaussians of a pixel lie
+            in one plane; 0 where nothing is, or where the plane is seen edge-on. Differentiable.
             "normal": (H, W, 3) composited `facing_normals` of unit length, world axes, 0 where nothing is.
             Differentiable; see there what is constant.
+            "distortion": (H, W) how far the Gaussians of a pixel lie apart in depth, world units squared.
+            Differentiable.
         settings: Render settings; depths are rendered as the names need them. None uses the defaults.
         backend: As for `render`.
 
@@ -81,22 +64,40 @@ def render_maps(
         depth="depth" in names or "expected-depth" in names,
         median_depth="median-depth" in names,
     )
-    features = facing_normals(gaussians, one) if "normal" in names else None
-    view = render(gaussians, one, settings=settings, features=features, backend=backend)
-    return {name: _map(view, name) for name in names}, view
+    parts = []
+    if "planar-depth" in names:
+        parts.append(plane_features(gaussians, one))
+    elif "normal" in names:
+        parts.append(facing_normals(gaussians, one))
+    if "distortion" in names:
+        parts.append(distortion_features(gaussians, one))
+    view = render(
+        gaussians,
+        one,
+        settings=settings,
+        features=torch.cat(parts, dim=1) if parts else None,
+        backend=backend,
+    )
+    return {name: _map(view, one, name) for name in names}, view
 
 
-def _map(view: RenderOutput, name: str) -> Tensor:
-    found: Tensor | None
+def _map(view: RenderOutput, camera: Camera, name: str) -> Tensor:
     if name == "alpha":
-        found = view.alpha
-    elif name == "depth":
-        found = view.mean_depth
-    else:
-        images = {"expected-depth": view.depth, "median-depth": view.median_depth, "normal": view.features}
-        found = images[name]
+        return view.alpha
+    if name == "depth":
+        return view.mean_depth
+    images = {"expected-depth": view.depth, "median-depth": view.median_depth}
+    found = images.get(name, view.features)
     assert found is not None, "render_maps asks for what the names need"
-    return _unit(found) if name == "normal" else found
+    if name == "normal":
+        return _unit(found[..., :3])
+    if name == "planar-depth":
+        rays = torch.from_numpy(camera.rays()).to(found)
+        return planar_depth(found[..., :PLANE_CHANNELS], rays)
+    if name == "distortion":
+        first, second = found[..., -2], found[..., -1]
+        return view.alpha * second - first * first
+    return found
 
 
 def _unit(vectors: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:

@@ -12,7 +12,7 @@ BACKENDS = ("cuda", "webgpu", "cpu", "torch")
 """All backends: Triton kernels on a GPU; WGSL kernels on any GPU; native SIMD kernels; the dense reference, which
 evaluates every splat at every pixel."""
 
-MAPS = ("alpha", "depth", "expected-depth", "median-depth", "normal")
+MAPS = ("alpha", "depth", "expected-depth", "median-depth", "planar-depth", "normal", "distortion")
 """The maps of `gsplat_edu.render.maps`, by name. The command line lists them without importing torch."""
 
 

@@ -276,6 +276,16 @@ class Camera:
         u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
         return np.asarray(u), np.asarray(v), np.array(z)  # for a single point: 0-d arrays, not scalars
 
+    def rays(self) -> Float64[np.ndarray, "H W 3"]:
+        """Return the ray of every pixel, in world axes and of camera depth 1.
+
+        r = R' ((u - cx) / fx, (v - cy) / fy, 1),  so that eye + z r lies at the camera depth z
+        """
+        u, v = np.arange(self.W), np.arange(self.H)[:, None]
+        x, y = np.broadcast_arrays((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+        rays: Float64[np.ndarray, "H W 3"] = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.R
+        return rays
+
 
 @runtime_checkable
 class CameraLike(Protocol):

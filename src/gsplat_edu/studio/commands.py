@@ -153,6 +153,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "eval_every": _whole(0, 1_000_000),
     "save_every": _whole(0, 1_000_000),
     "antialiased": _switch,
+    "surface": _switch,
     "white_background": _switch,
     "random_background": _switch,
     "set": _set,

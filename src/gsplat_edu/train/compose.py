@@ -125,7 +125,7 @@ def training(
         density=make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
         callbacks=callbacks,
         parts=StepParts(
-            make_objective(config, shell, backend.loss),
+            make_objective(config, shell, backend.loss, extent),
             make_view_model(config, cameras, extent, gaussians, backend.recolored),
             transients=make_transients(config, dataset.train, features),
             fused=fused,

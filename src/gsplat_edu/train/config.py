@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Any
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError
@@ -27,10 +27,10 @@ from gsplat_edu.train.checks import (
     accept_not_negative as _not_negative,
     accept_opacity as _opacity,
     accept_positive as _positive,
-    accept_share as _share,
     accept_whole as _whole,
 )
-from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Check, Setting as Setting
+from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Setting as Setting
+from gsplat_edu.train.strategy_config import AdcConfig, FastConfig, McmcConfig, documented, number
 from gsplat_edu.train.tempo import Tempo, accept_tempo as _tempo
 
 RECIPE_ITERATIONS = 30_000
@@ -40,7 +40,6 @@ SHORT_RUN = 3_000
 """Runs shorter than this do not reset opacities: there is no time to recover."""
 
 STRATEGIES = ("adc", "mcmc", "fast", "none")
-OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
 APPEARANCES = ("none", "exposure", "vignetting")
 SKIES = ("none", "shell")
@@ -71,141 +70,8 @@ DEFAULT_STRATEGY = "fast"
 FAST_FROM_SCENE = {"fast_start_factor": 1.0}
 """Further default of a fast run that starts from a scene: small photos would undo its detail."""
 
-Class = TypeVar("Class", bound=type)
 
-
-def _number(default: Any, check: Check, help: str, source: str = "", *, milestone: bool = False) -> Any:  # noqa: A002, ANN401
-    """Declare a setting: default, range, meaning, source, and whether `recipe` scales it with the run's length."""
-    metadata = {"check": check, "help": help, "source": source, "milestone": milestone}
-    return dataclasses.field(default=default, metadata=metadata)
-
-
-def _documented(kind: Class) -> Class:
-    """Add the help texts of the settings to a class's docstring, as its arguments."""
-    lines = [f"    {field.name}: {field.metadata['help']}" for field in fields(kind) if field.metadata]
-    kind.__doc__ = "\n".join([f"{(kind.__doc__ or '').rstrip()}", "", "Args:", *lines, ""])
-    return kind
-
-
-@_documented
-@dataclass(frozen=True)
-class AdcConfig:
-    """Settings of adaptive density control: clone, split, prune, reset."""
-
-    over_cap: str = _number(
-        "strongest",
-        _one_of(OVER_CAP),
-        'Which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with the largest'
-        ' gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors, clones,'
-        " children, which the Gaussians then keep; the parent of dropped children is removed too (the course).",
-    )
-    densify_stop: int = _number(
-        15_000, _whole(0), "Densification ends before this iteration.", "2023", milestone=True
-    )
-    grad_threshold: float = _number(
-        2e-4,
-        _not_negative,
-        "Clone or split Gaussians whose mean image-plane gradient norm, in normalised device coordinates, exceeds"
-        " this.",
-        "2023",
-    )
-    percent_dense: float = _number(
-        0.01,
-        _not_negative,
-        "Fraction of the extent: Gaussians of a larger scale are split, smaller ones cloned.",
-        "2023",
-    )
-    split_shrink: float = _number(
-        1.6, _positive, "Divisor of the scales of the two children of a split.", "2023"
-    )
-    prune_scale: float = _number(
-        0.1,
-        _not_negative,
-        "Fraction of the extent: once opacities have been reset, Gaussians of a larger scale are pruned; 0 prunes"
-        " none.",
-        "2023",
-    )
-    reset_every: int = _number(
-        3_000,
-        _whole(0),
-        "Iterations between resets of the opacities while densifying; 0 never resets.",
-        "2023",
-        milestone=True,
-    )
-    reset_opacity: float = _number(0.01, _opacity, "Upper bound of opacities after a reset.", "2023")
-
-
-@_documented
-@dataclass(frozen=True)
-class McmcConfig:
-    """Settings of Markov chain Monte Carlo: relocate, grow, add noise, regularise."""
-
-    stop: int = _number(
-        25_000, _whole(0), "Relocation and growth end before this iteration.", "2024's code", milestone=True
-    )
-    start_opacity: float = _number(0.5, _opacity, "Opacity of the initial Gaussians.", "2024's code")
-    start_scale: float = _number(
-        0.1,
-        _positive,
-        "Factor on the initial scales, which are the root mean squared distance to 3 neighbours.",
-        "2024's code",
-    )
-    growth: float = _number(
-        1.05,
-        _at_least_1,
-        "Growth factor of the number of Gaussians per densification, up to the cap.",
-        "2024, section 4.3",
-    )
-    noise: float = _number(
-        5e5,
-        _not_negative,
-        "Noise on the means, relative to their learning rate.",
-        "2024, section 4.1: lambda_noise",
-    )
-    opacity_weight: float = _number(
-        0.01, _not_negative, "Weight of the mean opacity in the objective.", "2024, eq. 10: lambda_o"
-    )
-    scale_weight: float = _number(
-        0.01, _not_negative, "Weight of the mean scale in the objective.", "2024, eq. 10: lambda_Sigma"
-    )
-
-
-@_documented
-@dataclass(frozen=True)
-class FastConfig:
-    """Settings of the fast recipe: small photos first, a planned number of Gaussians, rates that fall to the end."""
-
-    start_factor: float = _number(
-        4.0,
-        _at_least_1,
-        "Divisor of the photos' size at the start; it falls by sqrt 2 per step, each equally long, to 1.",
-        "DashGaussian",
-    )
-    full_size: int = _number(
-        18_000, _whole(0), "Iteration from which photos have their full size.", "ours", milestone=True
-    )
-    stop: int = _number(
-        18_000, _whole(0), "Iteration at which the planned number is reached.", "ours", milestone=True
-    )
-    decay_start: int = _number(
-        21_000,
-        _whole(0),
-        "Iteration at which all rates but the means' begin to fall.",
-        "ours",
-        milestone=True,
-    )
-    opacity_weight: float = _number(
-        0.002,
-        _not_negative,
-        "Weight of the mean opacity in the objective until `fast_stop`: what no photo needs fades and is pruned.",
-        "ours",
-    )
-    decay: float = _number(
-        0.1, _share, "Factor on these rates once the means' rate is final; log-linear between.", "ours"
-    )
-
-
-@_documented
+@documented
 @dataclass(frozen=True)
 class TrainConfig:
     """One training run; see `recipe` for runs of other lengths than 30,000 iterations.
@@ -214,145 +80,164 @@ class TrainConfig:
     range raises an `ArgumentError` that names it.
     """
 
-    iterations: int = _number(
+    iterations: int = number(
         RECIPE_ITERATIONS, _whole(1), "Number of images to train on; a step renders `batch` of them.", "2023"
     )
-    batch: int = _number(1, _whole(1, 4096), "Views of a step; rates grow with its root.", "Zhao et al. 2024")
-    tempo: str = _number(
+    batch: int = number(1, _whole(1, 4096), "Views of a step; rates grow with its root.", "Zhao et al. 2024")
+    tempo: str = number(
         "",
         _tempo,
         "How a run with a time limit stretched its schedule: iterations of the recipe, then FROM:END for each change.",
         "ours",
     )
-    seed: int = _number(
+    seed: int = number(
         0,
         _whole(0),
         "Seed of the view order, splits, relocations, noise, and of the choice of start points over the cap.",
     )
-    means_rate: float = _number(
+    means_rate: float = number(
         1.6e-4, _not_negative, "Initial learning rate of the means, times the scene's extent.", "2023"
     )
-    means_rate_final: float = _number(
+    means_rate_final: float = number(
         1.6e-6, _not_negative, "Final learning rate of the means; log-linear between, then constant.", "2023"
     )
-    means_rate_iterations: int = _number(
+    means_rate_iterations: int = number(
         30_000,
         _whole(1),
         "Iteration at which the learning rate of the means is final.",
         "2023",
         milestone=True,
     )
-    quats_rate: float = _number(1e-3, _not_negative, "Learning rate of the quaternions.", "2023")
-    scales_rate: float = _number(5e-3, _not_negative, "Learning rate of the log scales.", "2023")
-    sh0_rate: float = _number(2.5e-3, _not_negative, "Learning rate of the degree-0 harmonic.", "2023")
-    sh_rest_rate: float = _number(
+    quats_rate: float = number(1e-3, _not_negative, "Learning rate of the quaternions.", "2023")
+    scales_rate: float = number(5e-3, _not_negative, "Learning rate of the log scales.", "2023")
+    sh0_rate: float = number(2.5e-3, _not_negative, "Learning rate of the degree-0 harmonic.", "2023")
+    sh_rest_rate: float = number(
         2.5e-3 / 20,
         _not_negative,
         "Learning rate of the higher harmonics: a twentieth of that of degree 0.",
         "2023",
     )
-    opacities_rate: float = _number(
+    opacities_rate: float = number(
         5e-2, _not_negative, "Learning rate of the logit opacities.", "2023; newer forks use 0.025"
     )
-    adam_eps: float = _number(
+    adam_eps: float = number(
         1e-15, _positive, "Adam's epsilon, the floor under the root of its second moment.", "2023"
     )
-    ssim_weight: float = _number(0.2, _fraction, "k of the loss (1 - k) L1 + k (1 - SSIM).", "2023, eq. 7")
-    sh_degree: int = _number(
+    ssim_weight: float = number(0.2, _fraction, "k of the loss (1 - k) L1 + k (1 - SSIM).", "2023, eq. 7")
+    sh_degree: int = number(
         SH_MAX_DEGREE, _whole(0, SH_MAX_DEGREE), "Highest degree of spherical harmonics.", "2023"
     )
-    sh_every: int = _number(
+    sh_every: int = number(
         1_000,
         _whole(0),
         "Iterations between increases of the degree in use; 0 uses all degrees from the start.",
         "2023",
         milestone=True,
     )
-    view_order: str = _number(
+    view_order: str = number(
         "shuffled",
         _one_of(VIEW_ORDERS),
         '"shuffled" shows each view once before any is repeated; "random" draws with replacement.',
         "2023",
     )
-    appearance: str = _number(
+    appearance: str = number(
         "none",
         _one_of(APPEARANCES),
         '"exposure": measure the exposure and white balance of each photo while training, and correct the render by'
         ' them before it is compared; "vignetting": also its vignetting; "none": compare the render itself.',
         "ours",
     )
-    sky: str = _number("none", _one_of(SKIES), '"shell": start with far splats where photos show sky.')
-    refine: str = _number(
+    sky: str = number("none", _one_of(SKIES), '"shell": start with far splats where photos show sky.')
+    refine: str = number(
         "none",
         _one_of(REFINEMENTS),
         "Which numbers of the cameras are learned with the scene: poses, intrinsics, both or none.",
     )
-    transients: str = _number(
+    transients: str = number(
         "none",
         _one_of(TRANSIENTS),
         '"mask": find and mask what only single photos show; "none": use all pixels.',
     )
-    outside_masks: str = _number(
+    outside_masks: str = number(
         "ignore",
         _one_of(OUTSIDE_MASKS),
         'What the scene shows where masks exclude pixels. "ignore": anything; "empty": nothing.',
     )
-    pose_spread: float = _number(
+    pose_spread: float = number(
         1e-2,
         _positive,
         "How far off the given poses are expected to be, radians and fractions of the extent: where photos say little,"
         " they hold.",
     )
-    lens_rate: float = _number(
+    lens_rate: float = number(
         2e-4, _not_negative, "Initial learning rate of the intrinsics, relative; it falls to a hundredth."
     )
-    background: tuple[float, float, float] = _number(
+    background: tuple[float, float, float] = number(
         (0.0, 0.0, 0.0), _color, "Background colour, RGB, 0 to 1.", "2023"
     )
-    random_background: bool = _number(False, _flag, "Draw a new background colour for every iteration.")
-    antialiased: bool = _number(
+    random_background: bool = number(False, _flag, "Draw a new background colour for every iteration.")
+    antialiased: bool = number(
         False, _flag, "Train for antialiased rendering: Mip-Splatting's opacity factor.", "Yu et al. 2024"
     )
-    jacobian_limit: float | None = _number(
+    jacobian_limit: float | None = number(
         1.3,
         _at_least_1,
         "Clamp of the projection's Jacobian, in half fields of view; none clamps nothing.",
         "2023's code",
     )
-    start_opacity: float = _number(0.1, _opacity, "Opacity of the initial Gaussians.", "2023")
-    start_scale: float = _number(
+    start_opacity: float = number(0.1, _opacity, "Opacity of the initial Gaussians.", "2023")
+    start_scale: float = number(
         1.0,
         _positive,
         "Factor on the initial scales, which are the root mean squared distance to 3 neighbours.",
         "2023",
     )
-    strategy: str = _number(
+    strategy: str = number(
         "adc",
         _one_of(STRATEGIES),
         '"adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "fast": small photos first, split by'
         ' score up to a planned number; "none" keeps the number of Gaussians.',
     )
-    max_gaussians: int | None = _number(
+    max_gaussians: int | None = number(
         None, _cap, "Cap on the number of Gaussians; mcmc and fast require one."
     )
-    densify_start: int = _number(
+    densify_start: int = number(
         500, _whole(0), "Density control begins after this iteration.", "2023, 2024", milestone=True
     )
-    densify_every: int = _number(
+    densify_every: int = number(
         100,
         _whole(1),
         "Density control runs at the multiples of this, so first at 600; never scaled, except for short fast runs.",
         "2023, 2024",
     )
-    min_opacity: float = _number(
+    min_opacity: float = number(
         0.005,
         _fraction,
         "adc and fast prune Gaussians below this opacity, mcmc relocates them.",
         "2023, 2024",
     )
-    adc: AdcConfig = AdcConfig()
-    mcmc: McmcConfig = McmcConfig()
-    fast: FastConfig = FastConfig()
+    surface: bool = number(
+        False, _flag, "Learn a surface: normals agree with the depth, and Gaussians are flat."
+    )
+    surface_start: int = number(
+        9_000,
+        _whole(0),
+        "Iteration from which `surface` learns from normals and flatness.",
+        "ours",
+        milestone=True,
+    )
+    surface_every: int = number(
+        4, _whole(1), "`surface` acts in every n-th step, with n times its weights.", "ours"
+    )
+    normal_weight: float = number(
+        0.04, _not_negative, "Weight of the distance between normals and those of the depth.", "2DGS"
+    )
+    flat_weight: float = number(
+        0.01, _not_negative, "Weight of the mean smallest scale, as a fraction of the extent.", "ours"
+    )
+    adc: AdcConfig = dataclasses.field(default=AdcConfig())
+    mcmc: McmcConfig = dataclasses.field(default=McmcConfig())
+    fast: FastConfig = dataclasses.field(default=FastConfig())
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -19,12 +19,11 @@ from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.losses import LossKernel, photo_loss
-from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
-from gsplat_edu.train.feed import Draw, Target
+from gsplat_edu.train.rendered import Rendered as Rendered
+from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
 
 FEW_VISIBLE = 0.25
 """Regularise only the visible Gaussians if they are fewer than this fraction of all. Views of one subject show at least
@@ -36,30 +35,14 @@ OUTSIDE_WEIGHT = 0.3
 inside (benchmarks/RESULTS.md)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Rendered:
-    """The render of one view of a step: the input of an objective's terms.
-
-    Args:
-        gaussians: The rendered Gaussians, raw parameters.
-        draw: The view and its index.
-        output: The render: image, transmittance, and depth if the settings ask for it.
-        image: (H, W, 3) the output of the view model, which is compared with the photo.
-        target: The photo over the step's background, and its mask.
-        iteration: Counted from 0.
-    """
-
-    gaussians: Gaussians
-    draw: Draw
-    output: RenderOutput
-    image: Float[Tensor, "H W 3"]
-    target: Target
-    iteration: int
-
-
 @runtime_checkable
 class Term(Protocol):
-    """One summand of an objective. A term that uses `output.depth` has a true attribute `needs_depth`."""
+    """One summand of an objective.
+
+    A term that uses `output.depth` has a true attribute `needs_depth`. One that in some steps uses the depth and the
+    composited normals (`gsplat_edu.render.planes.facing_normals`), in `output.features`, has a method
+    `needs_normals(iteration)`.
+    """
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return the weighted value, differentiable in what the step learns."""
@@ -85,6 +68,11 @@ class Objective:
     def needs_depth(self) -> bool:
         """Whether a term uses the depth; only then is it rendered."""
         return any(getattr(term, "needs_depth", False) for term in self.terms.values())
+
+    def needs_normals(self, iteration: int) -> bool:
+        """Whether a term uses depth and normals in the step of this iteration; only then are they rendered."""
+        asked = (getattr(term, "needs_normals", None) for term in self.terms.values())
+        return any(needs(iteration) for needs in asked if needs is not None)
 
     def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
         """Add the gradients of the sum to the `grad` of its leaves; return the value of every term, detached."""
@@ -117,12 +105,16 @@ def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
 
 
 def make_objective(
-    config: TrainConfig, shell: Shell | None = None, loss: LossKernel | None = None
+    config: TrainConfig,
+    shell: Shell | None = None,
+    loss: LossKernel | None = None,
+    extent: float = 1.0,
 ) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
-    if nothing is outside of masks + weight_e sum_outside(alpha) / (H W)
+    if nothing is outside of masks + weight_e sum_outside(alpha) / (H W);
+    for a surface + weight_n mean a (a - N . m) + weight_f mean(smallest scale) / extent
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
     rate if all its gradients agree, however small they are. If each view shows a twentieth of the scene, invisible
@@ -132,6 +124,7 @@ def make_objective(
         config: The configuration.
         shell: Where far splats lie, whose scale is not regularised; None if there are none.
         loss: Compares images and photos; see `photo_loss`.
+        extent: Size of the scene, world units.
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
@@ -143,6 +136,10 @@ def make_objective(
         terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, FEW_VISIBLE)
     if config.outside_masks == "empty":
         terms["outside"] = EmptyOutside(OUTSIDE_WEIGHT)
+    if config.surface:
+        turns = Turns(config.surface_start, config.surface_every, config.batch)
+        terms[NORMAL] = NormalTerm(config.normal_weight, turns)
+        terms[FLAT] = FlatTerm(config.flat_weight, extent, turns, shell)
     return Objective(terms)
 
 

@@ -122,6 +122,7 @@ def leaves_device(config: TrainConfig) -> str | None:
     settings = {
         f"batch is {config.batch}": config.batch > 1,
         f"outside_masks is {config.outside_masks}": config.outside_masks != "ignore",
+        "surface is on": config.surface,
     }
     for name in ("appearance", "refine", "transients"):
         value = getattr(config, name)

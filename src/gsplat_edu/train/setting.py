@@ -21,9 +21,13 @@ WITH_OPTION = frozenset(
     {
         *("iterations", "batch", "seed", "sh_degree", "strategy", "max_gaussians", "antialiased"),
         *("appearance", "sky", "refine", "transients", "outside_masks", "background", "random_background"),
+        "surface",
     }
 )
 """Settings that `gsplat-edu train` has an option for; the others are given by `--set NAME=VALUE`."""
+
+FOR_SURFACE = ("surface_start", "surface_every", "normal_weight", "flat_weight")
+"""Settings that only a training with `surface` uses."""
 
 COURSE_ONLY = frozenset({"over_cap", "view_order"})
 """Settings that only the course's trainings change (`gsplat_edu.train.course`); `gsplat-edu train` has none of them."""

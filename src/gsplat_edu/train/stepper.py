@@ -11,7 +11,7 @@ Chapter: 09_train_in_3d.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -23,6 +23,8 @@ from gsplat_edu.ops.adam import AdamKernel
 from gsplat_edu.ops.moments import AdamInBackward
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.camera_tensors import split_camera
+from gsplat_edu.render.planes import facing_normals
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.batches import Batch
@@ -355,13 +357,17 @@ class TensorStepper:
         """Render a view, measure it for the view model, and correct the image that is compared."""
         index, target, model = view.draw.index, view.target, self.parts.view_model
         camera = model.camera(index, view.draw.view.camera)
-        output = render(self.gaussians, camera, settings=view.settings, backend=self._backend)
+        at, _ = split_camera(camera)
+        settings, normals = view.settings, None
+        if self.objective.needs_normals(iteration):
+            settings, normals = replace(settings, depth=True), facing_normals(self.gaussians, at)
+        output = render(self.gaussians, camera, settings=settings, features=normals, backend=self._backend)
         given = ViewRender(
             output.image, output.transmittance, view.settings.background, camera, output.median_depth
         )
         rows = model.measure(index, given, target, iteration)
         image = model.correct(index, given, target, rows)
-        return Rendered(self.gaussians, view.draw, output, image, target, iteration), rows
+        return Rendered(self.gaussians, view.draw, output, image, target, iteration, at), rows
 
     def _store(self, index: int, rows: Rows) -> None:
         """Write what was measured of a view into the view model's tensors."""

@@ -114,7 +114,7 @@ class Trainer:
         self._callbacks = tuple(callbacks)
         behind, device = None if config.random_background else config.background, gaussians.means.device
         empty = config.outside_masks == "empty"
-        objective = parts.objective or make_objective(config, loss=backend.loss)
+        objective = parts.objective or make_objective(config, loss=backend.loss, extent=extent)
         groups = gaussian_groups(config, extent)
         self.stepper = make_stepper(gaussians, backend, groups, objective, density, parts, config.batch)
         room = self.stepper.photo_room

@@ -1,0 +1,171 @@
+"""Surfaces in images: planar depth, the normals of a depth map, and how far composited normals are from them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.validation import check_shape, in_range
+from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.scene.camera import Camera
+
+GRAZE = 0.02
+"""Smallest |cos| between a plane's normal and the ray for which the plane has a depth: 88.9 degrees. Nearer to edge-on,
+the depth's error grows without bound."""
+
+JUMP = 0.05
+"""Largest difference of depth within a pixel's four neighbours, as a fraction of the nearest: beyond it, they lie on
+different surfaces. With a focal length of 300 px, a plane reaches it at 82 degrees."""
+
+
+def planar_depth(planes: Float[Tensor, "H W 4"], rays: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """Return the camera depth at which each pixel's ray meets the composited plane: z = D / (N . r).
+
+    Args:
+        planes: (H, W, 4) composited `plane_features`.
+        rays: (H, W, 3) world rays of camera depth 1 (`Camera.rays`), of the planes' dtype.
+
+    Returns:
+        (H, W) world units; 0 where nothing is, or the plane is seen from behind or edge-on (`GRAZE`).
+
+    Differentiable in: planes.
+    """
+    check_shape("rays", rays.shape, (*planes.shape[:2], 3), {})
+    normal, distance = planes[..., :3], planes[..., 3]
+    slope = (normal * rays).sum(dim=-1)
+    squared = (normal * normal).sum(dim=-1) * (rays * rays).sum(dim=-1)
+    held = (slope < 0) & (distance < 0) & (slope * slope > GRAZE**2 * squared)
+    # where() twice keeps the division by 0 out of the chain rule.
+    return torch.where(held, distance / torch.where(held, slope, 1.0), 0.0)
+
+
+def normals_of_depth(depth: Float[Tensor, "H W"], rays: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """Return the normals of a depth map by central differences, towards the camera.
+
+    m = ty x tx,  tx = P(u + 1) - P(u - 1),  ty = P(v + 1) - P(v - 1),  P = z r
+
+    Args:
+        depth: (H, W) camera depth, world units; 0 where there is none.
+        rays: (H, W, 3) world rays of camera depth 1, of the depth's dtype.
+
+    Returns:
+        (H, W, 3) unit vectors in world axes; 0 on the border, where one of the four neighbours has no depth, and where
+        their depths differ by more than `JUMP`.
+
+    Differentiable in: depth.
+    """
+    points = depth[..., None] * rays
+    along_u, along_v = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    normals = torch.linalg.cross(along_v, along_u)
+    around = torch.stack([depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]])
+    nearest, farthest = around.amin(dim=0), around.amax(dim=0)
+    squared = (normals * normals).sum(dim=-1)
+    held = (nearest > 0) & (farthest < (1 + JUMP) * nearest) & (squared > 0)
+    length = torch.where(held, squared, 1.0).sqrt()
+    inner = torch.where(held[..., None], normals / length[..., None], 0.0)
+    return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1))
+
+
+def normal_error(
+    normals: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    camera: Camera,
+    weight: float = 1.0,
+) -> Float[Tensor, ""]:
+    """Return how far composited normals are from those of the mean depth: weight mean_pixels a (a - N . m).
+
+    m is the normal of `normals_of_depth` of the mean depth, sum w z / a; pixels without one add 0. The factors a are
+    constants. The value is 0 where the splats of an opaque surface lie in it; splats of a pixel that disagree shorten N
+    and raise it.
+
+    Args:
+        normals: (H, W, 3) composited `gsplat_edu.render.planes.facing_normals`.
+        depth: (H, W) sum of w z, world units.
+        alpha: (H, W) accumulated alpha.
+        camera: The camera.
+        weight: Factor of the value.
+
+    Returns:
+        () scalar, differentiable in normals, depth and alpha; the same bits for any number of threads on the CPU.
+
+    Raises:
+        ShapeError: the sizes differ.
+        ArgumentError: the weight is negative, or dtypes or devices differ.
+
+    Source: Huang et al. 2024 (2DGS), eq. 14.
+    """
+    check_shape("normals", normals.shape, (camera.H, camera.W, 3), {})
+    for name, given in (("depth", depth), ("alpha", alpha)):
+        check_shape(name, given.shape, (camera.H, camera.W), {})
+        if (given.dtype, given.device) != (normals.dtype, normals.device):
+            wanted = f"{normals.dtype} on {normals.device}"
+            raise ArgumentError(f"{name}: is {given.dtype} on {given.device}, but normals are {wanted}")
+    in_range("weight", weight, 0.0)
+    if normals.device.type != "cpu" or normals.dtype not in SUFFIXES:
+        return normal_error_in_torch(normals, depth, alpha, camera, weight)
+    value: Tensor = _NormalError.apply(normals, depth, alpha, camera, weight)  # type: ignore[no-untyped-call]
+    return value
+
+
+@one_thread()  # the rounding of torch's sum depends on the number of threads
+def normal_error_in_torch(
+    normals: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    camera: Camera,
+    weight: float = 1.0,
+) -> Float[Tensor, ""]:
+    """Return `normal_error` from its definition, by torch's operations, on any device."""
+    rays = torch.from_numpy(camera.rays()).to(normals)
+    drawn = alpha > 0
+    mean_depth = (depth / alpha.where(drawn, 1.0)).where(drawn, 0.0)
+    given = normals_of_depth(mean_depth, rays)
+    a = alpha.detach() * (given.detach() != 0).any(dim=-1)
+    agreement = (normals * given).sum(dim=-1)
+    return weight * (a * (a - agreement)).sum() / (camera.H * camera.W)
+
+
+class _NormalError(torch.autograd.Function):
+    """Compute value and gradients in one native call; backward only scales."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401
+        normals: Tensor,
+        depth: Tensor,
+        alpha: Tensor,
+        camera: Camera,
+        weight: float,
+    ) -> Tensor:
+        given = [tensor.detach().contiguous() for tensor in (normals, depth, alpha)]
+        gradients = [reusable_tensor(tensor.shape, tensor) for tensor in given]
+        names = ("normals", "depth", "alpha")
+        value = kernel("surface_f", normals.dtype)(
+            **{name: native_array(tensor) for name, tensor in zip(names, given, strict=True)},
+            **{f"grad_{name}": native_array(tensor) for name, tensor in zip(names, gradients, strict=True)},
+            R=camera.R.ravel().tolist(),
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            scale=weight / (camera.H * camera.W),
+            jump=JUMP,
+            threads=torch.get_num_threads(),
+        )
+        ctx.save_for_backward(*gradients)
+        return normals.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        # grad is almost always 1: needless passes over the images would wake torch's threads.
+        scaled = [g if float(grad) == 1.0 else g * grad for g in ctx.saved_tensors]
+        return (*scaled, None, None)

@@ -1,0 +1,150 @@
+"""Gaussians as planes: normals and distances, and features that composite to planar depth and distortion.
+
+A Gaussian stands for the plane  n . (x - mean) = 0  through its mean, whose normal n is its shortest axis. A ray r of
+camera depth 1 from the eye meets it at the depth  d / (n . r),  d = n . (mean - eye). With the weights w of a pixel,
+
+    planar depth = sum w d / (sum w n . r)
+    distortion = sum_{i<j} w_i w_j (z_i - z_j)² = A sum w z² - (sum w z)²,   A = sum w
+
+Planar depth is exact where all Gaussians of a pixel lie in one plane, however oblique; the depth of the means is not.
+Source: Chen et al. 2024 (PGSR), section 4.1; Huang et al. 2024 (2DGS), eq. 13.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
+from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
+
+PLANE_CHANNELS = 4
+"""Channels of `plane_features`."""
+
+
+def facing_normals(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 3"]:
+    """Return each Gaussian's shortest axis, turned towards the camera. For a sphere it is one of three arbitrary ones.
+
+    Args:
+        gaussians: N Gaussians.
+        camera: A `Camera` or any object with its members.
+
+    Returns:
+        (N, 3) unit vectors in world axes; zero for a Gaussian whose rotation is undefined.
+
+    Raises:
+        ArgumentError: `camera` is invalid.
+
+    Differentiable in: quats. Which axis is the shortest, and its sign, are constants.
+    """
+    eye = as_camera("camera", camera).eye
+    means, quats, log_scales = gaussians.means, gaussians.quats, gaussians.log_scales
+    if means.device.type != "cpu" or means.dtype not in SUFFIXES:
+        return facing_normals_in_torch(gaussians, eye)
+    found: Tensor = _Normals.apply(means, quats, log_scales, eye)  # type: ignore[no-untyped-call]
+    return found
+
+
+def facing_normals_in_torch(gaussians: Gaussians, eye: Float64[np.ndarray, "3"]) -> Float[Tensor, "N 3"]:
+    """Return `facing_normals` for a camera at `eye` from their definition, by torch's operations, on any device."""
+    at = torch.tensor(eye).to(gaussians.means)
+    shortest = gaussians.log_scales.detach().argmin(dim=-1)
+    rotations = unchecked_rotations(gaussians.quats)
+    axes = rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
+    axes = axes.where(axes.detach().isfinite(), 0.0)
+    away = ((gaussians.means - at) * axes).sum(dim=-1, keepdim=True).detach() > 0
+    return torch.where(away, -axes, axes)
+
+
+def plane_features(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 4"]:
+    """Return each Gaussian's plane as features to composite: its normal (world axes), and its distance from the eye.
+
+    (n, d),  n: `facing_normals`,  d = n . (mean - eye), at most 0
+
+    Args:
+        gaussians: N Gaussians.
+        camera: A `Camera` or any object with its members.
+
+    Returns:
+        (N, 4); zero for a Gaussian whose rotation is undefined.
+
+    Raises:
+        ArgumentError: `camera` is invalid.
+
+    Differentiable in: means, quats. Which axis is the shortest, its sign, and the camera are constants.
+    """
+    camera = as_camera("camera", camera)
+    eye = torch.tensor(camera.eye).to(gaussians.means)
+    normals = facing_normals(gaussians, camera)
+    distances = ((gaussians.means - eye) * normals).sum(dim=-1, keepdim=True)
+    return torch.cat([normals, distances], dim=-1)
+
+
+def distortion_features(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 2"]:
+    """Return (z - m, (z - m)²) with the camera depths z of the means and the median m of those in front of the camera.
+
+    The distortion does not depend on m. Subtracting m keeps digits in float32, because A M2 - M1² cancels.
+
+    Args:
+        gaussians: N Gaussians.
+        camera: A `Camera` or any object with its members.
+
+    Raises:
+        ArgumentError: `camera` is invalid.
+
+    Differentiable in: means. m and the camera are constants.
+    """
+    camera = as_camera("camera", camera)
+    depths = _camera_depths(gaussians.means, camera)
+    ahead = depths.detach()[depths.detach() > 0]
+    offset = depths - (ahead.median() if len(ahead) else 0.0)
+    return torch.stack([offset, offset * offset], dim=-1)
+
+
+def _camera_depths(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, " N"]:
+    eye, forward = (torch.tensor(v).to(means) for v in (camera.eye, camera.R[2]))
+    return ((means - eye) * forward).sum(dim=-1)
+
+
+class _Normals(torch.autograd.Function):
+    """The normals of all Gaussians, natively; the same bits for any number of threads."""
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, eye: np.ndarray) -> Tensor:  # noqa: ANN401
+        given = [tensor.detach().contiguous() for tensor in (means, quats, log_scales)]
+        out = reusable_tensor((len(means), 3), means)
+        kernel("normals_f", means.dtype)(**_arguments(given, eye), out=native_array(out))
+        ctx.save_for_backward(*given)
+        ctx.eye = eye
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        given = ctx.saved_tensors
+        gradient = reusable_tensor(given[1].shape, given[1])
+        kernel("normals_backward_f", grad.dtype)(
+            **_arguments(given, ctx.eye),
+            grad=native_array(grad.contiguous()),
+            grad_quats=native_array(gradient),
+        )
+        return None, gradient, None, None
+
+
+def _arguments(given: Sequence[Tensor], eye: np.ndarray) -> dict[str, Any]:
+    means, quats, log_scales = map(native_array, given)
+    return {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales,
+        "eye": eye.tolist(),
+        "threads": torch.get_num_threads(),
+    }
