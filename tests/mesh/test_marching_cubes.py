@@ -102,7 +102,7 @@ def test_a_torus_is_the_oracles():
 
 
 def test_noise_has_the_oracles_vertices():
-    """Ambiguous cells are joined in other ways, and the oracle puts vertices inside some; those on edges are the same."""
+    """The oracle joins ambiguous cells in other ways and puts vertices inside some; those on edges are the same."""
     distances = noise(5, size=16)
     vertices, _ = oracle(distances)
     on_edges = (np.abs((vertices - 0.5) - np.round(vertices - 0.5)) < 1e-6).sum(axis=1) >= 2

@@ -44,8 +44,8 @@ class SparseVolume:
 
     Args:
         voxel: Edge length of a voxel, world units.
-        truncation: t, world units, 1 to 64 voxels; `TRUNCATION` voxels if None. It should be at least twice the standard
-            deviation of the depth maps' errors.
+        truncation: t, world units, 1 to 64 voxels; `TRUNCATION` voxels if None. It should be at least twice the
+            standard deviation of the depth maps' errors.
         max_bytes: Most memory of the blocks; if None, what is free now.
 
     Raises:
@@ -93,7 +93,8 @@ class SparseVolume:
         Raises:
             ShapeError: an array differs in size from the camera.
             ArgumentError: an array has another dtype, is on another device, or holds a number that is NaN, infinite or
-                out of range; an image is missing or unexpected; the depth reaches beyond 8 million voxels from the origin.
+                out of range; an image is missing or unexpected; the depth reaches beyond 8 million voxels from the
+                origin.
             NotEnoughMemoryError: the blocks would take more than `max_bytes`.
         """
         camera = as_camera("camera", camera)
