@@ -13,6 +13,8 @@
 namespace gsplat {
 namespace {
 
+constexpr int TILE = 16;                               // pixels, along both axes
+constexpr double BALL = 0.867;                         // radius of the ball around a cube of edge 1: sqrt(3) / 2, and a margin
 constexpr int STRIP = 16;                              // rows of pixels per task
 constexpr size_t COMPACT = size_t(1) << 18;            // keys that a task collects before it removes duplicates
 constexpr float GUESS = 1.0f / 64;                     // weight of a depth beside a jump: it closes holes, and no other depth notices it
@@ -118,7 +120,12 @@ class Touched {
 class Integrator {
   public:
     Integrator(const DepthView &view, const Planes &planes, double voxel, double truncation)
-        : view_(view), planes_(planes), voxel_(voxel), truncation_(float(truncation)), slope_(float(2 / truncation)) {
+        : view_(view),
+          planes_(planes),
+          voxel_(voxel),
+          truncation_(float(truncation)),
+          slope_(float(2 / truncation)),
+          tiles_across_((int64_t(view.W) + TILE - 1) / TILE) {
         const double K[9] = {view.fx, 0, view.cx, 0, view.fy, view.cy, 0, 0, 1};
         for (int row = 0; row < 3; ++row)
             for (int k = 0; k < 3; ++k) {
@@ -126,11 +133,17 @@ class Integrator {
                 for (int m = 0; m < 3; ++m) sum += K[3 * row + m] * view.R[3 * m + k];
                 KR_[row][k] = sum, step_[row][k] = float(sum * voxel);
             }
-        const float nearest = *std::max_element(planes.inverse.begin(), planes.inverse.end());
-        float farthest = nearest;
-        for (const float inverse : planes.inverse)
-            if (inverse > 0) farthest = std::min(farthest, inverse);
-        deepest_ = 1 / double(farthest) + truncation;
+        for (int axis = 0; axis < 2; ++axis) {
+            const double focal = axis ? view.fy : view.fx, middle = axis ? view.cy : view.cx, size = axis ? view.H : view.W;
+            reach_[axis][0] = std::hypot(focal, middle + 0.5), reach_[axis][1] = std::hypot(focal, size - 0.5 - middle);
+        }
+        least_.resize(size_t(tiles_across_ * ((int64_t(view.H) + TILE - 1) / TILE)));
+        for (int64_t row = 0; row < view.H; ++row)
+            for (int64_t column = 0; column < view.W; ++column) {
+                const float inverse = planes.inverse[size_t((row + 1) * planes.stride + column + 1)];
+                float &least = least_[size_t(row / TILE * tiles_across_ + column / TILE)];
+                if (inverse > 0 && !(least > 0 && least < inverse)) least = inverse;
+            }
     }
 
     void integrate(Block &block) const {
@@ -151,19 +164,34 @@ class Integrator {
     }
 
   private:
-    // Whether the ball around a block, given by its middle relative to the eye, may touch the frustum up to the deepest surface.
+    // Whether the view may have something to say about a block, of which `middle` is the middle relative to the eye: whether the
+    // ball around the block touches the frustum, and is not entirely behind the deepest surface of the pixels that it covers.
     bool may_see(const double *middle) const {
-        const double radius = 0.5 * std::sqrt(3.0) * SIDE * voxel_;
+        const double radius = BALL * SIDE * voxel_;
         double p[3];
         for (int row = 0; row < 3; ++row) p[row] = KR_[row][0] * middle[0] + KR_[row][1] * middle[1] + KR_[row][2] * middle[2];
         const double z = p[2];
-        if (z < -radius || z > deepest_ + radius) return false;
-        // The planes at half a pixel beyond the outer pixels; a normal's length says how far a step of one world unit gets.
-        const double low_u = p[0] + 0.5 * z, high_u = (view_.W - 0.5) * z - p[0];
-        const double low_v = p[1] + 0.5 * z, high_v = (view_.H - 0.5) * z - p[1];
-        return low_u > -radius * std::hypot(view_.fx, view_.cx + 0.5) &&
-               high_u > -radius * std::hypot(view_.fx, view_.W - 0.5 - view_.cx) &&
-               low_v > -radius * std::hypot(view_.fy, view_.cy + 0.5) && high_v > -radius * std::hypot(view_.fy, view_.H - 0.5 - view_.cy);
+        if (z < -radius) return false;
+        int64_t low[2], high[2];
+        for (int axis = 0; axis < 2; ++axis) {
+            const double focal = axis ? view_.fy : view_.fx, center = axis ? view_.cy : view_.cx, size = axis ? view_.H : view_.W;
+            // The planes at half a pixel beyond the outer pixels; a normal's length says how far a step of one world unit gets.
+            if (p[axis] + 0.5 * z < -radius * reach_[axis][0] || (size - 0.5) * z - p[axis] < -radius * reach_[axis][1]) return false;
+            // The pixels that the ball covers, with the neighbours that interpolation takes.
+            const double near = std::max(z - radius, 1e-3 * radius), far = z + radius, offset = p[axis] - center * z,
+                         spread = focal * radius;
+            const double first = center + (offset - spread) / (offset < spread ? near : far) - 1;
+            const double last = center + (offset + spread) / (offset < -spread ? far : near) + 1;
+            low[axis] = int64_t(std::clamp(first, 0.0, size - 1)) / TILE, high[axis] = int64_t(std::clamp(last, 0.0, size - 1)) / TILE;
+        }
+        if (z < 2 * radius) return true;               // the ball is around the eye or nearly so
+        float least = 0;
+        for (int64_t line = low[1]; line <= high[1]; ++line)
+            for (int64_t column = low[0]; column <= high[0]; ++column) {
+                const float here = least_[size_t(line * tiles_across_ + column)];
+                if (here > 0 && !(least > 0 && least < here)) least = here;
+            }
+        return least > 0 && z - radius <= (1 / double(least) + double(truncation_)) * (1 + 1e-5);
     }
 
     // What a row of voxels finds in the depth map.
@@ -247,9 +275,11 @@ class Integrator {
     const Planes &planes_;
     double voxel_;
     float truncation_, slope_;                         // slope_: 2 / truncation
+    int64_t tiles_across_;
+    std::vector<float> least_;                         // the least inverse depth in each tile of pixels; 0 without surface
+    double reach_[2][2];
     double KR_[3][3];                                  // intrinsics times rotation: to (u z, v z, z)
     float step_[3][3];                                 // the same for one voxel
-    double deepest_;
 };
 
 }  // namespace
