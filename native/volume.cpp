@@ -220,17 +220,19 @@ class Integrator {
         if (!any) return;
         if (block.color) mix_colors(block, first, row);
         float *distance = block.field.get() + first, *weight = distance + VOXELS;
+        const float truncation = truncation_, slope = slope_;
+        float distances[SIDE], weights[SIDE];          // so that the compiler need not expect the block to overlap other memory
         for (int i = 0; i < SIDE; ++i) {
             const bool known = row.inverse[i] > 0;
             const float behind = 1 / (known ? row.inverse[i] : 1.0f) - row.z[i];
             // Halfway to the truncation behind the surface the weight begins to fall, so that what lies behind an edge or a thin
             // wall is no match for the views that see it.
-            const float ramp = 2 + behind * slope_;
-            const float added = known && ramp > 0 ? row.weight[i] * (ramp < 1 ? ramp : 1.0f) : 0.0f;
-            const float clamped = behind < truncation_ ? behind : truncation_, total = weight[i] + added;
-            distance[i] += (clamped - distance[i]) * (added / (total > 0 ? total : 1.0f));
-            weight[i] = total;
+            const float ramp = 2 + behind * slope, full = ramp < 1 ? ramp : 1.0f, share = ramp > 0 ? full : 0.0f;
+            const float added = known ? row.weight[i] * share : 0.0f, total = weight[i] + added;
+            const float clamped = behind < truncation ? behind : truncation;
+            distances[i] = distance[i] + (clamped - distance[i]) * (added / (total > 0 ? total : 1.0f)), weights[i] = total;
         }
+        std::copy_n(distances, SIDE, distance), std::copy_n(weights, SIDE, weight);
     }
 
     // The inverse depth at a place of the image, zero where there is no surface: bilinear between four pixels whose depths differ
@@ -255,7 +257,7 @@ class Integrator {
     // Only voxels within the truncation take a colour: beyond it, a pixel shows another surface.
     void mix_colors(Block &block, int first, const Row &row) const {
         for (int i = 0; i < SIDE; ++i) {
-            if (!(row.inverse[i] > 0)) continue;
+            if (!(row.inverse[i] > 0 && row.weight[i] > 0)) continue;
             const float behind = 1 / row.inverse[i] - row.z[i];
             if (!(std::abs(behind) <= truncation_)) continue;
             const int64_t column = std::clamp<int64_t>(int64_t(row.u[i] - 0.5f), 0, view_.W - 1);
