@@ -183,7 +183,8 @@ class _File:
         if primitive.get("mode", TRIANGLES) != TRIANGLES:
             refuse(self._path, f"has a primitive of mode {str(primitive['mode'])[:9]}, not of triangles")
         attributes = primitive["attributes"]
-        points = self._array(attributes["POSITION"], "VEC3").astype(np.float64)
+        with np.errstate(invalid="ignore"):  # signalling NaN; the caller looks for NaN
+            points = self._array(attributes["POSITION"], "VEC3").astype(np.float64)
         if "indices" in primitive:
             corners = self._array(primitive["indices"], "SCALAR", whole=True)[:, 0].astype(np.int64)
         else:

@@ -95,11 +95,16 @@ def read(path: Path) -> StoredMesh:
         tables[element.name] = body.rows(element)
         if "vertex" in tables and "face" in tables:
             break
-    points = np.stack([np.asarray(tables["vertex"][name], np.float64) for name in COORDINATES], axis=1)
+    points = _numbers(tables["vertex"], COORDINATES)
     check_vertices(path, points, lambda row: f"vertex {row}")
     sizes, corners = tables["face"][lists[0][0]]
     triangles = triangles_in(path, points, Polygons(sizes, corners, lambda row: f"face {row}"))
     return StoredMesh(Mesh(points, corners[triangles], _colors(path, vertex, tables["vertex"])), unit)
+
+
+def _numbers(table: dict[str, Any], names: tuple[str, ...]) -> Float64[np.ndarray, "V C"]:
+    with np.errstate(invalid="ignore"):  # signalling NaN; the caller looks for NaN
+        return np.stack([np.asarray(table[name], np.float64) for name in names], axis=1)
 
 
 def _colors(path: Path, vertex: Element, table: dict[str, Any]) -> Float32[np.ndarray, "V 3"] | None:
@@ -112,7 +117,7 @@ def _colors(path: Path, vertex: Element, table: dict[str, Any]) -> Float32[np.nd
         white = LARGEST.get(kind or "")
         if white is None or any(kinds[name] != kind for name in names):
             refuse(path, f"has colours {', '.join(names)} that are not uchar, ushort or float")
-        values = np.stack([np.asarray(table[name], np.float64) for name in names], axis=1)
+        values = _numbers(table, names)
         inside = (values >= 0.0) & (values <= white)
         if not inside.all():
             row, channel = np.argwhere(~inside)[0]
