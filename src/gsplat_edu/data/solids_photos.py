@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt8
 
 from gsplat_edu.base.validation import one_of, whole_number
-from gsplat_edu.data.solids import Points, Shape, Solids, Values, gradient, lengths, solids
+from gsplat_edu.data.solids import Solids, solids
+from gsplat_edu.data.solids_shapes import Points, Shape, Values, gradient, lengths
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.views import View
 

@@ -27,7 +27,7 @@ Counts: TypeAlias = Callable[[Float64[np.ndarray, "n 3"]], Bool[np.ndarray, " n"
 """Returns which points of the truth count for completeness."""
 
 CANDIDATES = 8
-"""Number of nearest samples of a mesh whose triangles are searched for the closest point."""
+"""Number of nearest samples and middles of faces whose triangles are searched for the closest point of a mesh."""
 
 AT_ONCE = 65_536
 """Points whose distances are computed together; limits memory to about 50 MB."""
@@ -158,9 +158,9 @@ def score_surface(
         ShapeError: points or normals of the truth are not (n, 3).
         ArgumentError: a coordinate is NaN, or no point of the truth is left.
     """
-    right, counted = _truth(truth, comparison, counts)
-    found = _within(_sample(mesh, comparison.samples, comparison.seed), comparison)
-    distances, agreement = _compare(found, right, counted, comparison.tau)
+    right = _Surface.of_truth(truth, comparison, counts)
+    found = _Surface.of_mesh(mesh, comparison, comparison.seed)
+    distances, agreement = _compare(found, right, comparison.tau)
     cosine = degrees = None
     if len(agreement):
         cosine = float(agreement.mean())
@@ -184,9 +184,10 @@ def score_points(
         ArgumentError: as for `score_surface`.
     """
     given = float64_array("points", points, ("n", 3))
-    right, counted = _truth(truth, comparison, counts)
-    found = _within(_Samples(given, np.zeros_like(given), None), comparison)
-    return _compare(found, right, counted, comparison.tau)[0]
+    right = _Surface.of_truth(truth, comparison, counts)
+    mine = _Samples(given, np.zeros_like(given), None)
+    found = _Surface(mine.chosen(comparison.inside(given)), mine)
+    return _compare(found, right, comparison.tau)[0]
 
 
 def visible_points(
@@ -268,6 +269,46 @@ class _Samples(NamedTuple):
         )
 
 
+class _Surface(NamedTuple):
+    """What is needed to measure distances from a surface and to it."""
+
+    asking: _Samples  # whose distances to the other surface are measured
+    places: _Samples  # among which the point closest to those of the other surface is searched
+    share: float = 1.0  # fraction of the samples inside the bounds that ask
+
+    @classmethod
+    def of_mesh(cls, mesh: Mesh, comparison: Comparison, seed: int) -> _Surface:
+        """Sample a mesh. The middles of its faces are places too, because faces may outnumber the samples."""
+        samples = _sample(mesh, comparison.samples, seed)
+        assert samples.triangles is not None, "samples of a mesh have triangles"
+        doubled = mesh.face_normals()
+        size = np.linalg.norm(doubled, axis=1)
+        flat = size > 0
+        corners = mesh.corners[flat]
+        places = _Samples(
+            np.concatenate([samples.points, corners.mean(axis=1)]),
+            np.concatenate([samples.normals, doubled[flat] / size[flat, None]]),
+            np.concatenate([samples.triangles, corners]),
+        )
+        return cls(samples.chosen(comparison.inside(samples.points)), places)
+
+    @classmethod
+    def of_truth(cls, truth: Truth, comparison: Comparison, counts: Counts | None) -> _Surface:
+        """Sample the truth, and choose the points that count for completeness."""
+        if isinstance(truth, Mesh):
+            found = cls.of_mesh(truth, comparison, comparison.seed + 1)
+        else:
+            sizes: dict[str, int] = {}
+            points = float64_array("truth points", truth[0], ("n", 3), sizes)
+            given = _Samples(points, float64_array("truth normals", truth[1], ("n", 3), sizes), None)
+            found = cls(given.chosen(comparison.inside(points)), given)
+        asking = found.asking
+        counted = np.ones(len(asking.points), dtype=bool) if counts is None else counts(asking.points)
+        if not counted.any():
+            raise ArgumentError("truth: has no point that counts; check the bounds, and what the cameras see")
+        return cls(asking.chosen(counted), found.places, float(counted.mean()))
+
+
 def _sample(mesh: Mesh, count: int, seed: int) -> _Samples:
     """Sample a mesh; see `sample_surface`."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -288,63 +329,41 @@ def _sample(mesh: Mesh, count: int, seed: int) -> _Samples:
     return _Samples(points, doubled[face] / areas[face, None], corners)
 
 
-def _within(samples: _Samples, comparison: Comparison) -> _Samples:
-    """Return the samples inside the bounds."""
-    return samples.chosen(comparison.inside(samples.points))
-
-
-def _truth(
-    truth: Truth, comparison: Comparison, counts: Counts | None
-) -> tuple[_Samples, Bool[np.ndarray, " n"]]:
-    """Return samples of the truth inside the bounds, and which of them count for completeness."""
-    if isinstance(truth, Mesh):
-        right = _sample(truth, comparison.samples, comparison.seed + 1)
-    else:
-        sizes: dict[str, int] = {}
-        points = float64_array("truth points", truth[0], ("n", 3), sizes)
-        right = _Samples(points, float64_array("truth normals", truth[1], ("n", 3), sizes), None)
-    right = _within(right, comparison)
-    counted = np.ones(len(right.points), dtype=bool) if counts is None else counts(right.points)
-    if not counted.any():
-        raise ArgumentError("truth: has no point that counts; check the bounds, and what the cameras see")
-    return right, counted
-
-
 def _compare(
-    found: _Samples, right: _Samples, counted: Bool[np.ndarray, " m"], tau: float
+    found: _Surface, right: _Surface, tau: float
 ) -> tuple[DistanceScores, Float64[np.ndarray, " both"]]:
     """Return the scores, and |cos| between the normals of closest points, both ways."""
-    tree = cKDTree(right.points)
-    share = float(counted.mean())
-    spacing = float(tree.query(right.points, k=2)[0][:, 1].mean()) if len(right.points) > 1 else 0.0
-    if len(found.points) == 0:
-        return DistanceScores(None, None, None, 0.0, 0.0, 0.0, tau, share, spacing), np.zeros(0)
-    there, at = _nearest(found.points, right, tree)
-    asked = right.chosen(counted)
-    back, near = _nearest(asked.points, found, cKDTree(found.points))
+    asked = right.asking
+    spacing = 0.0
+    if len(asked.points) > 1:
+        spacing = float(cKDTree(asked.points).query(asked.points, k=2)[0][:, 1].mean())
+    if len(found.asking.points) == 0:
+        return DistanceScores(None, None, None, 0.0, 0.0, 0.0, tau, right.share, spacing), np.zeros(0)
+    there, at = _nearest(found.asking.points, right.places)
+    back, near = _nearest(asked.points, found.places)
     precision, recall = float((there < tau).mean()), float((back < tau).mean())
     f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
     accuracy, completeness = float(there.mean()), float(back.mean())
     agreement = np.concatenate(
         [
-            np.abs((found.normals * right.normals[at]).sum(axis=1)),
-            np.abs((asked.normals * found.normals[near]).sum(axis=1)),
+            np.abs((found.asking.normals * right.places.normals[at]).sum(axis=1)),
+            np.abs((asked.normals * found.places.normals[near]).sum(axis=1)),
         ]
     )
     half = (accuracy + completeness) / 2
-    scores = DistanceScores(accuracy, completeness, half, precision, recall, f1, tau, share, spacing)
+    scores = DistanceScores(accuracy, completeness, half, precision, recall, f1, tau, right.share, spacing)
     return scores, agreement
 
 
 def _nearest(
-    points: Float64[np.ndarray, "q 3"], surface: _Samples, tree: cKDTree
+    points: Float64[np.ndarray, "q 3"], surface: _Samples
 ) -> tuple[Float64[np.ndarray, " q"], Int64[np.ndarray, " q"]]:
-    """Return the distance of each point to a surface, and the sample that stands for the closest point.
+    """Return the distance of each point to a surface, and the place that stands for the closest point.
 
-    On a mesh, the triangles of the nearest samples are searched. The result is the exact distance or, if the closest
-    triangle has none of these samples, slightly too long: on a torus by 0.2 % of the samples' spacing on average. It
-    never exceeds the distance to the nearest sample.
+    On a mesh, the triangles of the nearest places are searched. The result is the exact distance or, if the closest
+    triangle has none of these places, slightly too long; it never exceeds the distance to the nearest place.
     """
+    tree = cKDTree(surface.points)
     best, index = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
     k = 1 if surface.triangles is None else min(CANDIDATES, len(surface.points))
     for first in range(0, len(points), AT_ONCE):
