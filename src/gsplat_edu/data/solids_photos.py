@@ -164,12 +164,28 @@ def photograph_solids(scene: Solids, camera: Camera, finish: str = "textured") -
         ArgumentError: the finish is unknown.
     """
     one_of("finish", finish, list(FINISHES))
-    bands = []
+    image = np.concatenate([_pixels(scene, camera, band, finish) for band in _bands(camera)])
+    return SolidsPhoto(image, *scan_solids(scene, camera))
+
+
+def scan_solids(
+    scene: Solids, camera: Camera
+) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W 3"], Int8[np.ndarray, "H W"]]:
+    """Return depth, normals and part at the centres of pixels; see `SolidsPhoto`.
+
+    Args:
+        scene: The solids.
+        camera: A camera outside them.
+    """
+    bands = [_exact(scene, camera, band) for band in _bands(camera)]
+    depth, normals, part = (np.concatenate(values) for values in zip(*bands, strict=True))
+    return depth, normals, part
+
+
+def _bands(camera: Camera) -> list[slice]:
+    """Return the rows of pixels that are traced together."""
     rows = max(1, RAYS_AT_ONCE // camera.W)
-    for top in range(0, camera.H, rows):
-        band = slice(top, min(top + rows, camera.H))
-        bands.append(SolidsPhoto(_pixels(scene, camera, band, finish), *_exact(scene, camera, band)))
-    return SolidsPhoto(*(np.concatenate(part) for part in zip(*bands, strict=True)))
+    return [slice(top, min(top + rows, camera.H)) for top in range(0, camera.H, rows)]
 
 
 def _pixels(scene: Solids, camera: Camera, band: slice, finish: str) -> UInt8[np.ndarray, "h W 3"]:
