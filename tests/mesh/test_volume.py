@@ -155,7 +155,7 @@ def test_every_voxel_is_as_defined(seed):
     mean, total = expected(centres.reshape(-1, 3), views, 3 * 0.05)
     # float32 decides otherwise at places between two pixels and at jumps of just the truncation
     close = np.isclose(weights.ravel(), total, atol=1e-3) & np.isclose(distances.ravel(), mean, atol=1e-4)
-    assert (total > 0).mean() > 0.1 and close.mean() > 0.999
+    assert (total > 0).mean() > 0.1 and (~close).sum() <= 3
 
 
 def test_weights_weigh():
