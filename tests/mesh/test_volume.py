@@ -94,6 +94,70 @@ def test_a_slanted_plane_is_exact():
     assert (towards_camera <= 0).all()
 
 
+def expected(centres, views, truncation):
+    """The definition in float64: mean distance and weight at points, after (camera, depth, weights) of each view."""
+    mean, total = np.zeros(len(centres)), np.zeros(len(centres))
+    for camera, given, weighed in views:
+        x, y, z = ((centres - camera.eye) @ camera.R.T).T
+        ahead = z > 0
+        u = np.where(ahead, camera.fx * x / np.where(ahead, z, 1) + camera.cx, -9)
+        v = np.where(ahead, camera.fy * y / np.where(ahead, z, 1) + camera.cy, -9)
+        u, v = np.clip(u, -2, camera.W + 1), np.clip(v, -2, camera.H + 1)
+        depth, weights = np.pad(np.where(weighed > 0, given, 0), 3), np.pad(weighed, 3)
+        left, top = np.floor(u).astype(int), np.floor(v).astype(int)
+        right, down = u - left, v - top
+        four = np.stack([depth[top + 3 + k // 2, left + 3 + k % 2] for k in range(4)])
+        share = np.stack([(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down])
+        smooth = (four.min(axis=0) > 0) & (four.max(axis=0) - four.min(axis=0) < truncation)
+        nearest = (np.floor(v + 0.5).astype(int) + 3, np.floor(u + 0.5).astype(int) + 3)
+        between = 1 / (share / np.where(smooth, four, 1)).sum(axis=0)
+        behind = np.where(smooth, between, depth[nearest]) - z
+        known = smooth | (depth[nearest] > 0)
+        weight = weights[nearest] * np.where(smooth, 1, 1 / 64) * np.clip(2 + 2 * behind / truncation, 0, 1)
+        weight = np.where(known, weight, 0)
+        total = total + weight
+        mean += np.where(
+            weight > 0, (np.minimum(behind, truncation) - mean) * weight / np.maximum(total, 1e-30), 0
+        )
+    return mean, total
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_voxel_is_as_defined(seed):
+    """Cameras anywhere, also in the middle of the surface, with rough depth: no block is skipped that a view sees."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for _ in range(6):
+        R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        R *= np.sign(np.linalg.det(R))
+        H, W = map(int, rng.integers(20, 70, 2))
+        focal, middle = rng.uniform(15, 90, 2), rng.uniform(-0.2, 1.2, 2) * (W, H)
+        camera = Camera(R, rng.normal(scale=0.5, size=3), *focal, *middle, H, W)
+        depth = rng.uniform(0.1, 2.5) + 0.3 * rng.normal() * np.arange(W) / W + 0.01 * rng.normal(size=(H, W))
+        depth = np.where(rng.uniform(size=(H, W)) < 0.02, 0, np.maximum(depth, 0)).astype(np.float32)
+        weights = rng.integers(0, 40, (H, W)).clip(max=3).astype(np.float32)
+        views.append((camera, depth, weights))
+    volume = SparseVolume(0.05)
+    for camera, depth, weights in views:
+        volume.integrate(depth, camera, weights)
+    places = np.empty((volume.blocks, 3), np.int64)
+    distances, weights = np.empty((2, volume.blocks, 8, 8, 8), np.float32)
+    volume._native.read(places=places, distances=distances, weights=weights)
+    k, j, i = np.indices((8, 8, 8)).reshape(3, -1)
+    centres = 0.05 * (8 * places[:, None] + np.stack([i, j, k], axis=-1) + 0.5)
+    # Every voxel takes only the views up to those that made its block: all views see blocks of the first ones.
+    again = SparseVolume(0.05)
+    again._native.load(places=places, distances=np.zeros_like(distances), weights=np.zeros_like(weights))
+    for camera, depth, given in views:
+        again.integrate(depth, camera, given)
+    assert again.blocks == volume.blocks
+    again._native.read(places=places, distances=distances, weights=weights)
+    mean, total = expected(centres.reshape(-1, 3), views, 3 * 0.05)
+    # float32 decides otherwise at places between two pixels and at jumps of just the truncation
+    close = np.isclose(weights.ravel(), total, atol=1e-3) & np.isclose(distances.ravel(), mean, atol=1e-4)
+    assert (total > 0).mean() > 0.1 and (~close).sum() <= 3
+
+
 def test_weights_weigh():
     camera = facing()
     volume = SparseVolume(0.1, truncation=0.5)
@@ -116,6 +180,15 @@ def test_a_hole_in_the_depth_stays_open():
     ends = mesh.vertices[surfaces.open_edges(mesh).ravel()]
     assert len(ends) > 40 and (np.abs(ends[:, 0] - 0.8) < 0.12).all()
     assert mesh.vertices[:, 0].max() < 0.9 and mesh.vertices[:, 0].min() < -0.99
+
+
+def test_blocks_smaller_than_a_pixel_leave_no_hole():
+    camera = facing(12, 16, 16.0)
+    volume = SparseVolume(2 / 16 / 12)  # a pixel covers 12 voxels of the plane at 2
+    volume.integrate(np.full((12, 16), 2.0), camera)
+    mesh = volume.mesh()
+    border = len(surfaces.open_edges(mesh))
+    assert len(mesh.vertices) - (3 * len(mesh.faces) + border) // 2 + len(mesh.faces) == 1  # a disc
 
 
 def test_a_view_says_nothing_behind_its_surface():
