@@ -119,7 +119,8 @@ def test_the_scene_is_a_lower_bound_with_slope_one_at_its_surface(floor):
 
 @each_shape
 def test_the_area_is_that_of_a_fine_mesh(name):
-    assert topology(extracted(SHAPES[name], 90)).area == pytest.approx(SHAPES[name].area, rel=0.025)
+    close = 0.025 if name == "block" else 0.004  # marching cubes cuts off edges
+    assert topology(extracted(SHAPES[name], 90)).area == pytest.approx(SHAPES[name].area, rel=close)
 
 
 def test_samples_of_a_block_follow_the_areas_of_its_faces():
