@@ -22,7 +22,13 @@ from gsplat_edu.data.solids_photos import (
     surface_colors,
 )
 from gsplat_edu.data.solids_shapes import Block, Bowl, Rod, Torus, gradient
-from gsplat_edu.evaluate.surface import Comparison, sample_surface, score_surface, visible_points
+from gsplat_edu.evaluate.surface import (
+    Comparison,
+    sample_surface,
+    score_points,
+    score_surface,
+    visible_points,
+)
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.scene.mesh import Mesh
 
@@ -119,7 +125,8 @@ def test_the_scene_is_a_lower_bound_with_slope_one_at_its_surface(floor):
 
 @each_shape
 def test_the_area_is_that_of_a_fine_mesh(name):
-    assert topology(extracted(SHAPES[name], 90)).area == pytest.approx(SHAPES[name].area, rel=0.025)
+    close = 0.025 if name == "block" else 0.004  # marching cubes cuts off edges
+    assert topology(extracted(SHAPES[name], 90)).area == pytest.approx(SHAPES[name].area, rel=close)
 
 
 def test_samples_of_a_block_follow_the_areas_of_its_faces():
@@ -342,3 +349,19 @@ def test_a_virtual_scan_sees_the_bowl_from_both_sides_but_nothing_below_the_floo
     assert seen[on & inner].mean() > 0.9 and seen[on & ~inner].mean() > 0.5
     floor = (np.abs(points[:, 1]) < 1e-9) & (np.abs(points).max(axis=1) > 1.2)
     assert seen[floor].mean() > 0.9
+
+
+def test_exact_depths_score_full_marks_where_photos_see_the_surface():
+    """As points in space they are on the surface; unseen surface lowers recall only if it counts."""
+    cameras, depths = solids_orbit(8, SIZE), [photo(i).depth for i in range(8)]
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    points = []
+    for camera, depth in zip(cameras, depths, strict=True):
+        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+        points.append((camera.eye + (depth[..., None] * rays) @ camera.R)[depth > 0])
+    truth, comparison = whole().surface(20_000), Comparison(0.08)
+    seen = functools.partial(visible_points, cameras=cameras, depths=depths, tolerance=0.01)
+    fair = score_points(np.concatenate(points), truth, comparison, seen)
+    assert fair.precision > 0.999 and fair.recall > 0.99 and 0.3 < fair.counted < 0.7
+    unfair = score_points(np.concatenate(points), truth, comparison)
+    assert unfair.precision == fair.precision and unfair.recall < 0.75

@@ -227,7 +227,7 @@ def trace(
         scene: The solids.
         eye: (3,) start of the rays, outside the solids.
         rays: (n, 3) directions of any length.
-        exact: Whether the hits are within `EXACT` of the surface; else within `CLOSE`, which takes half the time.
+        exact: Whether the hits are within `EXACT` of the surface; else within `CLOSE`, in less time.
 
     Returns:
         at: Multiple of the direction; infinity where the ray misses.
