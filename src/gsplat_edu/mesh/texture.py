@@ -104,14 +104,15 @@ def textured(mesh: Mesh, views: Iterable[TextureView], settings: TextureSettings
     points = np.einsum("tk,tkd->td", weights, mesh.corners[face])
     normals = np.einsum("tk,tkd->td", weights, vertex_normals(mesh)[mesh.faces[face]])
     found = _Best(len(face), settings.best)
+    facing, anchors = mesh.face_normals(), mesh.corners[:, 0]
     for view in views:
         _check_view(view)
-        for start in range(0, len(face), ROWS):
-            rows = slice(start, start + ROWS)
-            seen, scores, colors = _looked_up(
-                view, points[rows], normals[rows], mesh.face_normals()[face[rows]], settings
-            )
-            found.add(start + seen, scores, colors)
+        front = (facing * (view.camera.eye - anchors)).sum(axis=1) > 0.0
+        texels = np.flatnonzero(front[face])
+        for start in range(0, len(texels), ROWS):
+            rows = texels[start : start + ROWS]
+            seen, scores, colors = _looked_up(view, points[rows], normals[rows], facing[face[rows]], settings)
+            found.add(rows[seen], scores, colors)
     painted, seen_by_any = found.colors(settings.median)
     if not seen_by_any.all():
         _fill(mesh, painted, seen_by_any, points, weights, face)
