@@ -179,7 +179,8 @@ def test_an_obj_and_its_files_appear_together(tmp_path, monkeypatch):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a b#c.obj", "a_b_c.mtl", "a_b_c.png"]
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
 
-    def full(self, *_, **__):
+    def full(self, file, *_, **__):
+        file.write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Image.Image, "save", full)

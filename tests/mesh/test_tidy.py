@@ -7,8 +7,10 @@ import pytest
 from skimage.measure import marching_cubes
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.mesh import tidy
 from gsplat_edu.mesh.tidy import (
     TidySettings,
+    _turned_over,
     decimated,
     tidied,
     with_filled_holes,
@@ -256,6 +258,23 @@ def test_decimation_far_from_the_origin_and_with_a_boundary():
     bowl = decimated(with_hole(ball, lambda centres: centres[:, 2] < 0.3), 300)
     assert edges_by_faces(bowl)[1:] == (0, 0) and len(boundary_loops(bowl)) == 1
     assert np.abs(bowl.vertices[:, 2].max() - 0.3) < 0.06
+
+
+def test_faces_that_are_turned_over_are_unfolded(monkeypatch):
+    """fast-simplification seldom turns a face over; here it is made to, by a vertex beyond its neighbours."""
+    ball = level_set(sphere)
+    fine = decimated(ball, 400)
+    spread = np.linalg.norm(fine.vertices - fine.vertices[0], axis=1)
+    vertices = fine.vertices.copy()
+    vertices[0] = (
+        0.7 * np.array(vertices[np.argsort(spread)[30]]) / np.linalg.norm(vertices[np.argsort(spread)[30]])
+    )
+    folded = Mesh(vertices, fine.faces)
+    assert _turned_over(ball, folded).any()
+    monkeypatch.setattr(tidy, "_simplified", lambda *_: folded)
+    mended = decimated(ball, 400)
+    assert not _turned_over(ball, mended).any() and np.array_equal(mended.faces, fine.faces)
+    assert np.abs(np.linalg.norm(mended.vertices, axis=1) - 0.7).max() < 0.05
 
 
 def test_the_sides_of_a_thin_wall_keep_their_colours():

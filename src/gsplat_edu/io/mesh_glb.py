@@ -10,10 +10,9 @@ colours, so these are left out beside a texture. Materials are unlit where viewe
 photos already contain the light, and are seen from both sides.
 
 A vertex of glTF has one texture coordinate. Vertices at seams are therefore repeated when written. Vertices at the
-same position become one when read, in files of any program. Of these, triangles of all meshes of the scene are read,
-moved by the transforms of their nodes; a texture is read if one embedded image covers all of them. Anything that needs
-an extension (compressed meshes, for example) is rejected with an error that names it; how to read it is in
-`gsplat_edu.io.mesh_glb_reading`.
+same position become one when read, in files of any program. `gsplat_edu.io.mesh_glb_reading` reads the triangles of all
+meshes of the scene, moved by the transforms of their nodes, and a texture if one embedded image covers all of them. A
+file that needs an extension (compressed meshes, for example) is rejected with an error that names it.
 
 Source: Khronos, "glTF 2.0 Specification".
 """

@@ -29,6 +29,8 @@ from gsplat_edu.mesh.topology import (
     mean_edge,
     opposite_half_edges,
     separated,
+    unit,
+    vertex_normals,
 )
 from gsplat_edu.scene.mesh import Mesh, Texture
 from gsplat_edu.scene.polygons import area_vector, has_plain_fan, least_area_triangles
@@ -347,18 +349,12 @@ def _simplified(mesh: Mesh, faces: int, aggressiveness: float) -> Mesh:
     return Mesh(points, triangles[~spoiled[triangles].any(axis=1)])
 
 
-def _unit(vectors: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-    """Return vectors of length 1; zero stays zero."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.where(lengths > 0.0, lengths, 1.0))
-
-
 def _turned_over(mesh: Mesh, candidate: Mesh) -> Bool[np.ndarray, " F"]:
     """Return for each face of a decimated mesh whether it opposes all original faces near its centre."""
     near = min(NEAREST_FACES, len(mesh.faces))
     _, found = cKDTree(mesh.corners.mean(axis=1)).query(candidate.corners.mean(axis=1), k=near)
-    original = _unit(mesh.face_normals())[found.reshape(-1, near)]
-    return np.asarray((np.einsum("fkd,fd->fk", original, _unit(candidate.face_normals())) < 0.0).all(axis=1))
+    original = unit(mesh.face_normals())[found.reshape(-1, near)]
+    return np.asarray((np.einsum("fkd,fd->fk", original, unit(candidate.face_normals())) < 0.0).all(axis=1))
 
 
 def _unfolded(mesh: Mesh, candidate: Mesh) -> Mesh:
@@ -381,16 +377,6 @@ def _unfolded(mesh: Mesh, candidate: Mesh) -> Mesh:
     return best
 
 
-def _vertex_facing(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
-    """Return the normals of vertices, of length 1."""
-    sums = np.zeros_like(mesh.vertices)
-    normals = mesh.face_normals()
-    for corner in range(3):
-        for axis in range(3):
-            sums[:, axis] += np.bincount(mesh.faces[:, corner], normals[:, axis], len(sums))
-    return _unit(sums)
-
-
 def _carried_colors(
     mesh: Mesh, colors: Float32[np.ndarray, "V 3"], smaller: Mesh
 ) -> Float32[np.ndarray, "U 3"]:
@@ -400,8 +386,8 @@ def _carried_colors(
     as an edge, so that the sides of a thin wall keep their colours. A new vertex without any takes the nearest colour.
     """
     reach = 0.5 * mean_edge(smaller)
-    old = np.concatenate([mesh.vertices, reach * _vertex_facing(mesh)], axis=1)
-    new = np.concatenate([smaller.vertices, reach * _vertex_facing(smaller)], axis=1)
+    old = np.concatenate([mesh.vertices, reach * vertex_normals(mesh)], axis=1)
+    new = np.concatenate([smaller.vertices, reach * vertex_normals(smaller)], axis=1)
     used = np.unique(mesh.faces)
     _, owner = cKDTree(new).query(old[used])
     counts = np.bincount(owner, minlength=len(new))

@@ -1,4 +1,4 @@
-"""How the faces of a mesh are connected: opposite half-edges, components, boundary loops, and sheets that touch.
+"""How the faces of a mesh are connected: opposite half-edges, components, boundary loops, normals of vertices.
 
 Half-edge 3 f + k is the edge of face f from its corner k to its corner k + 1; the same number names corner k.
 """
@@ -249,3 +249,19 @@ def mean_edge(mesh: Mesh) -> float:
     """Return the mean length of the half-edges, world units."""
     ends: Float64[np.ndarray, "F 3 3"] = mesh.corners - np.roll(mesh.corners, -1, axis=1)
     return float(np.linalg.norm(ends, axis=2).mean())
+
+
+def unit(vectors: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """Return vectors of length 1; zero stays zero."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.where(lengths > 0.0, lengths, 1.0))
+
+
+def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
+    """Return normals of vertices, averaged over their faces by area, of length 1; zero at unused vertices."""
+    sums = np.zeros_like(mesh.vertices)
+    normals = mesh.face_normals()
+    for corner in range(3):
+        for axis in range(3):
+            sums[:, axis] += np.bincount(mesh.faces[:, corner], normals[:, axis], len(sums))
+    return unit(sums)
