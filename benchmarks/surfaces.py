@@ -5,11 +5,12 @@
 Captures: the textured box, and the solids with textured, plain and glossy surfaces. Each is trained by the recipe
 `fast`, from start points that are off the surface by 0.01. Median depths of the training views are compared with the
 true ones at each pixel, and as points in space with the true surface: F1 at 0.01 world units, where only surface that a
-photo sees counts for recall. Floor far from the objects is left out. The setting is skipped if the package lacks it.
+photo sees counts for recall. Floor far from the objects is left out. Then each scene is meshed, and the mesh compared.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import sys
 import time
@@ -20,6 +21,7 @@ import hardware
 import numpy as np
 import torch
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.solids import Part, Solids
 from gsplat_edu.data.solids_mesh import solids_mesh
@@ -27,12 +29,14 @@ from gsplat_edu.data.solids_photos import FINISHES, START_NOISE, scan_solids, so
 from gsplat_edu.data.solids_shapes import Block
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.evaluate.surface import Comparison, score_points, visible_points
+from gsplat_edu.evaluate.surface import Comparison, Counts, score_points, score_surface, visible_points
+from gsplat_edu.mesh.extract import extract_mesh
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import training
@@ -177,6 +181,7 @@ def measure_one(capture: Capture, truth: Mesh, iterations: int, seed: int, surfa
     )
     comparison = Comparison(TAU, seed=seed, bounds=capture.bounds)
     scores = score_points(depths.points[chosen], truth, comparison, counts)
+    row |= mesh_scores(capture, truth, trainer.gaussians, settings, comparison, counts)
     return row | {
         "depth error mean": float(depths.errors.mean()),
         "depth error median": float(np.median(depths.errors)),
@@ -186,6 +191,36 @@ def measure_one(capture: Capture, truth: Mesh, iterations: int, seed: int, surfa
         "precision": scores.precision,
         "recall": scores.recall,
         "f1": scores.f1,
+    }
+
+
+def mesh_scores(
+    capture: Capture,
+    truth: Mesh,
+    gaussians: Gaussians,
+    settings: RenderSettings,
+    comparison: Comparison,
+    counts: Counts,
+) -> dict[str, Any]:
+    """Mesh a trained scene and compare it with the truth: at the threshold of the depths, and at one voxel."""
+    cameras = [(view.name, view.camera) for view in capture.train]
+    began = time.perf_counter()
+    try:
+        found = extract_mesh(gaussians, cameras, settings, load_backend("cpu"))
+    except ArgumentError:  # a training of a few steps has no surface
+        return {"mesh faces": 0}
+    seconds = time.perf_counter() - began
+    scores = score_surface(found.mesh, truth, comparison, counts)
+    at_voxel = score_surface(found.mesh, truth, dataclasses.replace(comparison, tau=found.voxel), counts)
+    return {
+        "mesh faces": len(found.mesh.faces),
+        "mesh seconds": seconds,
+        "mesh voxel": found.voxel,
+        "mesh f1": scores.distances.f1,
+        "mesh f1 at a voxel": at_voxel.distances.f1,
+        "mesh accuracy": scores.distances.accuracy,
+        "mesh completeness": scores.distances.completeness,
+        "mesh normals, degrees": scores.normal_degrees,
     }
 
 

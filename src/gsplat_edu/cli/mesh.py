@@ -10,12 +10,13 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.text import short_number, spelled_bytes
-from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS
+from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS, TEXTURE_FACES
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points, score_surface
 from gsplat_edu.evaluate.topology import Topology, topology
-from gsplat_edu.io.mesh_files import mesh_losses, read_mesh, write_mesh
+from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
 from gsplat_edu.mesh.depths import render_depths
@@ -23,9 +24,10 @@ from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, ext
 from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.runs.cleaning import open_subject
+from gsplat_edu.runs.painting import painted
 from gsplat_edu.runs.source import NamedCamera, Source, open_source
 from gsplat_edu.scene.mesh import Mesh
-from gsplat_edu.viewer import export
 
 ORBIT_VIEWS, ORBIT_SIZE = 48, 800
 """Cameras around a scene that comes without any, and the longer side of their images, px."""
@@ -40,9 +42,14 @@ MOST_HELD_OUT = 8
 def run(arguments: argparse.Namespace) -> None:
     """Make the mesh, write it, and say how far it can be trusted."""
     console, backend = Terminal(), load_backend(arguments.backend)
-    export.check_target("OUT", arguments.out)
+    check_writable("OUT", arguments.out)
     truth = None if arguments.truth is None else read_mesh(arguments.truth)
-    source = open_source(arguments.source)
+    source, dataset = open_source(arguments.source), None
+    if arguments.texture:
+        subject = open_subject(arguments.source, arguments.dataset, load_backend("cpu"))
+        source, dataset = subject.source, subject.dataset
+        for told in dataset.notes:
+            console.print(str(told), soft_wrap=True)
     cameras = _cameras(source, console)
     settings = _settings(arguments, source, cameras, backend)
     columns = (
@@ -60,7 +67,12 @@ def run(arguments: argparse.Namespace) -> None:
         result = extract_mesh(source.scene.gaussians, cameras, source.settings, backend, settings, progress)
     for note in result.notes:
         console.print(note, soft_wrap=True)
-    mesh = _moved(result.mesh, source.origin)
+    mesh = result.mesh
+    if dataset is not None:
+        mesh = painted(mesh, dataset, result.views)
+        if not mesh_format_of(arguments.out).colors_with_texture:
+            mesh = replace(mesh, colors=None)  # the texture has a colour for every place
+    mesh = _moved(mesh, source.origin)
     for loss in mesh_losses(arguments.out, mesh, source.scene.unit):
         console.print(loss, soft_wrap=True)
     write_mesh(arguments.out, mesh, source.scene.unit)
@@ -96,6 +108,8 @@ def _settings(
 ) -> MeshSettings:
     """Return the settings of the options; the bounds are relative to the run's origin, as the scene is."""
     faces = arguments.faces
+    if faces is None and arguments.texture:
+        faces = TEXTURE_FACES
     voxel = arguments.voxel
     if arguments.collider:
         faces = COLLIDER_FACES if faces is None else faces
@@ -107,7 +121,7 @@ def _settings(
     bounds = None
     if arguments.bounds is not None:
         bounds = np.array(arguments.bounds).reshape(2, 3) - np.array(source.origin)
-    tidy = TidySettings(share, arguments.keep == "largest", not arguments.open, faces)
+    tidy = TidySettings(share, arguments.keep == "largest", faces=faces)
     return MeshSettings(voxel, bounds, arguments.max_memory, tidy)
 
 

@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
@@ -27,6 +28,9 @@ from gsplat_edu.scene.gaussians import Gaussians
 LEAST_ALPHA = 0.5
 """Pixels with less accumulated alpha have no surface."""
 
+CLEAR = 0.1
+"""Pixels with less accumulated alpha see through everything that other views place there."""
+
 FOG = 0.02
 """Largest difference of mean and median depth, as a fraction of the median, for which the mean is taken."""
 
@@ -34,7 +38,7 @@ LEAST_COSINE = 0.17
 """Surfaces seen at more than 80 degrees from their normal are dropped (PGSR)."""
 
 SEEN_THROUGH = 0.02
-"""A neighbour contradicts a depth if it sees farther than the point by more than this fraction."""
+"""A neighbour contradicts a depth if it sees farther than the point by more than this fraction, or nothing at all."""
 
 CONTRADICTIONS = 2
 """A depth that so many neighbours contradict is dropped."""
@@ -56,6 +60,7 @@ class DepthView:
         depth: (H, W) camera depth, world units; 0 where there is no surface.
         weight: (H, W) weight of each pixel, 0 to 1.
         image: (H, W, 3) the rendered colours.
+        clear: (H, W) pixels in the middle of an area that is less opaque than `CLEAR`: nothing is there.
         transparent: Number of pixels that are less opaque than `LEAST_ALPHA`.
     """
 
@@ -64,7 +69,8 @@ class DepthView:
     depth: Float32[np.ndarray, "H W"]
     weight: Float32[np.ndarray, "H W"]
     image: UInt8[np.ndarray, "H W 3"]
-    transparent: int = 0
+    clear: Bool[np.ndarray, "H W"]
+    transparent: int
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,9 @@ def render_depths(
         found = torch.where(cosines >= LEAST_COSINE, depth, 0.0).numpy().astype(np.float32)
         weight = np.divide(cosines.numpy(), found**2, out=np.zeros(found.shape), where=found > 0)
         pixels = np.round(255.0 * image.clamp(0, 1).numpy()).astype(np.uint8)
-        views.append(DepthView(name, camera, found, weight.astype(np.float32), pixels, transparent))
+        # A pixel at the rim of a surface may be clear by rounding.
+        clear = cv2.erode((alpha.numpy() < CLEAR).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        views.append(DepthView(name, camera, found, weight.astype(np.float32), pixels, clear, transparent))
         progress("depth maps", done, len(cameras))
     return views
 
@@ -215,9 +223,10 @@ def _contradictions(
                 & (v < other.camera.H - 0.5)
             )
         at = np.flatnonzero(inside)
-        seen = other.depth[np.rint(v[at]).astype(int), np.rint(u[at]).astype(int)].astype(np.float64)
+        place = np.rint(v[at]).astype(int), np.rint(u[at]).astype(int)
+        seen = other.depth[place].astype(np.float64)
         relative = np.where(seen > 0, seen / depth[at] - 1.0, 0.0)
-        count[rows[at], columns[at]] += relative > SEEN_THROUGH
+        count[rows[at], columns[at]] += (relative > SEEN_THROUGH) | other.clear[place]
         near = (seen > 0) & (np.abs(relative) <= SEEN_THROUGH)
         differences.append(np.abs(relative[near][::7]))
     found = np.concatenate(differences) if differences else np.zeros(0)

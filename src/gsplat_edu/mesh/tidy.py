@@ -96,7 +96,8 @@ def tidied(mesh: Mesh, settings: TidySettings | None = None) -> Mesh:
     if settings.holes:
         mesh = with_filled_holes(mesh)
     if settings.faces is not None:
-        mesh = decimated(mesh, settings.faces)
+        # Repairs after decimation cut specks off.
+        mesh = with_large_components(decimated(mesh, settings.faces), settings.share, settings.largest)
     return mesh
 
 
