@@ -1,4 +1,4 @@
-// The module gsplat_edu._native. Only this file, structures.h and arguments.h know Python.
+// The module gsplat_edu._native. Only this file, bindings_volume.cpp, structures.h and arguments.h know Python.
 //
 // Every call takes its arguments by name. The dtype, shape, layout, alignment and device of every array are checked here,
 // before a kernel gets its address. Kernels check nothing.
@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "bindings_surface.h"
+#include "bindings_volume.h"
 #include "buffers.h"
 #include "dispatch.h"
 #include "loss.h"
@@ -422,6 +423,7 @@ NB_MODULE(_native, m) {
     bind_struct<StatisticArrays>(m, "Statistics", [](Arguments a) { return StatisticArrays(std::move(a)); });
     bind_frame<float>(m, "FrameF32");
     bind_frame<double>(m, "FrameF64");
+    bind_volume(m);
     m.def("adam_f32", &adam<float>);
     m.def("adam_f64", &adam<double>);
     m.def("noise_f32", &noise<float>);

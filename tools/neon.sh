@@ -89,7 +89,7 @@ else
     export GSPLAT_TEST_NATIVE="$here/module"
 fi
 
-[ $# -gt 0 ] || set -- tests/test_losses.py tests/test_noise.py tests/train/test_optimizer.py tests/native -m "not own_process"
+[ $# -gt 0 ] || set -- tests/test_losses.py tests/test_noise.py tests/train/test_optimizer.py tests/mesh/test_volume.py tests/mesh/test_marching_cubes.py tests/native -m "not own_process"
 echo "== neon: running $*"
 unset OPENBLAS_CORETYPE
 PYTHONPATH="$package:$here/site" OPENBLAS_NUM_THREADS=1 \

@@ -66,6 +66,28 @@ class FrameF32:
 
 class FrameF64(FrameF32): ...
 
+class Volume:
+    blocks: int
+    bytes: int
+    def __init__(self, *, voxel: float, truncation: float, max_bytes: int) -> None: ...
+    def integrate(
+        self,
+        *,
+        depth: object,
+        weights: object,
+        image: object,
+        R: object,
+        eye: object,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        threads: int,
+    ) -> None: ...
+    def extract(self, *, min_weight: float, threads: int) -> tuple[object, object, object | None]: ...
+    def load(self, *, places: object, distances: object, weights: object) -> None: ...
+    def read(self, *, places: object, distances: object, weights: object) -> None: ...
+
 def adam_f32(
     *,
     parameter: object,

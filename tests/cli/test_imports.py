@@ -31,6 +31,7 @@ NEEDED = {
     "render": "a",
     "convert": "a b.ply",
     "clean": "a",
+    "mesh": "a b.glb",
     "view": "a",
     "studio": "",
     "doctor": "a",
@@ -58,6 +59,8 @@ OUT_OF_RANGE = [
     "sfm a b --frames 0",
     "clean a --max-loss -1",
     "clean a --dry-run --out b.ply",
+    "mesh a b.stl",
+    "mesh a b.glb --voxel 0",
     "studio --jobs 0",
 ]
 

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -66,11 +67,13 @@ class Element:
         name: Its name, for example "vertex".
         count: Number of rows declared in the header.
         properties: Name and NumPy type (without byte order) of each; the type of a list is None.
+        lists: For each list its name, and the NumPy types of its length and of its items.
     """
 
     name: str
     count: int
     properties: tuple[tuple[str, str | None], ...]
+    lists: tuple[tuple[str, str, str], ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -109,7 +112,7 @@ class Header:
     comments: tuple[tuple[str, ...], ...] = ()
 
 
-def read_elements(path: Path, file: BinaryIO) -> Header:
+def read_elements(path: Path, file: BinaryIO | BytesIO) -> Header:
     """Read the header, leaving the file at the first byte after it.
 
     Raises:
@@ -135,7 +138,10 @@ def read_elements(path: Path, file: BinaryIO) -> Header:
         raise SceneFormatError(f"{path}: no end_header in {HEADER_LIMIT} lines; the file is damaged")
     if header.format is None:
         raise SceneFormatError(f"{path}: its header names no format; the file is damaged, get it again")
-    elements = tuple(Element(n, c, tuple(p.items())) for n, (c, p) in header.elements.items())
+    elements = tuple(
+        Element(n, c, tuple(p.items()), tuple(header.lists.get(n, ())))
+        for n, (c, p) in header.elements.items()
+    )
     return Header(header.format, elements, tuple(header.comments))
 
 
@@ -145,6 +151,7 @@ class _HeaderLines:
     def __init__(self) -> None:
         self.format: str | None = None
         self.elements: dict[str, tuple[int, dict[str, str | None]]] = {}
+        self.lists: dict[str, list[tuple[str, str, str]]] = {}
         self.comments: list[tuple[str, ...]] = []
 
     def add(self, words: list[str]) -> str | None:
@@ -160,7 +167,11 @@ class _HeaderLines:
                     return f"element {name[:40]} of {count[:30]} rows is more than any file holds"
                 self.elements[name] = (int(count), {})
             case ["property", "list", size, number, name] if size in NUMBERS and number in NUMBERS:
-                return self._property(name, None)
+                mistake = self._property(name, None)
+                if mistake is None:
+                    owner = next(reversed(self.elements))
+                    self.lists.setdefault(owner, []).append((name, NUMBERS[size], NUMBERS[number]))
+                return mistake
             case ["property", number, name] if number in NUMBERS:
                 return self._property(name, NUMBERS[number])
             case _:

@@ -30,6 +30,7 @@ COMMANDS = {
     "render": "render images or a video of a run or a scene file, along a path or from a capture's cameras",
     "convert": "write a scene in another format, or as a web page; filter, transform, merge and verify it",
     "clean": "remove floaters, and splats that no camera supports, from a scene",
+    "mesh": "make a triangle mesh of a scene's surfaces, and say how far it can be trusted",
     "view": "show a scene or a run in the browser",
     "studio": "take photos to a finished scene on one page in the browser",
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",

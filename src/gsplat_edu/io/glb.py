@@ -21,32 +21,22 @@ before April 2026 had logarithms.
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
-from gsplat_edu.base.errors import ArgumentError, SceneFormatError
-from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.ply_table import LFS_POINTER
-from gsplat_edu.base.reading import parse_json, read_bytes
+from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
+from gsplat_edu.io.glb_container import container, refuse, write_container
 from gsplat_edu.io.quantize import unit_quats
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
-
-FILE_HEADER = struct.Struct("<4sII")
-"""glTF, version 2, length of the file."""
-
-CHUNK_HEADER = struct.Struct("<I4s")
-"""Length, kind."""
 
 POINTS, FLOAT, ARRAY_BUFFER = 0, 5126, 34962
 """Mode of a primitive; component type of an accessor; target of a buffer view."""
@@ -56,13 +46,6 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 LARGEST_LOG_SCALE = 88.0
 """exp of this is just below the largest float32."""
-
-LARGEST_FILE = (1 << 32) - 1
-"""Largest file in bytes: its length is stored in 32 bits."""
-
-
-MOST_JSON = 1 << 20
-"""Most bytes of JSON to parse; a description of splats needs a few thousand."""
 
 OPAQUE = 2.0**-24
 """Opacities are kept this far from 0 and 1 (half a float32 step at 1), so that their logits are finite."""
@@ -85,21 +68,8 @@ def write(path: Path, scene: Scene) -> None:
     gaussians = half_turned(scene.gaussians).map(torch.Tensor.float)
     gaussians.check_finite()
     attributes = _attributes(gaussians) if len(gaussians) else {}
-    described = json.dumps(_description(scene, attributes), separators=(",", ":")).encode("ascii")
-    described += b" " * (-len(described) % 4)
-    size = sum(array.nbytes for array in attributes.values())  # a multiple of 4, as required for chunks
-    length = FILE_HEADER.size + CHUNK_HEADER.size + len(described) + (CHUNK_HEADER.size + size if size else 0)
-    if length > LARGEST_FILE:
-        raise ArgumentError(
-            f"{path}: {len(gaussians):,} Gaussians do not fit into glTF's 4 GiB; write a .ply"
-        )
-    with written_aside(path) as aside, aside.open("wb") as file:
-        file.write(FILE_HEADER.pack(b"glTF", 2, length))
-        file.write(CHUNK_HEADER.pack(len(described), b"JSON") + described)
-        if size:
-            file.write(CHUNK_HEADER.pack(size, b"BIN\0"))
-        for array in attributes.values():
-            file.write(array.tobytes())
+    parts = list(attributes.values())
+    write_container(path, _description(scene, attributes), parts, f"{len(gaussians):,} Gaussians")
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, Float32[np.ndarray, "N C"]]:
@@ -170,59 +140,22 @@ def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]
 def read(path: Path) -> Scene:
     """Read a binary glTF; see `gsplat_edu.io.formats.read_scene`."""
     data = read_bytes(path)
-    document, body = _chunks(path, data)
+    document, body = container(path, data)
     try:
         return _scene(path, document, body)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
-        _refuse(path, "its JSON does not describe splats as glTF does")
-
-
-def _refuse(path: Path, fault: str) -> NoReturn:
-    raise SceneFormatError(f"{path}: {fault}; export it again")
-
-
-def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview]:
-    """Return the JSON and the buffer."""
-    if data.startswith(LFS_POINTER):
-        raise SceneFormatError(
-            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
-        )
-    if len(data) < FILE_HEADER.size + CHUNK_HEADER.size or not data.startswith(b"glTF"):
-        _refuse(path, "is not a binary glTF")
-    _, version, length = FILE_HEADER.unpack_from(data)
-    if version != 2 or length != len(data):
-        _refuse(path, f"is version {version} of {length:,} bytes, where {len(data):,} of version 2 should be")
-    size, kind = CHUNK_HEADER.unpack_from(data, FILE_HEADER.size)
-    start = FILE_HEADER.size + CHUNK_HEADER.size
-    if kind != b"JSON" or size > min(len(data) - start, MOST_JSON):
-        _refuse(path, "does not begin with its JSON")
-    try:
-        document = parse_json(data[start : start + size])
-    except ValueError:
-        _refuse(path, "has JSON that cannot be read")
-    if not isinstance(document, dict):
-        _refuse(path, "has JSON that is not an object")
-    start += size
-    if start == len(data):
-        return document, memoryview(b"")
-    if start + CHUNK_HEADER.size > len(data):
-        _refuse(path, "ends inside its second chunk")
-    size, kind = CHUNK_HEADER.unpack_from(data, start)
-    start += CHUNK_HEADER.size
-    if kind != b"BIN\0" or start + size != len(data):
-        _refuse(path, "has a second chunk that is not its buffer")
-    return document, memoryview(data)[start:]
+        refuse(path, "its JSON does not describe splats as glTF does")
 
 
 def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
     extras = document["asset"].get("extras", {})
     antialiased, up = extras.get("antialiased"), extras.get("up")
     if antialiased not in (None, True, False):
-        _refuse(path, f"says antialiased is {antialiased!r}"[:80])
+        refuse(path, f"says antialiased is {antialiased!r}"[:80])
     if up is not None:
         x, y, z = (float(sign) * float(value) for sign, value in zip(POSITION_SIGNS, up, strict=True))
         if not np.isfinite([x, y, z]).all() or not any((x, y, z)):
-            _refuse(path, "has an up that is not a direction")
+            refuse(path, "has an up that is not a direction")
         up = (x, y, z)
     found = [
         primitive
@@ -231,11 +164,11 @@ def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
         if EXTENSION in primitive.get("extensions", {})
     ]
     if not found and (body or document.get("meshes")):
-        _refuse(path, f"has no splats: no primitive with {EXTENSION}")
+        refuse(path, f"has no splats: no primitive with {EXTENSION}")
     if len(found) > 1:
-        _refuse(path, f"has {len(found)} primitives of splats, but only one is supported")
+        refuse(path, f"has {len(found)} primitives of splats, but only one is supported")
     if any(name in node for node in document.get("nodes", []) for name in TRANSFORMS):
-        _refuse(path, "transforms its splats by a node; apply the transform first")
+        refuse(path, "transforms its splats by a node; apply the transform first")
     attributes = found[0]["attributes"] if found else {}
     arrays = {
         name: _array(path, document, body, index) for name, index in attributes.items() if index is not None
@@ -249,18 +182,18 @@ def _array(path: Path, document: dict[str, Any], body: memoryview, index: int) -
     view = document["bufferViews"][accessor["bufferView"]]
     widths = [width for width, name in TYPES.items() if name == accessor["type"]]
     if accessor["componentType"] != FLOAT or not widths or "sparse" in accessor:
-        _refuse(path, f"has attributes that are not float32 (accessor {index})")
+        refuse(path, f"has attributes that are not float32 (accessor {index})")
     count, size = accessor["count"], 4 * widths[0]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     if view.get("byteStride", size) != size or view.get("buffer", 0) != 0:
-        _refuse(path, f"has attributes that are interleaved or in another file (accessor {index})")
+        refuse(path, f"has attributes that are interleaved or in another file (accessor {index})")
     if not (
         type(count) is type(start) is int and count >= 0 and 0 <= start <= start + count * size <= len(body)
     ):
-        _refuse(path, f"has an attribute that extends beyond the file's end (accessor {index})")
+        refuse(path, f"has an attribute that extends beyond the file's end (accessor {index})")
     numbers = np.frombuffer(body, "<f4", count * widths[0], start)
     if not np.isfinite(numbers).all():
-        _refuse(path, f"has NaN or infinite values (accessor {index})")
+        refuse(path, f"has NaN or infinite values (accessor {index})")
     return numbers.reshape(count, widths[0])
 
 
@@ -275,17 +208,17 @@ def _gaussians(path: Path, arrays: dict[str, Float32[np.ndarray, "N C"]]) -> Gau
     if not arrays:
         arrays = {name: np.empty((0, width), np.float32) for name, width in zip(names, widths, strict=True)}
     elif not harmonics:
-        _refuse(path, "has splats without colour")
+        refuse(path, "has splats without colour")
     missing = [name for name in names if name not in arrays]
     if missing:
-        _refuse(path, f"has splats without {missing[0]}")
+        refuse(path, f"has splats without {missing[0]}")
     values = [arrays[name] for name in names]
     count = len(values[0])
     if [value.shape for value in values] != [(count, width) for width in widths]:
-        _refuse(path, "has attributes of different numbers of splats")
+        refuse(path, "has attributes of different numbers of splats")
     means, quats, scales, opacities = (value.astype(np.float64) for value in values[:4])
     if not ((scales >= 0).all() and ((opacities >= 0) & (opacities <= 1)).all()):
-        _refuse(path, "has a negative scale or an opacity outside 0 to 1")
+        refuse(path, "has a negative scale or an opacity outside 0 to 1")
     tiny = np.finfo(np.float32).smallest_subnormal
     inside = np.clip(opacities[:, 0], OPAQUE, 1.0 - OPAQUE)
     sh = np.stack(values[4:], axis=1) if harmonics else np.empty((count, 1, 3))

@@ -40,7 +40,8 @@ from scipy.spatial.transform import Rotation
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import named_failure, written_aside
 from gsplat_edu.io.axes import POSITION_SIGNS
-from gsplat_edu.io.glb import CHUNK_HEADER, EXTENSION, FILE_HEADER, FLOAT, POINTS
+from gsplat_edu.io.glb import EXTENSION, FLOAT, POINTS
+from gsplat_edu.io.glb_container import CHUNK_HEADER, FILE_HEADER
 from gsplat_edu.io.lod.levels import Leaf, LodOptions, Node, build_levels, leaves_of, level_of
 from gsplat_edu.io.lod.meta import rounded
 from gsplat_edu.io.scene import Scene

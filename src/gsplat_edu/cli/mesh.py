@@ -1,0 +1,177 @@
+"""`gsplat-edu mesh`: a triangle mesh of a scene's surfaces."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import check_writable
+from gsplat_edu.base.text import short_number, spelled_bytes
+from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS, TEXTURE_FACES
+from gsplat_edu.cli.terminal import Bar, Field, Terminal
+from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points, score_surface
+from gsplat_edu.evaluate.topology import Topology, topology
+from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
+from gsplat_edu.io.ply import ORIGIN
+from gsplat_edu.jobs import emitter
+from gsplat_edu.mesh.depths import render_depths
+from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh, views_of_vertices
+from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.runs.cleaning import open_subject
+from gsplat_edu.runs.painting import painted
+from gsplat_edu.runs.source import NamedCamera, Source, open_source
+from gsplat_edu.scene.mesh import Mesh
+
+ORBIT_VIEWS, ORBIT_SIZE = 48, 800
+"""Cameras around a scene that comes without any, and the longer side of their images, px."""
+
+FEW_VIEWS = 3
+"""A part of the surface that fewer views see is uncertain."""
+
+MOST_HELD_OUT = 8
+"""Largest number of held-out views whose depth is compared with the mesh."""
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Make the mesh, write it, and say how far it can be trusted."""
+    console, backend = Terminal(), load_backend(arguments.backend)
+    check_writable("OUT", arguments.out)
+    truth = None if arguments.truth is None else read_mesh(arguments.truth)
+    source, dataset = open_source(arguments.source), None
+    if arguments.texture:
+        subject = open_subject(arguments.source, arguments.dataset, load_backend("cpu"))
+        source, dataset = subject.source, subject.dataset
+        for told in dataset.notes:
+            console.print(str(told), soft_wrap=True)
+    cameras = _cameras(source, console)
+    settings = _settings(arguments, source, cameras, backend)
+    columns = (
+        Field("{task.description}"),
+        BarColumn(bar_width=16),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("depth maps", total=None)
+
+        def progress(what: str, done: int, total: int) -> None:
+            bar.update(task, description=what, completed=done, total=total)
+
+        result = extract_mesh(source.scene.gaussians, cameras, source.settings, backend, settings, progress)
+    for note in result.notes:
+        console.print(note, soft_wrap=True)
+    mesh = result.mesh
+    if dataset is not None:
+        mesh = painted(mesh, dataset, result.views)
+        if not mesh_format_of(arguments.out).colors_with_texture:
+            mesh = replace(mesh, colors=None)  # the texture has a colour for every place
+    mesh = _moved(mesh, source.origin)
+    for loss in mesh_losses(arguments.out, mesh, source.scene.unit):
+        console.print(loss, soft_wrap=True)
+    write_mesh(arguments.out, mesh, source.scene.unit)
+    emitter.report_output(arguments.out)
+    unit = source.scene.unit or "world units"
+    console.print(
+        f"wrote {arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles; voxels of"
+        f" {short_number(result.voxel, 3)} {unit}, volume of {spelled_bytes(result.volume_bytes)}",
+        soft_wrap=True,
+    )
+    console.print(*_trust(result, source, backend), sep="\n", soft_wrap=True)
+    if truth is not None:
+        comparison = Comparison(arguments.tau or result.voxel)
+        console.print(*_compared(score_surface(mesh, truth, comparison), unit), sep="\n", soft_wrap=True)
+
+
+def _cameras(source: Source, console: Terminal) -> Sequence[NamedCamera]:
+    """Return the training cameras of a run; cameras around a scene that has none."""
+    own = [(name, camera) for name, camera in source.cameras if name not in source.held_out]
+    if own:
+        return own
+    if source.cameras:
+        return source.cameras
+    console.print(
+        f"the scene has no cameras: {ORBIT_VIEWS} views around it are used, which may see it from where no photo did",
+        soft_wrap=True,
+    )
+    return source.probes(ORBIT_VIEWS, ORBIT_SIZE)
+
+
+def _settings(
+    arguments: argparse.Namespace, source: Source, cameras: Sequence[NamedCamera], backend: Backend
+) -> MeshSettings:
+    """Return the settings of the options; the bounds are relative to the run's origin, as the scene is."""
+    faces = arguments.faces
+    if faces is None and arguments.texture:
+        faces = TEXTURE_FACES
+    voxel = arguments.voxel
+    if arguments.collider:
+        faces = COLLIDER_FACES if faces is None else faces
+        if voxel is None:
+            some = cameras[:: max(len(cameras) // MOST_HELD_OUT, 1)]
+            views = render_depths(source.scene.gaussians, some, source.settings, backend)
+            voxel = COLLIDER_VOXELS * default_voxel(views)
+    share = {"large": SMALLEST_SHARE, "largest": SMALLEST_SHARE, "all": 0.0}[arguments.keep]
+    bounds = None
+    if arguments.bounds is not None:
+        bounds = np.array(arguments.bounds).reshape(2, 3) - np.array(source.origin)
+    tidy = TidySettings(share, arguments.keep == "largest", faces=faces)
+    return MeshSettings(voxel, bounds, arguments.max_memory, tidy)
+
+
+def _moved(mesh: Mesh, origin: tuple[float, float, float]) -> Mesh:
+    """Return the mesh in the coordinates of the capture, whose origin was subtracted for the training."""
+    return mesh if origin == ORIGIN else replace(mesh, vertices=mesh.vertices + np.array(origin))
+
+
+def _trust(result: MeshResult, source: Source, backend: Backend) -> list[str]:
+    """Say what of the mesh few views saw, how held-out views agree with it, and where it is open."""
+    views = views_of_vertices(result.mesh, result.views, result.truncation)
+    certain = short_number(100 * float((views >= FEW_VIEWS).mean()), 3)
+    said = [f"{certain} % of the vertices are seen by {FEW_VIEWS} views or more"]
+    held_out = [(name, camera) for name, camera in source.cameras if name in source.held_out]
+    said += _held_out(result, source, held_out[:MOST_HELD_OUT], backend)
+    return [*said, _shape(topology(result.mesh))]
+
+
+def _held_out(
+    result: MeshResult, source: Source, cameras: Sequence[NamedCamera], backend: Backend
+) -> list[str]:
+    """Compare the mesh with the depths of views that it was not made from."""
+    points = []
+    for view in render_depths(source.scene.gaussians, cameras, source.settings, backend):
+        rows, columns = np.nonzero(view.depth[::4, ::4])
+        depth = view.depth[::4, ::4][rows, columns]
+        points.append(view.camera.eye + depth[:, None] * view.camera.rays()[::4, ::4][rows, columns])
+    if not points or not sum(map(len, points)):
+        return []
+    scores = score_points(np.concatenate(points), result.mesh, Comparison(result.voxel))
+    within = short_number(100 * scores.precision, 3)
+    return [f"{within} % of the depths of {len(cameras)} held-out views lie within a voxel of the mesh"]
+
+
+def _shape(shape: Topology) -> str:
+    parts = f"{shape.components} connected part" + ("s" if shape.components != 1 else "")
+    if shape.boundary_edges == 0:
+        return f"{parts}, closed"
+    loops = "" if shape.boundary_loops is None else f" around {shape.boundary_loops} holes"
+    return f"{parts}, open along {shape.boundary_edges:,} edges{loops}"
+
+
+def _compared(scores: SurfaceScores, unit: str) -> list[str]:
+    """Describe the comparison with the truth."""
+    found = scores.distances
+    if found.accuracy is None or found.completeness is None:
+        raise ArgumentError("--truth: the mesh has no area to compare")
+    distances = f"accuracy {short_number(found.accuracy, 3)}, completeness {short_number(found.completeness, 3)} {unit}"
+    rates = f"precision {found.precision:.3f}, recall {found.recall:.3f}, F1 {found.f1:.3f}"
+    angle = (
+        "" if scores.normal_degrees is None else f"; normals {short_number(scores.normal_degrees, 3)} degrees"
+    )
+    return [f"against the truth: {distances}", f"within {short_number(found.tau, 3)} {unit}: {rates}{angle}"]

@@ -1,0 +1,108 @@
+"""The container of binary glTF 2.0: a header, a chunk of JSON and a chunk of bytes, in a file of at most 4 GiB.
+
+Source: Khronos, "glTF 2.0 Specification", section 4.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.reading import parse_json
+
+FILE_HEADER = struct.Struct("<4sII")
+"""glTF, version 2, length of the file."""
+
+CHUNK_HEADER = struct.Struct("<I4s")
+"""Length, kind."""
+
+LARGEST_FILE = (1 << 32) - 1
+"""Largest file in bytes: its length is stored in 32 bits."""
+
+MOST_JSON = 1 << 20
+"""Most bytes of JSON to parse; a description of splats needs a few thousand."""
+
+
+def write_container(
+    path: Path, document: dict[str, Any], parts: Sequence[bytes | np.ndarray], content: str
+) -> None:
+    """Write a binary glTF.
+
+    Args:
+        path: Output file; parent folders are created.
+        document: The JSON.
+        parts: The contents of the file's own buffer, one after the other; each a multiple of 4 bytes long.
+        content: What the file holds, for the message if there is too much of it.
+
+    Raises:
+        ArgumentError: the file would exceed 4 GiB.
+        OSError: the file cannot be written. An existing file stays unchanged.
+    """
+    described = json.dumps(document, separators=(",", ":")).encode("ascii")
+    described += b" " * (-len(described) % 4)
+    size = sum(len(part) if isinstance(part, bytes) else part.nbytes for part in parts)
+    length = FILE_HEADER.size + CHUNK_HEADER.size + len(described) + (CHUNK_HEADER.size + size if size else 0)
+    if length > LARGEST_FILE:
+        raise ArgumentError(f"{path}: {content} do not fit into glTF's 4 GiB; write a .ply")
+    with written_aside(path) as aside, aside.open("wb") as file:
+        file.write(FILE_HEADER.pack(b"glTF", 2, length))
+        file.write(CHUNK_HEADER.pack(len(described), b"JSON") + described)
+        if size:
+            file.write(CHUNK_HEADER.pack(size, b"BIN\0"))
+        for part in parts:
+            file.write(part if isinstance(part, bytes) else part.tobytes())
+
+
+def refuse(path: Path, fault: str) -> NoReturn:
+    """Raise a SceneFormatError that names the file and its fault."""
+    raise SceneFormatError(f"{path}: {fault}; export it again")
+
+
+def container(path: Path, data: bytes, most_json: int = MOST_JSON) -> tuple[dict[str, Any], memoryview]:
+    """Return the JSON and the buffer of a binary glTF.
+
+    Args:
+        path: The file, for messages.
+        data: Its bytes.
+        most_json: Most bytes of JSON to parse.
+
+    Raises:
+        SceneFormatError: the file is not a binary glTF of version 2, or is damaged.
+    """
+    if data.startswith(LFS_POINTER):
+        raise SceneFormatError(
+            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
+        )
+    if len(data) < FILE_HEADER.size + CHUNK_HEADER.size or not data.startswith(b"glTF"):
+        refuse(path, "is not a binary glTF")
+    _, version, length = FILE_HEADER.unpack_from(data)
+    if version != 2 or length != len(data):
+        refuse(path, f"is version {version} of {length:,} bytes, where {len(data):,} of version 2 should be")
+    size, kind = CHUNK_HEADER.unpack_from(data, FILE_HEADER.size)
+    start = FILE_HEADER.size + CHUNK_HEADER.size
+    if kind != b"JSON" or size > min(len(data) - start, most_json):
+        refuse(path, "does not begin with its JSON")
+    try:
+        document = parse_json(data[start : start + size])
+    except ValueError:
+        refuse(path, "has JSON that cannot be read")
+    if not isinstance(document, dict):
+        refuse(path, "has JSON that is not an object")
+    start += size
+    if start == len(data):
+        return document, memoryview(b"")
+    if start + CHUNK_HEADER.size > len(data):
+        refuse(path, "ends inside its second chunk")
+    size, kind = CHUNK_HEADER.unpack_from(data, start)
+    start += CHUNK_HEADER.size
+    if kind != b"BIN\0" or start + size != len(data):
+        refuse(path, "has a second chunk that is not its buffer")
+    return document, memoryview(data)[start:]

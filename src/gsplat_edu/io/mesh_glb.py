@@ -1,0 +1,182 @@
+"""Meshes as binary glTF 2.0: positions and normals as float32, with colours per vertex or a texture.
+
+glTF's y points up and its front is +z, so a mesh is converted by a half turn about x, as scenes are
+(`gsplat_edu.io.axes`): (x, y, z) becomes (x, -y, -z). glTF's unit is the metre: if the scene's unit is known,
+coordinates are converted to metres, and the asset's extras say so. Positions are float32, which is all that glTF has.
+
+Colours of vertices (COLOR_0) are linear in glTF. They are written in 16 bits: in 8 bits, the darker sRGB values would
+become equal. A texture is an embedded PNG or JPEG, which stays sRGB. A viewer would multiply it by the vertices'
+colours, so these are left out beside a texture. Materials are unlit where viewers know KHR_materials_unlit, because
+photos already contain the light, and are seen from both sides.
+
+A vertex of glTF has one texture coordinate. Vertices at seams are therefore repeated when written. Vertices at the
+same position become one when read, in files of any program. `gsplat_edu.io.mesh_glb_reading` reads the triangles of all
+meshes of the scene, moved by the transforms of their nodes, and a texture if one embedded image covers all of them. A
+file that needs an extension (compressed meshes, for example) is rejected with an error that names it.
+
+Source: Khronos, "glTF 2.0 Specification".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64, UInt16
+
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.io.axes import POSITION_SIGNS
+from gsplat_edu.io.glb_container import write_container
+from gsplat_edu.io.mesh_image import encoded
+from gsplat_edu.io.mesh_parts import METRES, distinct_rows
+from gsplat_edu.scene.mesh import Mesh
+
+TRIANGLES, FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 4, 5126, 5123, 5125
+"""Mode of a primitive; component types of accessors."""
+
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+"""Targets of buffer views."""
+
+LINEAR, CLAMP_TO_EDGE = 9729, 33071
+"""Filter and wrapping of a sampler."""
+
+GENERATOR = "gsplat-edu"
+"""Program named in the asset."""
+
+UNLIT = "KHR_materials_unlit"
+"""Extension for materials that show their colour as it is."""
+
+WIDE = np.float64(65535.0)
+"""White in 16 bits."""
+
+
+def linear(srgb: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
+    """Return linear values of sRGB values, both 0 to 1 (IEC 61966-2-1)."""
+    values = np.asarray(srgb, np.float64)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
+    """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
+    origin, faces, uvs = _split(mesh)
+    turned = mesh.vertices[origin] * np.array(POSITION_SIGNS) * METRES.get(unit or "m", 1.0) + 0.0  # no -0.0
+    with np.errstate(over="ignore"):
+        positions = turned.astype("<f4")
+    if not np.isfinite(positions).all():
+        raise ArgumentError(f"{path}: a coordinate is beyond float32, which glTF uses; write a .ply")
+    normals = _vertex_normals(mesh)[origin] * np.array(POSITION_SIGNS) + 0.0
+    file = _Document()
+    attributes = {"POSITION": file.attribute(positions, bounds=True)}
+    attributes["NORMAL"] = file.attribute(normals.astype("<f4"))
+    material: dict[str, Any] = {
+        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+        "doubleSided": True,
+    }
+    if uvs is not None and mesh.texture is not None:
+        attributes["TEXCOORD_0"] = file.attribute(uvs.astype("<f4"))
+        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    elif mesh.colors is not None:
+        attributes["COLOR_0"] = file.attribute(_wide_colors(mesh.colors))
+    if len(attributes) > 2:
+        material["extensions"] = {UNLIT: {}}
+        file.document["extensionsUsed"] = [UNLIT]
+    primitive = {"attributes": attributes, "indices": file.indices(faces), "mode": TRIANGLES, "material": 0}
+    if mesh.texture is not None:
+        file.image(encoded(mesh.texture.image, jpeg), "image/png" if jpeg is None else "image/jpeg")
+    if unit is not None:
+        file.document["asset"]["extras"] = {"unit": "m"}
+    file.document |= {"meshes": [{"primitives": [primitive]}], "materials": [material]}
+    file.write(path, f"{len(mesh.faces):,} faces")
+
+
+def _split(
+    mesh: Mesh,
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, "F 3"], Float32[np.ndarray, "N 2"] | None]:
+    """Repeat vertices until each has one texture coordinate.
+
+    Returns:
+        The mesh's vertex that each vertex of the file repeats, in its order; the faces among the file's vertices; the
+        texture coordinates, None without a texture.
+    """
+    if mesh.texture is None:
+        return np.arange(len(mesh.vertices)), mesh.faces, None
+    corners, uvs = mesh.faces.ravel(), mesh.texture.uvs.reshape(-1, 2)
+    first, group = distinct_rows(corners, uvs[:, 0], uvs[:, 1])
+    return corners[first], group.reshape(-1, 3), uvs[first]
+
+
+def _vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
+    """Return normals of length 1, averaged over the faces of a vertex by area; of unused vertices, the z axis."""
+    sums = np.zeros_like(mesh.vertices)
+    facing = mesh.face_normals()
+    for corner in range(3):
+        for axis in range(3):
+            sums[:, axis] += np.bincount(mesh.faces[:, corner], facing[:, axis], len(sums))
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    usable = lengths[:, 0] > np.finfo(np.float64).tiny
+    return np.where(usable[:, None], sums / np.where(usable[:, None], lengths, 1.0), [0.0, 0.0, 1.0])
+
+
+def _wide_colors(colors: Float32[np.ndarray, "V 3"]) -> UInt16[np.ndarray, "V 4"]:
+    """Return linear colours in 16 bits; the opacity fills rows up to a multiple of 4 bytes, which glTF requires."""
+    rows = np.full((len(colors), 4), WIDE)
+    rows[:, :3] = np.rint(linear(np.clip(colors, 0.0, 1.0)) * WIDE)
+    return rows.astype("<u2")
+
+
+class _Document:
+    """The JSON and the buffer of a file with one mesh, under construction."""
+
+    def __init__(self) -> None:
+        self.document: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": GENERATOR},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def _view(self, data: bytes, **more: int) -> int:
+        """Add bytes to the buffer, and return their view."""
+        views = self.document["bufferViews"]
+        views.append({"buffer": 0, "byteOffset": self._size, "byteLength": len(data), **more})
+        self._parts.append(data + b"\0" * (-len(data) % 4))
+        self._size += len(self._parts[-1])
+        return len(views) - 1
+
+    def attribute(self, values: np.ndarray, bounds: bool = False) -> int:
+        """Add an attribute of vertices, and return its accessor. glTF wants bounds for positions."""
+        kind, integers = FLOAT, values.dtype.kind == "u"
+        described: dict[str, Any] = {"bufferView": self._view(values.tobytes(), target=ARRAY_BUFFER)}
+        if integers:
+            kind, described["normalized"] = UNSIGNED_SHORT, True
+        described |= {"componentType": kind, "count": len(values), "type": f"VEC{values.shape[1]}"}
+        if bounds:
+            described |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        self.document["accessors"].append(described)
+        return len(self.document["accessors"]) - 1
+
+    def indices(self, faces: Int64[np.ndarray, "F 3"]) -> int:
+        """Add the vertices of faces, and return their accessor."""
+        wide = faces.max() >= 65535  # glTF reserves the largest index
+        view = self._view(faces.astype("<u4" if wide else "<u2").tobytes(), target=ELEMENT_ARRAY_BUFFER)
+        kind = UNSIGNED_INT if wide else UNSIGNED_SHORT
+        accessor = {"bufferView": view, "componentType": kind, "count": faces.size, "type": "SCALAR"}
+        self.document["accessors"].append(accessor)
+        return len(self.document["accessors"]) - 1
+
+    def image(self, data: bytes, kind: str) -> None:
+        """Add the image of the only texture."""
+        self.document["images"] = [{"bufferView": self._view(data), "mimeType": kind}]
+        sampler = {"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+        self.document["samplers"] = [sampler]
+        self.document["textures"] = [{"source": 0, "sampler": 0}]
+
+    def write(self, path: Path, content: str) -> None:
+        """Write the file."""
+        self.document["buffers"] = [{"byteLength": self._size}]
+        write_container(path, self.document, self._parts, content)

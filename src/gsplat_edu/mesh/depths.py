@@ -1,0 +1,233 @@
+"""Depth maps of a scene for a mesh: rendered, checked against their neighbours, and weighted.
+
+A pixel's depth is the mean depth where it is near the median depth, and the median depth elsewhere: the mean is
+smoother on surfaces, the median ignores fog. A depth is dropped where the scene is not opaque, where the surface is
+seen edge-on, where it is too far for the voxels, and where two neighbouring views see through it.
+
+Weight of a pixel: cos(angle between ray and normal) / z², at most 1 at the nearest depth of the scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from gsplat_edu.ops.surface import normals_of_depth
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+
+LEAST_ALPHA = 0.5
+"""Pixels with less accumulated alpha have no surface."""
+
+CLEAR = 0.1
+"""Pixels with less accumulated alpha see through everything that other views place there."""
+
+FOG = 0.02
+"""Largest difference of mean and median depth, as a fraction of the median, for which the mean is taken."""
+
+LEAST_COSINE = 0.17
+"""Surfaces seen at more than 80 degrees from their normal are dropped (PGSR)."""
+
+SEEN_THROUGH = 0.02
+"""A neighbour contradicts a depth if it sees farther than the point by more than this fraction, or nothing at all."""
+
+CONTRADICTIONS = 2
+"""A depth that so many neighbours contradict is dropped."""
+
+NEIGHBOURS = 6
+"""Neighbouring views that check a depth map."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is done, how much of it is done, and how much there is."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A view of the scene for the mesh.
+
+    Args:
+        name: Name of the view.
+        camera: Its camera.
+        depth: (H, W) camera depth, world units; 0 where there is no surface.
+        weight: (H, W) weight of each pixel, 0 to 1.
+        image: (H, W, 3) the rendered colours.
+        clear: (H, W) pixels in the middle of an area that is less opaque than `CLEAR`: nothing is there.
+        transparent: Number of pixels that are less opaque than `LEAST_ALPHA`.
+    """
+
+    name: str
+    camera: Camera
+    depth: Float32[np.ndarray, "H W"]
+    weight: Float32[np.ndarray, "H W"]
+    image: UInt8[np.ndarray, "H W 3"]
+    clear: Bool[np.ndarray, "H W"]
+    transparent: int
+
+
+@dataclass(frozen=True)
+class DepthCounts:
+    """What happened to the pixels of all depth maps.
+
+    Args:
+        pixels: All pixels.
+        transparent: Less opaque than `LEAST_ALPHA`.
+        edge_on: Seen at more than 80 degrees, or at the border of an image or of a surface.
+        far: Too far for the voxels.
+        contradicted: Seen through by `CONTRADICTIONS` neighbours.
+        error: Median relative difference between a depth and those of its neighbours there; 0 without neighbours.
+    """
+
+    pixels: int
+    transparent: int
+    edge_on: int
+    far: int
+    contradicted: int
+    error: float
+
+
+def render_depths(
+    gaussians: Gaussians,
+    cameras: Sequence[tuple[str, Camera]],
+    settings: RenderSettings,
+    backend: Backend,
+    progress: Progress = lambda what, done, total: None,
+) -> list[DepthView]:
+    """Render the depth maps, with the depths of transparent pixels and edge-on surfaces 0.
+
+    Args:
+        gaussians: The scene.
+        cameras: Names and cameras.
+        settings: The scene's render settings; without its Jacobian limit, splats beside a camera would veil its image.
+        backend: What renders.
+        progress: Called after every view.
+    """
+    views, device = [], gaussians.to(backend.device)
+    wanted = replace(settings, depth=True, median_depth=True)
+    for done, (name, camera) in enumerate(cameras, 1):
+        with torch.no_grad():
+            output = render(device, camera, settings=wanted, backend=backend)
+        assert output.median_depth is not None, "the settings ask for it"
+        alpha, median, mean, image = (
+            tensor.cpu() for tensor in (output.alpha, output.median_depth, output.mean_depth, output.image)
+        )
+        depth = torch.where((mean - median).abs() < FOG * median, mean, median)
+        depth = torch.where(alpha >= LEAST_ALPHA, depth, 0.0).double()
+        transparent = int((depth == 0).sum())
+        cosines = facing_cosines(depth, camera)
+        found = torch.where(cosines >= LEAST_COSINE, depth, 0.0).numpy().astype(np.float32)
+        weight = np.divide(cosines.numpy(), found**2, out=np.zeros(found.shape), where=found > 0)
+        pixels = np.round(255.0 * image.clamp(0, 1).numpy()).astype(np.uint8)
+        # A pixel at the rim of a surface may be clear by rounding.
+        clear = cv2.erode((alpha.numpy() < CLEAR).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        views.append(DepthView(name, camera, found, weight.astype(np.float32), pixels, clear, transparent))
+        progress("depth maps", done, len(cameras))
+    return views
+
+
+def facing_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
+    """Return the cosine of the angle between each ray and the depth map's normal, (H, W); 0 without a normal."""
+    rays = torch.from_numpy(camera.rays())
+    normals = normals_of_depth(depth, rays)
+    lengths = rays.norm(dim=-1)
+    cosines: torch.Tensor = -(normals * rays).sum(dim=-1) / lengths
+    return cosines.clamp(0.0, 1.0)
+
+
+def focal(camera: Camera) -> float:
+    """Return the geometric mean of a camera's focal lengths, px."""
+    return math.sqrt(camera.fx * camera.fy)
+
+
+def neighbours_of(index: int, cameras: Sequence[Camera], most: int = NEIGHBOURS) -> list[int]:
+    """Return the views most like one: by the angle between the optical axes and the distance of the centres.
+
+    Args:
+        index: The view.
+        cameras: All cameras.
+        most: Largest number of neighbours.
+    """
+    eyes = np.stack([camera.eye for camera in cameras])
+    axes = np.stack([camera.R[2] for camera in cameras])
+    apart = np.linalg.norm(eyes - eyes[index], axis=1)
+    spread = float(np.median(apart)) or 1.0
+    angles = np.arccos(np.clip(axes @ axes[index], -1.0, 1.0))
+    # Views from the same place check nothing, those that look elsewhere see little of the same.
+    score = angles + apart / spread + np.where(apart < 1e-6 * spread, np.inf, 0.0)
+    order = np.argsort(score, kind="stable")
+    return [int(i) for i in order if i != index and np.isfinite(score[i])][:most]
+
+
+def checked(
+    views: Sequence[DepthView],
+    coarsest: float = np.inf,
+    progress: Progress = lambda what, done, total: None,
+) -> tuple[list[DepthView], DepthCounts]:
+    """Drop what is too far, and what neighbouring views see through; scale the weights to at most 1.
+
+    Args:
+        views: The depth maps of `render_depths`.
+        coarsest: Largest size of a pixel on the surface, world units; what is farther is dropped.
+        progress: Called after every view.
+
+    Returns:
+        The views in the same order, and what happened to the pixels.
+    """
+    cameras = [view.camera for view in views]
+    kept, errors = [], []
+    far_pixels = contradicted_pixels = 0
+    scale = max((float(view.weight.max(initial=0.0)) for view in views), default=1.0) or 1.0
+    for index, view in enumerate(views):
+        far = view.depth > coarsest * focal(view.camera)
+        against, differences = _contradictions(view, [views[i] for i in neighbours_of(index, cameras)])
+        wrong = against & ~far
+        far_pixels, contradicted_pixels = far_pixels + int(far.sum()), contradicted_pixels + int(wrong.sum())
+        if len(differences):
+            errors.append(float(np.median(differences)))
+        good = ~(far | wrong)
+        weight = (view.weight * good / scale).astype(np.float32)
+        kept.append(replace(view, depth=view.depth * good, weight=weight))
+        progress("checks", index + 1, len(views))
+    pixels = sum(view.depth.size for view in views)
+    transparent = sum(view.transparent for view in views)
+    edge_on = sum(int((view.depth == 0).sum()) for view in views) - transparent
+    error = float(np.median(errors)) if errors else 0.0
+    return kept, DepthCounts(pixels, transparent, edge_on, far_pixels, contradicted_pixels, error)
+
+
+def _contradictions(
+    view: DepthView, others: Sequence[DepthView]
+) -> tuple[Bool[np.ndarray, "H W"], Float64[np.ndarray, " n"]]:
+    """Return which pixels enough neighbours see through, and relative differences to the neighbours that agree."""
+    count = np.zeros(view.depth.shape, dtype=np.int16)
+    rows, columns = np.nonzero(view.depth)
+    z = view.depth[rows, columns].astype(np.float64)
+    points = view.camera.eye + z[:, None] * view.camera.rays()[rows, columns]
+    differences = []
+    for other in others:
+        u, v, depth = other.camera.project(other.camera.world_to_cam(points))
+        with np.errstate(invalid="ignore"):
+            inside = (
+                (depth > 0)
+                & (u > -0.5)
+                & (v > -0.5)
+                & (u < other.camera.W - 0.5)
+                & (v < other.camera.H - 0.5)
+            )
+        at = np.flatnonzero(inside)
+        place = np.rint(v[at]).astype(int), np.rint(u[at]).astype(int)
+        seen = other.depth[place].astype(np.float64)
+        relative = np.where(seen > 0, seen / depth[at] - 1.0, 0.0)
+        count[rows[at], columns[at]] += (relative > SEEN_THROUGH) | other.clear[place]
+        near = (seen > 0) & (np.abs(relative) <= SEEN_THROUGH)
+        differences.append(np.abs(relative[near][::7]))
+    found = np.concatenate(differences) if differences else np.zeros(0)
+    return count >= CONTRADICTIONS, found

@@ -1,0 +1,67 @@
+"""A mesh painted with the photos of its scene's capture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.mesh.depths import DepthView
+from gsplat_edu.mesh.texture import TextureSettings, TextureView, textured
+from gsplat_edu.scene.mesh import Mesh
+from gsplat_edu.scene.views import Photo, View
+
+HALF_OPAQUE = 128
+"""Pixels of photos with a smaller alpha paint nothing."""
+
+
+def painted(
+    mesh: Mesh, dataset: Dataset, views: Sequence[DepthView], settings: TextureSettings | None = None
+) -> Mesh:
+    """Give a mesh a texture from the training photos.
+
+    What masks exclude, and what photos with alpha show less than half opaque, paints nothing.
+
+    Args:
+        mesh: The mesh, in the frame of the dataset's cameras.
+        dataset: The capture; photos at the scene's exposure, as `gsplat_edu.runs.cleaning.open_subject` gives them.
+        views: Depth maps of the scene, by the names of the photos; photos without one are not used.
+        settings: Size and blending; None for the defaults.
+
+    Raises:
+        ArgumentError: no photo has a depth map, or as for `textured`.
+        DatasetError: a photo cannot be read.
+    """
+    photos = {view.name: view for view in dataset.train}
+    if not any(view.name in photos for view in views):
+        raise ArgumentError("--texture: none of the depth maps is of a photo of the capture; check --dataset")
+    return textured(mesh, _views(views, photos), settings)
+
+
+def _views(views: Sequence[DepthView], photos: Mapping[str, View]) -> Iterator[TextureView]:
+    """Yield the photos one by one, at the size of their depth maps."""
+    for view in views:
+        if view.name not in photos:
+            continue
+        photo = photos[view.name].read()
+        H, W = view.depth.shape
+        image = _bytes(photo)
+        counts = np.ones(image.shape[:2], dtype=bool)
+        if photo.mask is not None:
+            counts &= photo.mask
+        if photo.alpha is not None:
+            counts &= photo.alpha >= HALF_OPAQUE
+        if image.shape[:2] != (H, W):
+            image = cv2.resize(image, (W, H), interpolation=cv2.INTER_AREA)
+            counts = cv2.resize(counts.astype(np.uint8), (W, H), interpolation=cv2.INTER_NEAREST) > 0
+        yield TextureView(view.camera, image, np.where(counts, view.depth, np.float32(0)))
+
+
+def _bytes(photo: Photo) -> UInt8[np.ndarray, "H W 3"]:
+    if photo.image.dtype == np.uint8:
+        return np.ascontiguousarray(photo.image)
+    return np.rint(255.0 * np.clip(photo.image, 0.0, 1.0)).astype(np.uint8)

@@ -1,0 +1,79 @@
+"""`gsplat-edu mesh`: files of every format, what it says, and what it refuses."""
+
+import numpy as np
+import pytest
+
+from gsplat_edu import write_scene
+from gsplat_edu.cli.main import main
+from gsplat_edu.io.mesh_files import read_mesh, write_mesh
+from gsplat_edu.scene.mesh import Mesh
+from splat_ball import RADIUS, ball
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "ball.ply"
+    write_scene(path, ball())
+    return path
+
+
+def test_a_scene_without_cameras_is_seen_from_around(scene, tmp_path, capsys):
+    out = tmp_path / "ball.glb"
+    assert main(["mesh", str(scene), str(out), "--voxel", "0.05", "--backend", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert "the scene has no cameras: 48 views around it are used" in said
+    assert "are seen by 3 views or more" in said and "1 connected part" in said
+    mesh = read_mesh(out)
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean() < 0.03
+    assert mesh.colors is not None
+
+
+def test_the_truth_is_compared_and_a_collider_is_coarse(scene, tmp_path, capsys):
+    truth = tmp_path / "truth.ply"
+    assert main(["mesh", str(scene), str(truth), "--voxel", "0.05", "--backend", "cpu"]) == 0
+    out = tmp_path / "collider.obj"
+    words = [
+        "mesh",
+        str(scene),
+        str(out),
+        "--voxel",
+        "0.1",
+        "--faces",
+        "300",
+        "--truth",
+        str(truth),
+        "--tau",
+        "0.05",
+    ]
+    assert main([*words, "--collider", "--backend", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert "against the truth: accuracy" in said and "F1" in said and "degrees" in said
+    assert len(read_mesh(out).faces) <= 300
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["out.stl"], "unknown mesh format; known are .glb, .ply, .obj"),
+        (["out.glb", "--voxel", "0"], "--voxel"),
+        (["out.glb", "--faces", "3"], "--faces: is 3, but has to be at least 4"),
+        (["out.glb", "--tau", "1"], "--tau: is for --truth"),
+        (["out.glb", "--truth", "missing.ply"], "--truth: missing.ply does not exist"),
+        (["out.glb", "--bounds", "0,0,0,1,0,1"], "--bounds: X1, Y1 and Z1 have to be larger"),
+    ],
+)
+def test_bad_options_are_one_line(scene, words, said, capsys):
+    assert main(["mesh", str(scene), *words]) == 2
+    error = capsys.readouterr().err.strip()
+    assert said in error and "\n" not in error
+
+
+def test_a_missing_scene_and_a_bad_truth_leave_the_file_that_was_there(scene, tmp_path, capsys):
+    out = tmp_path / "kept.ply"
+    triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+    write_mesh(out, triangle)
+    before = out.read_bytes()
+    assert main(["mesh", str(tmp_path / "nothing"), str(out)]) == 2
+    (tmp_path / "bad.ply").write_bytes(b"ply\nno more")
+    assert main(["mesh", str(scene), str(out), "--truth", str(tmp_path / "bad.ply")]) == 2
+    assert "bad.ply" in capsys.readouterr().err and out.read_bytes() == before

@@ -1,0 +1,143 @@
+"""From splats to a mesh: a ball of flat splats becomes a closed ball; what is left out is said."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import ArgumentError, Camera, load_backend
+from gsplat_edu.base.errors import NotEnoughMemoryError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.evaluate.surface import Comparison, score_surface
+from gsplat_edu.evaluate.topology import topology
+from gsplat_edu.mesh.depths import checked, neighbours_of, render_depths
+from gsplat_edu.mesh.extract import MeshSettings, default_voxel, extract_mesh, views_of_vertices
+from gsplat_edu.mesh.tidy import TidySettings
+from gsplat_edu.render.settings import RenderSettings
+from splat_ball import RADIUS, ball
+
+SETTINGS = RenderSettings(jacobian_limit=1.3)
+
+
+def orbit(count=24, size=120):
+    """Return cameras around the ball, from all sides."""
+    index = np.arange(count) + 0.5
+    y, turn = 0.9 * (1 - 2 * index / count), np.pi * (1 + 5**0.5) * index
+    ring = np.sqrt(1 - y * y)
+    eyes = 3.0 * np.stack([ring * np.cos(turn), y, ring * np.sin(turn)], axis=1)
+    return [
+        (f"{i:02d}", Camera.looking_at(eye, (0, 0, 0), 1.4 * size, 1.4 * size, size, size))
+        for i, eye in enumerate(eyes)
+    ]
+
+
+@pytest.fixture(scope="module")
+def result():
+    return extract_mesh(ball(), orbit(), SETTINGS, load_backend("cpu"))
+
+
+def test_a_ball_of_splats_becomes_a_closed_ball(result):
+    mesh = result.mesh
+    shape = topology(mesh)
+    assert shape.components == 1 and shape.boundary_edges == 0 and shape.euler == 2 and shape.manifold
+    off = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
+    # A splat's depth is that of its mean: between splats 0.045 apart, the surface is up to 0.3 mm below the ball.
+    assert off.mean() < 0.3 * result.voxel and off.max() < 1.5 * result.voxel
+    # ... and depths of means lie behind slanted splats
+    assert abs(shape.volume / (4 / 3 * np.pi * RADIUS**3) - 1) < 0.03
+    outward = (mesh.face_normals() * mesh.corners.mean(axis=1)).sum(axis=1)
+    assert (outward > 0).mean() > 0.999
+
+
+def test_colours_are_those_of_the_splats(result):
+    y = np.sin(8 * result.mesh.vertices[:, 1] / RADIUS)
+    red, blue = result.mesh.colors[:, 0], result.mesh.colors[:, 2]
+    clear = np.abs(y) > 0.8
+    assert ((red > blue) == (y > 0))[clear].mean() > 0.98
+
+
+def test_the_same_bits_for_any_number_of_threads(result):
+    before, seen = torch.get_num_threads(), set()
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            mesh = extract_mesh(ball(), orbit(8, 64), SETTINGS, load_backend("cpu")).mesh
+            seen.add((mesh.vertices.tobytes(), mesh.faces.tobytes(), mesh.colors.tobytes()))
+    finally:
+        torch.set_num_threads(before)
+    assert len(seen) == 1
+
+
+def test_scores_against_the_truth_and_views_of_each_vertex(result):
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(50_000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    scores = score_surface(result.mesh, (RADIUS * normals, normals), Comparison(result.voxel, samples=20_000))
+    assert scores.distances.f1 > 0.98 and scores.normal_degrees < 8
+    views = views_of_vertices(result.mesh, result.views, result.truncation)
+    assert np.median(views) >= 5 and views.min() >= 1
+
+
+def test_depths_that_neighbours_see_through_are_left_out():
+    """Fog in one view: a patch on the ball and one beside it are nearer than what the other views see there."""
+    cameras = orbit(24, 64)
+    with one_thread():
+        views = render_depths(ball(), cameras, SETTINGS, load_backend("cpu"))
+    clean, before = checked(views)
+    depth = views[10].depth.copy()
+    fog = np.zeros(depth.shape, dtype=bool)
+    fog[28:34, 28:34] = fog[1:4, 30:34] = True
+    assert (depth[28:34, 28:34] > 0).all() and not depth[1:4, 30:34].any()
+    depth[fog] = 2.1
+    views[10] = dataclasses.replace(views[10], depth=depth)
+    kept, counts = checked(views)
+    assert not kept[10].depth[fog].any() and counts.contradicted >= before.contradicted + fog.sum()
+    assert np.array_equal(kept[10].depth[~fog], clean[10].depth[~fog])
+    assert before.contradicted < 0.02 * sum(view.depth.astype(bool).sum() for view in views)
+    assert max(float(view.weight.max()) for view in kept) <= 1
+
+
+def test_voxels_grow_until_the_volume_fits_and_a_given_size_does_not(result):
+    small = extract_mesh(
+        ball(), orbit(), SETTINGS, load_backend("cpu"), MeshSettings(max_bytes=result.volume_bytes // 3)
+    )
+    assert small.voxel > result.voxel and small.volume_bytes <= result.volume_bytes // 3
+    assert any("so that the volume fits" in note for note in small.notes)
+    with pytest.raises(NotEnoughMemoryError):
+        extract_mesh(
+            ball(),
+            orbit(),
+            SETTINGS,
+            load_backend("cpu"),
+            MeshSettings(voxel=result.voxel, max_bytes=result.volume_bytes // 3),
+        )
+
+
+def test_bounds_leave_a_hole_and_faces_are_reduced():
+    bounds = np.array([[-2.0, -2, -2], [0.2, 2, 2]])
+    settings = MeshSettings(bounds=bounds, tidy=TidySettings(faces=500))
+    found = extract_mesh(ball(), orbit(), SETTINGS, load_backend("cpu"), settings)
+    assert found.mesh.vertices[:, 0].max() < 0.2 + 3 * found.voxel
+    assert topology(found.mesh).boundary_edges > 0 and len(found.mesh.faces) <= 500
+
+
+def test_nothing_to_mesh_is_said():
+    backend = load_backend("cpu")
+    with pytest.raises(ArgumentError, match="at least one camera"):
+        extract_mesh(ball(), [], SETTINGS, backend)
+    with pytest.raises(ArgumentError, match="no view has a pixel with an alpha"):
+        extract_mesh(ball(-6.0), orbit(4, 48), SETTINGS, backend)
+
+
+def test_neighbours_look_at_the_same_from_elsewhere():
+    cameras = [camera for _, camera in orbit(12, 32)]
+    cameras.append(cameras[3])  # the same place
+    for index in (0, 3, 7):
+        found = neighbours_of(index, cameras, 3)
+        assert index not in found and len(found) == 3
+        apart = [float(np.linalg.norm(camera.eye - cameras[index].eye)) for camera in cameras]
+        assert min(apart[i] for i in found) > 0
+        nearest = sorted(distance for distance in apart if distance > 0)[:6]
+        assert max(apart[i] for i in found) <= nearest[-1]
+    assert default_voxel(render_depths(ball(), orbit(2, 32), SETTINGS, load_backend("cpu"))) > 0
