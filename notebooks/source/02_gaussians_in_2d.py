@@ -147,7 +147,7 @@ for ax, cov2d in zip(axes, pushed, strict=True):
     for arm in (directions * np.sqrt(np.maximum(lengths, 0.0))).T:
         ax.plot([-arm[0], arm[0]], [-arm[1], arm[1]], color="white", linewidth=1.5)
     title = f"xy = {cov2d[0, 1]:.2f}, eigenvalues {lengths[0]:.2f}, {lengths[1]:.2f}"
-    ax.set(title=title, xlabel="x (px)", ylabel="y (px)")
+    ax.set(title=title.replace("-", "\N{MINUS SIGN}"), xlabel="x (px)", ylabel="y (px)")
 fig.colorbar(picture, ax=axes, label="value of the splat, cut at 2")
 plt.show()
 peaks = [footprint(cov2d, fine_x, fine_y).max() for cov2d in pushed]
@@ -215,7 +215,7 @@ assert abs(summed / mass - 1) < 8 * np.exp(-2 * np.pi**2 * np.linalg.eigvalsh(le
 # > it still?
 
 # %%
-titles = ("sampled as it is", f"after adding {DILATION} px² on the diagonal")
+titles = ("sampled as it is", f"after adding {DILATION} px², vertical axis enlarged 200 times")
 
 
 def light(width, added):
@@ -230,12 +230,14 @@ for width, style in zip((0.1, 0.2, 0.3, 0.6, 1.0), ("-", "--", "-.", ":", "-"), 
     before, after = light(width, 0.0), light(width, DILATION)
     for ax, curve, title in zip(axes, (before, after), titles, strict=True):
         ax.plot(places, curve, style, label=f"sigma {width:.1f} px")
-        ax.set(title=title, xlabel="column of the centre (px)", ylabel="sum over pixels / mass", ylim=(0, 4))
+        ax.set(title=title, xlabel="column of the centre (px)", ylabel="sum over pixels / mass")
     print(f"sigma {width:.1f} px: peak to peak {np.ptp(before):.4f} before, {np.ptp(after):.4f} after")
     # Two axes, each 1 plus or minus 2 exp(-2 pi² variance): peak to peak at most 8 of these, and a tenth more
     # for their product and the next frequencies.
     assert np.ptp(after) < 1.1 * 8 * np.exp(-2 * np.pi**2 * (width**2 + DILATION))
     assert np.ptp(before) > 1 or width > 0.3
+axes[0].set(ylim=(0, 4))
+axes[1].set(ylim=(0.99, 1.01))
 axes[0].legend()
 plt.show()
 
@@ -303,10 +305,10 @@ for mode in MODES:
         energy[mode].append(np.sum(splats, axis=(1, 2)) / (2 * np.pi * sigma**2))
 
 fig, ax = plt.subplots(figsize=(6.6, 4), layout="constrained")
-for mode, mark in zip(MODES, ("x", "s", "."), strict=True):
+for mode, mark, size in zip(MODES, ("x", "s", "."), (11, 6, 6), strict=True):
     low, high, mean = (f(energy[mode], axis=1) for f in (np.min, np.max, np.mean))
     ax.fill_between(sigmas, np.maximum(low, 1e-2), high, alpha=0.25)
-    ax.plot(sigmas, mean, mark, markersize=6, label=f"{mode}: mean, range over positions")
+    ax.plot(sigmas, mean, mark, markersize=size, label=f"{mode}: mean, range over positions")
 ax.set(title="how much a splat paints, against what it should", xscale="log", yscale="log", ylim=(1e-2, 3e2))
 ax.set(xlabel="standard deviation of the splat (px)", ylabel="sum over pixels / mass")
 ax.legend()

@@ -41,19 +41,19 @@ def ellipse(cov2d, k=1.0):
 
 
 rod = rng.normal(size=(400, 3)) * [0.1, 0.1, 1.0]
-fig, axes = plt.subplots(1, 3, figsize=(10.5, 3.6), layout="constrained")
+fig, axes = plt.subplots(1, 3, figsize=(10.5, 3.3), layout="constrained", sharey=True)
 fitted = []
 for ax, degrees in zip((axes[0], axes[2], axes[1]), (-60, 60, 0), strict=True):
     a = np.radians(degrees)
     seen = np.stack([np.cos(a) * rod[:, 0] + np.sin(a) * rod[:, 2], rod[:, 1]])
     fitted.append(np.cov(seen) if degrees else (fitted[0] + fitted[1]) / 2)
     ax.plot(*seen, ".", markersize=3, label="the rod")
-    ax.plot(
-        *ellipse(fitted[-1], 2), linewidth=2, label="averaged" if degrees == 0 else "the splat, two sigma"
-    )
-    ax.set(title=f"{degrees} degrees", xlabel="x (world units)", ylabel="y (world units)", aspect="equal")
+    ax.plot(*ellipse(fitted[-1], 2), linewidth=2, label="the splat, two sigma")
+    title = f"{degrees} degrees" + ": the average of the two" * (degrees == 0)
+    ax.set(title=title.replace("-", "\N{MINUS SIGN}"), xlabel="x (world units)", aspect="equal")
     ax.axis((-2.5, 2.5, 1.5, -1.5))
-    ax.legend(loc="upper right")
+axes[0].set(ylabel="y (world units)")
+fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 plt.show()
 print(f"variance across from the front: rod {np.var(rod[:, 0]):.3f}, averaged splat {fitted[-1][0, 0]:.3f}")
 assert fitted[-1][0, 0] > 30 * np.var(rod[:, 0])

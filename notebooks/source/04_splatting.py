@@ -251,7 +251,7 @@ angle_ax.plot(angles, factors, "o", color=BLUE, label="measured at standard devi
 angle_ax.plot(angles, predicted_factor(tangents), color=ORANGE, label="(3 + 8t²) / (1 + t²)")
 angle_ax.set(title="and against the angle", xlabel="angle off the axis (degrees)", ylim=(0, 9))
 angle_ax.set(ylabel="relative error / (standard deviation / depth)²")
-angle_ax.legend()
+angle_ax.legend(loc="lower right")
 plt.show()
 
 # %% [markdown]
@@ -306,13 +306,13 @@ seen = seen[np.all((seen > -0.5) & (seen < 127.5), axis=-1)]
 unclamped, clamped = footprints(None), footprints(1.3)
 half = (CAMERA.W / 2) / CAMERA.fx
 
-fig, axes = plt.subplots(1, 4, figsize=(14, 3.8), layout="constrained")
+fig, axes = plt.subplots(1, 4, figsize=(14, 3.8), layout="constrained", width_ratios=(1.7, 1, 1, 1))
 for ball in balls:
     axes[0].plot(*outline(ball[[0, 2]], ball_cov[:2, :2], 2).T, color=BLUE)
 for slope, style in ((half, "-"), (1.3 * half, "--")):
     axes[0].plot([-1.8 * slope, 0, 1.8 * slope], [1.8, 0, 1.8], style, color=ORANGE)
 axes[0].set(title="from above: balls (2 sigma), the image\n(line) and 1.3 times it (dashes)", aspect="equal")
-axes[0].set(xlabel="x (world units)", ylabel="z (world units)")
+axes[0].set(xlabel="x (world units)", ylabel="z (world units)", xlim=(-1.75, 1.75), ylim=(-0.1, 1.95))
 axes[1].plot(*seen.T, ".", color="white", markersize=1)
 axes[1].set(xlim=(-0.5, 127.5), ylim=(127.5, -0.5), aspect="equal", facecolor="black")
 axes[1].set(title="what the camera sees:\nsamples of all balls", xticks=[], yticks=[])

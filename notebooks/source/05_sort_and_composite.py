@@ -294,7 +294,7 @@ plt.show()
 # at the very end: $C = C_{splats} + T_{final}\, b$. It also tells where there was no scene.
 
 # %%
-fig, axes = plt.subplots(2, 4, figsize=(11, 5.8), layout="constrained")
+fig, axes = plt.subplots(2, 4, figsize=(11, 6.6), layout="constrained")
 for column, azimuth in zip(axes.T, (0.5, 2.1, 3.6, 5.2), strict=True):
     camera = view_from(azimuth)
     black, T_final = render_gaussians(camera, *SHELL)
@@ -302,9 +302,10 @@ for column, azimuth in zip(axes.T, (0.5, 2.1, 3.6, 5.2), strict=True):
     assert np.allclose(white, black + T_final[..., None], rtol=0, atol=1e-14)
     column[0].imshow(np.clip(white, 0, 1), interpolation="nearest")
     column[0].set(title=f"azimuth {np.degrees(azimuth):.0f} degrees", xticks=[], yticks=[])
-    shown = column[1].imshow(T_final, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    shown = column[1].imshow(T_final, cmap="gray", vmin=0, vmax=0.1, interpolation="nearest")
     column[1].set(title="transmittance left over", xticks=[], yticks=[])
-fig.colorbar(shown, ax=axes[1], label="share of light")
+label = "transmittance left over (share of light); white from 0.1"
+fig.colorbar(shown, ax=axes[1], label=label, location="bottom", shrink=0.5, extend="max")
 fig.suptitle("the sphere over a white background, and where that comes through")
 plt.show()
 print(f"largest transmittance inside the sphere, last view: {T_final[true_sphere(camera)[1]].max():.2f}")
@@ -346,7 +347,7 @@ one_way, other_way = a * amber + (1 - a) * b * blue, b * blue + (1 - b) * a * am
 by_pixel = np.where(np.arange(EDGE)[:, None] < EDGE / 2, one_way, other_way)
 fig, axes = plt.subplots(1, 4, figsize=(13.5, 3.5), layout="constrained")
 names = [
-    *(f"camera at {degrees:.2f} degrees" for degrees in path[flip : flip + 2]),
+    *(f"camera at {degrees:.2f} degrees".replace("-", "\N{MINUS SIGN}") for degrees in path[flip : flip + 2]),
     "each half in its own order",
 ]
 for ax, image, title in zip(axes, (views[flip], views[flip + 1], by_pixel), names, strict=False):

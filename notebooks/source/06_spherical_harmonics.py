@@ -190,7 +190,7 @@ for ax in axes.flat:
     if not ax.get_title():
         ax.remove()
 fig.colorbar(lobes, ax=list(fig.axes), label="value")
-fig.suptitle("the 16 harmonics; azimuth from left to right, +z at the top and -z at the bottom")
+fig.suptitle("the 16 harmonics; azimuth from left to right, +z at the top and \N{MINUS SIGN}z at the bottom")
 plt.show()
 
 # %% [markdown]
@@ -271,7 +271,8 @@ for row, camera in enumerate(cameras):
     truth = picture(camera, glossy(d))
     azimuth = np.degrees(np.arctan2(camera.eye[0], -camera.eye[2]))
     axes[row + 1, 0].imshow(np.clip(truth, 0, 1), interpolation="nearest")
-    axes[row + 1, 0].set(title=f"truth, azimuth {azimuth:.0f} degrees", xticks=[], yticks=[])
+    title = f"truth, azimuth {azimuth:.0f} degrees".replace("-", "\N{MINUS SIGN}")
+    axes[row + 1, 0].set(title=title, xticks=[], yticks=[])
     for degree in range(4):
         image = picture(camera, eval_sh(degree, sh, d))
         errors[row, degree] = np.abs(image - truth).mean()
@@ -279,8 +280,10 @@ for row, camera in enumerate(cameras):
         axes[row + 1, degree + 1].set(title=f"degree {degree}", xticks=[], yticks=[])
 for degree in range(4):
     k = num_coefficients(degree)
-    axes[0, degree + 1].imshow(sh_basis(chart)[..., :k] @ gloss[one, :k], cmap="magma", vmin=0, vmax=GLOSS)
+    fitted = sh_basis(chart)[..., :k] @ gloss[one, :k]
+    shown = axes[0, degree + 1].imshow(fitted, cmap="magma", vmin=0, vmax=GLOSS)
     axes[0, degree + 1].set(title=f"degree {degree}", xticks=[], yticks=[])
+fig.colorbar(shown, ax=axes[0], label="gloss")
 plt.show()
 print("mean error of the three views, degrees 0 to 3:", *(f"{e:.4f}" for e in errors.mean(axis=0)))
 assert np.all(np.diff(errors, axis=1) < 0) and errors[:, 3].max() < 0.2 * errors[:, 0].min()

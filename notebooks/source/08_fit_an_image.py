@@ -58,7 +58,7 @@ def draw_images(axes, images):
         ax.set(xticks=[], yticks=[], title=title)
 
 
-fig, axes = plt.subplots(1, 3, figsize=(8.5, 3.6), layout="constrained")
+fig, axes = plt.subplots(1, 3, figsize=(8.5, 3.9), layout="constrained")
 draw_images(axes, {"the photo": photo, "the picture": wrong.image})
 draw_ellipses(axes[2], start, "the ellipses it is made of")
 plt.show()
@@ -334,7 +334,8 @@ assert moved(trial.splats)["means"] > 10 * moved(stuck)["means"]
 
 fig, (loss_ax, psnr_ax) = plt.subplots(1, 2, figsize=(12, 3.4), layout="constrained")
 for (rate, (_, history)), style in zip(descents.items(), ("C0:", "C1--", "C2-."), strict=True):
-    loss_ax.semilogy(history, style, label=f"one rate for all, {rate}")
+    end = "" if len(history) == TRIAL else ": diverges, stopped"
+    loss_ax.semilogy(history, style, label=f"one rate for all, {rate}{end}")
 loss_ax.semilogy(trial.losses, "k", label="Adam")
 psnr_ax.plot(trial.psnrs, "k")
 loss_ax.set(title="the same start, the same gradients", xlabel="step", ylabel="mean squared error")
@@ -388,8 +389,10 @@ def seen_from(x):
 
 assert np.abs(seen_from(0.0) - fit.image).max() < 1e-10
 
-fig, axes = plt.subplots(1, 3, figsize=(8.5, 3.6), layout="constrained")
-draw_images(axes, {f"{x} to the right, 2 to 4 away": seen_from(x) for x in (0.0, 0.3, 1.2)})
+fig, axes = plt.subplots(1, 3, figsize=(8.5, 3.9), layout="constrained")
+draw_images(
+    axes, {f"{x} world units to the right,\n2 to 4 world units away": seen_from(x) for x in (0.0, 0.3, 1.2)}
+)
 plt.show()
 
 # %% [markdown]

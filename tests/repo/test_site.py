@@ -267,6 +267,31 @@ def test_no_line_of_code_is_cut_off(site, width, browser):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("width", [1440, 390])
+@pytest.mark.sliced(1, group="built whole", together=True)
+def test_pictures_of_chapters_are_whole_and_large_enough_to_read(site, width, browser):
+    """A picture that is wider than a phone keeps up to 640 px of its width, and its cell scrolls."""
+    _, out = site
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    chapters = sorted((out / "notebooks").glob("*.html"))
+    assert len(chapters) == 14
+    for path in chapters:
+        page.goto(path.as_uri())
+        pictures = page.evaluate(
+            """() => [...document.querySelectorAll(".cell_output img")].map(picture => {
+                const cell = picture.closest(".cell_output"), scrolls = getComputedStyle(cell).overflowX === "auto";
+                return [picture.clientWidth, picture.naturalWidth, cell.clientWidth, scrolls];
+            })"""
+        )
+        assert pictures, path.name
+        for shown, natural, room, scrolls in pictures:
+            assert shown >= min(natural, 640) - 1, f"{path.name}: {natural} px are shown as {shown} px"
+            assert shown <= room + 1 or scrolls, f"{path.name}: {shown} px do not fit into {room} px"
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, path.name
+    page.close()
+
+
+@pytest.mark.slow
 @pytest.mark.sliced(1, group="built whole", together=True)
 def test_broken_links_are_found(site, tmp_path):
     texts = {"a": '<a href="b.html#here"><a href="gone.html#x">', "b": '<p id="there"><img src="c.png">'}
