@@ -3,8 +3,4 @@
 
 #include <nanobind/nanobind.h>
 
-namespace gsplat {
-
-void bind_surface(nanobind::module_ &m);
-
-}  // namespace gsplat
+namespace gsplat { void bind_surface(nanobind::module_ &m); }  // namespace gsplat

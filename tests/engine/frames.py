@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsplat_edu.engine import frame
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 from gsplat_edu.scene.camera import Camera
 from native_scenes import BACKGROUND
 
@@ -24,7 +24,7 @@ def view_of(scene, **changes):
         "alpha_max": 0.99,
         "z_near": 0.05,
     }
-    return View(scene.camera, **settings | changes)
+    return DeviceView(scene.camera, **settings | changes)
 
 
 def drawn(pool, scene, **changes):
@@ -33,4 +33,4 @@ def drawn(pool, scene, **changes):
 
 def plain_view(H, W):
     camera = Camera(np.eye(3), np.zeros(3), 30.0, 30.0, W / 2, H / 2, H, W)
-    return View(camera, (0.0, 0.0, 0.0), 0, False, 0.3, None, 0.99, 0.01)
+    return DeviceView(camera, (0.0, 0.0, 0.0), 0, False, 0.3, None, 0.99, 0.01)

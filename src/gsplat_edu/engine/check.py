@@ -25,11 +25,19 @@ import numpy as np
 
 from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine.adapters import adapters
-from gsplat_edu.engine.frame import GRADS, Frame, FrameGradients, Pool, Scene, differentiate_frame, draw_frame
+from gsplat_edu.engine.frame import (
+    GRADS,
+    DeviceFrame,
+    FrameGradients,
+    Pool,
+    Scene,
+    differentiate_frame,
+    draw_frame,
+)
 from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.measure import as_table, measure_step
 from gsplat_edu.engine.passes import WORD, Buffer, Program, Size, scan, scan_scratch, sort, sort_scratch
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 from gsplat_edu.scene.camera import Camera
 
 SUMMARY = "Check the engine on this computer's adapter, and measure its passes."
@@ -98,14 +106,14 @@ def _random_scene(count: int) -> Scene:
     return Scene(np.concatenate(columns, axis=1).astype(np.float32), rest)
 
 
-def _view(width: int, height: int) -> View:
+def _view(width: int, height: int) -> DeviceView:
     """Return a camera in front of that cube."""
     focal = 1.2 * width
     camera = Camera(np.eye(3), (0.0, 0.0, -3.0), focal, focal, width / 2, height / 2, height, width)
-    return View(camera, (0.0, 0.0, 0.0), 3, False, 0.3, 1.3, 0.99, 0.05)
+    return DeviceView(camera, (0.0, 0.0, 0.0), 3, False, 0.3, 1.3, 0.99, 0.05)
 
 
-def _same_bits(first: tuple[Frame, FrameGradients], second: tuple[Frame, FrameGradients]) -> bool:
+def _same_bits(first: tuple[DeviceFrame, FrameGradients], second: tuple[DeviceFrame, FrameGradients]) -> bool:
     """Return whether two frames and their gradients have the same bits."""
     return all(
         np.array_equal(getattr(one, name), getattr(other, name))
@@ -116,13 +124,13 @@ def _same_bits(first: tuple[Frame, FrameGradients], second: tuple[Frame, FrameGr
     )
 
 
-def measure_frame(pool: Pool, scene: Scene, view: View, rounds: int) -> tuple[bool, dict[str, object]]:
+def measure_frame(pool: Pool, scene: Scene, view: DeviceView, rounds: int) -> tuple[bool, dict[str, object]]:
     """Render and differentiate; return whether two runs have the same bits, and what was counted and measured.
 
     Times are medians over the rounds, in milliseconds: of the device by part and entry point, and of the host's calls.
     """
     grads = np.random.default_rng(2).normal(size=(view.camera.H, view.camera.W, GRADS)).astype(np.float32)
-    results: list[tuple[Frame, FrameGradients]] = []
+    results: list[tuple[DeviceFrame, FrameGradients]] = []
     forward, backward = [], []
     for _ in range(max(rounds, 2) + 1):  # the first one compiles
         began = time.perf_counter()

@@ -30,7 +30,7 @@ from gsplat_edu.engine.passes import (
     sort_scratch,
 )
 from gsplat_edu.engine.statistics import Asked, collect
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 
 CORE, OUT, RECORD, SLOT, PIXEL, GRADS, CAMERA_NUMBERS = 14, 16, 16, 10, 6, 5, 16
 """Numbers of a Gaussian without its higher harmonics, of their gradient, a record, a slot, a pixel, its gradient, and
@@ -212,7 +212,7 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class DeviceFrame:
     """A rendered view, whose buffers stay on the device for its gradients.
 
     Args:
@@ -320,7 +320,7 @@ def rounded_pairs(pairs: int) -> int:
     return max(-(-pairs // step) * step, FEWEST_PAIRS)
 
 
-def draw_frame(pool: Pool, scene: Scene, view: View) -> Frame:
+def draw_frame(pool: Pool, scene: Scene, view: DeviceView) -> DeviceFrame:
     """Render a scene.
 
     Args:
@@ -349,7 +349,7 @@ def draw_frame(pool: Pool, scene: Scene, view: View) -> Frame:
             break
         room = needed
     image = _pixels(found["image"], H, W)
-    frame = Frame(
+    frame = DeviceFrame(
         *(image[..., :3], image[..., 3], image[..., 4], image[..., 5]),
         visible=found["order"][:visible].astype(np.int64),
         radii=found["radii"].view(np.float32)[: 2 * visible].reshape(visible, 2).copy(),
@@ -377,7 +377,7 @@ def _drawn_features(memory: Memory, scene: Scene, H: int, W: int) -> np.ndarray 
 
 
 def differentiate_frame(
-    frame: Frame,
+    frame: DeviceFrame,
     scene: Scene,
     grads: np.ndarray,
     of_features: np.ndarray | None,

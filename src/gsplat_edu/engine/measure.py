@@ -14,7 +14,7 @@ from gsplat_edu.engine.model import Counters, by_stage, forecast, step_costs
 from gsplat_edu.engine.passes import sort_bits
 from gsplat_edu.engine.step import GROUPS, HALT, LIVE, STATE, Photo, StepNumbers, step_program
 from gsplat_edu.engine.transfers import Kept
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 
 NUMBERS = StepNumbers(
     dict.fromkeys(GROUPS, (1e-4, 0.9, 0.999, 1e-15, 0.1, 1e-3)),
@@ -82,7 +82,7 @@ class MeasuredStep:
 class _Run:
     """Buffers of a training with room for its pairs."""
 
-    def __init__(self, device: Device, scene: Scene, view: View) -> None:
+    def __init__(self, device: Device, scene: Scene, view: DeviceView) -> None:
         self.device, self.scene, self.view = device, scene, view
         self.host: list[tuple[float, float]] = []  # milliseconds to record and submit each step
         pixels = view.camera.H * view.camera.W
@@ -142,7 +142,7 @@ class _Run:
         return {name: self.memory.read(name) for name in STATE}
 
 
-def measure_step(device: Device, scene: Scene, view: View, rounds: int) -> MeasuredStep:
+def measure_step(device: Device, scene: Scene, view: DeviceView, rounds: int) -> MeasuredStep:
     """Measure a step of training.
 
     Args:

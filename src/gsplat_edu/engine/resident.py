@@ -35,7 +35,7 @@ from gsplat_edu.engine.step import (
     step_program,
 )
 from gsplat_edu.engine.transfers import Kept, Ticket
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 
 PHOTO_ROOM = 1 << 30
 """Bytes of photos that stay on the device; others are sent again for each step. WebGPU does not tell free memory."""
@@ -100,7 +100,7 @@ class Result:
 class _Step:
     """A step as it was submitted, to be submitted again if it found no room."""
 
-    view: View
+    view: DeviceView
     photo: _KeptPhoto
     numbers: StepNumbers
     result: Result
@@ -132,7 +132,7 @@ class Resident:
         self._waiting: deque[_Step] = deque()
         self._photos: dict[int, tuple[object, _KeptPhoto]] = {}
         self._photo_room = photo_room
-        self._last: View | None = None
+        self._last: DeviceView | None = None
         self._failure: BackendUnavailableError | None = None
 
     def load(self, state: Mapping[str, np.ndarray]) -> None:
@@ -180,7 +180,7 @@ class Resident:
 
     def step(
         self,
-        view: View,
+        view: DeviceView,
         index: int,
         photo: Callable[[], Photo],
         constant: object | None,
@@ -288,7 +288,7 @@ class Resident:
             self._photos[index] = constant, sent
         return sent
 
-    def _make_room_for(self, view: View) -> None:
+    def _make_room_for(self, view: DeviceView) -> None:
         """Enlarge the buffers if a view is larger than all before."""
         pixels = view.camera.H * view.camera.W
         if pixels > self._pixels or view.tiles > self._tiles:

@@ -19,7 +19,7 @@ NO_STOP = -1.0
 
 
 @dataclass(frozen=True)
-class View:
+class DeviceView:
     """The camera and the settings of one render; they mean what `gsplat_edu.render.settings.RenderSettings` says.
 
     Args:

@@ -26,7 +26,7 @@ from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.frame import GRADS, FrameGradients, Pool, Scene, differentiate_frame, draw_frame
 from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.statistics import Asked
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
@@ -46,7 +46,7 @@ CORE = {"means": 3, "quats": 4, "log_scales": 3, "sh0": 3, "logit_opacities": 1}
 class _Call:
     """State of one render: inputs that are no tensors, and outputs that are no images."""
 
-    view: View
+    view: DeviceView
     depth: bool
     visible: Tensor = field(init=False)
     radii: Tensor = field(init=False)
@@ -125,7 +125,9 @@ def _collect(call: _Call, rest: int, errors: Tensor | None) -> Callable[[], Tens
     return found
 
 
-def engine_view(camera: Camera, settings: RenderSettings, background: tuple[float, ...], degree: int) -> View:
+def engine_view(
+    camera: Camera, settings: RenderSettings, background: tuple[float, ...], degree: int
+) -> DeviceView:
     """Return camera and settings as the engine takes them.
 
     Args:
@@ -135,7 +137,7 @@ def engine_view(camera: Camera, settings: RenderSettings, background: tuple[floa
         degree: Degree of the harmonics that are used; the Gaussians have them.
     """
     red, green, blue = background
-    return View(
+    return DeviceView(
         camera, (red, green, blue), degree, settings.antialiased, settings.dilation, settings.jacobian_limit,
         settings.alpha_max, settings.z_near, settings.stop == "pixel",
     )  # fmt: skip
