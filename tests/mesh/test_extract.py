@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu import ArgumentError, Camera, load_backend
+from gsplat_edu import ArgumentError, Camera, Gaussians, load_backend
 from gsplat_edu.base.errors import NotEnoughMemoryError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.evaluate.surface import Comparison, score_surface
@@ -96,6 +96,17 @@ def test_depths_that_neighbours_see_through_are_left_out():
     assert np.array_equal(kept[10].depth[~fog], clean[10].depth[~fog])
     assert before.contradicted < 0.02 * sum(view.depth.astype(bool).sum() for view in views)
     assert max(float(view.weight.max()) for view in kept) <= 1
+
+
+def test_splats_of_the_sky_are_no_surface(result):
+    gaussians = ball()
+    sky = gaussians.map(lambda tensor: tensor[:300].clone())
+    sky = dataclasses.replace(
+        sky, means=80 * ball().means[::10], log_scales=torch.full((300, 3), float(np.log(8.0)))
+    )
+    both = Gaussians(**{name: torch.cat([t, getattr(sky, name)]) for name, t in gaussians.tensors().items()})
+    found = extract_mesh(both, orbit(), SETTINGS, load_backend("cpu"))
+    assert found.voxel == result.voxel and np.array_equal(found.mesh.vertices, result.mesh.vertices)
 
 
 def test_voxels_grow_until_the_volume_fits_and_a_given_size_does_not(result):

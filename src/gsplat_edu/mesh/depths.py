@@ -25,6 +25,7 @@ from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
 
 LEAST_ALPHA = 0.5
 """Pixels with less accumulated alpha have no surface."""
@@ -99,7 +100,7 @@ def render_depths(
     backend: Backend,
     progress: Progress = lambda what, done, total: None,
 ) -> list[DepthView]:
-    """Render the depth maps, with the depths of transparent pixels and edge-on surfaces 0.
+    """Render the depth maps, with the depths of transparent pixels, edge-on surfaces and the sky 0.
 
     Args:
         gaussians: The scene.
@@ -108,7 +109,8 @@ def render_depths(
         backend: What renders.
         progress: Called after every view.
     """
-    views, device = [], gaussians.to(backend.device)
+    sky = torch.from_numpy(far_shell(gaussians.means.numpy(force=True)))
+    views, device = [], gaussians[~sky].to(backend.device)
     wanted = replace(settings, depth=False, median_depth=True)
     for done, (name, camera) in enumerate(cameras, 1):
         with torch.no_grad():
