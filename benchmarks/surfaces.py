@@ -23,7 +23,7 @@ import torch
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import run_command
-from gsplat_edu.data.solids import Part, Solids
+from gsplat_edu.data.solids import Part, SolidScene
 from gsplat_edu.data.solids_mesh import solids_mesh
 from gsplat_edu.data.solids_photos import FINISHES, START_NOISE, scan_solids, solids_capture
 from gsplat_edu.data.solids_shapes import Block
@@ -72,7 +72,7 @@ class Capture:
     points: np.ndarray
     colors: np.ndarray
     scans: list[tuple[np.ndarray, np.ndarray]]
-    scene: Solids
+    scene: SolidScene
     bounds: np.ndarray
 
     @functools.cached_property
@@ -102,7 +102,7 @@ def box_of(size: int, count: int, seed: int) -> Capture:
     """Make the capture of the textured box; its truth are two blocks."""
     floor = Block(np.array([0.0, 0.05, 0.0]), np.array([4.0, 0.05, 4.0]))
     body = Block(np.array([0.0, -0.475, 0.0]), np.array([0.7, 0.525, 0.5]))
-    scene = Solids((Part("floor", floor), Part("box", body)))
+    scene = SolidScene((Part("floor", floor), Part("box", body)))
     cameras = box_orbit(count, size=(size, 3 * size // 4))
     views = [
         View(camera, photograph_box(camera), name=f"view_{i:03d}.png") for i, camera in enumerate(cameras)

@@ -11,7 +11,7 @@ from scipy.stats import chi2_contingency, chisquare
 from skimage.measure import marching_cubes
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.data.solids import Part, Solids, solids
+from gsplat_edu.data.solids import Part, SolidScene, solids
 from gsplat_edu.data.solids_mesh import solids_mesh
 from gsplat_edu.data.solids_photos import (
     LIGHT,
@@ -131,7 +131,7 @@ def test_the_area_is_that_of_a_fine_mesh(name):
 
 def test_samples_of_a_block_follow_the_areas_of_its_faces():
     block = Block(np.zeros(3), np.array([0.2, 0.5, 0.9]))
-    points = Solids((Part("slots", block),)).surface(12_000, seed=5)[0]
+    points = SolidScene((Part("slots", block),)).surface(12_000, seed=5)[0]
     face = np.abs(np.abs(points) - block.half).argmin(axis=1) * 2 + 0
     side = face + (points[np.arange(len(points)), face // 2] > 0)
     a, b, c = 2 * block.half
@@ -142,7 +142,7 @@ def test_samples_of_a_block_follow_the_areas_of_its_faces():
 @pytest.mark.parametrize("name", ["rod", "torus", "bowl", "deep bowl", "scene"])
 def test_samples_are_as_uniform_as_those_of_a_mesh(name):
     """Counts in cells of both, by a chi-square of two samples; the mesh is within a percent of the area."""
-    scene = whole(False) if name == "scene" else Solids((Part("x", SHAPES[name]),))
+    scene = whole(False) if name == "scene" else SolidScene((Part("x", SHAPES[name]),))
     mesh = solids_mesh(scene, 0.012) if name == "scene" else extracted(SHAPES[name], 70)
     mine, theirs = scene.surface(6_000, seed=6)[0], sample_surface(mesh, 6_000, seed=7)[0]
     both = np.concatenate([mine, theirs])
@@ -166,7 +166,7 @@ def test_samples_depend_on_the_seed_only():
 
 def test_the_mesh_of_a_torus_has_its_hole_area_and_volume():
     shape = SHAPES["torus"]
-    mesh = solids_mesh(Solids((Part("torus", shape),)), 0.02)
+    mesh = solids_mesh(SolidScene((Part("torus", shape),)), 0.02)
     found = topology(mesh)
     assert found.closed and (found.components, found.genus) == (1, 1)
     assert found.volume == pytest.approx(2 * math.pi**2 * 0.5 * 0.2**2, rel=0.01)

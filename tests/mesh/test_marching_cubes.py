@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
-import surfaces
+import known_surfaces as surfaces
 from gsplat_edu import _native
 from gsplat_edu.scene.mesh import Mesh
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-import surfaces
+import known_surfaces as surfaces
 from gsplat_edu import ArgumentError, Camera
 from gsplat_edu.base.errors import NotEnoughMemoryError
 from gsplat_edu.mesh.volume import SparseVolume
@@ -227,10 +227,10 @@ def test_views_have_images_or_none():
     ):
         volume = SparseVolume(0.1)
         volume.integrate(plane, camera, image=first)
-        before, size = volume.mesh(), volume.bytes
+        before, size = volume.mesh(), volume.memory
         with pytest.raises(ArgumentError, match=words):
             volume.integrate(plane + 1, camera, image=second)
-        assert same(volume.mesh(), before) and volume.bytes == size
+        assert same(volume.mesh(), before) and volume.memory == size
 
 
 def test_tensors_and_float32_and_strides_are_the_same_as_arrays():
@@ -287,7 +287,7 @@ def test_what_does_not_fit_is_named_and_changes_nothing(words, given, as_shipped
     with pytest.raises(ArgumentError, match=re.escape(words)) as caught:
         volume.integrate(**arguments)
     assert "\n" not in str(caught.value)
-    assert volume.bytes == 0 and len(volume.mesh().faces) == 0
+    assert volume.memory == 0 and len(volume.mesh().faces) == 0
 
 
 @pytest.mark.parametrize(
@@ -314,16 +314,16 @@ def test_settings_out_of_range_are_named(words, settings, as_shipped):
 def test_the_limit_is_kept_and_the_volume_unchanged():
     first, *others = surfaces.orbit(8)
     free = scanned(surfaces.sphere_depth, [first], 0.02)
-    volume = scanned(surfaces.sphere_depth, [first], 0.02, max_bytes=free.bytes)  # fits exactly
+    volume = scanned(surfaces.sphere_depth, [first], 0.02, max_bytes=free.memory)  # fits exactly
     before = volume.mesh()
     with pytest.raises(NotEnoughMemoryError) as caught:
         volume.integrate(surfaces.sphere_depth(others[-1]), others[-1])
     sizes = r"needs at least [\d.]+ MiB with this view, but may take [\d.]+ MiB"
     assert re.fullmatch(f"volume: {sizes}; take a voxel larger than 0.02", str(caught.value))
-    assert same(volume.mesh(), before) and volume.bytes == free.bytes == 4120 * free.blocks
+    assert same(volume.mesh(), before) and volume.memory == free.memory == 4120 * free.blocks
     volume.integrate(surfaces.sphere_depth(first), first)  # what needs no new block still goes in
     with pytest.raises(NotEnoughMemoryError):
-        scanned(surfaces.sphere_depth, [first], 0.02, max_bytes=free.bytes - 1)
+        scanned(surfaces.sphere_depth, [first], 0.02, max_bytes=free.memory - 1)
 
 
 def test_a_limit_ends_a_hopeless_view_early():
@@ -337,7 +337,7 @@ def test_a_limit_ends_a_hopeless_view_early():
 
 def test_without_views_or_surfaces_the_mesh_is_empty():
     volume = SparseVolume(0.1)
-    assert volume.mesh().vertices.shape == (0, 3) and volume.bytes == 0
+    assert volume.mesh().vertices.shape == (0, 3) and volume.memory == 0
     volume.integrate(np.zeros((60, 80)), facing(), image=np.zeros((60, 80, 3)))
     mesh = volume.mesh()
     assert mesh.vertices.shape == mesh.faces.shape == mesh.colors.shape == (0, 3)

@@ -20,7 +20,7 @@ from gsplat_edu.data.solids_shapes import (
     Bowl,
     Points,
     Rod,
-    Shape,
+    SolidShape,
     Torus,
     Values,
     gradient,
@@ -38,11 +38,11 @@ class Part(NamedTuple):
     """A shape of a scene, and the object that it belongs to."""
 
     name: str
-    shape: Shape
+    shape: SolidShape
 
 
 @dataclass(frozen=True, eq=False)
-class Solids:
+class SolidScene:
     """A scene of solids; they may overlap.
 
     Args:
@@ -128,7 +128,7 @@ class Solids:
         return free
 
 
-def solids(floor: bool = True) -> Solids:
+def solids(floor: bool = True) -> SolidScene:
     """Make the scene: a bowl, an arch of thin rods and a leaning one, a block with slots, and a leaning torus.
 
     The scene is 3 world units wide; y points down. What stands on the floor is sunk into it by a few hundredths, so
@@ -149,7 +149,7 @@ def solids(floor: bool = True) -> Solids:
     axis /= np.linalg.norm(axis)
     lean = 0.3 * math.hypot(axis[0], axis[2]) + 0.11
     parts.append(Part("torus", Torus(np.array([-0.6, 0.01 - lean, 0.6]), axis, 0.3, 0.11)))
-    return Solids(tuple(parts))
+    return SolidScene(tuple(parts))
 
 
 def _slots(place: Float64[np.ndarray, "3"], turn: float) -> list[Block]:

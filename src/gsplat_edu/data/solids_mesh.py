@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int8, Int64
 
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.data.solids import Solids
+from gsplat_edu.data.solids import SolidScene
 from gsplat_edu.scene.mesh import Mesh
 
 BLOCK = 16
@@ -26,7 +26,7 @@ SIDE = 1 << 20
 Cells = Int64[np.ndarray, "n 3"]
 
 
-def solids_mesh(scene: Solids, step: float = 0.015) -> Mesh:
+def solids_mesh(scene: SolidScene, step: float = 0.015) -> Mesh:
     """Mesh the surface of a scene.
 
     The mesh is closed. Where the surface nearly touches itself, such as along a concave edge, four faces may share an
@@ -77,7 +77,7 @@ def _index(code: Int64[np.ndarray, " n"]) -> Cells:
 
 
 def _cells_near(
-    scene: Solids, low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"], step: float
+    scene: SolidScene, low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"], step: float
 ) -> Cells:
     """Return the indices of the cells that the surface may cross: blocks that it may cross are halved repeatedly."""
     blocks = [np.arange(n) for n in np.ceil((high - low) / (step * BLOCK)).astype(int)]
@@ -93,7 +93,7 @@ def _cells_near(
 
 
 def _vertices(
-    scene: Solids, low: Float64[np.ndarray, "n 3"], corners: Float64[np.ndarray, "n 8"], step: float
+    scene: SolidScene, low: Float64[np.ndarray, "n 3"], corners: Float64[np.ndarray, "n 8"], step: float
 ) -> Float64[np.ndarray, "n 3"]:
     """Return a point of the surface in each cell: the mean of the crossings of its edges, projected.
 

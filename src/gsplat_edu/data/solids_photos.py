@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt8
 
 from gsplat_edu.base.validation import one_of, whole_number
-from gsplat_edu.data.solids import Solids, solids
-from gsplat_edu.data.solids_shapes import Points, Shape, Values, gradient, lengths
+from gsplat_edu.data.solids import SolidScene, solids
+from gsplat_edu.data.solids_shapes import Points, SolidShape, Values, gradient, lengths
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.views import View
 
@@ -88,13 +88,13 @@ class SolidsPhoto(NamedTuple):
         np.ndarray, "H W"
     ]  # along the optical axis at the pixel's centre, world units; 0 for no surface
     normals: Float64[np.ndarray, "H W 3"]  # outward unit normals at the centre, world axes; 0 for no surface
-    part: Int8[np.ndarray, "H W"]  # index in `Solids.parts` at the centre, -1 for no surface
+    part: Int8[np.ndarray, "H W"]  # index in `SolidScene.parts` at the centre, -1 for no surface
 
 
 class SolidsCapture(NamedTuple):
     """Photos of solids, and their true surface."""
 
-    scene: Solids
+    scene: SolidScene
     views: list[View]  # names sorted
     points: Float64[np.ndarray, "N 3"]  # noisy points of the surface that a photo sees, world units
     colors: Float64[np.ndarray, "N 3"]  # their colours without highlights, 0 to 1
@@ -152,7 +152,7 @@ def solids_orbit(count: int, size: tuple[int, int] = (320, 240)) -> list[Camera]
     return cameras
 
 
-def photograph_solids(scene: Solids, camera: Camera, finish: str = "textured") -> SolidsPhoto:
+def photograph_solids(scene: SolidScene, camera: Camera, finish: str = "textured") -> SolidsPhoto:
     """Trace a photo.
 
     Args:
@@ -169,7 +169,7 @@ def photograph_solids(scene: Solids, camera: Camera, finish: str = "textured") -
 
 
 def scan_solids(
-    scene: Solids, camera: Camera
+    scene: SolidScene, camera: Camera
 ) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W 3"], Int8[np.ndarray, "H W"]]:
     """Return depth, normals and part at the centres of pixels; see `SolidsPhoto`.
 
@@ -188,7 +188,7 @@ def _bands(camera: Camera) -> list[slice]:
     return [slice(top, min(top + rows, camera.H)) for top in range(0, camera.H, rows)]
 
 
-def _pixels(scene: Solids, camera: Camera, band: slice, finish: str) -> UInt8[np.ndarray, "h W 3"]:
+def _pixels(scene: SolidScene, camera: Camera, band: slice, finish: str) -> UInt8[np.ndarray, "h W 3"]:
     """Return some rows of a photo."""
     s = RAYS_PER_SIDE
     rays = _rays(camera, band, s)
@@ -204,7 +204,7 @@ def _pixels(scene: Solids, camera: Camera, band: slice, finish: str) -> UInt8[np
 
 
 def _exact(
-    scene: Solids, camera: Camera, band: slice
+    scene: SolidScene, camera: Camera, band: slice
 ) -> tuple[Float64[np.ndarray, "h W"], Float64[np.ndarray, "h W 3"], Int8[np.ndarray, "h W"]]:
     """Return depth, normals and part of some rows of pixels."""
     rays = _rays(camera, band, 1)
@@ -219,7 +219,7 @@ def _exact(
 
 
 def trace(
-    scene: Solids, eye: Float64[np.ndarray, "3"], rays: Points, exact: bool = True
+    scene: SolidScene, eye: Float64[np.ndarray, "3"], rays: Points, exact: bool = True
 ) -> tuple[Values, Int8[np.ndarray, " n"]]:
     """Return where each ray first meets the surface, and which part it meets.
 
@@ -249,7 +249,7 @@ def trace(
 
 
 def _towards(
-    shape: Shape, eye: Float64[np.ndarray, "3"], rays: Points, squared: Values
+    shape: SolidShape, eye: Float64[np.ndarray, "3"], rays: Points, squared: Values
 ) -> Int64[np.ndarray, " m"]:
     """Return the rays that meet the bounding sphere of a shape; `squared` are the squares of their lengths."""
     away = shape.center - eye
@@ -261,7 +261,7 @@ def _towards(
 
 
 def _first_hit(
-    shape: Shape, eye: Float64[np.ndarray, "3"], rays: Points, near: Values, far: Values
+    shape: SolidShape, eye: Float64[np.ndarray, "3"], rays: Points, near: Values, far: Values
 ) -> Values:
     """Return where rays meet one shape between `near` and `far`, infinity where they miss."""
     at = near.copy()
@@ -279,7 +279,7 @@ def _first_hit(
     return at
 
 
-def _polished(shape: Shape, eye: Float64[np.ndarray, "3"], rays: Points, at: Values) -> Values:
+def _polished(shape: SolidShape, eye: Float64[np.ndarray, "3"], rays: Points, at: Values) -> Values:
     """Return where rays meet the surface exactly, from places at most `CLOSE` before it; infinity if they pass it.
 
     Each step follows the slope of the distance along the ray. Steps that approach too slowly are those of sphere
@@ -315,7 +315,7 @@ def _rays(camera: Camera, band: slice, s: int) -> Points:
 
 
 def _shaded(
-    name: str, shape: Shape, points: Points, eye: Float64[np.ndarray, "3"], finish: Finish
+    name: str, shape: SolidShape, points: Points, eye: Float64[np.ndarray, "3"], finish: Finish
 ) -> Float32[np.ndarray, "n 3"]:
     """Return the RGB of points of one part as seen from a place."""
     normals = gradient(shape, points)
@@ -362,7 +362,7 @@ def _waves(
 
 
 def _start(
-    scene: Solids,
+    scene: SolidScene,
     cameras: Sequence[Camera],
     photos: Sequence[SolidsPhoto],
     finish: Finish,

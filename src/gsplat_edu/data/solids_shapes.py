@@ -23,7 +23,7 @@ DOWN = np.array([0.0, 1.0, 0.0])
 
 
 @runtime_checkable
-class Shape(Protocol):
+class SolidShape(Protocol):
     """A solid shape."""
 
     @property
@@ -313,7 +313,7 @@ def lengths(vectors: Points) -> Values:
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))
 
 
-def gradient(shape: Shape, points: Points) -> Points:
+def gradient(shape: SolidShape, points: Points) -> Points:
     """Return the unit gradients of a distance field by central differences, outward normals on the surface.
 
     Args:

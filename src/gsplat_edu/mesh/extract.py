@@ -137,7 +137,7 @@ def extract_mesh(
     notes += _sentences(counts)
     if len(mesh.faces) != len(raw.faces):
         notes.append(f"{len(raw.faces):,} faces before tidying, {len(mesh.faces):,} after it")
-    return MeshResult(mesh, volume.voxel, volume.truncation, volume.bytes, counts, views, tuple(notes))
+    return MeshResult(mesh, volume.voxel, volume.truncation, volume.memory, counts, views, tuple(notes))
 
 
 def _fitting(camera: Camera) -> Camera:

@@ -69,7 +69,7 @@ class SparseVolume:
         return int(self._native.blocks)
 
     @property
-    def bytes(self) -> int:
+    def memory(self) -> int:
         """Memory of the blocks: 4,120 bytes each, 12,312 with colours."""
         return int(self._native.bytes)
 
