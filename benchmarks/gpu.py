@@ -43,7 +43,7 @@ from gsplat_edu.engine.adapters import chosen_adapter
 from gsplat_edu.engine.frame import Scene as EngineScene
 from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.measure import as_table, measure_step
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import gpu_of, load_backend, unavailable
@@ -272,7 +272,9 @@ def packed(gaussians: Gaussians) -> EngineScene:
 def resident_step(count: int, width: int, height: int, rounds: int) -> dict[str, Any]:
     """Return what a training step on the device of webgpu takes, by stage, beside what the model computes."""
     gaussians, cam = scene(count, "cpu"), camera(width, height)
-    view = View(cam, (0.0, 0.0, 0.0), 3, False, SETTINGS.dilation, 1.3, SETTINGS.alpha_max, SETTINGS.z_near)
+    view = DeviceView(
+        cam, (0.0, 0.0, 0.0), 3, False, SETTINGS.dilation, 1.3, SETTINGS.alpha_max, SETTINGS.z_near
+    )
     found = measure_step(Device.default(), packed(gaussians), view, rounds)
     return {"two runs have the same bits": found.same_bits, **found.report()}
 

@@ -36,7 +36,7 @@ from gsplat_edu.engine.passes import (
     sort_bits,
     sort_scratch,
 )
-from gsplat_edu.engine.view import View
+from gsplat_edu.engine.view import DeviceView
 from ladder.splats import Splats
 
 OWN = {
@@ -150,7 +150,7 @@ def records(splats: Splats) -> np.ndarray:
 def view_of(splats: Splats) -> bytes:
     """Return the uniform block of the splats' screen; the background is black."""
     camera = splats.flat()[0]
-    return View(camera, (0.0, 0.0, 0.0), 0, False, DILATION, None, ALPHA_MAX, Z_NEAR).packed(0)
+    return DeviceView(camera, (0.0, 0.0, 0.0), 0, False, DILATION, None, ALPHA_MAX, Z_NEAR).packed(0)
 
 
 def counts_of(splats: Splats, pairs: int) -> dict[str, int]:

@@ -11,7 +11,17 @@ ISA_FREE = {
     *(
         f"{name}.{end}"
         for name in (
-            *("bindings_volume", "buffers", "dispatch", "frame", "loss", "marching_cubes", "scan", "sort"),
+            *(
+                "bindings_surface",
+                "bindings_volume",
+                "buffers",
+                "dispatch",
+                "frame",
+                "loss",
+                "marching_cubes",
+                "scan",
+                "sort",
+            ),
             *("system", "threads", "volume"),
         )
         for end in ("cpp", "h")
