@@ -5,7 +5,8 @@ import pytest
 
 from gsplat_edu import write_scene
 from gsplat_edu.cli.main import main
-from gsplat_edu.io.mesh_files import read_mesh, write_mesh
+from gsplat_edu.cli.options.mesh import SUFFIXES
+from gsplat_edu.io.mesh_files import MESH_FORMATS, read_mesh, write_mesh
 from gsplat_edu.scene.mesh import Mesh
 from splat_ball import RADIUS, ball
 
@@ -77,3 +78,7 @@ def test_a_missing_scene_and_a_bad_truth_leave_the_file_that_was_there(scene, tm
     (tmp_path / "bad.ply").write_bytes(b"ply\nno more")
     assert main(["mesh", str(scene), str(out), "--truth", str(tmp_path / "bad.ply")]) == 2
     assert "bad.ply" in capsys.readouterr().err and out.read_bytes() == before
+
+
+def test_the_options_know_every_format():
+    assert tuple(found.suffix for found in MESH_FORMATS) == SUFFIXES

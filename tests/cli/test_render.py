@@ -165,14 +165,16 @@ def test_maps_are_written_beside_the_images(made, cli, capsys, tmp_path):
         "--out",
         str(tmp_path / "seen"),
         "--maps",
-        "depth, normal,alpha,depth",
+        "depth, normal,alpha,depth,distortion",
     ]
     assert cli(["render", str(bare), *words]) == 0
-    assert "6 images and their maps (depth, normal, alpha) of " in capsys.readouterr().out
+    assert "6 images and their maps (depth, normal, alpha, distortion) of " in capsys.readouterr().out
     listed = json.loads((tmp_path / "seen" / "maps.json").read_text())
-    assert len(listed) == 18 and len(list((tmp_path / "seen").iterdir())) == 6 * (1 + 3 * 3) + 1
+    assert len(listed) == 24 and len(list((tmp_path / "seen").iterdir())) == 6 * (1 + 3 * 4) + 1
     settings = RenderSettings(background=BLUE)
-    maps, _ = render_maps(load_ply(bare), views[2].camera, ["depth", "normal", "alpha"], settings)
+    maps, _ = render_maps(
+        load_ply(bare), views[2].camera, ["depth", "normal", "alpha", "distortion"], settings
+    )
     for name, tensor in maps.items():
         stem, truth = tmp_path / "seen" / f"view_002.{name}", tensor.numpy()
         values = cv2.imread(f"{stem}.tiff", cv2.IMREAD_UNCHANGED)

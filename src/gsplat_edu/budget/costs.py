@@ -63,7 +63,8 @@ LATER = 150 * 2**20
 
 
 SURFACE_TIME = 3.0
-"""Further time of a step that learns from normals and flatness, in times of a plain one (benchmarks/RESULTS.md)."""
+"""Further time of a step that learns from normals and flatness, in times of a plain one
+(benchmarks/archive/RESULTS-2026-11.md, "Surfaces")."""
 
 
 Amount = TypeVar("Amount", float, np.ndarray)

@@ -48,8 +48,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.texture:
         subject = open_subject(arguments.source, arguments.dataset, load_backend("cpu"))
         source, dataset = subject.source, subject.dataset
-        for told in dataset.notes:
-            console.print(str(told), soft_wrap=True)
+        for note in dataset.notes:
+            console.print(str(note), soft_wrap=True)
     cameras = _cameras(source, console)
     settings = _settings(arguments, source, cameras, backend)
     columns = (
@@ -65,8 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
             bar.update(task, description=what, completed=done, total=total)
 
         result = extract_mesh(source.scene.gaussians, cameras, source.settings, backend, settings, progress)
-    for note in result.notes:
-        console.print(note, soft_wrap=True)
+    for sentence in result.notes:
+        console.print(sentence, soft_wrap=True)
     mesh = result.mesh
     if dataset is not None:
         mesh = painted(mesh, dataset, result.views)
@@ -117,7 +117,7 @@ def _settings(
             some = cameras[:: max(len(cameras) // MOST_HELD_OUT, 1)]
             views = render_depths(source.scene.gaussians, some, source.settings, backend)
             voxel = COLLIDER_VOXELS * default_voxel(views)
-    share = {"large": SMALLEST_SHARE, "largest": SMALLEST_SHARE, "all": 0.0}[arguments.keep]
+    share = 0.0 if arguments.keep == "all" else SMALLEST_SHARE
     bounds = None
     if arguments.bounds is not None:
         bounds = np.array(arguments.bounds).reshape(2, 3) - np.array(source.origin)

@@ -102,7 +102,7 @@ class Rod:
 
     Args:
         start: (3,) centre of one end's hemisphere, world units.
-        end: (3,) centre of the other's.
+        end: (3,) centre of the other end.
         thickness: Its radius, world units.
     """
 

@@ -27,8 +27,8 @@ Map = Float[np.ndarray, "H W"] | Float[np.ndarray, "H W 3"]
 def write_maps(folder: Path, stem: str, maps: Mapping[str, Map]) -> dict[str, dict[str, float]]:
     """Write the maps of one view: STEM.MAP.tiff, STEM.MAP.png and STEM.MAP.preview.png each.
 
-    The TIFF has float32 values. The PNG has 16 bits: alpha is v / 65535, a depth v times a unit that differs from file
-    to file, an axis of a normal 2 v / 65535 - 1.
+    The TIFF has float32 values. The PNG has 16 bits: alpha is v / 65535, a depth or distortion v times a unit that
+    differs from file to file, an axis of a normal 2 v / 65535 - 1.
 
     Args:
         folder: Output folder; it is created.
@@ -48,7 +48,7 @@ def write_maps(folder: Path, stem: str, maps: Mapping[str, Map]) -> dict[str, di
         if not np.isfinite(values).all():
             raise ArgumentError(f"{name}: has values that are NaN or infinite")
         low, high = (-1.0, 1.0) if values.ndim == 3 else (0.0, 1.0)
-        if "depth" in name:
+        if values.ndim == 2 and name != "alpha":
             high = float(values.max(initial=0.0)) or 1.0
         file = folder / f"{stem}.{name}.png"
         _write(file.with_suffix(".tiff"), values)
@@ -74,14 +74,15 @@ def preview(name: str, values: Map) -> UInt8[np.ndarray, "H W 3"]:
         values: The map.
 
     Returns:
-        (H, W, 3): alpha in grey; normals as (n + 1) / 2; a depth from near (red) to far (blue) between its 2nd and 98th
-        percentile, black where there is none.
+        (H, W, 3): alpha in grey, distortion too, white at its 98th percentile; normals as (n + 1) / 2; a depth from
+        near (red) to far (blue) between its 2nd and 98th percentile, black where there is none.
     """
     if values.ndim == 3:
         drawn = (values != 0).any(axis=-1, keepdims=True)
         return _bytes(np.where(drawn, (values + 1.0) / 2.0, 0.0))
     if "depth" not in name:
-        return _bytes(np.repeat(values[..., None], 3, axis=2))
+        white = 1.0 if name == "alpha" else float(np.percentile(values, 98)) or 1.0
+        return _bytes(np.repeat(values[..., None] / white, 3, axis=2))
     drawn = values > 0
     near, far = np.percentile(values[drawn], (2, 98)) if drawn.any() else (0.0, 1.0)
     share = (values - near) / max(far - near, np.finfo(np.float32).tiny)

@@ -273,7 +273,7 @@ class _Surface(NamedTuple):
     """What is needed to measure distances from a surface and to it."""
 
     asking: _Samples  # whose distances to the other surface are measured
-    places: _Samples  # among which the point closest to those of the other surface is searched
+    places: _Samples  # where the other surface's closest points are searched
     share: float = 1.0  # fraction of the samples inside the bounds that ask
 
     @classmethod

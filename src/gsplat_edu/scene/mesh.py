@@ -60,8 +60,8 @@ class Mesh:
     def __repr__(self) -> str:
         """Say how many vertices and faces there are, and what they carry."""
         extras = [field.name for field in fields(self)[2:] if getattr(self, field.name) is not None]
-        told = "".join(f", {name}" for name in extras)
-        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces{told})"
+        carried = "".join(f", {name}" for name in extras)
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces{carried})"
 
     @property
     def corners(self) -> Float64[np.ndarray, "F 3 3"]:

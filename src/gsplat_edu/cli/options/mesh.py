@@ -18,7 +18,7 @@ TEXTURE_FACES = 50_000
 """Faces of a mesh with a texture unless --faces gives another number: the layout of more takes minutes."""
 
 COLLIDER_VOXELS = 4.0
-"""Voxels of a collider, in voxels of the mesh."""
+"""Edge of a collider's voxels, in edges of the mesh's."""
 
 COLLIDER_FACES = 5_000
 """Faces of a collider unless --faces gives another number."""
