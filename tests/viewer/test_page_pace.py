@@ -7,6 +7,7 @@ from gsplat_edu.render.settings import RenderSettings
 
 PARTS = """async () => {
   const { renderer } = viewer;
+  if (!viewer.isWhole) await viewer.followed(); // a slow browser still draws the page's first picture
   const sizes = [];
   const drawPart = renderer.drawPart.bind(renderer);
   renderer.drawPart = (camera, settings, from, to, ...rest) => {
