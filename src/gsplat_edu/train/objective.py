@@ -22,6 +22,7 @@ from gsplat_edu.ops.losses import LossKernel, photo_loss
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
+from gsplat_edu.train.patches import PATCHES, Neighbourhood, PatchTerm
 from gsplat_edu.train.rendered import Rendered as Rendered
 from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
 
@@ -109,12 +110,14 @@ def make_objective(
     shell: Shell | None = None,
     loss: LossKernel | None = None,
     extent: float = 1.0,
+    around: Neighbourhood | None = None,
 ) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
     if nothing is outside of masks + weight_e sum_outside(alpha) / (H W);
     for a surface + weight_n mean a (a - N . m) + weight_f mean(smallest scale) / extent
+    + weight_p mean min(1 - ncc, most)
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
     rate if all its gradients agree, however small they are. If each view shows a twentieth of the scene, invisible
@@ -125,6 +128,10 @@ def make_objective(
         shell: Where far splats lie, whose scale is not regularised; None if there are none.
         loss: Compares images and photos; see `photo_loss`.
         extent: Size of the scene, world units.
+        around: The photos whose patches a surface compares with their neighbours'.
+
+    Raises:
+        ArgumentError: the configuration compares patches, but there are no photos to compare.
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
@@ -140,6 +147,10 @@ def make_objective(
         turns = Turns(config.surface_start, config.surface_every, config.batch)
         terms[NORMAL] = NormalTerm(config.normal_weight, turns)
         terms[FLAT] = FlatTerm(config.flat_weight, extent, turns, shell)
+        if config.patch_weight > 0:
+            if around is None:
+                raise ArgumentError("around: has to be given, because patch_weight compares photos; or set it to 0")
+            terms[PATCHES] = PatchTerm(config.patch_weight, turns, around, config.seed)
     return Objective(terms)
 
 

@@ -26,7 +26,7 @@ WITH_OPTION = frozenset(
 )
 """Settings that `gsplat-edu train` has an option for; the others are given by `--set NAME=VALUE`."""
 
-FOR_SURFACE = ("surface_start", "surface_every", "normal_weight", "flat_weight")
+FOR_SURFACE = ("surface_start", "surface_every", "normal_weight", "patch_weight", "flat_weight")
 """Settings that only a training with `surface` uses."""
 
 COURSE_ONLY = frozenset({"over_cap", "view_order"})
