@@ -24,6 +24,7 @@ def test_a_scene_without_cameras_is_seen_from_around(scene, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "the scene has no cameras: 48 views around it are used" in said
     assert "are seen by 3 views or more" in said and "1 connected part" in said
+    assert "no triangle passes through another one" in said
     mesh = read_mesh(out)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean() < 0.03
     assert mesh.colors is not None

@@ -14,6 +14,7 @@ from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.text import short_number, spelled_bytes
 from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS, TEXTURE_FACES
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
+from gsplat_edu.evaluate.intersections import Intersections, self_intersections
 from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points, score_surface
 from gsplat_edu.evaluate.topology import Topology, topology
 from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
@@ -137,7 +138,7 @@ def _trust(result: MeshResult, source: Source, backend: Backend) -> list[str]:
     said = [f"{certain} % of the vertices are seen by {FEW_VIEWS} views or more"]
     held_out = [(name, camera) for name, camera in source.cameras if name in source.held_out]
     said += _held_out(result, source, held_out[:MOST_HELD_OUT], backend)
-    return [*said, _shape(topology(result.mesh))]
+    return [*said, _shape(topology(result.mesh)), _intersecting(self_intersections(result.mesh))]
 
 
 def _held_out(
@@ -162,6 +163,18 @@ def _shape(shape: Topology) -> str:
         return f"{parts}, closed"
     loops = "" if shape.boundary_loops is None else f" around {shape.boundary_loops} holes"
     return f"{parts}, open along {shape.boundary_edges:,} edges{loops}"
+
+
+def _intersecting(found: Intersections) -> str:
+    if not found.found:
+        return "no triangle passes through another one" + _of_tested(found)
+    share = short_number(100 * found.share, 2)
+    return f"{found.found:,} triangles ({share} %) pass through another one" + _of_tested(found)
+
+
+def _of_tested(found: Intersections) -> str:
+    """Say how many triangles were tested, if not all."""
+    return "" if found.tested == found.faces else f", of {found.tested:,} that were tested"
 
 
 def _compared(scores: SurfaceScores, unit: str) -> list[str]:
