@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
@@ -18,8 +19,10 @@ from gsplat_edu.evaluate.intersections import Intersections, self_intersections
 from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points, score_surface
 from gsplat_edu.evaluate.topology import Topology, topology
 from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
+from gsplat_edu.io.mesh_glb import write_parts
 from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
+from gsplat_edu.mesh.convex import convex_parts, farthest_outside
 from gsplat_edu.mesh.depths import render_depths
 from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh, views_of_vertices
 from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings
@@ -74,20 +77,37 @@ def run(arguments: argparse.Namespace) -> None:
         if not mesh_format_of(arguments.out).colors_with_texture:
             mesh = replace(mesh, colors=None)  # the texture has a colour for every place
     mesh = _moved(mesh, source.origin)
-    for loss in mesh_losses(arguments.out, mesh, source.scene.unit):
-        console.print(loss, soft_wrap=True)
-    write_mesh(arguments.out, mesh, source.scene.unit)
+    if arguments.collider == "convex":
+        _write_convex(arguments.out, mesh, source.scene.unit, console)
+    else:
+        for loss in mesh_losses(arguments.out, mesh, source.scene.unit):
+            console.print(loss, soft_wrap=True)
+        write_mesh(arguments.out, mesh, source.scene.unit)
     emitter.report_output(arguments.out)
     unit = source.scene.unit or "world units"
-    console.print(
-        f"wrote {arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles; voxels of"
-        f" {short_number(result.voxel, 3)} {unit}, volume of {spelled_bytes(result.volume_bytes)}",
-        soft_wrap=True,
-    )
+    if arguments.collider != "convex":
+        counted = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
+        console.print(f"wrote {arguments.out}: {counted}; {_volume(result, unit)}", soft_wrap=True)
     console.print(*_trust(result, source, backend), sep="\n", soft_wrap=True)
     if truth is not None:
         comparison = Comparison(arguments.tau or result.voxel)
         console.print(*_compared(score_surface(mesh, truth, comparison), unit), sep="\n", soft_wrap=True)
+
+
+def _volume(result: MeshResult, unit: str) -> str:
+    """Describe the volume that the mesh was cut from."""
+    return f"voxels of {short_number(result.voxel, 3)} {unit}, volume of {spelled_bytes(result.volume_bytes)}"
+
+
+def _write_convex(out: Path, mesh: Mesh, unit: str | None, console: Terminal) -> None:
+    """Write convex parts of the mesh, and say how much of it they leave out."""
+    parts = convex_parts(mesh)
+    write_parts(out, [(f"collider_{number}", part) for number, part in enumerate(parts)], unit)
+    outside = short_number(farthest_outside(mesh.vertices, parts), 2)
+    triangles = sum(len(part.faces) for part in parts)
+    counted = f"{len(parts)} convex part{'s' * (len(parts) != 1)}, {triangles:,} triangles"
+    left_out = f"a vertex of the coarse mesh lies at most {outside} {unit or 'world units'} outside of them"
+    console.print(f"wrote {out}: {counted}; {left_out}", soft_wrap=True)
 
 
 def _cameras(source: Source, console: Terminal) -> Sequence[NamedCamera]:
