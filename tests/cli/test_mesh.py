@@ -55,7 +55,9 @@ def test_the_truth_is_compared_and_a_collider_is_coarse(scene, tmp_path, capsys)
     assert len(read_mesh(out).faces) <= 300
 
 
-def test_a_collider_of_convex_parts(scene, tmp_path, capsys):
+def test_a_collider_of_convex_parts(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gsplat_edu.cli.mesh.ORBIT_VIEWS", 20)
+    monkeypatch.setattr("gsplat_edu.cli.mesh.ORBIT_SIZE", 240)
     out = tmp_path / "parts.glb"
     words = ["--voxel", "0.1", "--faces", "500", "--collider", "convex", "--backend", "cpu"]
     assert main(["mesh", str(scene), str(out), *words]) == 0
