@@ -47,6 +47,7 @@ EXCEPTIONS = {"pillow-heif"}
 """Packages that are not held to COMPATIBLE; NOTES says why."""
 
 NOTES = {
+    "coacd": "its wheels also contain OpenVDB (MPL-2.0, since version 12 Apache-2.0), oneTBB, Boost and GCC's libgomp",
     "opencv-python-headless": "its wheels also contain FFmpeg, a library under LGPL-2.1",
     "pillow-heif": "only with the extra heic: its wheels also contain x265, and are GPL-2.0 as a whole",
     "wgpu": "its wheels also contain wgpu-native, under MIT OR Apache-2.0",
