@@ -9,10 +9,11 @@ import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Shaped
+from PIL import UnidentifiedImageError
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.headroom import require_memory
@@ -66,7 +67,8 @@ def read_depth(path: Path) -> Map:
             raise ValueError(f"has none of the suffixes {', '.join(ENDINGS)}")
         values = reader(path)
     except (*UNDECODABLE, zipfile.BadZipFile) as error:
-        reason = getattr(error, "strerror", None) or str(error).replace("\n", " ")[:200]
+        said = "it is no image" if isinstance(error, UnidentifiedImageError) else str(error)
+        reason = getattr(error, "strerror", None) or said.replace("\n", " ")[:200]
         raise DatasetError(f"{path}: is no depth map: {reason}; export it again", reason) from None
     found = np.where(np.isfinite(values) & (values > 0), values, np.nan).astype(np.float32)
     if not np.isfinite(found).any():
@@ -99,7 +101,7 @@ def _image(path: Path) -> Shaped[np.ndarray, "h w"]:
         return np.asarray(file).astype(np.float64)
 
 
-def _header(file: BinaryIO, path: Path) -> tuple[int, int]:
+def _header(file: Any, path: Path) -> tuple[int, int]:  # noqa: ANN401 - also a member of an archive
     """Read an NPY's header, and return height and width."""
     major, minor = np.lib.format.read_magic(file)
     if (major, minor) not in ((1, 0), (2, 0)):
@@ -128,7 +130,7 @@ def _npz(path: Path) -> Shaped[np.ndarray, "h w"]:
         if name not in names:
             raise ValueError(f"it holds {len(names)} arrays, none of which is called depth")
         with archive.open(name) as member:
-            size = _header(member, path)  # type: ignore[arg-type]
+            size = _header(member, path)
         with archive.open(name) as member:
             return np.lib.format.read_array(member, allow_pickle=False).reshape(size).astype(np.float64)
 

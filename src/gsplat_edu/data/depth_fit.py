@@ -253,9 +253,11 @@ def _thinned(matches: Matches) -> Matches:
 
 
 def no_jumps(depth: Float64[np.ndarray, "h w"], jump: float) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels with depth none of whose four neighbours is farther or nearer by more than a fraction.
+    """Return the pixels with depth that lie beside no jump from one surface to another.
 
-    At the edge of an object, a sensor's pixel mixes two depths, and it lies beside the photo's edge.
+    At the edge of an object, a sensor's pixel mixes two depths, and it lies beside the photo's edge. On a plane, the
+    inverse depth w is linear in the pixels, however steep the plane is. A jump has both a difference of neighbours and
+    a second difference larger than a fraction of w.
 
     Args:
         depth: NaN where there is none.
@@ -263,11 +265,11 @@ def no_jumps(depth: Float64[np.ndarray, "h w"], jump: float) -> Bool[np.ndarray,
     """
     held: Bool[np.ndarray, "h w"] = np.isfinite(depth)
     with np.errstate(invalid="ignore", divide="ignore"):
-        for axis in (0, 1):
-            a, b = np.split(depth, [-1], axis)[0], np.split(depth, [1], axis)[1]
-            far = np.maximum(a, b) > (1 + jump) * np.minimum(a, b)  # false where one is NaN
-            np.split(held, [-1], axis)[0][far] = False
-            np.split(held, [1], axis)[1][far] = False
+        for w, kept in ((1 / depth, held), (1 / depth.T, held.T)):
+            before, here, after = w[:-2], w[1:-1], w[2:]
+            step = np.maximum(np.abs(here - before), np.abs(after - here))
+            bend = np.abs(before - 2 * here + after)
+            kept[1:-1][np.minimum(step, bend) > jump * here] = False  # NaN is no jump
     return held
 
 

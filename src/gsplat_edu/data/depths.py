@@ -46,7 +46,7 @@ POINTS, CAPTURE = Path("points"), Path("capture")
 """Sources of depth that are no folders: the points in COLMAP's tracks, and the maps that transforms.json names."""
 
 JUMP = 0.05
-"""Pixels whose neighbours' depth differs by more than this fraction are left out."""
+"""Pixels beside a jump of more than this fraction of the inverse depth are left out."""
 
 MOST_SAMPLES = 2**16
 """Most samples of a photo: 1.3 times the pixels of a phone's sensor. Of larger maps every n-th column and row count."""
