@@ -1,6 +1,5 @@
 """A traced capture with exact depth, written as COLMAP or transforms.json, and its depth maps in any form."""
 
-
 import functools
 
 import numpy as np
@@ -65,5 +64,3 @@ def write_maps(folder, change=lambda depth, view: depth, scale=1000.0):
 def views_of(dataset):
     """Return the views with depth, by name."""
     return {view.name: view for view in dataset.train if view.depth is not None}
-
-

@@ -26,7 +26,9 @@ def save(path, values):
         np.savez_compressed(path, depth=values, other=np.zeros(3))
     elif name.endswith(".exr"):
         exr = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed (extra depth)")
-        exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"Z": values}).write(str(path))
+        exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"Z": values}).write(
+            str(path)
+        )
     else:
         h, w = values.shape
         path.write_bytes(f"{w}&{h}&1&".encode() + values.astype("<f4").tobytes())
@@ -127,16 +129,25 @@ def test_maps_are_found_by_the_photos_names(tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         save(tmp_path / name, DEPTH)
     names = ["images/left/a.JPG", "right/a.heic", "b.JPG", "deep/c.png", "other/d.png"]
-    found = {name: file.path.relative_to(tmp_path).as_posix() for name, file in depth_files(tmp_path, names).items()}
-    assert found == dict(zip(names[:4], ["left/a.png", "right/a.npy", "b.JPG.geometric.bin", "c.png"], strict=True))
+    found = {
+        name: file.path.relative_to(tmp_path).as_posix()
+        for name, file in depth_files(tmp_path, names).items()
+    }
+    assert found == dict(
+        zip(names[:4], ["left/a.png", "right/a.npy", "b.JPG.geometric.bin", "c.png"], strict=True)
+    )
 
 
 def test_two_maps_of_a_photo_and_foreign_names_are_refused(tmp_path):
     save(tmp_path / "a.png", DEPTH)
-    with pytest.raises(DatasetError, match="the first of its maps is a.png, and none is named like a photo such as b"):
+    with pytest.raises(
+        DatasetError, match="the first of its maps is a.png, and none is named like a photo such as b"
+    ):
         depth_files(tmp_path, ["b.jpg"])
     save(tmp_path / "a.npy", DEPTH)
-    with pytest.raises(DatasetError, match="a.npy and a.png are both named like depth maps of the photo a.jpg"):
+    with pytest.raises(
+        DatasetError, match="a.npy and a.png are both named like depth maps of the photo a.jpg"
+    ):
         depth_files(tmp_path, ["a.jpg"])
     with pytest.raises(DatasetError, match="is no folder"):
         depth_files(tmp_path / "a.png", ["a.jpg"])

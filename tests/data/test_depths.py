@@ -4,8 +4,18 @@ import json
 
 import numpy as np
 import pytest
-from data.depth_maps import SIZE, exact_depths, ray_lengths, small_camera, traced, views_of, write_capture, write_maps
 
+from data.conftest import WRITERS
+from data.depth_maps import (
+    SIZE,
+    exact_depths,
+    ray_lengths,
+    small_camera,
+    traced,
+    views_of,
+    write_capture,
+    write_maps,
+)
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.depths import CAPTURE, POINTS, DepthSource, with_depth
@@ -39,7 +49,9 @@ def test_unit_and_kind_are_found(tmp_path, kind, layout):
     folder = write_capture(tmp_path / "capture", layout)
     ray = kind == "ray"
     maps = write_maps(
-        tmp_path / "maps", lambda depth, view: depth * (ray_lengths(view.camera) if ray else 1.0), scale=2500.0
+        tmp_path / "maps",
+        lambda depth, view: depth * (ray_lengths(view.camera) if ray else 1.0),
+        scale=2500.0,
     )
     dataset, report = given(folder, DepthSource(maps))
     assert report.fit.kind == kind and report.fit.certain
@@ -52,10 +64,16 @@ def test_unit_and_kind_are_found(tmp_path, kind, layout):
 
 def test_a_wrong_unit_and_a_wrong_kind_are_refused_in_one_line(tmp_path):
     folder, maps = write_capture(tmp_path / "capture"), write_maps(tmp_path / "maps")
-    with pytest.raises(DatasetError, match=r"depth_unit=1, depth is \d+ times too large .* say 0\.00"):
+    with pytest.raises(DatasetError, match=r"depth_unit=1, depth is \d+ times too large .* or give 0\.00"):
         given(folder, DepthSource(maps, unit=1.0))
+    with pytest.raises(
+        DatasetError, match=r"values are camera depth \(z\), not lengths of rays.*leave depth_kind out"
+    ):
+        given(folder, DepthSource(maps, "ray"))
     inverse = write_maps(tmp_path / "inverse", lambda depth, view: 1 / np.maximum(depth, 0.1), 20_000)
-    with pytest.raises(DatasetError, match="neither z nor ray length in any unit.*add --set depth_kind=inverse"):
+    with pytest.raises(
+        DatasetError, match="neither z nor ray length in any unit.*add --set depth_kind=inverse"
+    ):
         given(folder, DepthSource(inverse))
     with pytest.raises(DatasetError, match="larger values are farther away"):
         given(folder, DepthSource(maps, "inverse"))
@@ -141,8 +159,6 @@ def test_without_points_the_unit_has_to_be_named(tmp_path):
 
 @pytest.mark.parametrize("layout", ["colmap", "text"])
 def test_points_in_tracks_give_sparse_depth(tmp_path, layout):
-    from data.conftest import WRITERS
-
     made = traced()
     WRITERS[layout](tmp_path, made.views, made.points, made.colors)
     dataset, report = given(tmp_path, DepthSource(POINTS))
@@ -160,12 +176,14 @@ def test_points_in_tracks_give_sparse_depth(tmp_path, layout):
 def test_points_of_large_error_or_few_views_are_left_out(tmp_path):
     """An error of 3 px, and two views, are not enough."""
     made = traced()
-    write = __import__("data.conftest", fromlist=["WRITERS"]).WRITERS["text"]
-    write(tmp_path, made.views, made.points, made.colors)
+    WRITERS["text"](tmp_path, made.views, made.points, made.colors)
     path = tmp_path / "sparse" / "0" / "points3D.txt"
     lines = path.read_text().splitlines()
     before = len(tracked_points(tmp_path).points)
-    changed = [" ".join([*line.split()[:7], "3.0", *line.split()[8:]]) if i % 2 else line for i, line in enumerate(lines)]
+    changed = [
+        " ".join([*line.split()[:7], "3.0", *line.split()[8:]]) if i % 2 else line
+        for i, line in enumerate(lines)
+    ]
     path.write_text("\n".join([lines[0], *changed[1:]]) + "\n")
     after = len(tracked_points(tmp_path).points)
     assert 0.4 * before < after < 0.6 * before
@@ -190,15 +208,13 @@ def test_samples_fit_photos_of_any_size_and_distorted_ones(tmp_path):
     path = folder / "sparse" / "0" / "cameras.bin"
     path.unlink()
     made, camera = traced(), traced().views[0].camera
-    from data.conftest import WRITERS
-
     WRITERS["text"](folder, made.views, made.points, made.colors)
     cameras = path.with_suffix(".txt")
     values = f"64 48 {camera.fx} {camera.cx + 0.5} {camera.cy + 0.5} 0.05"
     cameras.write_text(f"1 SIMPLE_RADIAL {values}\n")
     for name in ("images.bin", "points3D.bin"):
         path.with_name(name).unlink()
-    dataset, report = given(folder, DepthSource(maps))  # the maps are not distorted, so they agree a little less
+    dataset, _ = given(folder, DepthSource(maps))
     samples, small = dataset.train[0].depth(), small_camera(dataset.train[0].camera)
     columns = small.fx * samples.rays[:, 0] + small.cx
     assert np.abs(columns - np.rint(columns)).max() < 0.05 and columns.max() < SIZE[0] - 0.9

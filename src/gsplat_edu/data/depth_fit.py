@@ -50,6 +50,20 @@ ROUNDS = 20
 """Rounds of reweighting."""
 
 
+class DepthMisfitError(DatasetError):
+    """Depth maps that do not fit the points of their photos.
+
+    Args:
+        where: The folder of maps, or the capture.
+        reason: What does not fit.
+        advice: What to do.
+    """
+
+    def __init__(self, where: str, reason: str, advice: str) -> None:
+        super().__init__(f"{where}: {reason}; {advice}", reason)
+        self.advice = advice
+
+
 class Matches(NamedTuple):
     """Points in a photo, and what its map says there."""
 
@@ -123,31 +137,32 @@ def fit_depths(
     if kind == INVERSE:
         return _inverse(matches, where)
     if count < LEAST_POINTS:
-        if unit <= 0:
-            raise DatasetError(
-                f"{where}: {count} points lie where the maps have depth, too few to find its unit; name it with"
-                " --set depth_unit=U, the world units for a unit of the maps"
-            )
-        fits = dict.fromkeys(matches, PhotoFit(unit))
-        return DepthFit(Z if kind == AUTO_KIND else kind, unit, 0, 0.0, kind != AUTO_KIND, fits, ())
+        return _unchecked(matches, count, kind, unit, where)
     every = Matches(*(np.concatenate(column) for column in zip(*matches.values(), strict=True)))
     ratio, length = np.log(every.depths / every.values), np.log(every.lengths)
     line = _robust_line(length, ratio)
-    certain = kind != AUTO_KIND or line.error < CERTAIN
-    if kind == AUTO_KIND:
-        kind = RAY if certain and line.scale < -0.5 else Z
-    power = 1.0 if kind == RAY else 0.0
+    told = line.error < CERTAIN
+    says = RAY if told and line.scale < -0.5 else Z
+    certain, power = told or kind != AUTO_KIND, 1.0 if (says if kind == AUTO_KIND else kind) == RAY else 0.0
     level = float(np.median(ratio + power * length))
     found, spread = math.exp(level), _relative(ratio + power * length - level)
     if spread > SPREAD:
-        raise DatasetError(f"{where}: {_neither(matches, spread)}")
+        raise DepthMisfitError(where, *_neither(matches, spread))
+    if kind != AUTO_KIND and told and says != kind:
+        names = {Z: "camera depth (z)", RAY: "lengths of rays"}
+        raise DepthMisfitError(
+            where,
+            f"its values are {names[says]}, not {names[kind]}: {count:,} points agree",
+            "leave depth_kind out",
+        )
+    kind = says if kind == AUTO_KIND else kind
     if unit > 0 and abs(math.log(found / unit)) > UNIT_OFF:
         times = short_number(max(found / unit, unit / found), 3)
         larger = "large" if unit > found else "small"
-        raise DatasetError(
-            f"{where}: with depth_unit={unit:g}, depth is {times} times too {larger} at the {count:,} points that"
-            f" photos see; the points say {short_number(found, 4)}, so leave depth_unit out"
+        reason = (
+            f"with depth_unit={unit:g}, depth is {times} times too {larger} at {count:,} points of the photos"
         )
+        raise DepthMisfitError(where, reason, f"leave depth_unit out, or give {short_number(found, 4)}")
     used = unit if unit > 0 else found
     reasons = {
         name: _why_rejected(np.log(each.depths / each.values) + power * np.log(each.lengths) - math.log(used))
@@ -156,6 +171,18 @@ def fit_depths(
     photos = {name: PhotoFit(used) for name, reason in reasons.items() if reason is None}
     rejected = tuple(Rejected(name, reason) for name, reason in reasons.items() if reason is not None)
     return DepthFit(kind, used, count, spread, certain, photos, rejected)
+
+
+def _unchecked(matches: Mapping[str, Matches], count: int, kind: str, unit: float, where: str) -> DepthFit:
+    """Take unit and kind as they are named, because too few points tell them."""
+    if unit <= 0:
+        raise DepthMisfitError(
+            where,
+            f"{count} points lie where the maps have depth, too few to find its unit",
+            "name it with --set depth_unit=U, the world units for a unit of the maps",
+        )
+    fits = dict.fromkeys(matches, PhotoFit(unit))
+    return DepthFit(Z if kind == AUTO_KIND else kind, unit, 0, 0.0, kind != AUTO_KIND, fits, ())
 
 
 def _why_rejected(off: Float64[np.ndarray, " n"]) -> str | None:
@@ -170,16 +197,14 @@ def _why_rejected(off: Float64[np.ndarray, " n"]) -> str | None:
     return None
 
 
-def _neither(matches: Mapping[str, Matches], spread: float) -> str:
-    """Describe maps that have no unit, and what they may be."""
-    text = (
-        f"neither z nor ray length in any unit: depth differs from that of the points by {100 * spread:.0f} %"
-    )
+def _neither(matches: Mapping[str, Matches], spread: float) -> tuple[str, str]:
+    """Describe maps that have no unit, and what to do."""
+    text = f"they are neither z nor ray length in any unit: depth differs from the points' by {100 * spread:.0f} %"
     try:
         spread = _inverse(matches, "").spread
     except DatasetError:
-        return f"{text}; check that the maps belong to these photos and poses"
-    return f"{text}; inverse depth fits to {100 * spread:.1f} %, so add --set depth_kind=inverse"
+        return text, "check that the maps belong to these photos and poses"
+    return f"{text}, while inverse depth fits to {100 * spread:.1f} %", "add --set depth_kind=inverse"
 
 
 def _inverse(matches: Mapping[str, Matches], where: str) -> DepthFit:
@@ -204,17 +229,26 @@ def _inverse(matches: Mapping[str, Matches], where: str) -> DepthFit:
             farthest = 2.0 * float(np.max(matches[name].depths))
             photos[name] = PhotoFit(line.scale, line.shift, farthest)
     if usual <= 0 or not photos:
-        why = (
-            "points tell no scale and shift: none of the photos sees enough"
-            if not lines
-            else "larger values are farther away, so the maps are no inverse depth; leave depth_kind out"
-            if usual <= 0
-            else f"{rejected[0].name}: {rejected[0].reason}, and the others are no better"
-        )
-        raise DatasetError(f"{where}: {why}")
+        raise DepthMisfitError(where, *_no_inverse(rejected, bool(lines), usual))
     spread = float(np.median([spreads[name] for name in photos]))
     count = sum(len(matches[name].values) for name in photos)
     return DepthFit(INVERSE, 0.0, count, spread, True, photos, tuple(sorted(rejected)))
+
+
+def _no_inverse(rejected: Sequence[Rejected], enough: bool, usual: float) -> tuple[str, str]:
+    """Say why no photo has inverse depth, and what to do."""
+    if not enough:
+        return (
+            "no photo sees enough points to find a scale and a shift",
+            "inverse depth needs a capture with points",
+        )
+    if usual <= 0:
+        return "larger values are farther away, so the maps are no inverse depth", "leave depth_kind out"
+    first = rejected[0]
+    return (
+        f"{first.name}: {first.reason}, and the others are no better",
+        "check that the maps belong to these photos",
+    )
 
 
 def _robust_line(x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"]) -> _Line:
