@@ -14,9 +14,12 @@ def lines_of(capsys):
     return " ".join((out + err).split())
 
 
+WORDS = "--iterations 20 --backend cpu --appearance none --sky none --max-gaussians 800 --save-every 10"
+
+
 def train(folder, out, *words):
-    return main(["train", str(folder), "--out", str(out), "--iterations", "20", "--backend", "cpu", "--appearance", "none",
-          "--sky", "none", "--max-gaussians", "800", "--save-every", "10", *words])  # fmt: skip
+    """Train 20 iterations; return the exit code."""
+    return main(["train", str(folder), "--out", str(out), *WORDS.split(), *words])
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import short_number
-from gsplat_edu.data.capture import Frame, fits_camera
+from gsplat_edu.data.capture import Frame, fits_camera, is_folder
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.depth_fit import (
     AUTO_KIND,
@@ -30,7 +30,7 @@ from gsplat_edu.data.depth_fit import (
     matched,
     no_jumps,
 )
-from gsplat_edu.data.depth_folder import DepthFile, confidence_of, depth_files, read_map
+from gsplat_edu.data.depth_folder import GEOMETRIC_MAPS, DepthFile, confidence_of, depth_files, read_map
 from gsplat_edu.data.images import turned, upright_size
 from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.orientation import oriented
@@ -202,8 +202,13 @@ def _files(capture: Path, frames: Sequence[Frame], folder: Path) -> dict[str, De
     if folder != CAPTURE:
         return depth_files(folder, [frame.name for frame in frames])
     named = {frame.name: frame.depth for frame in frames if frame.depth is not None}
+    if not named and not is_folder(capture / GEOMETRIC_MAPS):
+        raise DatasetError(
+            f"{capture}: holds no depth map: transforms.json names none as depth_file_path, and there is no folder"
+            f" {GEOMETRIC_MAPS}; give --depth the folder of maps"
+        )
     if not named:
-        return depth_files(capture, [frame.name for frame in frames])
+        return depth_files(capture / GEOMETRIC_MAPS, [frame.name for frame in frames])
     return {name: DepthFile(path, confidence_of(path)) for name, path in named.items()}
 
 

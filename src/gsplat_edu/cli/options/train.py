@@ -66,7 +66,6 @@ COMMON = (
         "test_every",
         "appearance",
         "surface",
-        "depth",
         "sky",
         "white_background",
         "seed",
