@@ -54,7 +54,7 @@ NOTES = {
 }
 """What the metadata of a package do not say about its wheels."""
 
-TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause", "xatlas": "MIT"}
+TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause", "xatlas": "MIT", "openexr": "BSD-3-Clause"}
 """Packages whose metadata contain the text of their licence, but not its SPDX name."""
 
 CLASSIFIERS = {
