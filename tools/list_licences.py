@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "LICENCES.md"
-EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu", "mesh")
+EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu", "mesh", "depth")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {
@@ -55,7 +55,7 @@ NOTES = {
 }
 """What the metadata of a package do not say about its wheels."""
 
-TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause", "xatlas": "MIT"}
+TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause", "xatlas": "MIT", "openexr": "BSD-3-Clause"}
 """Packages whose metadata contain the text of their licence, but not its SPDX name."""
 
 CLASSIFIERS = {

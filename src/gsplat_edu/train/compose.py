@@ -116,6 +116,7 @@ def training(
     extent = scene_extent(cameras) if start.extent is None else start.extent
     gaussians, shell = start.gaussians.to(backend.device), start.shell
     features = functools.partial(render, backend=backend)
+    has_depth = any(view.depth is not None for view in dataset.train)
     return Trainer(
         gaussians,
         dataset.train,
@@ -125,7 +126,7 @@ def training(
         density=make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
         callbacks=callbacks,
         parts=StepParts(
-            make_objective(config, shell, backend.loss, extent),
+            make_objective(config, shell, backend.loss, extent, has_depth),
             make_view_model(config, cameras, extent, gaussians, backend.recolored),
             transients=make_transients(config, dataset.train, features),
             fused=fused,

@@ -20,6 +20,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.losses import LossKernel, photo_loss
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.depth import DEPTH, DepthTerm
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.rendered import Rendered as Rendered
@@ -41,7 +42,7 @@ class Term(Protocol):
 
     A term that uses `output.depth` has a true attribute `needs_depth`. One that in some steps uses the depth and the
     composited normals (`gsplat_edu.render.planes.facing_normals`), in `output.features`, has a method
-    `needs_normals(iteration)`.
+    `needs_normals(iteration)`. One that in some steps uses the depth only has a method `needs_depth_in(iteration)`.
     """
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
@@ -72,6 +73,11 @@ class Objective:
     def needs_normals(self, iteration: int) -> bool:
         """Whether a term uses depth and normals in the step of this iteration; only then are they rendered."""
         asked = (getattr(term, "needs_normals", None) for term in self.terms.values())
+        return any(needs(iteration) for needs in asked if needs is not None)
+
+    def needs_depth_in(self, iteration: int) -> bool:
+        """Whether a term uses the depth in the step of this iteration."""
+        asked = (getattr(term, "needs_depth_in", None) for term in self.terms.values())
         return any(needs(iteration) for needs in asked if needs is not None)
 
     def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
@@ -109,12 +115,14 @@ def make_objective(
     shell: Shell | None = None,
     loss: LossKernel | None = None,
     extent: float = 1.0,
+    has_depth: bool = False,
 ) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
     if nothing is outside of masks + weight_e sum_outside(alpha) / (H W);
     for a surface + weight_n mean a (a - N . m) + weight_f mean(smallest scale) / extent
+    with given depth + weight_d mean rho(z / z* - 1), or for points + weight_p extent mean |1/z - 1/z*|
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
     rate if all its gradients agree, however small they are. If each view shows a twentieth of the scene, invisible
@@ -125,6 +133,7 @@ def make_objective(
         shell: Where far splats lie, whose scale is not regularised; None if there are none.
         loss: Compares images and photos; see `photo_loss`.
         extent: Size of the scene, world units.
+        has_depth: Whether views have depth (`View.depth`).
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
@@ -140,6 +149,9 @@ def make_objective(
         turns = Turns(config.surface_start, config.surface_every, config.batch)
         terms[NORMAL] = NormalTerm(config.normal_weight, turns)
         terms[FLAT] = FlatTerm(config.flat_weight, extent, turns, shell)
+    if has_depth:
+        turns = Turns(0, config.depth_every, config.batch)
+        terms[DEPTH] = DepthTerm(config.depth_weight, config.points_weight, extent, turns)
     return Objective(terms)
 
 
