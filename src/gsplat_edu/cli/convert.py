@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,10 +90,7 @@ def run(arguments: argparse.Namespace) -> None:
             export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
         bar.advance(steps)
         emitter.report_output(arguments.out)
-        count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
-        say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}{_with_mesh(arguments.out, meshes)}")
-        if export.has_levels(arguments.out):
-            say(export.levels_line(arguments.out))
+        _say_written(arguments.out, source, meshes, say)
         if arguments.scale is not None:
             say(
                 f"1 unit of {arguments.out.name} = 1 {given.unit}; it was {given.apart / given.length:.6g} units before"
@@ -102,11 +99,15 @@ def run(arguments: argparse.Namespace) -> None:
             check_and_say(arguments.out, source, backend, bar, say)
 
 
-def _with_mesh(path: Path, meshes: Meshes | None) -> str:
-    """Describe the mesh of a page, and the size of the page with it; nothing without a mesh."""
-    if meshes is None:
-        return ""
-    return f"; mesh of {len(meshes.surface.faces):,} triangles; {path.stat().st_size:,} bytes"
+def _say_written(path: Path, source: Source, meshes: Meshes | None, say: Callable[[str], None]) -> None:
+    """Say what a written file contains, and the size of a page with a mesh."""
+    count, degree = len(source.scene.gaussians), export.kept_degree(path, source.scene)
+    more = ""
+    if meshes is not None:
+        more = f"; mesh of {len(meshes.surface.faces):,} triangles; {path.stat().st_size:,} bytes"
+    say(f"wrote {path}: {count:,} splats, SH degree {degree}{more}")
+    if export.has_levels(path):
+        say(export.levels_line(path))
 
 
 def _after_edits(source: Source, edits: Edits, views: Views, arguments: argparse.Namespace) -> Source:
