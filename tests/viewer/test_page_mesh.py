@@ -13,6 +13,7 @@ from gsplat_edu.runs.source import Source, file_settings
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.mesh import Mesh, Texture
 from gsplat_edu.viewer import page, page_mesh
+from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
 from viewer.conftest import described
 
@@ -258,6 +259,36 @@ def test_a_ray_meets_the_surface_where_numpy_says(opened):
     hit = face >= 0
     np.testing.assert_allclose(found[hit], depth[hit], rtol=1e-9)
     assert (found[hit].astype(np.float32) == depth[hit].astype(np.float32)).mean() > 0.99
+
+
+def test_measuring_snaps_to_the_mesh(visit, tmp_path, random_gaussians):
+    """Two clicks on the mesh give the points that the ray caster finds; beside it, the splats decide."""
+    mesh = Mesh(ball().vertices.astype(np.float32).astype(np.float64), ball().faces)
+    scene = Scene(random_gaussians(40))
+    source = Source(tmp_path / "scene.ply", scene, (("view", VIEW),), file_settings(scene))
+    editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
+    tour = page.Tour(meshes=Meshes(mesh))
+    html = page.html(scene, source.cameras, source.settings, "scene", (), tour, editing)
+    (tmp_path / "edit.html").write_bytes(html)
+    tab = visit(width=1200, height=600).open(tmp_path / "edit.html").ready().tab
+    tab.wait_for_selector("#edit")
+    assert tab.evaluate("viewer.meshes.share") == 1  # the picture to edit is that of the splats
+    tab.evaluate("document.querySelector('[data-tool=measure]').click()")
+    tab.evaluate("() => { viewer.goTo(0); return viewer.settled(); }")
+    camera = Camera(**{k: v for k, v in tab.evaluate("viewer.camera()").items() if k in described(VIEW)})
+    center = camera.world_to_cam(np.array([[0.1, -0.1, 0.0], [-0.2, 0.15, 0.1]]))
+    clicks = np.rint(center[:, :2] / center[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+    for column, row in clicks:
+        tab.mouse.click(column + 0.5, row + 0.5)
+    found = np.array(tab.evaluate("editor.tools.points"))
+    seen = tab.evaluate("([x, y]) => editor.tools.pointOf(viewer.camera(), x, y)", (clicks[0] + 0.5).tolist())
+    assert (seen["u"], seen["v"]) == tuple(clicks[0])
+    directions = rays(camera, *clicks.T)
+    face, depth, _ = cast(mesh, np.broadcast_to(camera.eye, directions.shape), directions)
+    assert (face >= 0).all()
+    expected = camera.eye + depth[:, None] * directions
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    assert (found.astype(np.float32) == expected.astype(np.float32)).all()
 
 
 def test_meshes_follow_the_origin_the_unit_and_moves_of_the_scene(tmp_path, random_gaussians):

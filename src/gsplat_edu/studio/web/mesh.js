@@ -5,7 +5,8 @@ import { attempt, button, errorLine, h, heading } from "./dom.js";
 import { frame } from "./frame.js";
 import { jobPlace, startJob } from "./jobs.js";
 
-const newestOf = (exports, format) => exports.filter((one) => one.format === format).sort((a, b) => b.modified - a.modified)[0] ?? null;
+// The newest exported file of a format; null without one.
+export const newestOf = (exports, format) => exports.filter((one) => one.format === format).sort((a, b) => b.modified - a.modified)[0] ?? null;
 
 export function meshes(store, entry) {
   const line = errorLine();

@@ -168,7 +168,7 @@ class Meshes {
     [this.below, this.above] = [new Layer(gl), new Layer(gl)]; // the surface, and the collider over everything
     this.style = "surface"; // or "edges" on it, or "wireframe"
     this.showsCollider = collider !== null;
-    this.share = 0.5; // of the picture's width, from the left, that shows the splats
+    this.share = viewer.facts.edit ? 1 : 0.5; // of the picture's width, from the left, that shows the splats
     if (gl.getError() !== gl.NO_ERROR) throw new Error("The mesh does not fit into the graphics processor's memory.");
     this.setUpPanel();
   }
@@ -241,11 +241,13 @@ class Meshes {
     const { width, height } = gl.canvas;
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.enable(gl.SCISSOR_TEST);
-    const begin = Math.round(this.share * width);
-    gl.scissor(begin, 0, width - begin, height);
-    viewer.renderer.copy(this.below.texture, this.below.width, this.below.height);
-    gl.disable(gl.SCISSOR_TEST);
+    if (this.share < 1) {
+      const begin = Math.round(this.share * width);
+      gl.enable(gl.SCISSOR_TEST);
+      gl.scissor(begin, 0, width - begin, height);
+      viewer.renderer.copy(this.below.texture, this.below.width, this.below.height);
+      gl.disable(gl.SCISSOR_TEST);
+    }
     if (this.showsCollider) viewer.renderer.copy(this.above.texture, this.above.width, this.above.height);
     gl.disable(gl.BLEND);
     const { left, width: across } = this.shown();
