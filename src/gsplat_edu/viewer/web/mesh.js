@@ -177,7 +177,7 @@ class Meshes {
     const [range, style, collider] = ["mesh-share", "mesh-style", "mesh-collider"].map(element);
     const count = this.surface.faces.length / 3;
     element("mesh-count").textContent = `${count.toLocaleString("en")} triangles`;
-    element("mesh").hidden = element("mesh-line").hidden = false;
+    for (const id of ["mesh", "mesh-line", "mesh-help"]) element(id).hidden = false;
     collider.parentElement.hidden = !this.collider;
     collider.checked = this.showsCollider;
     range.addEventListener("input", () => this.split(Number(range.value) / 100));
