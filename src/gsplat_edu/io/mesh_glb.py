@@ -30,7 +30,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.glb_container import write_container
 from gsplat_edu.io.mesh_image import encoded
-from gsplat_edu.io.mesh_parts import METRES, distinct_rows
+from gsplat_edu.io.mesh_parts import METRES, split_at_seams
 from gsplat_edu.scene.mesh import Mesh
 
 TRIANGLES, FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 4, 5126, 5123, 5125
@@ -60,7 +60,7 @@ def linear(srgb: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
 
 def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
-    origin, faces, uvs = _split(mesh)
+    origin, faces, uvs = split_at_seams(mesh)
     positions = _positions(path, mesh.vertices[origin], unit)
     normals = _vertex_normals(mesh)[origin] * np.array(POSITION_SIGNS) + 0.0
     file = _Document()
@@ -130,22 +130,6 @@ def _positions(
     if not np.isfinite(positions).all():
         raise ArgumentError(f"{path}: a coordinate is beyond float32, which glTF uses; write a .ply")
     return positions
-
-
-def _split(
-    mesh: Mesh,
-) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, "F 3"], Float32[np.ndarray, "N 2"] | None]:
-    """Repeat vertices until each has one texture coordinate.
-
-    Returns:
-        The mesh's vertex that each vertex of the file repeats, in its order; the faces among the file's vertices; the
-        texture coordinates, None without a texture.
-    """
-    if mesh.texture is None:
-        return np.arange(len(mesh.vertices)), mesh.faces, None
-    corners, uvs = mesh.faces.ravel(), mesh.texture.uvs.reshape(-1, 2)
-    first, group = distinct_rows(corners, uvs[:, 0], uvs[:, 1])
-    return corners[first], group.reshape(-1, 3), uvs[first]
 
 
 def _vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
