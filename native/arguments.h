@@ -138,6 +138,7 @@ class Arguments {
     nb::handle take(const char *name) {
         PyObject *value = PyDict_GetItemString(given_.ptr(), name);
         if (!value) throw nb::type_error((std::string(owner_) + ": " + name + " is missing").c_str());
+        if (count_ == taken_.size()) throw nb::type_error((std::string(owner_) + ": has too many arguments").c_str());
         taken_[count_++] = name;
         return value;
     }
@@ -273,7 +274,7 @@ class Arguments {
 
     const char *owner_;
     nb::kwargs given_;
-    std::array<const char *, 16> taken_{};
+    std::array<const char *, 32> taken_{};  // names that live as long as the call: literals
     size_t count_ = 0;
 };
 

@@ -4,6 +4,7 @@
 #include "arguments.h"
 #include "buffers.h"
 #include "dispatch.h"
+#include "patches.h"
 #include "structures.h"
 #include "threads.h"
 
@@ -81,11 +82,67 @@ void normals_backward(nb::args positional, nb::kwargs given) {
     parallel(threads, (args.n + BLOCK - 1) / BLOCK, [&](int64_t block, int) { kernels<T>().normals_backward(args, block); });
 }
 
+// A photo of one channel with its camera; which of its pixels count may be None.
+Grey grey_of(Arguments &a, const char *name, const char *counts, const char *intrinsics, const Shape &wanted) {
+    Grey grey{};
+    const Array pixels = a.array(name, {Kind::U8}, wanted);
+    grey.counts = a.array_or_none(counts, Kind::U8, pixels.shape).as<uint8_t>();
+    if (pixels.shape[0] > MOST || pixels.shape[1] > MOST) a.fail(name, "is too large");
+    grey.pixels = pixels.as<uint8_t>();
+    grey.H = int32_t(pixels.shape[0]), grey.W = int32_t(pixels.shape[1]);
+    double numbers[4];
+    a.numbers(intrinsics, numbers, 4);
+    grey.fx = numbers[0], grey.fy = numbers[1], grey.cx = numbers[2], grey.cy = numbers[3];
+    return grey;
+}
+
+// Returns the loss of a camera's patches, and how many of them learn; writes their gradients.
+template <class T>
+nb::tuple patches_of(nb::args positional, nb::kwargs given) {
+    Arguments a("patches", positional, given);
+    const Array normals = a.array("normals", {KIND<T>}, {ANY, ANY, 3});
+    const Shape plane = {normals.shape[0], normals.shape[1]};
+    PatchArgs<T> args{};
+    args.normals = normals.as<T>();
+    args.depth = a.array("depth", {KIND<T>}, plane).template as<T>();
+    args.alpha = a.array("alpha", {KIND<T>}, plane).template as<T>();
+    args.grad_normals = a.array("grad_normals", {KIND<T>}, normals.shape, true).template as<T>();
+    args.grad_depth = a.array("grad_depth", {KIND<T>}, plane, true).template as<T>();
+    args.grad_alpha = a.array("grad_alpha", {KIND<T>}, plane, true).template as<T>();
+    args.photo = grey_of(a, "photo", "photo_counts", "photo_intrinsics", plane);
+    args.other = grey_of(a, "other", "other_counts", "other_intrinsics", {ANY, ANY});
+    a.numbers("R", args.R, 9), a.numbers("turn", args.turn, 9), a.numbers("shift", args.shift, 3);
+    args.radius = int32_t(a.whole("radius", 1, MOST_RADIUS)), args.stride = int32_t(a.whole("stride", 1, MOST));
+    args.first_u = int32_t(a.whole("first_u", 0, MOST)), args.first_v = int32_t(a.whole("first_v", 0, MOST));
+    args.scale = a.number("scale"), args.most = a.number("most");
+    args.least_alpha = a.number("least_alpha"), args.least_cosine = a.number("least_cosine"), args.least_spread = a.number("least_spread");
+    const int threads = int(a.whole("threads", 1, MOST_THREADS));
+    a.finish();
+    double total = 0, learning = 0;
+    {
+        nb::gil_scoped_release release;
+        const size_t pixels = size_t(plane.size());
+        if (pixels) {  // an empty array may have no address
+            memset(args.grad_normals, 0, 3 * pixels * sizeof(T));
+            memset(args.grad_depth, 0, pixels * sizeof(T));
+            memset(args.grad_alpha, 0, pixels * sizeof(T));
+        }
+        Buffer sums;
+        const int64_t rows = args.rows();
+        args.sums = static_cast<double *>(sums.reserve((2 * size_t(rows) + 1) * sizeof(double)));
+        parallel(threads, rows, [&](int64_t row, int) { patch_row(args, row); });
+        for (int64_t row = 0; row < rows; ++row) total += args.sums[2 * row], learning += args.sums[2 * row + 1];
+    }
+    return nb::make_tuple(total, int64_t(learning));
+}
+
 }  // namespace
 
 void bind_surface(nb::module_ &m) {
     m.def("surface_f32", &surface_of<float>);
     m.def("surface_f64", &surface_of<double>);
+    m.def("patches_f32", &patches_of<float>);
+    m.def("patches_f64", &patches_of<double>);
     m.def("normals_f32", &normals<float>);
     m.def("normals_f64", &normals<double>);
     m.def("normals_backward_f32", &normals_backward<float>);

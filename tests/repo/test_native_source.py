@@ -19,6 +19,7 @@ ISA_FREE = {
                 "frame",
                 "loss",
                 "marching_cubes",
+                "patches",
                 "scan",
                 "sort",
             ),

@@ -1,0 +1,295 @@
+"""Patches of neighbouring photos: how well they agree when they are seen through a rendered surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.validation import check_shape, whole_number
+from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import Photo
+
+RADIUS = 3
+"""A patch has 7 x 7 pixels, as in Chen et al. 2024 (PGSR)."""
+
+MOST = 0.6
+"""Largest loss of a patch, 1 - ncc: patches that agree less show another surface, as where one hides the other, and
+learn nothing."""
+
+LEAST_ALPHA = 0.9
+"""A pixel has a surface if its alpha is at least this."""
+
+LEAST_COSINE = 0.2
+"""A patch is compared if |cos| of its rays and its normal is at least this, 78 degrees: nearer to edge-on, a pixel of
+it covers five or more of the surface."""
+
+LEAST_SPREAD = 2.0
+"""Smallest standard deviation of a patch's values, in levels of 255: below it there is noise and no texture."""
+
+
+@dataclass(frozen=True, eq=False)
+class GreyPhoto:
+    """A photo of one channel with its camera.
+
+    Args:
+        camera: The camera.
+        pixels: (H, W) uint8 mean of red, green and blue, rounded.
+        counts: (H, W) true for pixels that count; None if all do.
+
+    Raises:
+        ShapeError: the sizes differ from the camera's.
+    """
+
+    camera: Camera
+    pixels: UInt8[np.ndarray, "H W"]
+    counts: Bool[np.ndarray, "H W"] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        for name, plane in (("pixels", self.pixels), ("counts", self.counts)):
+            if plane is not None:
+                check_shape(name, plane.shape, (self.camera.H, self.camera.W), {})
+
+    @classmethod
+    def of(cls, photo: Photo, camera: Camera) -> GreyPhoto:
+        """Return a photo without its colours; pixels count that its mask does not exclude and that are opaque."""
+        image = photo.image if photo.image.dtype == np.uint8 else np.rint(255.0 * photo.image)
+        total = image[..., 0].astype(np.uint16) + image[..., 1] + image[..., 2]
+        counts, opaque = photo.mask, photo.opaque
+        if opaque is not None:
+            counts = opaque if counts is None else counts & opaque
+        return cls(camera, ((total + 1) // 3).astype(np.uint8), counts)
+
+    @property
+    def nbytes(self) -> int:
+        """Size in bytes."""
+        return self.pixels.nbytes + (0 if self.counts is None else self.counts.nbytes)
+
+
+class Grid(NamedTuple):
+    """Which pixels are the centres of patches: (first_u + k stride, first_v + l stride)."""
+
+    stride: int
+    first_u: int = 0
+    first_v: int = 0
+
+    def size(self, H: int, W: int) -> int:
+        """Return how many pixels of an image the grid has."""
+        return len(range(self.first_v, H, self.stride)) * len(range(self.first_u, W, self.stride))
+
+
+class PatchLoss(NamedTuple):
+    """How far patches are from their neighbours.
+
+    Args:
+        value: () scalar, differentiable in normals, depth and alpha.
+        learning: Number of patches whose loss is below `MOST`.
+    """
+
+    value: Float[Tensor, ""]
+    learning: int
+
+
+def patch_error(
+    normals: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    photo: GreyPhoto,
+    other: GreyPhoto,
+    grid: Grid,
+    weight: float = 1.0,
+) -> PatchLoss:
+    """Return how far patches of a photo are from a neighbouring photo: weight mean min(1 - ncc, MOST).
+
+    The plane of a patch goes through the mean depth of its centre, sum w z / a, with the composited normal. The plane
+    leads every pixel of the patch to a point of the other photo; ncc is the correlation of the values there, by
+    bilinear interpolation, with the patch's own: 1 if they differ by brightness and contrast only. The mean is over all
+    pixels of the grid. Those add 0 that have no surface, see it edge-on, whose patch leaves a photo, has pixels that do
+    not count, or shows no texture.
+
+    Args:
+        normals: (H, W, 3) composited `gsplat_edu.render.planes.facing_normals`.
+        depth: (H, W) sum of w z, world units.
+        alpha: (H, W) accumulated alpha.
+        photo: The photo of this camera.
+        other: The neighbouring photo.
+        grid: The patches' centres.
+        weight: Factor of the value.
+
+    Raises:
+        ShapeError: the sizes differ.
+        ArgumentError: dtypes or devices differ, or the grid is impossible.
+
+    Source: Chen et al. 2024 (PGSR), eq. 13.
+    """
+    H, W = photo.camera.H, photo.camera.W
+    check_shape("normals", normals.shape, (H, W, 3), {})
+    for name, given in (("depth", depth), ("alpha", alpha)):
+        check_shape(name, given.shape, (H, W), {})
+        if (given.dtype, given.device) != (normals.dtype, normals.device):
+            wanted = f"{normals.dtype} on {normals.device}"
+            raise ArgumentError(f"{name}: is {given.dtype} on {given.device}, but normals are {wanted}")
+    whole_number("stride", grid.stride, 1)
+    whole_number("first_u", grid.first_u, 0)
+    whole_number("first_v", grid.first_v, 0)
+    scale = weight / max(grid.size(H, W), 1)
+    if normals.device.type != "cpu" or normals.dtype not in SUFFIXES:
+        return patch_error_in_torch(normals, depth, alpha, photo, other, grid, weight)
+    learning: list[int] = []
+    value: Tensor = _PatchError.apply(  # type: ignore[no-untyped-call]
+        normals, depth, alpha, photo, other, (grid, scale), learning
+    )
+    return PatchLoss(value, learning[0])
+
+
+def relative_pose(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotation (3, 3) and shift (3,) from a camera's axes to another's: x -> rotation x + shift."""
+    return other.R @ camera.R.T, other.R @ (camera.eye - other.eye)
+
+
+@one_thread()  # the rounding of torch's sum depends on the number of threads
+def patch_error_in_torch(
+    normals: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    photo: GreyPhoto,
+    other: GreyPhoto,
+    grid: Grid,
+    weight: float = 1.0,
+) -> PatchLoss:
+    """Return `patch_error` from its definition, by torch's operations, on any device."""
+    H, W = alpha.shape
+    seats = [torch.arange(first, size, grid.stride) for first, size in ((grid.first_v, H), (grid.first_u, W))]
+    v, u = (seat.reshape(-1).to(alpha.device) for seat in torch.meshgrid(*seats, indexing="ij"))
+    away = torch.arange(-RADIUS, RADIUS + 1, device=alpha.device)
+    down, right = (offsets.reshape(-1) for offsets in torch.meshgrid(away, away, indexing="ij"))
+    held = (u >= RADIUS) & (v >= RADIUS) & (u < W - RADIUS) & (v < H - RADIUS)
+    held = held & (alpha[v, u] >= LEAST_ALPHA) & (normals[v, u] != 0).any(dim=-1) & (depth[v, u] > 0)
+    u, v = u[held], v[held]
+    of_u, of_v = u[:, None] + right, v[:, None] + down
+    own, counts = _values(photo, normals, of_u, of_v)
+    x, y, held = _seen(normals, depth, alpha, (photo.camera, other.camera), (u, v), (of_u, of_v))
+    last_u, last_v = other.camera.W - 1, other.camera.H - 1
+    held = held & ((x >= 0) & (y >= 0) & (x <= last_u) & (y <= last_v)).all(dim=1) & counts
+    left, top = (at.detach().floor().clamp(0, max(last - 1, 0)) for at, last in ((x, last_u), (y, last_v)))
+    corners, weights = [], ((1 - (x - left), x - left), (1 - (y - top), y - top))
+    for below in (0, 1):
+        for beside in (0, 1):
+            at_u, at_v = (left + beside).clamp(max=last_u).long(), (top + below).clamp(max=last_v).long()
+            values, counts = _values(other, normals, at_u, at_v)
+            held = held & counts
+            corners.append(values * weights[0][beside] * weights[1][below])
+    seen = corners[0] + corners[1] + corners[2] + corners[3]
+    own, seen = own - own.mean(dim=1, keepdim=True), seen - seen.mean(dim=1, keepdim=True)
+    squares = torch.stack([(own * own).sum(dim=1), (seen * seen).sum(dim=1)])
+    held = held & (squares.detach() >= LEAST_SPREAD**2 * own.shape[1]).all(dim=0)
+    lengths = squares.where(held, 1.0).sqrt()
+    error = 1 - (own * seen).sum(dim=1) / (lengths[0] * lengths[1])
+    bounded = error.clamp(max=MOST).where(held, 0.0)
+    value = weight / max(grid.size(H, W), 1) * bounded.sum()
+    return PatchLoss(value, int((held & (error < MOST)).sum()))
+
+
+def _values(photo: GreyPhoto, like: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the values at pixels (P, K), and whether all of a patch's count (P,)."""
+    values = torch.from_numpy(np.array(photo.pixels)).to(like)[v, u]
+    if photo.counts is None:
+        return values, torch.ones(len(u), dtype=torch.bool, device=like.device)
+    return values, torch.from_numpy(np.array(photo.counts)).to(like.device)[v, u].all(dim=1)
+
+
+def _seen(
+    normals: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    cameras: tuple[Camera, Camera],
+    centre: tuple[Tensor, Tensor],
+    pixels: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return where the other camera sees the pixels of patches, (P, K) each, px, and whether it sees all of one (P,)."""
+    camera, other = cameras
+    to_camera, turn, shift = (
+        torch.from_numpy(np.array(m)).to(normals) for m in (camera.R, *relative_pose(*cameras))
+    )
+    u, v = centre
+    z = depth[v, u] / alpha[v, u]
+    n = torch.nn.functional.normalize(normals[v, u], dim=-1) @ to_camera.T
+
+    def ray(u: Tensor, v: Tensor) -> Tensor:
+        x, y = (u.to(n) - camera.cx) / camera.fx, (v.to(n) - camera.cy) / camera.fy
+        return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+    rays = ray(*pixels)
+    facing, of_pixels = (n * ray(u, v)).sum(dim=-1), (n[:, None] * rays).sum(dim=-1)
+    held = (of_pixels < -LEAST_COSINE * rays.norm(dim=-1)).all(dim=1)
+    s = (z * facing)[:, None] / of_pixels.where(held[:, None], -1.0)
+    points = (s[..., None] * rays) @ turn.T + shift
+    held = held & (points[..., 2] > 0).all(dim=1)
+    ahead = points[..., 2].where(held[:, None], 1.0)
+    return other.fx * points[..., 0] / ahead + other.cx, other.fy * points[..., 1] / ahead + other.cy, held
+
+
+class _PatchError(torch.autograd.Function):
+    """Compute value and gradients in one native call; backward only scales."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401
+        normals: Tensor,
+        depth: Tensor,
+        alpha: Tensor,
+        photo: GreyPhoto,
+        other: GreyPhoto,
+        placed: tuple[Grid, float],
+        learning: list[int],
+    ) -> Tensor:
+        given = [tensor.detach().contiguous() for tensor in (normals, depth, alpha)]
+        gradients = [reusable_tensor(tensor.shape, tensor) for tensor in given]
+        names, (grid, scale) = ("normals", "depth", "alpha"), placed
+        turn, shift = relative_pose(photo.camera, other.camera)
+        value, count = kernel("patches_f", normals.dtype)(
+            **{name: native_array(tensor) for name, tensor in zip(names, given, strict=True)},
+            **{f"grad_{name}": native_array(tensor) for name, tensor in zip(names, gradients, strict=True)},
+            **_named("photo", photo),
+            **_named("other", other),
+            R=photo.camera.R.ravel().tolist(),
+            turn=turn.ravel().tolist(),
+            shift=shift.tolist(),
+            radius=RADIUS,
+            **grid._asdict(),
+            scale=scale,
+            most=MOST,
+            least_alpha=LEAST_ALPHA,
+            least_cosine=LEAST_COSINE,
+            least_spread=LEAST_SPREAD,
+            threads=torch.get_num_threads(),
+        )
+        learning.append(count)
+        ctx.save_for_backward(*gradients)
+        return normals.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        scaled = [g if float(grad) == 1.0 else g * grad for g in ctx.saved_tensors]
+        return (*scaled, None, None, None, None)
+
+
+def _named(name: str, photo: GreyPhoto) -> dict[str, Any]:
+    """Return the arguments of a photo for the native call."""
+    camera, counts = photo.camera, photo.counts
+    return {
+        name: np.ascontiguousarray(photo.pixels),
+        f"{name}_counts": None if counts is None else np.ascontiguousarray(counts).view(np.uint8),
+        f"{name}_intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+    }
