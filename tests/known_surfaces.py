@@ -5,6 +5,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from gsplat_edu import Camera
+from gsplat_edu.scene.mesh import Mesh
 
 BOX_NORMALS = np.array(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0.634, 0.634, 0.4428]]
@@ -82,3 +83,26 @@ def enclosed(mesh):
     """Volume inside; positive if the faces look outward."""
     a, b, c = np.moveaxis(mesh.corners, 1, 0)
     return (np.cross(a, b) * c).sum() / 6
+
+
+def joined(*meshes):
+    """Return several meshes as one."""
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + at for mesh, at in zip(meshes, offsets, strict=False)]),
+    )
+
+
+def torus(around=24, tube=12, R=1.0, r=0.4):
+    """Return a closed torus, faces outward."""
+    i, j = np.meshgrid(np.arange(around), np.arange(tube), indexing="ij")
+    a, b = 2 * np.pi * i / around, 2 * np.pi * j / tube
+    out = R + r * np.cos(b)
+    vertices = np.stack([out * np.cos(a), out * np.sin(a), r * np.sin(b)], -1).reshape(-1, 3)
+
+    def at(k, m):
+        return ((k % around) * tube + m % tube).ravel()
+
+    one, two, three, four = at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)
+    return Mesh(vertices, np.concatenate([np.stack([one, two, three], 1), np.stack([one, three, four], 1)]))

@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "LICENCES.md"
-EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu", "mesh")
+EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu", "mesh", "depth")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {
@@ -47,6 +47,7 @@ EXCEPTIONS = {"pillow-heif"}
 """Packages that are not held to COMPATIBLE; NOTES says why."""
 
 NOTES = {
+    "coacd": "its wheels also contain OpenVDB (MPL-2.0, since version 12 Apache-2.0), oneTBB, Boost and GCC's libgomp",
     "opencv-python-headless": "its wheels also contain FFmpeg, a library under LGPL-2.1",
     "pillow-heif": "only with the extra heic: its wheels also contain x265, and are GPL-2.0 as a whole",
     "wgpu": "its wheels also contain wgpu-native, under MIT OR Apache-2.0",
@@ -54,7 +55,7 @@ NOTES = {
 }
 """What the metadata of a package do not say about its wheels."""
 
-TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause", "xatlas": "MIT"}
+TEXTS = {"rendercanvas": "BSD-2-Clause", "wgpu": "BSD-2-Clause", "xatlas": "MIT", "openexr": "BSD-3-Clause"}
 """Packages whose metadata contain the text of their licence, but not its SPDX name."""
 
 CLASSIFIERS = {

@@ -15,8 +15,8 @@ from gsplat_edu.budget.costs import (
     Measurements,
     Speed,
     expected_counts,
-    pixel_share,
     photo_copies,
+    pixel_share,
     wanted_gaussians,
 )
 from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes

@@ -1,3 +1,5 @@
+import base64
+import gzip
 import json
 import re
 
@@ -9,8 +11,10 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, write_path
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
+from gsplat_edu.io.mesh_files import write_mesh
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.viewer.export import read_back
 from scene_files import make_run, random_scene
 
@@ -142,6 +146,30 @@ def test_a_page_gets_a_path_that_moves_with_the_scene(convert, tmp_path):
     assert '"path":null' in (tmp_path / "a.html").read_text()
 
 
+def test_a_page_carries_a_mesh_that_moves_with_the_scene(convert, tmp_path):
+    """The file has the capture's coordinates, the page those of its scene; the size of the page is printed."""
+    origin = (512.0, -64.0, 8.0)
+    folder, *_ = make_run(tmp_path / "run", origin)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    mesh = Mesh(corners + origin, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    write_mesh(tmp_path / "a.ply", mesh)
+    out = tmp_path / "a.html"
+    for moves, expected in (
+        ([], corners),
+        (["--transform", "scale=2", "--transform", "move=1,0,0"], 2 * corners + [1, 0, 0]),
+    ):
+        said = convert(folder.path, out, "--surface", tmp_path / "a.ply", *moves)
+        assert f"mesh of 4 triangles; {out.stat().st_size:,} bytes" in said
+        text = out.read_text()
+        facts = json.loads(re.search(r'id="facts">(.*?)</script>', text)[1])
+        assert facts["meshes"] == [
+            {"name": "surface", "vertices": 4, "faces": 4, "coloring": "none", "image": 0}
+        ]
+        data = gzip.decompress(base64.b64decode(re.search(r'class="meshes">(.*?)</script>', text)[1]))
+        np.testing.assert_allclose(np.frombuffer(data, "<f4", 12).reshape(4, 3), expected, atol=1e-6)
+        assert (np.frombuffer(data, "<u4", 12, 48).reshape(4, 3) == mesh.faces).all()
+
+
 def sorted_by_angle(named):
     """Return the run's cameras ordered by angle. The first is the test view, which `make_run` returns last."""
     return sorted(named.items(), key=lambda item: float(item[0].removesuffix(".jpg")))
@@ -173,6 +201,16 @@ def sorted_by_angle(named):
         ),
         (["IN", "out.html", "--path", "IN"], "in.ply: is not JSON"),
         (["IN", "out.html", "--path", "gone.json"], "gone.json"),
+        (
+            ["IN", "out.spz", "--surface", "a.glb"],
+            "--surface: only a page can show a mesh; out.spz is not a page, use .html",
+        ),
+        (["IN", "out.html", "--surface", "gone.glb"], "gone.glb"),
+        (
+            ["IN", "out.html", "--collider", "a.glb"],
+            "--collider: is shown with a surface; add --surface FILE",
+        ),
+        (["IN", "out.html", "--surface", "IN.stl"], "unknown mesh format; known are .glb, .ply, .obj"),
     ],
 )
 def test_mistakes_are_one_line_and_nothing_is_written(convert, plain, tmp_path, monkeypatch, words, says):

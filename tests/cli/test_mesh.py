@@ -1,5 +1,7 @@
 """`gsplat-edu mesh`: files of every format, what it says, and what it refuses."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,7 @@ def test_a_scene_without_cameras_is_seen_from_around(scene, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "the scene has no cameras: 48 views around it are used" in said
     assert "are seen by 3 views or more" in said and "1 connected part" in said
+    assert "no triangle passes through another one" in said
     mesh = read_mesh(out)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean() < 0.03
     assert mesh.colors is not None
@@ -52,12 +55,30 @@ def test_the_truth_is_compared_and_a_collider_is_coarse(scene, tmp_path, capsys)
     assert len(read_mesh(out).faces) <= 300
 
 
+def test_a_collider_of_convex_parts(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gsplat_edu.cli.mesh.ORBIT_VIEWS", 20)
+    monkeypatch.setattr("gsplat_edu.cli.mesh.ORBIT_SIZE", 240)
+    out = tmp_path / "parts.glb"
+    words = ["--voxel", "0.1", "--faces", "500", "--collider", "convex", "--backend", "cpu"]
+    assert main(["mesh", str(scene), str(out), *words]) == 0
+    said = capsys.readouterr().out
+    number = int(re.search(r"parts.glb: (\d+) convex part", said)[1])
+    outside = float(re.search(r"at most (\S+) world units outside", said)[1])
+    assert outside < 0.1  # a voxel
+    written = out.read_bytes()
+    assert all(b'"collider_%d"' % part in written for part in range(number))
+    assert b'"collider_%d"' % number not in written
+    radii = np.linalg.norm(read_mesh(out).vertices, axis=1)
+    assert RADIUS - 0.1 < radii.max() < RADIUS + 0.1
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["out.stl"], "unknown mesh format; known are .glb, .ply, .obj"),
         (["out.glb", "--voxel", "0"], "--voxel"),
         (["out.glb", "--faces", "3"], "--faces: is 3, but has to be at least 4"),
+        (["out.obj", "--collider", "convex"], "--collider convex: out.obj cannot hold several parts"),
         (["out.glb", "--tau", "1"], "--tau: is for --truth"),
         (["out.glb", "--truth", "missing.ply"], "--truth: missing.ply does not exist"),
         (["out.glb", "--bounds", "0,0,0,1,0,1"], "--bounds: X1, Y1 and Z1 have to be larger"),

@@ -17,7 +17,7 @@ from gsplat_edu.runs.identity import check_options
 from gsplat_edu.runs.training import document
 from gsplat_edu.train.config import SETTINGS, TrainConfig, recipe
 from gsplat_edu.train.length import QUALITIES
-from gsplat_edu.train.setting import COURSE_ONLY, FOR_SURFACE
+from gsplat_edu.train.setting import COURSE_ONLY, FOR_DEPTH, FOR_SURFACE
 
 
 def parsed(words):
@@ -133,6 +133,7 @@ def test_config_json_has_flat_names(tmp_path):
         "outside_masks",
         "surface",
         *FOR_SURFACE,
+        *FOR_DEPTH,
     }
     assert {name: value for name, value in found["train"].items() if name not in newer} == flat
     folder = RunFolder(tmp_path)

@@ -21,12 +21,15 @@ import gsplat_edu.cli.main as command_line
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, write_path
 from gsplat_edu.io.formats import write_scene
+from gsplat_edu.io.mesh_files import write_mesh
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.viewer import page
+from gsplat_edu.viewer.page_mesh import open_meshes
 from gsplat_edu.viewer.stream import folder_page
 from scene_files import small_levels
 from splats import splats_on
@@ -89,7 +92,9 @@ def test_a_run_is_shown_with_its_cameras_path_and_settings_until_ctrl_c(made, tm
     frames = [Keyframe.of_camera(camera) for _, _, camera in folder.read_cameras(ORIGIN)[:3]]
     path = KeyframePath(tuple(frames), True)
     write_path(tmp_path / "path.json", path, ORIGIN)
-    words = ["--port", "0", "--no-open", "--path", tmp_path / "path.json"]
+    mesh = Mesh(np.eye(3) + ORIGIN, np.array([[0, 1, 2]]), np.eye(3, dtype=np.float32))
+    write_mesh(tmp_path / "a.glb", mesh)
+    words = ["--port", "0", "--no-open", "--path", tmp_path / "path.json", "--surface", tmp_path / "a.glb"]
     with viewing(folder.path, *words) as (printed, url):
         source = open_source(folder.path)
         assert len(source.cameras) == 6 and len(source.held_out) == 2
@@ -100,7 +105,11 @@ def test_a_run_is_shown_with_its_cameras_path_and_settings_until_ctrl_c(made, tm
             source.settings,
             "egg & spoon",
             source.held_out,
-            page.Tour(read_path(tmp_path / "path.json", ORIGIN), ORIGIN),
+            page.Tour(
+                read_path(tmp_path / "path.json", ORIGIN),
+                ORIGIN,
+                meshes=open_meshes(tmp_path / "a.glb", None, source),
+            ),
         )
         with pytest.raises(urllib.error.HTTPError) as refused:
             fetched(f"{url}config.json")
@@ -195,6 +204,7 @@ def test_the_browser_opens_only_on_a_terminal_with_a_screen(made, tmp_path):
         (["cut.ply", "--path", "notes.txt"], "notes.txt: is not JSON"),
         (["desk.splat", "--budget", "5"], "--budget: desk.splat has no levels of detail"),
         (["levels", "--path", "notes.txt"], "--path: a page with levels of detail plays no path"),
+        (["levels", "--surface", "notes.txt"], "--surface: a page with levels of detail shows no mesh"),
         (["nowhere", "--port", "70000"], "--port: is 70000"),
         (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
         (["nowhere", "--host", "no such host"], "--host: 'no such host' is not an address"),

@@ -20,6 +20,7 @@ from gsplat_edu.evaluate.surface import (
 )
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.scene.mesh import Mesh
+from known_surfaces import joined, torus
 
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
 TRIANGLE = Mesh(np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]]))
@@ -47,29 +48,6 @@ def sheet(columns, rows, width=1.0, height=1.0, left=0.0, z=0.0):
         [np.stack([first, first + 1, first + n + 1], 1), np.stack([first, first + n + 1, first + n], 1)]
     )
     return Mesh(vertices, faces)
-
-
-def joined(*meshes):
-    """Return several meshes as one."""
-    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + at for mesh, at in zip(meshes, offsets, strict=False)]),
-    )
-
-
-def torus(around=24, tube=12, R=1.0, r=0.4):
-    """Return a closed torus, faces outward."""
-    i, j = np.meshgrid(np.arange(around), np.arange(tube), indexing="ij")
-    a, b = 2 * np.pi * i / around, 2 * np.pi * j / tube
-    out = R + r * np.cos(b)
-    vertices = np.stack([out * np.cos(a), out * np.sin(a), r * np.sin(b)], -1).reshape(-1, 3)
-
-    def at(k, m):
-        return ((k % around) * tube + m % tube).ravel()
-
-    one, two, three, four = at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)
-    return Mesh(vertices, np.concatenate([np.stack([one, two, three], 1), np.stack([one, three, four], 1)]))
 
 
 # sampling

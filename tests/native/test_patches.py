@@ -52,9 +52,9 @@ def disturbed(maps, amount=0.02):
     generator = torch.Generator().manual_seed(1)
     normals, depth, alpha = maps
     noise = [torch.randn(t.shape, dtype=torch.float64, generator=generator) for t in (normals, depth)]
-    return [
-        (t + amount * n).requires_grad_() for t, n in zip((normals, depth), noise, strict=True)
-    ] + [alpha.clone().requires_grad_()]
+    return [(t + amount * n).requires_grad_() for t, n in zip((normals, depth), noise, strict=True)] + [
+        alpha.clone().requires_grad_()
+    ]
 
 
 def test_the_true_surface_has_the_least_loss():
@@ -87,7 +87,9 @@ def test_the_native_loss_is_its_definition():
     maps[0][:, 30] = 0.0
     maps[1][5] = 0.0
     inputs = disturbed(maps, 0.1)
-    found, expected = (f(*inputs, photo, other, Grid(2, 1, 0), 1.7) for f in (patch_error, patch_error_in_torch))
+    found, expected = (
+        f(*inputs, photo, other, Grid(2, 1, 0), 1.7) for f in (patch_error, patch_error_in_torch)
+    )
     assert found.learning == expected.learning > 60
     assert abs(found.value.item() - expected.value.item()) < 1e-13 and expected.value.item() > 1e-2
     for one, other_one in zip(
@@ -132,7 +134,9 @@ def test_float32_maps():
     photo, other, maps = two_views()
     inputs = disturbed(maps)
     narrow = patch_error(*(t.detach().float() for t in inputs), photo, other, Grid(3))
-    assert float(narrow.value) == pytest.approx(patch_error(*inputs, photo, other, Grid(3)).value.item(), abs=1e-4)
+    assert float(narrow.value) == pytest.approx(
+        patch_error(*inputs, photo, other, Grid(3)).value.item(), abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("case", ["flat", "behind", "aside", "turned away", "tiny", "unlike"])
@@ -158,7 +162,11 @@ def test_what_has_no_neighbour_learns_nothing(case):
         assert loss.learning == 0
         gradients = torch.autograd.grad(loss.value, inputs, allow_unused=True)
         assert not any(g is not None and g.any() for g in gradients)
-        assert (float(loss.value.detach()) > 0.5 * MOST * (1 - 2 * RADIUS / 40)) if case == "unlike" else float(loss.value.detach()) == 0
+        assert (
+            (float(loss.value.detach()) > 0.5 * MOST * (1 - 2 * RADIUS / 40))
+            if case == "unlike"
+            else float(loss.value.detach()) == 0
+        )
 
 
 def test_a_photo_without_colours():

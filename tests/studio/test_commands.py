@@ -7,18 +7,16 @@ import pytest
 
 from gsplat_edu.cli.main import build_parser
 from gsplat_edu.jobs.record import Purpose, Work
-from gsplat_edu.studio.commands import (
+from gsplat_edu.studio.command_options import (
     CLEAN_OPTIONS,
     CONVERT_OPTIONS,
     DOCTOR_OPTIONS,
+    MESH_OPTIONS,
     RENDER_OPTIONS,
     SFM_OPTIONS,
     TRAIN_OPTIONS,
-    command_line,
-    subject_of,
-    title_of,
-    work_of,
 )
+from gsplat_edu.studio.commands import command_line, subject_of, title_of, work_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.refusal import RefusedError
 
@@ -77,6 +75,12 @@ def test_the_commands_and_their_defaults(library):
     assert words(command="convert", subject="runs/a", format="spz", edits=True) == [
         *("convert", "runs/a", "runs/a/exports/a.spz", "--edits", "runs/a/edits.json", "--verify")
     ]
+    assert words(command="mesh", subject="runs/a", format="mesh.glb", options={"texture": True}) == [
+        *("mesh", "runs/a", "runs/a/exports/a.mesh.glb", "--texture")
+    ]
+    assert words(
+        command="mesh", subject="scenes/a", format="collider.glb", to="x", options={"faces": 900}
+    ) == [*("mesh", "scenes/a/toy.spz", "scenes/a/exports/x.collider.glb", "--collider", "--faces", "900")]
     assert words(command="render", subject="scenes/a", options={"frames": 30, "orbit": True}) == [
         *("render", "scenes/a/toy.spz", "--out", "scenes/a/exports/a.mp4", "--frames", "30", "--orbit")
     ]
@@ -91,6 +95,7 @@ REQUESTS = (
     ),
     ({"command": "clean", "subject": "runs/a"}, "cleaning of a", "runs/a"),
     ({"command": "convert", "subject": "scenes/a", "format": "spz"}, "export of a.spz", "scenes/a"),
+    ({"command": "mesh", "subject": "runs/a", "format": "mesh.glb"}, "mesh of a", "runs/a"),
     ({"command": "render", "subject": "runs/a", "to": "film"}, "video of a", "runs/a"),
     ({"command": "doctor", "subject": "captures/a"}, "doctor of a", "captures/a"),
 )
@@ -184,6 +189,7 @@ SUBJECTS = {
         ("doctor", DOCTOR_OPTIONS),
         ("clean", CLEAN_OPTIONS),
         ("convert", CONVERT_OPTIONS),
+        ("mesh", MESH_OPTIONS),
         ("render", RENDER_OPTIONS),
     ],
 )
@@ -262,6 +268,10 @@ def test_values_reach_the_command(library, command):
         {"command": "sfm", "subject": "photos/none"},
         {"command": "convert", "subject": "scenes/none", "format": "spz"},
         {"command": "convert", "subject": "runs/a", "format": "exe"},
+        {"command": "mesh", "subject": "runs/a", "format": "obj"},
+        {"command": "mesh", "subject": "runs/a", "format": "mesh.glb", "options": {"voxel": 0}},
+        {"command": "mesh", "subject": "runs/a", "format": "mesh.glb", "options": {"dataset": "/"}},
+        {"command": "mesh", "subject": "runs/a", "format": "mesh.glb", "edits": True},
         {"command": "convert", "subject": "runs/a", "format": "spz", "to": "a/b"},
         {"command": "convert", "subject": "runs/a", "format": "spz", "edits": True},
         {"command": "clean", "subject": "scenes/a"},

@@ -13,8 +13,8 @@ from gsplat_edu.budget.costs import (
     Measurements,
     exchanged_gaussians,
     expected_counts,
-    pixel_share,
     photo_copies,
+    pixel_share,
     surface_factors,
 )
 from gsplat_edu.budget.probe import probe

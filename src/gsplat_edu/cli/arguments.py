@@ -14,6 +14,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from gsplat_edu.base.constants import AUTO, LOOPBACK
@@ -158,6 +159,22 @@ def add_address(parser: argparse.ArgumentParser, port: int) -> None:
         default=port,
         metavar="N",
         help=f"port to listen on; 0 for any free one (default: {port})",
+    )
+
+
+def add_meshes(parser: argparse.ArgumentParser) -> None:
+    """Add --surface and --collider, the meshes of a page."""
+    parser.add_argument(
+        "--surface",
+        type=Path,
+        metavar="FILE",
+        help="mesh of the scene, from gsplat-edu mesh, that the page shows beside the splats",
+    )
+    parser.add_argument(
+        "--collider",
+        type=Path,
+        metavar="FILE",
+        help="mesh from gsplat-edu mesh --collider that the page lays over --surface and the splats",
     )
 
 

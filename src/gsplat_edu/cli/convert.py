@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.sfm.scale_text import points_of
 from gsplat_edu.viewer import export, page
 from gsplat_edu.viewer.edit_page import tour_of
+from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -61,10 +62,12 @@ def run(arguments: argparse.Namespace) -> None:
     quiet = not console.is_terminal
     with Bar(*columns, console=console, transient=True, disable=quiet) as bar:
         steps = bar.add_task("reading", total=len(arguments.sources) + 1)
-        sources = []
+        sources: list[Source] = []
+        meshes: Meshes | None = None
         for path in arguments.sources:
             bar.update(steps, description=f"reading {path}")
             source = open_source(path)
+            meshes = open_meshes(arguments.surface, arguments.collider, source) if not sources else meshes
             if edits is not None:
                 source = _after_edits(source, edits, views, arguments)
             sources.append(_filtered(source, keep, move))
@@ -79,6 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
         for measure in views.measures:
             say(_measured(measure, total.s, source.scene.unit))
         source, tour = _toured(source, views, total, along)
+        tour = replace(tour, meshes=meshes and meshes.moved(total))
         bar.update(steps, description=f"writing {arguments.out}")
         if arguments.lod_refine is None:
             export.write(arguments.out, source, tour, options)
@@ -86,16 +90,24 @@ def run(arguments: argparse.Namespace) -> None:
             export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
         bar.advance(steps)
         emitter.report_output(arguments.out)
-        count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
-        say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")
-        if export.has_levels(arguments.out):
-            say(export.levels_line(arguments.out))
+        _say_written(arguments.out, source, meshes, say)
         if arguments.scale is not None:
             say(
                 f"1 unit of {arguments.out.name} = 1 {given.unit}; it was {given.apart / given.length:.6g} units before"
             )
         if arguments.verify:
             check_and_say(arguments.out, source, backend, bar, say)
+
+
+def _say_written(path: Path, source: Source, meshes: Meshes | None, say: Callable[[str], None]) -> None:
+    """Say what a written file contains, and the size of a page with a mesh."""
+    count, degree = len(source.scene.gaussians), export.kept_degree(path, source.scene)
+    more = ""
+    if meshes is not None:
+        more = f"; mesh of {len(meshes.surface.faces):,} triangles; {path.stat().st_size:,} bytes"
+    say(f"wrote {path}: {count:,} splats, SH degree {degree}{more}")
+    if export.has_levels(path):
+        say(export.levels_line(path))
 
 
 def _after_edits(source: Source, edits: Edits, views: Views, arguments: argparse.Namespace) -> Source:
@@ -139,6 +151,10 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.path is not None and arguments.out.suffix.lower() != export.PAGE:
         raise ArgumentError(
             f"--path: only a page can play a camera path; {arguments.out} is not a page, use {export.PAGE}"
+        )
+    if arguments.surface is not None and arguments.out.suffix.lower() != export.PAGE:
+        raise ArgumentError(
+            f"--surface: only a page can show a mesh; {arguments.out} is not a page, use {export.PAGE}"
         )
     _check_refining(arguments)
 

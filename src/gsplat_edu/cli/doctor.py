@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import whole_number
+from gsplat_edu.cli.options.depth import check_depth
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.reader import CaptureReader
@@ -22,6 +23,7 @@ from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.appearance import check_exposure
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.cameras import side_for_training
+from gsplat_edu.doctor.depth import own_depth
 from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, table_lines
 from gsplat_edu.doctor.moving import moved_parts
 from gsplat_edu.doctor.residuals import residuals
@@ -74,6 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
     settings, reader = DataSettings(resolution=arguments.resolution), CaptureReader(arguments.path)
+    check_depth(arguments.depth)
     if arguments.iterations is not None:
         whole_number("--iterations", arguments.iterations, 1)
     backend = resolve_backend(arguments.backend)
@@ -83,7 +86,10 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         )
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
-        survey = prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))
+        depth = arguments.depth or own_depth(reader)
+        survey = prepare(
+            reader, lambda done, total: bar.update(task, completed=done, total=total), depth=depth
+        )
         bar.add_task("comparing", total=None)
         diagnosis = examine(survey, _forecast_options(arguments))
     from gsplat_edu.budget.choice import Prospect, choose_backend, usual_choice
@@ -132,6 +138,8 @@ def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
         words += ("--iterations", str(arguments.iterations))
     if arguments.resolution is not None:
         words += ("--resolution", f"{arguments.resolution:g}")
+    if arguments.depth is not None:
+        words += ("--depth", str(arguments.depth))
     return words
 
 

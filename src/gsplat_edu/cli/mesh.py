@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
@@ -14,11 +15,14 @@ from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.text import short_number, spelled_bytes
 from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS, TEXTURE_FACES
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
+from gsplat_edu.evaluate.intersections import Intersections, self_intersections
 from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points, score_surface
 from gsplat_edu.evaluate.topology import Topology, topology
 from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
+from gsplat_edu.io.mesh_glb import write_parts
 from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
+from gsplat_edu.mesh.convex import convex_parts, farthest_outside
 from gsplat_edu.mesh.depths import render_depths
 from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh, views_of_vertices
 from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings
@@ -73,20 +77,37 @@ def run(arguments: argparse.Namespace) -> None:
         if not mesh_format_of(arguments.out).colors_with_texture:
             mesh = replace(mesh, colors=None)  # the texture has a colour for every place
     mesh = _moved(mesh, source.origin)
-    for loss in mesh_losses(arguments.out, mesh, source.scene.unit):
-        console.print(loss, soft_wrap=True)
-    write_mesh(arguments.out, mesh, source.scene.unit)
+    if arguments.collider == "convex":
+        _write_convex(arguments.out, mesh, source.scene.unit, console)
+    else:
+        for loss in mesh_losses(arguments.out, mesh, source.scene.unit):
+            console.print(loss, soft_wrap=True)
+        write_mesh(arguments.out, mesh, source.scene.unit)
     emitter.report_output(arguments.out)
     unit = source.scene.unit or "world units"
-    console.print(
-        f"wrote {arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles; voxels of"
-        f" {short_number(result.voxel, 3)} {unit}, volume of {spelled_bytes(result.volume_bytes)}",
-        soft_wrap=True,
-    )
+    if arguments.collider != "convex":
+        counted = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
+        console.print(f"wrote {arguments.out}: {counted}; {_volume(result, unit)}", soft_wrap=True)
     console.print(*_trust(result, source, backend), sep="\n", soft_wrap=True)
     if truth is not None:
         comparison = Comparison(arguments.tau or result.voxel)
         console.print(*_compared(score_surface(mesh, truth, comparison), unit), sep="\n", soft_wrap=True)
+
+
+def _volume(result: MeshResult, unit: str) -> str:
+    """Describe the volume that the mesh was cut from."""
+    return f"voxels of {short_number(result.voxel, 3)} {unit}, volume of {spelled_bytes(result.volume_bytes)}"
+
+
+def _write_convex(out: Path, mesh: Mesh, unit: str | None, console: Terminal) -> None:
+    """Write convex parts of the mesh, and say how much of it they leave out."""
+    parts = convex_parts(mesh)
+    write_parts(out, [(f"collider_{number}", part) for number, part in enumerate(parts)], unit)
+    outside = short_number(farthest_outside(mesh.vertices, parts), 2)
+    triangles = sum(len(part.faces) for part in parts)
+    counted = f"{len(parts)} convex part{'s' * (len(parts) != 1)}, {triangles:,} triangles"
+    left_out = f"a vertex of the coarse mesh lies at most {outside} {unit or 'world units'} outside of them"
+    console.print(f"wrote {out}: {counted}; {left_out}", soft_wrap=True)
 
 
 def _cameras(source: Source, console: Terminal) -> Sequence[NamedCamera]:
@@ -137,7 +158,7 @@ def _trust(result: MeshResult, source: Source, backend: Backend) -> list[str]:
     said = [f"{certain} % of the vertices are seen by {FEW_VIEWS} views or more"]
     held_out = [(name, camera) for name, camera in source.cameras if name in source.held_out]
     said += _held_out(result, source, held_out[:MOST_HELD_OUT], backend)
-    return [*said, _shape(topology(result.mesh))]
+    return [*said, _shape(topology(result.mesh)), _intersecting(self_intersections(result.mesh))]
 
 
 def _held_out(
@@ -162,6 +183,18 @@ def _shape(shape: Topology) -> str:
         return f"{parts}, closed"
     loops = "" if shape.boundary_loops is None else f" around {shape.boundary_loops} holes"
     return f"{parts}, open along {shape.boundary_edges:,} edges{loops}"
+
+
+def _intersecting(found: Intersections) -> str:
+    if not found.found:
+        return "no triangle passes through another one" + _of_tested(found)
+    share = short_number(100 * found.share, 2)
+    return f"{found.found:,} triangles ({share} %) pass through another one" + _of_tested(found)
+
+
+def _of_tested(found: Intersections) -> str:
+    """Say how many triangles were tested, if not all."""
+    return "" if found.tested == found.faces else f", of {found.tested:,} that were tested"
 
 
 def _compared(scores: SurfaceScores, unit: str) -> list[str]:

@@ -103,6 +103,7 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
         arguments.out,
         TrainConfig().changed(**train),
         DataSettings(**data),
+        depth=arguments.depth,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
     )

@@ -21,6 +21,7 @@ from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import export, page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
+from gsplat_edu.viewer.page_mesh import open_meshes
 from gsplat_edu.viewer.serve import PageServer, exposure
 from gsplat_edu.viewer.stream import folder_page
 
@@ -80,7 +81,8 @@ def _prepare(server: PageServer, console: Terminal, arguments: argparse.Namespac
     source = open_source(arguments.source)
     if along is not None:
         along = along.shifted(-np.array(source.origin))
-    title, tour = _title(arguments.source), page.Tour(along, source.origin)
+    meshes = open_meshes(arguments.surface, arguments.collider, source)
+    title, tour = _title(arguments.source), page.Tour(along, source.origin, meshes=meshes)
     editing = None
     if isinstance(server, EditServer):
         editing = editing_of(source, arguments.source, server.file, ADDRESS)
@@ -100,6 +102,8 @@ def _prepare_levels(server: PageServer, console: Terminal, arguments: argparse.N
     """Put a page on the server that loads levels of detail, and the files of their folder."""
     if arguments.path is not None:
         raise ArgumentError("--path: a page with levels of detail plays no path; view the scene itself")
+    if arguments.surface is not None:
+        raise ArgumentError("--surface: a page with levels of detail shows no mesh; view the scene itself")
     path = file_in(arguments.source)
     server.page, server.served = folder_page(path, _title(path.parent), arguments.budget)
     index = read_index(path)

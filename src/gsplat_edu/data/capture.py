@@ -51,6 +51,7 @@ class Frame:
         part: "train" or "test" if the capture assigns it, "left out" if it is missing from the capture's lists, else
             "".
         orientation: EXIF orientation by which the stored photo has to be turned to fit its pose; 1 for as stored.
+        depth: File of the photo's depth map, if the capture names one; it may be missing.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Frame:
     mask: Path | None = None
     part: str = ""
     orientation: int = UPRIGHT
+    depth: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable
@@ -58,6 +58,21 @@ class Pose(NamedTuple):
     camera: int
     quat: tuple[float, ...]  # (w, x, y, z), world to camera
     shift: tuple[float, ...]  # world units
+
+
+class Observed(NamedTuple):
+    """The points that an image of a model sees."""
+
+    name: str
+    points: Int64[np.ndarray, " n"]  # numbers of the points
+
+
+class Tracked(NamedTuple):
+    """The points of a model, with what the images' observations refer to."""
+
+    numbers: Int64[np.ndarray, " N"]
+    positions: Float64[np.ndarray, "N 3"]  # world units
+    errors: Float64[np.ndarray, " N"]  # mean reprojection error, px; negative if it was not computed
 
 
 def _name(raw: bytes) -> str:
@@ -135,6 +150,7 @@ _POINT = np.dtype(
         ("track", "<u8"),
     ]
 )
+_MARK = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 _COUNT = struct.Struct("<Q")
 CameraRow = tuple[str, int, str, int, int, tuple[float, ...]]
 
@@ -170,12 +186,41 @@ def images_bin(path: Path) -> list[Pose]:
     return poses
 
 
+def observations_bin(path: Path) -> Iterator[Observed]:
+    """Read images.bin: the name of each image, and the numbers of the points seen in it."""
+    with _binary(path, _IMAGE.size + 1 + _COUNT.size) as file:
+        for number in range(file.count):
+            file.where = f"image {number + 1} of {file.count}"
+            file.take(_IMAGE)
+            name, (count,) = file.word(), file.take(_COUNT)
+            if count * _MARK.itemsize > file.left:
+                raise file.corrupt(f"it ends inside {file.where}")
+            marks = np.frombuffer(file.read(count * _MARK.itemsize), _MARK)["point"]
+            yield Observed(name, marks[marks >= 0].astype(np.int64))
+
+
+def tracked_bin(path: Path) -> Tracked:
+    """Read numbers, positions and errors of the points of points3D.bin."""
+    table = _point_table(path)
+    return Tracked(
+        table["number"].astype(np.int64),
+        table["position"].astype(np.float64),
+        table["error"].astype(np.float64),
+    )
+
+
 def points_bin(path: Path) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
     """Read the points of points3D.bin, of which a model of thousands of photos has millions.
 
     Returns:
         Positions, world units, and colours, 0 to 255.
     """
+    table = _point_table(path)
+    return table["position"].astype(np.float64), table["color"].astype(np.float64)
+
+
+def _point_table(path: Path) -> np.ndarray:
+    """Read the rows of points3D.bin without the tracks."""
     rows, size = bytearray(), _POINT.itemsize
     with _binary(path, size) as file:
         for number in range(file.count):
@@ -183,8 +228,7 @@ def points_bin(path: Path) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarr
             row = file.read(size)
             file.skip(int.from_bytes(row[-8:], "little"), 8)
             rows += row
-    table = np.frombuffer(rows, _POINT)
-    return table["position"].astype(np.float64), table["color"].astype(np.float64)
+    return np.frombuffer(rows, _POINT)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -246,6 +290,39 @@ def images_txt(path: Path) -> list[Pose]:
         if len(observed.split()) % 3:
             raise _malformed(path, number + 1, "the image's points as X Y POINT3D_ID, or an empty line")
     return poses
+
+
+def observations_txt(path: Path) -> Iterator[Observed]:
+    """Read images.txt; see `observations_bin`."""
+    lines = _lines(path)
+    for _, line in lines:
+        words = line.split(maxsplit=9)
+        if not words or words[0].startswith("#"):
+            continue
+        number, observed = next(lines, (0, ""))
+        try:
+            points = np.array(observed.split()[2::3], np.int64)
+            name = _name(words[9].strip().encode("utf-8", "surrogateescape"))
+        except (ValueError, OverflowError, IndexError):
+            raise _malformed(path, number, "the image's points as X Y POINT3D_ID, or an empty line") from None
+        yield Observed(name, points[points >= 0])
+
+
+def tracked_txt(path: Path) -> Tracked:
+    """Read the points of points3D.txt; see `tracked_bin`."""
+    values = array.array("d")
+    for number, line in _lines(path):
+        words = line.split(maxsplit=8)
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            if len(words) < 8:
+                raise ValueError
+            values.extend([float(words[i]) for i in (0, 1, 2, 3, 7)])
+        except ValueError:
+            raise _malformed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from None
+    table = np.frombuffer(values, np.float64).reshape(-1, 5)
+    return Tracked(table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4].copy())
 
 
 def points_txt(path: Path) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:

@@ -63,7 +63,7 @@ class Found(NamedTuple):
     missing: list[str]
     """Names of photos without a file."""
     outside: list[Path]
-    """Photos and masks outside the file's folder."""
+    """Photos, masks and depth maps outside the file's folder."""
 
 
 def read_transforms(path: Path) -> Capture:
@@ -168,7 +168,10 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
         mask, its_part = _mask(where, path.parent, frame), part or parts.get(name, parts[""])
         outside += [image] if is_outside(path.parent, name) else []
         outside += [mask] if mask and is_outside(path.parent, _tidy(str(frame["mask_path"]))) else []
-        frames.append(checked_frame(where, Frame(legible(name), image, lens, R, eye, mask, its_part)))
+        depth = _depth(where, path.parent, frame)
+        outside += [depth] if depth and is_outside(path.parent, _tidy(frame["depth_file_path"])) else []
+        given = Frame(legible(name), image, lens, R, eye, mask, its_part, depth=depth)
+        frames.append(checked_frame(where, given))
     return Found(frames, missing, outside)
 
 
@@ -303,6 +306,18 @@ def _mask(where: str, folder: Path, frame: Mapping[str, Any]) -> Path | None:
     if not is_file(mask):
         raise DatasetError(f"{where}: its mask {mask} does not exist; add it or remove mask_path")
     return mask
+
+
+def _depth(where: str, folder: Path, frame: Mapping[str, Any]) -> Path | None:
+    """Return the file of a frame's depth map, which is read only if the training asks for depth."""
+    named = frame.get("depth_file_path")
+    if named is None:
+        return None
+    if not isinstance(named, str):
+        raise DatasetError(
+            f"{where}: depth_file_path is {str(named)[:40]}, but must be a path; repair or remove it"
+        )
+    return folder / as_file_name(_tidy(named))
 
 
 def _cloud(path: Path, contents: Mapping[str, Any]) -> tuple[Cloud | None, str]:

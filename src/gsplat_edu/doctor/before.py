@@ -67,6 +67,8 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
             --resolution auto where the photos are much larger than the scene resolves.
     """
     checks = [*OF_FILES, *(OF_VIEWS if len(survey.shots) > 1 else ()), *OF_LISTS]
+    if survey.depth is not None:
+        checks.append(("depth", lambda survey: list(survey.depth.findings) if survey.depth else []))
     findings, fine = list[Finding](), list[str]()
     for name, check in checks:
         found = check(survey)
@@ -91,6 +93,8 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
         facts.append(("cameras", _arrangement(survey)))
+    if survey.depth is not None and survey.depth.report is not None:
+        facts.append(("depth", survey.depth.report.lines()[0]))
     return tuple(facts)
 
 

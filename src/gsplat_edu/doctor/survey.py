@@ -14,12 +14,15 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
+from gsplat_edu.data.depths import DepthReport
 from gsplat_edu.data.images import PhotoHeaders
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.doctor.depth import judge_depth
+from gsplat_edu.doctor.finding import Finding
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.photos import PhotoStats, measure_photo
 from gsplat_edu.doctor.support import observed_points
@@ -62,6 +65,15 @@ class Refused(NamedTuple):
     """The reason in a few words: `DatasetError.reason`."""
 
 
+class JudgedDepth(NamedTuple):
+    """What was found about depth that the user has."""
+
+    report: DepthReport | None
+    """Depth that can be used; None if there is none."""
+    findings: Sequence[Finding]
+    """What is wrong with it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Survey:
     """Input of the checks.
@@ -75,6 +87,7 @@ class Survey:
         points: (N, 3) the capture's own points, world units; N is 0 if it has none.
         notes: Notes of the capture's reader.
         observed: Number of points observed in each photo, by shot name; empty if unknown.
+        depth: Sentences about depth that can be used, and findings about it; None if it was not looked at.
     """
 
     path: Path
@@ -85,6 +98,7 @@ class Survey:
     points: Float64[np.ndarray, "N 3"]
     notes: tuple[Note, ...]
     observed: Mapping[str, int] = field(default_factory=dict)
+    depth: JudgedDepth | None = None
 
     @property
     def names(self) -> list[str]:
@@ -97,13 +111,19 @@ class Survey:
         return Geometry([shot.camera for shot in self.shots], self.points)
 
 
-def prepare(reader: CaptureReader, progress: Progress | None = None, sharpness: bool = True) -> Survey:
+def prepare(
+    reader: CaptureReader,
+    progress: Progress | None = None,
+    sharpness: bool = True,
+    depth: Path | None = None,
+) -> Survey:
     """Read a capture and measure its photos, a few at a time.
 
     Args:
         reader: The capture.
         progress: Called with (photos done, total) in the calling thread.
         sharpness: Measure the photos' sharpness too, which takes most of the time.
+        depth: Where depth comes from that is judged too; see `gsplat_edu.data.depths.DepthSource`.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
@@ -123,6 +143,8 @@ def prepare(reader: CaptureReader, progress: Progress | None = None, sharpness: 
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+    cameras = [(shot.name, shot.camera) for shot in shots]
+    judged = None if depth is None or not shots else JudgedDepth(*judge_depth(reader, cameras, depth))
     return Survey(
         reader.path,
         capture.layout,
@@ -132,6 +154,7 @@ def prepare(reader: CaptureReader, progress: Progress | None = None, sharpness: 
         _points(capture),
         (*capture.notes, *UnreadColors.of([(shot.name, shot.colors) for shot in shots])),
         observed_points(reader.path) if capture.layout == "COLMAP" else {},
+        judged,
     )
 
 

@@ -1,7 +1,8 @@
 """How far a mesh is from the true surface: accuracy, completeness, F1, and the agreement of normals.
 
 All distances are measured at points that are uniform over area. An error that is averaged over vertices falls when the
-wrong part of a mesh gets fewer vertices; an error averaged over area does not. Self-intersections are not counted.
+wrong part of a mesh gets fewer vertices; an error averaged over area does not. `gsplat_edu.evaluate.intersections`
+counts self-intersections.
 """
 
 from __future__ import annotations

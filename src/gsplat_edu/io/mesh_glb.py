@@ -19,6 +19,7 @@ Source: Khronos, "glTF 2.0 Specification".
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.glb_container import write_container
 from gsplat_edu.io.mesh_image import encoded
-from gsplat_edu.io.mesh_parts import METRES, distinct_rows
+from gsplat_edu.io.mesh_parts import METRES, split_at_seams
 from gsplat_edu.scene.mesh import Mesh
 
 TRIANGLES, FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 4, 5126, 5123, 5125
@@ -59,12 +60,8 @@ def linear(srgb: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
 
 def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
-    origin, faces, uvs = _split(mesh)
-    turned = mesh.vertices[origin] * np.array(POSITION_SIGNS) * METRES.get(unit or "m", 1.0) + 0.0  # no -0.0
-    with np.errstate(over="ignore"):
-        positions = turned.astype("<f4")
-    if not np.isfinite(positions).all():
-        raise ArgumentError(f"{path}: a coordinate is beyond float32, which glTF uses; write a .ply")
+    origin, faces, uvs = split_at_seams(mesh)
+    positions = _positions(path, mesh.vertices[origin], unit)
     normals = _vertex_normals(mesh)[origin] * np.array(POSITION_SIGNS) + 0.0
     file = _Document()
     attributes = {"POSITION": file.attribute(positions, bounds=True)}
@@ -90,20 +87,49 @@ def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
     file.write(path, f"{len(mesh.faces):,} faces")
 
 
-def _split(
-    mesh: Mesh,
-) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, "F 3"], Float32[np.ndarray, "N 2"] | None]:
-    """Repeat vertices until each has one texture coordinate.
+def write_parts(path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str | None = None) -> None:
+    """Write several meshes as one binary glTF, a node for each; colours and textures are not written.
 
-    Returns:
-        The mesh's vertex that each vertex of the file repeats, in its order; the faces among the file's vertices; the
-        texture coordinates, None without a texture.
+    The same meshes give the same bytes.
+
+    Args:
+        path: Output file; parent folders are created.
+        parts: Name and mesh of each node, at least one, each with at least one face.
+        unit: Unit of the coordinates, "m", "cm" or "mm", which become metres; None if unknown.
+
+    Raises:
+        ArgumentError: there are no parts, one has no faces or a coordinate beyond float32, or the unit is unknown.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
-    if mesh.texture is None:
-        return np.arange(len(mesh.vertices)), mesh.faces, None
-    corners, uvs = mesh.faces.ravel(), mesh.texture.uvs.reshape(-1, 2)
-    first, group = distinct_rows(corners, uvs[:, 0], uvs[:, 1])
-    return corners[first], group.reshape(-1, 3), uvs[first]
+    path = Path(path)
+    if unit is not None and unit not in METRES:
+        raise ArgumentError(f"unit: is {unit!r}, but must be one of {', '.join(METRES)}")
+    if not parts or not all(len(mesh.faces) for _, mesh in parts):
+        raise ArgumentError(f"{path}: a part has no faces, or there are no parts; there is nothing to write")
+    file = _Document()
+    meshes: list[dict[str, Any]] = []
+    nodes: list[dict[str, Any]] = []
+    for name, mesh in parts:
+        attributes = {"POSITION": file.attribute(_positions(path, mesh.vertices, unit), bounds=True)}
+        primitive = {"attributes": attributes, "indices": file.indices(mesh.faces), "mode": TRIANGLES}
+        nodes.append({"name": name, "mesh": len(meshes)})
+        meshes.append({"name": name, "primitives": [primitive]})
+    file.document |= {"meshes": meshes, "nodes": nodes, "scenes": [{"nodes": list(range(len(nodes)))}]}
+    if unit is not None:
+        file.document["asset"]["extras"] = {"unit": "m"}
+    file.write(path, f"{len(parts):,} parts")
+
+
+def _positions(
+    path: Path, vertices: Float64[np.ndarray, "V 3"], unit: str | None
+) -> Float32[np.ndarray, "V 3"]:
+    """Return positions in glTF's axes and unit."""
+    turned = vertices * np.array(POSITION_SIGNS) * METRES.get(unit or "m", 1.0) + 0.0  # no -0.0
+    with np.errstate(over="ignore"):
+        positions: Float32[np.ndarray, "V 3"] = turned.astype("<f4")
+    if not np.isfinite(positions).all():
+        raise ArgumentError(f"{path}: a coordinate is beyond float32, which glTF uses; write a .ply")
+    return positions
 
 
 def _vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
@@ -126,7 +152,7 @@ def _wide_colors(colors: Float32[np.ndarray, "V 3"]) -> UInt16[np.ndarray, "V 4"
 
 
 class _Document:
-    """The JSON and the buffer of a file with one mesh, under construction."""
+    """The JSON and the buffer of a file, under construction."""
 
     def __init__(self) -> None:
         self.document: dict[str, Any] = {

@@ -190,3 +190,19 @@ def distinct_rows(*columns: np.ndarray) -> tuple[Int64[np.ndarray, " M"], Int64[
     group = np.empty(len(order), np.int64)
     group[order] = np.cumsum(new) - 1
     return order[new].astype(np.int64), group
+
+
+def split_at_seams(
+    mesh: Mesh,
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, "F 3"], Float32[np.ndarray, "N 2"] | None]:
+    """Repeat vertices until each has one texture coordinate.
+
+    Returns:
+        For each resulting vertex, the index of the mesh's vertex that it repeats; the faces among the resulting
+        vertices; the texture coordinates, None without a texture.
+    """
+    if mesh.texture is None:
+        return np.arange(len(mesh.vertices)), mesh.faces, None
+    corners, uvs = mesh.faces.ravel(), mesh.texture.uvs.reshape(-1, 2)
+    first, group = distinct_rows(corners, uvs[:, 0], uvs[:, 1])
+    return corners[first], group.reshape(-1, 3), uvs[first]

@@ -216,7 +216,7 @@ def _seen(
     centre: tuple[Tensor, Tensor],
     pixels: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return where the other camera sees the pixels of patches, (P, K) each, px, and whether it sees all of one (P,)."""
+    """Return where the other camera sees patches' pixels, (P, K) each, px, and whether it sees all of one (P,)."""
     camera, other = cameras
     to_camera, turn, shift = (
         torch.from_numpy(np.array(m)).to(normals) for m in (camera.R, *relative_pose(*cameras))

@@ -19,7 +19,7 @@ from gsplat_edu.train.config import ONLY_FOR
 SAME = ("train", "render", "data")
 """Sections of config.json that must be equal in a resumed run."""
 
-MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
+MAY_DIFFER = {"data": ("path", "points", "scene", "depth", "image_memory"), "train": ("iterations",)}
 """Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
 
 MOVED = 1e-9

@@ -26,6 +26,7 @@ class RunOptions:
         data_settings: How the capture is read.
         points: A PLY to start from; the capture's own points if None.
         scene: A trained scene to start from instead of points: a scene file or the folder of a run.
+        depth: Depth to learn from: a folder of maps, or a word of `gsplat_edu.data.depths`; None for none.
         backend: Name of the rendering backend.
         eval_every: Iterations between evaluations on the test views; 0 evaluates only at the end.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
@@ -41,6 +42,7 @@ class RunOptions:
     data_settings: DataSettings
     points: Path | None = None
     scene: Path | None = None
+    depth: Path | None = None
     backend: str = "cpu"
     eval_every: int = 1_000
     save_every: int = 500

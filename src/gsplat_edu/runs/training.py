@@ -25,6 +25,7 @@ from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, reader_for
+from gsplat_edu.runs.depth import check_depth, depth_digest, depth_name, with_run_depth
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
@@ -64,6 +65,7 @@ def document(options: RunOptions) -> dict[str, Any]:
             **data,
             "points": None if options.points is None else str(options.points.resolve()),
             "scene": None if options.scene is None else str(scene_file(options.scene).resolve()),
+            **({} if options.depth is None else {"depth": depth_name(options.depth)}),
         },
         "train": options.config.flat(),
         "render": dataclasses.asdict(options.render_settings),
@@ -184,8 +186,9 @@ class CaptureRun:
         self.seconds = 0.0
         self._began: float | None = None  # during training: when the count of seconds started
         settings = as_trained(options.data_settings, options.config.appearance)
-        dataset = Dataset.of(reader_for(options.data, reader), settings, points=options.points)
-        self.dataset = with_points_of_first(dataset, team)
+        reader = reader_for(options.data, reader)
+        dataset = Dataset.of(reader, settings, points=options.points)
+        self.dataset = with_run_depth(with_points_of_first(dataset, team), reader, options, say)
         for note in self.dataset.notes:
             say(str(note))
         check(self.dataset)
@@ -208,6 +211,7 @@ class CaptureRun:
         """Check that all processes start from equal data, and load the first one's checkpoint in all."""
         views = [(view.name, view.camera.W, view.camera.H) for view in self.dataset.train]
         start = {"photos": fingerprint(self.dataset), "views": digest_of(repr(views).encode())}
+        start |= {"depth": depth_digest(self.dataset) or "none"}
         check_alike(team, "start alike", start | {"Gaussians": scene_digest(gaussians)})
         checkpoints = list_checkpoints(self.folder.checkpoints) if self._leads else []
         state = team.shared_state(read_checkpoint(checkpoints[-1]) if checkpoints else None)
@@ -238,6 +242,7 @@ class CaptureRun:
         if folder.exists():
             remove_leftovers(folder.path)
             check_capture(folder, dataset)
+            check_depth(folder, folder.read_config(), depth_digest(dataset))
             if digest is not None and folder.read_config().get("start") != digest:
                 raise CheckpointError(
                     f"--resume: {folder.path} was not started from {options.scene} as it is now;"
@@ -248,6 +253,7 @@ class CaptureRun:
             folder.write_photos(photo_digests(dataset))
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
             facts |= {} if dataset.scale is None else {"scale": dataset.scale.json()}
+            facts |= {} if (depth := depth_digest(dataset)) is None else {"depth": depth}
             folder.write_config(document(options) | facts | ({"start": digest} if digest else {}))
         return sorted_in_space(gaussians)
 

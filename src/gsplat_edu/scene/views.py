@@ -12,6 +12,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, check_shape, first_index, float64_array
 from gsplat_edu.photos.resizing import area_mean, premultiplied, smaller_mask, unweighted
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.given_depth import GivenDepth
 
 Pixels = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 
@@ -154,12 +155,14 @@ class View:
     Attributes:
         read: Returns the photo, from memory or from disk; may be called from another thread.
         on_disk: Whether reading takes time, so that prefetching pays off.
+        depth: Returns the depth that the user has for the view; None if there is none.
     """
 
     camera: Camera
     name: str
     read: Callable[[], Photo]
     on_disk: bool
+    depth: Callable[[], GivenDepth] | None
 
     def __init__(
         self,
@@ -187,6 +190,16 @@ class View:
         view._set(camera, name, read, on_disk=True)
         return view
 
+    def with_depth(self, depth: Callable[[], GivenDepth] | None) -> View:
+        """Return the view with depth that the user has.
+
+        Args:
+            depth: Returns it, from memory or from disk, the same at each call; None for none.
+        """
+        view = View.__new__(View)
+        view._set(self.camera, self.name, self.read, on_disk=self.on_disk, depth=depth)
+        return view
+
     def scaled(self, factor: float) -> View:
         """Return the view with width and height divided by a factor, and intrinsics that fit exactly.
 
@@ -200,10 +213,18 @@ class View:
         intrinsics = self.camera.intrinsics
         W, H = (max(1, round(side / factor)) for side in (intrinsics.W, intrinsics.H))
         camera = Camera.posed(self.camera.R, self.camera.eye, intrinsics.scaled(W, H))
-        return View.stored(camera, lambda: self.read().scaled(W, H), self.name)
+        return View.stored(camera, lambda: self.read().scaled(W, H), self.name).with_depth(self.depth)
 
-    def _set(self, camera: Camera, name: str, read: Callable[[], Photo], on_disk: bool) -> None:
-        for key, value in {"camera": camera, "name": name, "read": read, "on_disk": on_disk}.items():
+    def _set(
+        self,
+        camera: Camera,
+        name: str,
+        read: Callable[[], Photo],
+        on_disk: bool,
+        depth: Callable[[], GivenDepth] | None = None,
+    ) -> None:
+        values = {"camera": camera, "name": name, "read": read, "on_disk": on_disk, "depth": depth}
+        for key, value in values.items():
             object.__setattr__(self, key, value)
 
     @property

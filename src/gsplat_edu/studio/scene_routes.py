@@ -22,7 +22,7 @@ from gsplat_edu.jobs.events import Metric
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import State
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, scene_of
+from gsplat_edu.studio.commands import COLLIDER, EDITS, EXPORTS, FORMATS, SURFACE, scene_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
@@ -31,6 +31,12 @@ from gsplat_edu.studio.state import Studio
 
 KEPT_PAGES = 12
 """Pages in the cache."""
+
+MESHES = ("surface", "collider")
+"""Parameters of a page's address that name exported meshes."""
+
+ENDINGS = sorted((*FORMATS, SURFACE, COLLIDER), key=len)[::-1]
+"""Endings of exported files, longest first."""
 
 BINARY = "application/octet-stream"
 
@@ -71,7 +77,9 @@ def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN
     scene = current_scene(studio.library, entry, kind)
     facts = scene.stat()
     editing = request.query_params.get("edit") == "1"
-    key = f"{scene} {facts.st_mtime_ns} {facts.st_size} {entry.name} {editing}"
+    meshes = {name: path for name in MESHES if (path := _mesh_file(entry, request, name)) is not None}
+    states = [(str(path), path.stat().st_mtime_ns, path.stat().st_size) for path in meshes.values()]
+    key = f"{scene} {facts.st_mtime_ns} {facts.st_size} {entry.name} {editing} {states or ''}"
     digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
     target = studio.library.hidden("cache") / "pages" / f"{digest}.html"
     policy = target.with_suffix(".policy")
@@ -79,11 +87,24 @@ def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN
         task = {"source": str(scene_of(entry, kind)), "title": legible(entry.name), "out": str(target)}
         if editing:
             task |= {"edits": str(entry / EDITS), "url": EDITS}
+        task |= {name: str(path) for name, path in meshes.items()}
         made = studio.worker.ask("page", **task)
         with written_aside(policy) as aside:
             aside.write_text(made["policy"], encoding="utf-8")
         _prune(target.parent)
     return page_answer(request, target, policy.read_text("utf-8"))
+
+
+def _mesh_file(entry: Path, request: Request, parameter: str) -> Path | None:
+    """Return the exported mesh that a parameter of the address names; None without the parameter."""
+    given = request.query_params.get(parameter)
+    if given is None:
+        return None
+    name = checked_name(parameter, given, LONGEST_FILE)
+    path = below(entry, Path(EXPORTS, name), parameter)
+    if not name.endswith((f".{SURFACE}", f".{COLLIDER}")) or not path.is_file():
+        raise not_found(f"{entry.name}/{EXPORTS}/{name}")
+    return path
 
 
 def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
@@ -126,7 +147,14 @@ def _exports(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
     for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else ():
         if path.name[0] == "." or path.is_symlink() or not path.is_file():
             continue
-        form = next((form for form in sorted(FORMATS, key=len)[::-1] if path.name.endswith(f".{form}")), None)
+        form = next(
+            (
+                form
+                for form in sorted((*FORMATS, SURFACE, COLLIDER), key=len)[::-1]
+                if path.name.endswith(f".{form}")
+            ),
+            None,
+        )
         facts = path.stat()
         found.append(
             {

@@ -26,7 +26,15 @@ IDLE = 600.0
 """Seconds without a request after which the process ends."""
 
 
-def make_page(source: str, title: str, out: str, edits: str = "", url: str = "") -> dict[str, Any]:
+def make_page(
+    source: str,
+    title: str,
+    out: str,
+    edits: str = "",
+    url: str = "",
+    surface: str = "",
+    collider: str = "",
+) -> dict[str, Any]:
     """Write the page that shows a scene (`gsplat_edu.viewer.page`).
 
     Args:
@@ -35,13 +43,17 @@ def make_page(source: str, title: str, out: str, edits: str = "", url: str = "")
         out: File to write.
         edits: File of the scene's edits, for a page with the editor; empty for one without.
         url: Where that page reads and stores edits, relative to itself.
+        surface: File of the mesh that the page shows beside the splats; empty for none.
+        collider: File of the collider over it; empty for none.
     """
     from gsplat_edu.runs.source import open_source
     from gsplat_edu.viewer import page, page_parts
     from gsplat_edu.viewer.edit_page import editing_of
+    from gsplat_edu.viewer.page_mesh import open_meshes
 
     found = open_source(source)
-    tour = page.Tour(origin=found.origin)
+    meshes = open_meshes(Path(surface) if surface else None, Path(collider) if collider else None, found)
+    tour = page.Tour(origin=found.origin, meshes=meshes)
     shown = (found.scene, found.cameras, found.settings, title, found.held_out, tour)
     if edits:
         editing = editing_of(found, Path(source), Path(edits), url)

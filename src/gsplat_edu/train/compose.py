@@ -119,6 +119,7 @@ def training(
     features = functools.partial(render, backend=backend)
     view_model = make_view_model(config, cameras, extent, gaussians, backend.recolored)
     around = neighbourhood_for(config, dataset.train, view_model, extent)
+    has_depth = any(view.depth is not None for view in dataset.train)
     return Trainer(
         gaussians,
         dataset.train,
@@ -128,7 +129,7 @@ def training(
         density=make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
         callbacks=callbacks,
         parts=StepParts(
-            make_objective(config, shell, backend.loss, extent, around),
+            make_objective(config, shell, backend.loss, extent, around, has_depth),
             view_model,
             transients=make_transients(config, dataset.train, features),
             fused=fused,

@@ -29,7 +29,7 @@ from gsplat_edu.train.checks import (
     accept_positive as _positive,
     accept_whole as _whole,
 )
-from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Setting as Setting
+from gsplat_edu.train.setting import DEPTH_KINDS, OUTSIDE_MASKS, TRANSIENTS, Setting as Setting
 from gsplat_edu.train.strategy_config import AdcConfig, FastConfig, McmcConfig, documented, number
 from gsplat_edu.train.tempo import Tempo, accept_tempo as _tempo
 
@@ -233,10 +233,37 @@ class TrainConfig:
         0.04, _not_negative, "Weight of the distance between normals and those of the depth.", "2DGS"
     )
     patch_weight: float = number(
-        0.1, _not_negative, "Weight of patches that differ from a neighbouring photo's; 0: no patches.", "ours"
+        0.1,
+        _not_negative,
+        "Weight of patches that differ from a neighbouring photo's; 0: no patches.",
+        "ours",
     )
     flat_weight: float = number(
         0.01, _not_negative, "Weight of the mean smallest scale, as a fraction of the extent.", "ours"
+    )
+    depth_kind: str = number(
+        "auto",
+        _one_of(DEPTH_KINDS),
+        'Values of the maps of --depth. "z": camera depth; "ray": length of the ray; "auto": one of these, by the'
+        ' points that photos see; "inverse": a network\'s inverse depth, with a scale and a shift for each photo.',
+    )
+    depth_unit: float = number(
+        0.0,
+        _not_negative,
+        "World units for a unit of the maps of --depth; 0 finds it from the points.",
+        "ours",
+    )
+    depth_weight: float = number(
+        0.1, _not_negative, "Weight of the relative difference from the depth of maps.", "ours"
+    )
+    points_weight: float = number(
+        0.01,
+        _not_negative,
+        "Weight of the difference of 1 / z from that of points, times the extent.",
+        "gsplat",
+    )
+    depth_every: int = number(
+        2, _whole(1), "Depth is compared in every n-th step, with n times its weight.", "ours"
     )
     adc: AdcConfig = dataclasses.field(default=AdcConfig())
     mcmc: McmcConfig = dataclasses.field(default=McmcConfig())

@@ -20,6 +20,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.losses import LossKernel, photo_loss
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.depth import DEPTH, DepthTerm
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.patches import PATCHES, Neighbourhood, PatchTerm
@@ -42,7 +43,7 @@ class Term(Protocol):
 
     A term that uses `output.depth` has a true attribute `needs_depth`. One that in some steps uses the depth and the
     composited normals (`gsplat_edu.render.planes.facing_normals`), in `output.features`, has a method
-    `needs_normals(iteration)`.
+    `needs_normals(iteration)`. One that in some steps uses the depth only has a method `needs_depth_in(iteration)`.
     """
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
@@ -73,6 +74,11 @@ class Objective:
     def needs_normals(self, iteration: int) -> bool:
         """Whether a term uses depth and normals in the step of this iteration; only then are they rendered."""
         asked = (getattr(term, "needs_normals", None) for term in self.terms.values())
+        return any(needs(iteration) for needs in asked if needs is not None)
+
+    def needs_depth_in(self, iteration: int) -> bool:
+        """Whether a term uses the depth in the step of this iteration."""
+        asked = (getattr(term, "needs_depth_in", None) for term in self.terms.values())
         return any(needs(iteration) for needs in asked if needs is not None)
 
     def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
@@ -111,6 +117,7 @@ def make_objective(
     loss: LossKernel | None = None,
     extent: float = 1.0,
     around: Neighbourhood | None = None,
+    has_depth: bool = False,
 ) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
@@ -118,6 +125,7 @@ def make_objective(
     if nothing is outside of masks + weight_e sum_outside(alpha) / (H W);
     for a surface + weight_n mean a (a - N . m) + weight_f mean(smallest scale) / extent
     + weight_p mean min(1 - ncc, most)
+    with given depth + weight_d mean rho(z / z* - 1), or for points + weight_p extent mean |1/z - 1/z*|
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
     rate if all its gradients agree, however small they are. If each view shows a twentieth of the scene, invisible
@@ -132,6 +140,7 @@ def make_objective(
 
     Raises:
         ArgumentError: the configuration compares patches, but there are no photos to compare.
+        has_depth: Whether views have depth (`View.depth`).
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
@@ -149,8 +158,13 @@ def make_objective(
         terms[FLAT] = FlatTerm(config.flat_weight, extent, turns, shell)
         if config.patch_weight > 0:
             if around is None:
-                raise ArgumentError("around: has to be given, because patch_weight compares photos; or set it to 0")
+                raise ArgumentError(
+                    "around: has to be given, because patch_weight compares photos; or set it to 0"
+                )
             terms[PATCHES] = PatchTerm(config.patch_weight, turns, around, config.seed)
+    if has_depth:
+        turns = Turns(0, config.depth_every, config.batch)
+        terms[DEPTH] = DepthTerm(config.depth_weight, config.points_weight, extent, turns)
     return Objective(terms)
 
 

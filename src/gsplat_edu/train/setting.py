@@ -17,6 +17,9 @@ TRANSIENTS = ("none", "mask")
 OUTSIDE_MASKS = ("ignore", "empty")
 """What the scene shows where the capture's masks exclude pixels: anything, or nothing."""
 
+DEPTH_KINDS = ("auto", "z", "ray", "inverse")
+"""What the values of the user's depth maps are."""
+
 WITH_OPTION = frozenset(
     {
         *("iterations", "batch", "seed", "sh_degree", "strategy", "max_gaussians", "antialiased"),
@@ -28,6 +31,9 @@ WITH_OPTION = frozenset(
 
 FOR_SURFACE = ("surface_start", "surface_every", "normal_weight", "patch_weight", "flat_weight")
 """Settings that only a training with `surface` uses."""
+
+FOR_DEPTH = ("depth_kind", "depth_unit", "depth_weight", "points_weight", "depth_every")
+"""Settings that only a training with the user's depth uses."""
 
 COURSE_ONLY = frozenset({"over_cap", "view_order"})
 """Settings that only the course's trainings change (`gsplat_edu.train.course`); `gsplat-edu train` has none of them."""

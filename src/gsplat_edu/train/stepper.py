@@ -361,6 +361,8 @@ class TensorStepper:
         settings, normals = view.settings, None
         if self.objective.needs_normals(iteration):
             settings, normals = replace(settings, depth=True), facing_normals(self.gaussians, at)
+        elif self.objective.needs_depth_in(iteration):
+            settings = replace(settings, depth=True)
         output = render(self.gaussians, camera, settings=settings, features=normals, backend=self._backend)
         given = ViewRender(
             output.image, output.transmittance, view.settings.background, camera, output.median_depth

@@ -26,8 +26,8 @@ from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Change, Event, Losses, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
 from gsplat_edu.train.objective import make_objective
-from gsplat_edu.train.patches import neighbourhood_for
 from gsplat_edu.train.optimizer import MOMENTS
+from gsplat_edu.train.patches import neighbourhood_for
 from gsplat_edu.train.resident import make_stepper
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree

@@ -1,8 +1,9 @@
 """Export a scene as one HTML file that any browser with WebGL2 renders offline.
 
 The file contains, in this order: our style, shaders and scripts (`viewer/web`), metadata of the scene as JSON, and the
-splats (`viewer/page_data.py`), compressed with gzip, encoded in base64, and split into elements that a browser can
-process one by one. Its Content-Security-Policy allows these scripts by their hashes and blocks everything external.
+splats (`viewer/page_data.py`) and meshes (`viewer/page_mesh.py`), compressed with gzip, encoded in base64, and split
+into elements that a browser can process one by one. Its Content-Security-Policy allows these scripts by their hashes
+and blocks everything external.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.viewer import page_data
+from gsplat_edu.viewer import page_data, page_mesh
+from gsplat_edu.viewer.page_mesh import Meshes
 from gsplat_edu.viewer.page_parts import filled, web
 from gsplat_edu.viewer.page_start import Start, first_camera, start_among, start_of, subjects_of
 
@@ -42,29 +44,32 @@ VERSION = 1
 PIECE = 12 << 20
 """Compressed bytes per element, a multiple of 3 so that the base64 of one element continues in the next."""
 
-FACTS_OPEN, SPLATS_OPEN, VALUES_OPEN, CLOSE = (
+FACTS_OPEN, SPLATS_OPEN, VALUES_OPEN, MESHES_OPEN, CLOSE = (
     b'<script type="application/json" id="facts">',
     b'<script type="application/octet-stream;base64" class="splats">',
     b'<script type="application/octet-stream;base64" class="values">',
+    b'<script type="application/octet-stream;base64" class="meshes">',
     b"</script>",
 )
 
 
 @dataclass(frozen=True)
 class Tour:
-    """The camera path of a page.
+    """What a page offers to look at besides the splats: a camera path, views and meshes.
 
     Args:
         path: Keyframes that the page plays, in the coordinates of the page's scene; None for none.
         origin: Origin subtracted from the coordinates of the scene's file; the page adds it to the views that it saves.
         start: The view in which the page opens; None lets the page choose one.
         views: Named views, listed before those of the capture.
+        meshes: Meshes in the coordinates of the page's scene; None for none.
     """
 
     path: KeyframePath | None = None
     origin: Sequence[float] = ORIGIN
     start: Start | None = None
     views: Sequence[NamedCamera] = ()
+    meshes: Meshes | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +102,8 @@ def write(
             out.
         settings: Render settings; None takes those of scene files (`gsplat_edu.runs.source.file_settings`).
         held_out: Names of the test views, which are marked in the list.
-        tour: The camera path to play and the origin of the coordinates; None for no path and none subtracted.
+        tour: The camera path to play, the origin of the coordinates, and meshes; None for no path, no meshes, and no
+            origin subtracted.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
@@ -232,11 +238,16 @@ def _pieces(
     facts = _facts(title, scene, views, settings or file_settings(scene), held_out, tour) | _toured(tour)
     facts["cameras"] = [*facts.pop("views"), *facts["cameras"]]
     facts |= more or {}
+    mesh_data = b""
+    if tour.meshes is not None:
+        facts["meshes"], mesh_data = page_mesh.packed(tour.meshes)
     head, tail = web("index.html").split("{{splats}}\n")
     yield filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
     yield from _elements(SPLATS_OPEN, page_data.packed(scene.gaussians))
     if editing is not None:
         yield from _elements(VALUES_OPEN, editing.values)
+    if mesh_data:
+        yield from _elements(MESHES_OPEN, mesh_data)
     yield tail.encode("utf-8")
 
 

@@ -18,6 +18,8 @@ SCRIPTS = (
     "camera.js",
     "path.js",
     "draw.js",
+    "mesh_rays.js",
+    "mesh.js",
     "sorter.js",
     "pace.js",
     "controls.js",
@@ -28,7 +30,7 @@ SCRIPTS = (
 
 LAST_SCRIPT = "main.js"
 
-SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
+SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "mesh.vert", "mesh.frag")
 
 SHADER_CONSTANTS = (
     "DILATION",

@@ -25,6 +25,7 @@ SPLIT, MERGE = UNTIL = ("split", "merge")
 
 UNUSED = {
     "points": "the coarse model starts from the capture's points",
+    "depth": "train the capture as a whole, with --resolution",
     "time_limit": "give --iterations or --quality",
     "max_memory": "use more blocks, or --resolution",
     "refine": "refine the cameras of the whole first, with --resolution",

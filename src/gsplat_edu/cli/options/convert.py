@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.cli.arguments import add_backend, numbers_text, whole_number_text
+from gsplat_edu.cli.arguments import add_backend, add_meshes, numbers_text, whole_number_text
 from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
@@ -71,18 +71,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="keyframes, as for render --path, that the page (OUT.html) plays; in the coordinates of IN",
     )
+    add_meshes(parser)
     _add_edits(parser)
-    parser.add_argument(
-        "--verify",
-        action="store_true",
-        help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
-    )
     _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json and OUT/tileset.json"))
     add_backend(parser)
 
 
 def _add_edits(parser: argparse.ArgumentParser) -> None:
-    """Add the options of edits files."""
+    """Add the options of edits files, and the check of what is written."""
     parser.add_argument(
         "--edits",
         type=Path,
@@ -93,6 +89,11 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
         "--edits-anyway",
         action="store_true",
         help="apply --edits to another scene than it was made for, if it selects by positions only",
+    )
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
     )
 
 

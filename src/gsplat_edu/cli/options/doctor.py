@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.cli.options.depth import add_depth
 from gsplat_edu.train.length import DEFAULT_QUALITY
 
 EXAMPLE = "example: gsplat-edu doctor captures/plush"
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="R",
         help="resolution of the forecast training: a divisor below 32, or the longest side in px",
     )
+    add_depth(before, "also judge the depth")
     after = parser.add_argument_group("after training")
     after.add_argument(
         "--dataset",

@@ -20,6 +20,9 @@ TEXTURE_FACES = 50_000
 COLLIDER_VOXELS = 4.0
 """Edge of a collider's voxels, in edges of the mesh's."""
 
+COLLIDERS = ("triangles", "convex")
+"""What a collider is made of."""
+
 COLLIDER_FACES = 5_000
 """Faces of a collider unless --faces gives another number."""
 
@@ -75,9 +78,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_kinds(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--collider",
-        action="store_true",
+        nargs="?",
+        choices=COLLIDERS,
+        const="triangles",
         help="make a coarse mesh for collisions: voxels four times as large, and 5,000 triangles unless --faces says"
-        " otherwise",
+        ' otherwise; "convex" cuts it into convex parts, nodes collider_0, collider_1, ... of a .glb (extra mesh)'
+        ' (default without a value: "triangles")',
     )
     parser.add_argument(
         "--texture",
@@ -126,6 +132,8 @@ def check(arguments: argparse.Namespace) -> None:
         raise ArgumentError("--dataset: is for --texture; add it, or leave --dataset out")
     if arguments.texture and arguments.collider:
         raise ArgumentError("--texture: a collider has none; leave one of them out")
+    if arguments.collider == "convex" and arguments.out.suffix.lower() != ".glb":
+        raise ArgumentError(f"--collider convex: {arguments.out} cannot hold several parts; write a .glb")
     if arguments.dataset is not None and not arguments.dataset.exists():
         raise DatasetError(f"--dataset: {arguments.dataset} does not exist; give the folder of a capture")
     if arguments.tau is not None and arguments.truth is None:

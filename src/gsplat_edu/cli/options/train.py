@@ -12,6 +12,7 @@ from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
+from gsplat_edu.cli.options.depth import add_depth, check_depth
 from gsplat_edu.cli.options.length import length_of, strategy_of
 from gsplat_edu.cli.options.settings import (
     add_settings,
@@ -282,6 +283,7 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         help='"empty" keeps the scene empty where masks exclude pixels, as around an object; "ignore" lets it show'
         ' anything there; "auto" lets the masks decide (default: auto for the strategy fast, ignore for the others)',
     )
+    add_depth(group, "learn from depth")
     group.add_argument(
         "--refine",
         metavar="NAME",
@@ -355,6 +357,7 @@ def check(arguments: argparse.Namespace) -> None:
         raise DatasetError(
             f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"
         )
+    check_depth(arguments.depth, arguments.settings)
     check_several(arguments)
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
         if path is not None and not path.exists() and (flag, path) != ("--points", RANDOM_POINTS):
@@ -389,6 +392,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         data_settings=settings,
         points=None if arguments.points == RANDOM_POINTS else arguments.points,
         scene=arguments.scene,
+        depth=arguments.depth,
         backend=backend,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,

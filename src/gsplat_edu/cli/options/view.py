@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.cli.arguments import add_address, whole_number_text
+from gsplat_edu.cli.arguments import add_address, add_meshes, whole_number_text
 from gsplat_edu.viewer.serve import PORT
 
 EXAMPLE = "example: gsplat-edu view runs/plush"
@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="keyframes, as for render --path, that the page plays",
     )
+    add_meshes(parser)
     parser.add_argument(
         "--budget",
         type=whole_number_text,

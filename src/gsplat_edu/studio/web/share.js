@@ -4,6 +4,7 @@ import { at, get, remove } from "./api.js";
 import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put } from "./dom.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
+import { meshes } from "./mesh.js";
 
 const FORMATS = [
   ["html", "HTML page", "one file that shows the scene in any browser, also offline"],
@@ -33,6 +34,7 @@ export function share({ place, store, entry }) {
   const job = jobPlace(store, entry.entry, ["convert", "render"], { main: true });
   const list = h("ul", { class: "plain exports", "aria-label": "exported files" });
   const none = h("p", { class: "quiet" }, "Nothing is exported yet.");
+  const mesh = meshes(store, entry);
   let [read, now] = ["", entry];
 
   const start = (more) => {
@@ -59,6 +61,7 @@ export function share({ place, store, entry }) {
   place.append(
     h("section", { "aria-label": "export" }, heading(2, "Export"), form, line, job.element),
     h("section", { "aria-label": "exported files" }, heading(2, "Exported files"), none, list),
+    mesh.element,
     entry.kind === "runs" ? cleaning(store, entry) : noCleaning(),
   );
 
@@ -82,6 +85,7 @@ export function share({ place, store, entry }) {
 
   function show(exports) {
     none.hidden = exports.length > 0;
+    mesh.show(exports);
     const newest = [...exports].sort((a, b) => b.modified - a.modified);
     keyed(list, newest, ({ file, modified, job: by }) => `${file} ${modified} ${by}`, item, (element, { file, bytes: size, psnr }) => {
       const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
@@ -90,12 +94,14 @@ export function share({ place, store, entry }) {
   }
 
   return {
+    close: () => mesh.close(),
     update(found) {
       now = found;
       withEdits.hidden = !now.edited;
       job.update();
+      mesh.update(now);
       make.disabled = film.disabled = entry.kind === "runs" && !now.files;
-      const states = store.jobsOf(entry.entry, "convert", "render").map(({ job: { id, state } }) => `${id} ${state}`);
+      const states = store.jobsOf(entry.entry, "convert", "render", "mesh").map(({ job: { id, state } }) => `${id} ${state}`);
       const version = `${states} ${now.modified} ${now.files}`;
       if (version === read) return;
       read = version;

@@ -234,15 +234,20 @@ class Renderer {
 
   // Copies the image onto the canvas, enlarged if the canvas is larger.
   show() {
+    this.gl.disable(this.gl.BLEND);
+    this.copy(this.image, this.width, this.height);
+  }
+
+  // Copies a texture of a size onto the canvas, enlarged if the canvas is larger.
+  copy(texture, imageWidth, imageHeight) {
     const gl = this.gl;
     const { width, height } = gl.canvas;
-    const enlarged = width !== this.width || height !== this.height;
+    const enlarged = width !== imageWidth || height !== imageHeight;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
-    gl.disable(gl.BLEND);
     gl.useProgram(this.screen);
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.image);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, enlarged ? gl.LINEAR : gl.NEAREST);
     gl.uniform1i(gl.getUniformLocation(this.screen, "enlarged"), enlarged ? 1 : 0);
     gl.uniform2f(gl.getUniformLocation(this.screen, "size"), width, height);

@@ -167,8 +167,14 @@ class EditTools {
     this.select(how, { by: "brush", camera: pictureOf(camera), radius, points });
   }
 
-  // The visible surface at a point of the picture; null where there is none.
+  // The surface at a point of the picture; null where there is none. Points to measure lie on the page's mesh, where it
+  // has one.
   surface({ camera, at: { u, v } }) {
+    const onMesh = this.tool in POINTS_OF ? (this.viewer.meshes?.depthAt(camera, u, v) ?? null) : null;
+    if (onMesh !== null) {
+      this.editor.say("");
+      return { point: pointAt(camera, u, v, onMesh), depth: onMesh };
+    }
     const [column, row] = [Math.round(u), Math.round(v)].map((x, i) => Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1));
     const depth = this.depthAt(camera, column, row);
     this.editor.say(depth === null ? "There is nothing at that point; choose one on the scene." : "");

@@ -18,6 +18,7 @@ class Viewer {
     this.cameraIndex = facts.start.index;
     this.exact = null; // the camera given to setCamera, until the user moves
     this.lost = false;
+    this.meshes = null; // beside the splats
     this.pace = new Pace();
     this.movedAt = -Infinity;
     this.gauged = false;
@@ -149,6 +150,7 @@ class Viewer {
 
   // Camera depth of the visible surface at a pixel; null if there is none.
   depthAt(camera, column, row) {
+    if (this.meshes?.covers(camera, column)) return this.meshes.depthAt(camera, column, row);
     return this.lost ? null : this.renderer.surface(camera, this.settings, column, row);
   }
 
@@ -240,6 +242,13 @@ class Viewer {
     if (this.canvas.width !== camera.W) this.canvas.width = camera.W;
     if (this.canvas.height !== camera.H) this.canvas.height = camera.H;
     this.renderer.show();
+    this.meshes?.show(camera);
+  }
+
+  // Shows the picture again, after a change of what lies over the splats.
+  repaint() {
+    if (this.isWhole && !this.lost) this.put(this.camera());
+    else this.refresh();
   }
 
   // Draws with less detail.
@@ -364,6 +373,7 @@ function fail(error) {
 async function start() {
   const splats = FACTS.lod ? null : await unpackSplats(FACTS);
   const viewer = splats ? new Viewer(FACTS, splats) : streamed(FACTS);
+  if (FACTS.meshes) viewer.meshes = await Meshes.open(viewer);
   if (viewer.levels) await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
   else {
     await viewer.gauge();

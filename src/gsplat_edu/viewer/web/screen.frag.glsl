@@ -9,7 +9,6 @@ uniform vec2 size;  // of the canvas
 out vec4 color;
 
 void main() {
-    vec3 light = enlarged ? textureLod(image, gl_FragCoord.xy / size, 0.0).rgb
-                          : texelFetch(image, ivec2(gl_FragCoord.xy), 0).rgb;
-    color = vec4(clamp(light, 0.0, 1.0), 1.0);
+    vec4 light = enlarged ? textureLod(image, gl_FragCoord.xy / size, 0.0) : texelFetch(image, ivec2(gl_FragCoord.xy), 0);
+    color = clamp(light, 0.0, 1.0);
 }

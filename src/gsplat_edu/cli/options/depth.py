@@ -1,0 +1,49 @@
+"""The option `--depth`: depth that the user has."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.train.setting import FOR_DEPTH, option_of
+
+WORDS = ("points", "capture")
+"""Values that are no folders; `gsplat_edu.data.depths` has them as paths."""
+
+
+def add_depth(group: argparse._ActionsContainer, text: str) -> None:
+    """Add the option.
+
+    Args:
+        group: Receives it.
+        text: What the command does with the depth.
+    """
+    group.add_argument(
+        "--depth",
+        type=Path,
+        metavar="DIR",
+        help=f"{text}: of a folder with a map for each photo (16-bit PNG, TIFF, NPY, NPZ, EXR, COLMAP's geometric maps,"
+        " Record3D); capture: the maps that transforms.json or COLMAP's folder has; points: the points of COLMAP's"
+        " tracks",
+    )
+
+
+def check_depth(path: Path | None, settings: Iterable[str] = ()) -> None:
+    """Check the option without reading a map.
+
+    Args:
+        path: Its value; None if it is not given.
+        settings: Names of the settings that are given.
+
+    Raises:
+        ArgumentError: the folder does not exist, or settings of depth are given without it.
+    """
+    if path is None:
+        if idle := [name for name in FOR_DEPTH if name in settings]:
+            raise ArgumentError(f"{option_of(idle[0])}: only --depth uses it; leave it out or add --depth")
+    elif str(path) not in WORDS and not path.is_dir():
+        raise ArgumentError(
+            f"--depth: {path} is no folder; give the folder of maps, or one of the words {' and '.join(WORDS)}"
+        )

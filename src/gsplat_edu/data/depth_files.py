@@ -1,0 +1,210 @@
+"""Read a depth map: 16-bit PNG and TIFF, NPY, NPZ, EXR, COLMAP's geometric maps, and Record3D's compressed floats.
+
+Values keep the file's unit. NaN, infinity, zero and negative values mean that a pixel has no depth and become NaN.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Shaped
+from PIL import UnidentifiedImageError
+
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.base.reading import TOO_LARGE, open_file, read_bytes
+from gsplat_edu.base.text import install_command
+from gsplat_edu.photos.image_files import UNDECODABLE, opened_image, require_room
+
+Map = Float32[np.ndarray, "h w"]
+
+GEOMETRIC, PHOTOMETRIC = ".geometric.bin", ".photometric.bin"
+"""Suffixes of COLMAP's maps; only the geometric ones agree between photos, so the others are not read."""
+
+ENDINGS = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr", GEOMETRIC, ".depth")
+"""Suffixes of depth maps, in any case."""
+
+MAX_PIXELS = 64_000_000
+"""Most pixels of a map; a header that claims more belongs to another or a damaged file."""
+
+MAX_SIDE = 32_767
+"""Longest side of a map, px."""
+
+LARGEST_HEADER = 10_000
+"""Bytes of an NPY's header; a longer one is no array of numbers."""
+
+LARGEST_LZFSE = 16 * 2**20
+"""Bytes of a compressed map of Record3D, whose 256x192 floats take less than 200,000."""
+
+RECORD3D = ((256, 192), (192, 256), (640, 480), (480, 640), (320, 240), (240, 320))
+"""Sizes of Record3D's maps, width and height, px; the files have no header."""
+
+CHANNELS = ("Z", "depth", "Y", "R", "V")
+"""Channels of an EXR that are taken for depth, the first one found."""
+
+
+def read_depth(path: Path) -> Map:
+    """Read a depth map.
+
+    Args:
+        path: A file whose suffix is one of `ENDINGS`.
+
+    Returns:
+        (h, w) values in the file's unit; NaN where there is no depth.
+
+    Raises:
+        DatasetError: the file is damaged, too large, of another kind, or holds no depth at all; a package is missing.
+        NotEnoughMemoryError: the map is larger than the free memory.
+    """
+    reader = next((read for ending, read in READERS.items() if path.name.lower().endswith(ending)), None)
+    try:
+        if reader is None:
+            raise ValueError(f"has none of the suffixes {', '.join(ENDINGS)}")
+        values = reader(path)
+    except (*UNDECODABLE, zipfile.BadZipFile) as error:
+        said = "it is no image" if isinstance(error, UnidentifiedImageError) else str(error)
+        reason = getattr(error, "strerror", None) or said.replace("\n", " ")[:200]
+        raise DatasetError(f"{path}: is no depth map: {reason}; export it again", reason) from None
+    found = np.where(np.isfinite(values) & (values > 0), values, np.nan).astype(np.float32)
+    if not np.isfinite(found).any():
+        reason = "no pixel has a depth above 0"
+        raise DatasetError(f"{path}: {reason}; export it again, or remove the file", reason)
+    return found
+
+
+def _checked_size(w: int, h: int) -> None:
+    if not (2 <= w <= MAX_SIDE and 2 <= h <= MAX_SIDE and w * h <= MAX_PIXELS):
+        raise ValueError(f"{w}x{h} px is no plausible size")
+
+
+def _plane(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return height and width of an array with one value a pixel; axes of length 1 do not count."""
+    sides = tuple(side for side in shape if side != 1)
+    if len(sides) != 2:
+        raise ValueError(f"an array of the shape {shape} has not one value for each pixel")
+    _checked_size(sides[1], sides[0])
+    return sides[0], sides[1]
+
+
+def _image(path: Path) -> Shaped[np.ndarray, "h w"]:
+    """Read a PNG or TIFF with one channel."""
+    with opened_image(path, ("PNG", "TIFF")) as file:
+        _checked_size(*file.size)
+        if file.mode not in ("I;16", "I;16B", "I;16L", "I", "F", "L"):
+            raise ValueError(f"it is a picture ({file.mode}), not one channel of 8, 16 or 32 bits")
+        require_room(path, file)
+        return np.asarray(file).astype(np.float64)
+
+
+def _header(file: Any, path: Path) -> tuple[int, int]:  # noqa: ANN401 - also a member of an archive
+    """Read an NPY's header, and return height and width."""
+    major, minor = np.lib.format.read_magic(file)
+    if (major, minor) not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {major}.{minor} of NPY is unknown")
+    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file, max_header_size=LARGEST_HEADER)
+    if dtype.kind not in "fui" or dtype.itemsize > 8:
+        raise ValueError(f"its values are {dtype}, not numbers")
+    h, w = _plane(shape)
+    require_memory(str(path), (dtype.itemsize + 12) * h * w, TOO_LARGE)
+    return h, w
+
+
+def _npy(path: Path) -> Shaped[np.ndarray, "h w"]:
+    with open_file(path) as file:
+        size = _header(file, path)
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False).reshape(size).astype(np.float64)
+
+
+def _npz(path: Path) -> Shaped[np.ndarray, "h w"]:
+    """Read the array `depth` of an NPZ, or its only array."""
+    with open_file(path) as file, zipfile.ZipFile(file) as archive:
+        names = archive.namelist()
+        name = names[0] if len(names) == 1 else "depth.npy"
+        if name not in names:
+            raise ValueError(f"it holds {len(names)} arrays, none of which is called depth")
+        with archive.open(name) as member:
+            size = _header(member, path)
+        with archive.open(name) as member:
+            return np.lib.format.read_array(member, allow_pickle=False).reshape(size).astype(np.float64)
+
+
+def _exr(path: Path) -> Shaped[np.ndarray, "h w"]:
+    try:
+        import OpenEXR
+    except ImportError:
+        reason = f"EXR needs OpenEXR: {install_command('depth')}"
+        raise DatasetError(f"{path}: cannot be read; {reason}", reason) from None
+    with open_file(path):  # only a regular file
+        low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+    w, h = (int(high[i]) - int(low[i]) + 1 for i in (0, 1))
+    _checked_size(w, h)
+    require_memory(str(path), 40 * w * h, TOO_LARGE)
+    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    names = {name.rpartition(".")[2]: name for name in channels}
+    name = next((names[name] for name in CHANNELS if name in names), None)
+    if name is None:
+        raise ValueError(
+            f"its channels are {', '.join(sorted(channels)) or 'none'}; depth is {' or '.join(CHANNELS)}"
+        )
+    values = np.asarray(channels[name].pixels, np.float64)
+    return values.reshape(_plane(values.shape))
+
+
+def _colmap(path: Path) -> Shaped[np.ndarray, "h w"]:
+    """Read WIDTH&HEIGHT&CHANNELS& and as many floats, row by row."""
+    with open_file(path) as file:
+        found = re.match(rb"(\d{1,6})&(\d{1,6})&(\d{1,3})&", file.read(24))
+        if found is None:
+            raise ValueError("it does not begin with WIDTH&HEIGHT&CHANNELS&")
+        w, h, channels = (int(number) for number in found.groups())
+        if channels != 1:
+            raise ValueError(f"it has {channels} channels; a map of depth has one")
+        _checked_size(w, h)
+        require_memory(str(path), 12 * w * h, TOO_LARGE)
+        file.seek(found.end())
+        data = file.read(4 * w * h + 1)
+    if len(data) != 4 * w * h:
+        raise ValueError(f"it does not hold the {w}x{h} floats of its header")
+    return np.frombuffer(data, "<f4").reshape(h, w).astype(np.float64)
+
+
+def _record3d(path: Path) -> Shaped[np.ndarray, "h w"]:
+    """Read floats compressed by LZFSE, whose number tells the map's size."""
+    try:
+        import liblzfse
+    except ImportError:
+        reason = "maps of Record3D need pyliblzfse: pip install pyliblzfse"
+        raise DatasetError(f"{path}: cannot be read; {reason}", reason) from None
+    packed = read_bytes(path)
+    if len(packed) > LARGEST_LZFSE:
+        raise ValueError(f"{len(packed):,} bytes are too many for a map of Record3D")
+    try:
+        data = liblzfse.decompress(packed)
+    except liblzfse.error as error:
+        raise ValueError(f"it is not compressed by LZFSE ({error})") from None
+    sizes = [(w, h) for w, h in RECORD3D if 4 * w * h == len(data)]
+    if not sizes:
+        known = ", ".join(f"{w}x{h}" for w, h in RECORD3D[::2])
+        raise ValueError(f"its {len(data) // 4:,} floats are no map of {known}")
+    w, h = sizes[0]
+    return np.frombuffer(data, "<f4").reshape(h, w).astype(np.float64)
+
+
+READERS: dict[str, Callable[[Path], Shaped[np.ndarray, "h w"]]] = {
+    ".png": _image,
+    ".tif": _image,
+    ".tiff": _image,
+    ".npy": _npy,
+    ".npz": _npz,
+    ".exr": _exr,
+    GEOMETRIC: _colmap,
+    ".depth": _record3d,
+}
+"""The function that reads a file, by its suffix."""

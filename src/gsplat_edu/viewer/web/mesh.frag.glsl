@@ -1,0 +1,26 @@
+// The colour of a mesh: of its texture, of its vertices, or of one tint that is shaded flat by a light at the camera.
+
+precision highp float;
+
+const int TINT = 0, VERTICES = 1, TEXTURE = 2, LINES = 3;
+const float AMBIENT = 0.3;
+
+uniform int coloring;
+uniform vec4 tint;  // RGB and opacity, of what has no colours
+uniform highp sampler2D photo;
+
+in vec3 seen;
+in vec3 paint;
+in vec2 place;
+
+out vec4 light;
+
+void main() {
+    vec3 normal = cross(dFdx(seen), dFdy(seen));
+    float facing = abs(dot(normal, seen)) / max(length(normal) * length(seen), 1e-30);
+    vec3 texel = texture(photo, place).rgb;
+    if (coloring == TEXTURE) light = vec4(texel, 1.0);
+    else if (coloring == VERTICES) light = vec4(paint, 1.0);
+    else if (coloring == LINES) light = vec4(tint.rgb * tint.a, tint.a);
+    else light = vec4((AMBIENT + (1.0 - AMBIENT) * facing) * tint.rgb * tint.a, tint.a);
+}

@@ -1,0 +1,67 @@
+"""A mesh is made, shown beside the splats and downloaded in the studio's page."""
+
+import re
+
+import numpy as np
+
+from gsplat_edu.io.mesh_files import read_mesh, write_mesh
+from gsplat_edu.scene.mesh import Mesh
+from studio.pages import until
+
+
+def viewer_frame(tab):
+    """Return the frame with the page that shows the mesh, once it is there."""
+    tab.locator("section[aria-label=mesh] iframe").wait_for()
+    return next(frame for frame in tab.frames if "surface=" in frame.url)
+
+
+def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library, wall_entry):
+    person = visitor()
+    tab = person.tab
+    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall/share")
+    section = tab.get_by_role("region", name="mesh")
+    assert not section.get_by_role("button", name="Show beside the splats").is_visible()
+    assert not section.get_by_text("texture of the photos").is_visible()  # a scene has no photos
+    section.locator("summary", has_text="More").click()
+    tab.get_by_label("Edge of a voxel").fill("0.1")
+    tab.get_by_role("button", name="Make a mesh").click()
+    show = section.get_by_role("button", name="Show beside the splats")
+    show.wait_for(timeout=180_000)
+    command = person.command("mesh of wall")
+    assert re.search(
+        r"^gsplat-edu mesh \S*/wall\.ply \S*/scenes/wall/exports/wall\.mesh\.glb --voxel 0\.1$", command
+    )
+
+    # a collider, here of another program, is shown as well
+    corners = np.array([[-1.5, -1, 0], [1.5, -1, 0], [0, 1, 0.2]])
+    write_mesh(wall_entry / "exports" / "wall.collider.glb", Mesh(corners, np.array([[0, 1, 2]])))
+    tab.reload()  # the mesh and its job are still there
+    show.wait_for()
+    section.get_by_role("article", name="mesh of wall").wait_for()
+    show.click()
+    frame = viewer_frame(tab)
+    until(tab, frame, "window.viewer?.meshes && document.getElementById('message').hidden")
+    mesh = read_mesh(wall_entry / "exports" / "wall.mesh.glb")
+    assert 50 < len(mesh.faces) < 50_000
+    assert frame.evaluate("viewer.meshes.surface.faces.length") == mesh.faces.size
+    assert frame.evaluate("viewer.meshes.collider.faces.length") == 3
+    assert frame.evaluate("document.getElementById('mesh-line').checkVisibility()")
+
+    item = tab.locator(".exports li", has_text="wall.mesh.glb")
+    with tab.expect_download() as download:
+        item.get_by_role("link", name="Download").click()
+    assert download.value.suggested_filename == "wall.mesh.glb"
+    stored = (wall_entry / "exports" / "wall.mesh.glb").read_bytes()
+    assert download.value.path().read_bytes() == stored
+
+
+def test_a_page_shows_only_exported_meshes(page, studio, tmp_path):
+    """The address can name no other file."""
+    folder = studio.library.root / "scenes" / "toy"
+    (folder / "exports").mkdir(parents=True)
+    (folder / "toy.ply").write_bytes(b"ply")
+    (folder / "exports" / "toy.spz").write_bytes(b"spz")
+    for name in ("gone.mesh.glb", "toy.spz", "../toy.ply", "%2e%2e%2ftoy.ply", "/etc/passwd"):
+        answer = page.get(f"/api/scenes/toy/page?surface={name}")
+        assert answer.status_code in (400, 404), name
+        assert answer.json()["error"].count("\n") == 0
