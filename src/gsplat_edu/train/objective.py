@@ -124,7 +124,7 @@ def make_objective(
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
     if nothing is outside of masks + weight_e sum_outside(alpha) / (H W);
     for a surface + weight_n mean a (a - N . m) + weight_f mean(smallest scale) / extent
-    + weight_p mean min(1 - ncc, most)
+    + weight_c mean min(1 - ncc, most)
     with given depth + weight_d mean rho(z / z* - 1), or for points + weight_p extent mean |1/z - 1/z*|
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
@@ -137,10 +137,10 @@ def make_objective(
         loss: Compares images and photos; see `photo_loss`.
         extent: Size of the scene, world units.
         around: The photos whose patches a surface compares with their neighbours'.
+        has_depth: Whether views have depth (`View.depth`).
 
     Raises:
         ArgumentError: the configuration compares patches, but there are no photos to compare.
-        has_depth: Whether views have depth (`View.depth`).
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
