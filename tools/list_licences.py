@@ -122,7 +122,7 @@ def licence(package: Distribution) -> str:
         for line in package.metadata.get_all("Classifier") or ()
         if line.startswith("License :: OSI Approved ::") and line.count("::") > 1
     ]
-    return " OR ".join(named) if named else TEXTS.get(package.metadata["Name"], "unknown")
+    return " OR ".join(named) if named else TEXTS.get(str(package.metadata["Name"]).lower(), "unknown")
 
 
 def compatible(expression: str) -> bool:
