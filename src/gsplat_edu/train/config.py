@@ -230,10 +230,10 @@ class TrainConfig:
         4, _whole(1), "`surface` acts in every n-th step, with n times its weights.", "ours"
     )
     normal_weight: float = number(
-        0.04, _not_negative, "Weight of the distance between normals and those of the depth.", "2DGS"
+        0.03, _not_negative, "Weight of the distance between normals and those of the depth.", "2DGS"
     )
     patch_weight: float = number(
-        0.1,
+        0.05,
         _not_negative,
         "Weight of patches that differ from a neighbouring photo's; 0: no patches.",
         "ours",
