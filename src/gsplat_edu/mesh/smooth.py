@@ -17,8 +17,8 @@ of the first; together they damp waves of less than about ten edges (Taubin 1995
 surface design")."""
 
 ROUNDS = 20
-"""Pairs of steps. Normals of meshes of the benchmark's box are off by 5.2 degrees instead of 8.4 with them, and points
-by 0.0020 instead of 0.0022; twice as many change little (benchmarks/archive/RESULTS-2026-11.md, "Surfaces")."""
+"""Pairs of steps. With 12 and 25, normals of the mesh of the benchmark's box are off by 5.6 and 5.0 degrees instead of
+8.4, and points by 0.0020 instead of 0.0022 (benchmarks/archive/RESULTS-2026-11.md, "Surfaces")."""
 
 
 def smoothed(mesh: Mesh, rounds: int = ROUNDS) -> Mesh:
