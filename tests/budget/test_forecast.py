@@ -15,8 +15,8 @@ from gsplat_edu.budget.costs import (
     Measurements,
     Speed,
     expected_counts,
+    photo_copies,
     pixel_share,
-    reduced_bytes,
     wanted_gaussians,
 )
 from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
@@ -146,9 +146,17 @@ def test_held_out_photos_have_no_copies_of_reduced_size():
     """The RGBA benchmark has 200 test and 100 training photos; forecasting copies of all 300 took 183 MiB too many."""
     config, photo = recipe(1_000, strategy="fast", max_gaussians=9), 3 * 640_000
     facts = Facts(100, 200, 9, 640_000.0, 640_000.0, 640_000.0, 300 * photo, 2)
-    assert reduced_bytes(config, facts) == 50 * photo - 180 * 640_000 // 2
-    assert reduced_bytes(config, dataclasses.replace(facts, train=1, test=0, photo_bytes=photo)) == 0
-    assert reduced_bytes(PLAIN, facts) == 0
+    assert photo_copies(config, facts) == 50 * photo - 180 * 640_000 // 2
+    assert photo_copies(config, dataclasses.replace(facts, train=1, test=0, photo_bytes=photo)) == 0
+    assert photo_copies(PLAIN, facts) == 0
+
+
+def test_patches_need_photos_without_colours():
+    facts = Facts(100, 200, 9, 640_000.0, 640_000.0, 640_000.0, 300 * 3 * 640_000, 2)
+    surface = PLAIN.changed(surface=True)
+    assert photo_copies(surface, facts) == 2 * 640_000 * 100
+    assert photo_copies(surface, dataclasses.replace(facts, train=1_000)) == 1 << 28
+    assert photo_copies(surface.changed(patch_weight=0.0), facts) == 0
 
 
 def test_pairs_are_forecast_at_the_photo_size_with_which_the_run_starts():

@@ -17,7 +17,7 @@ from gsplat_edu.budget.costs import (
     Footprint,
     Measurements,
     Speed,
-    reduced_bytes,
+    photo_copies,
     wanted_gaussians,
 )
 from gsplat_edu.budget.deadline import Deadline
@@ -83,7 +83,7 @@ def chosen(*arguments, **options):
 def peak(found):
     """Return the modelled peak memory of a plan with as many Gaussians as it allows."""
     facts, config = FACTS.smaller(found.resolution or 1.0), found.options.config
-    process = MEASURED.process + reduced_bytes(config, facts)
+    process = MEASURED.process + photo_copies(config, facts)
     footprint = Footprint(facts, process, MEASURED.pairs, config.sh_degree)
     return footprint.peak(found.max_gaussians, found.image_memory)
 

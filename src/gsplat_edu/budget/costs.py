@@ -25,6 +25,7 @@ from gsplat_edu.scene.sh import num_coefficients
 from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
+from gsplat_edu.train.patches import PHOTO_ROOM
 from gsplat_edu.train.schedule import photo_factor, planned_counts
 
 GROWTH = (0.005, 0.08)
@@ -61,6 +62,9 @@ TILE_PIXELS = 128
 LATER = 150 * 2**20
 """Growth of the process once it trains and evaluates, bytes, for any scene: code, threads, allocator arenas."""
 
+
+GREY_BYTES = 2
+"""Bytes per pixel of a photo without colours, with the mask of its pixels that count."""
 
 SURFACE_TIME = 3.0
 """Further time of a step that learns from normals and flatness, in times of a plain one
@@ -265,22 +269,26 @@ def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.
     return np.array(seconds * surface_factors(config))
 
 
-def reduced_bytes(config: TrainConfig, facts: Facts) -> int:
-    """Return how many bytes the reduced copies of photos add to the peak memory.
+def photo_copies(config: TrainConfig, facts: Facts) -> int:
+    """Return how many bytes the training's own copies of photos add to the peak memory.
 
-    Only training photos have reduced copies, with at most half of their pixels. All copies are freed before training
-    uses full size. While they exist, a step therefore takes at most half of the memory that the evaluation takes for
-    images, and only what exceeds the other half raises the peak.
+    Only training photos have copies: reduced ones early, with at most half of their pixels, and for patches those
+    without colours, which stay. All reduced ones are freed before training uses full size. While they exist, a step
+    therefore takes at most half of the memory that the evaluation takes for images, and only what exceeds the other
+    half raises the peak.
 
     Args:
         config: The run.
         facts: The capture at training size.
     """
+    grey = 0
+    if config.surface and config.patch_weight > 0:
+        grey = min(PHOTO_ROOM, GREY_BYTES * math.ceil(facts.pixels) * facts.train)
     if photo_factor(config, 0) <= 1.0:
-        return 0
+        return grey
     share = facts.train / max(facts.train + facts.test, 1)
     copies = min(REDUCED_ROOM, int(share * facts.photo_bytes) // 2)
-    return max(copies - int(PER_PIXEL * facts.largest) // 2, 0)
+    return grey + max(copies - int(PER_PIXEL * facts.largest) // 2, 0)
 
 
 def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int = PLANNED_VIEWS) -> int:

@@ -13,8 +13,8 @@ from gsplat_edu.budget.costs import (
     Measurements,
     exchanged_gaussians,
     expected_counts,
+    photo_copies,
     pixel_share,
-    reduced_bytes,
     surface_factors,
 )
 from gsplat_edu.budget.probe import probe
@@ -121,7 +121,7 @@ def predict(
         pixels = facts.pixels / photo_factor(config, iteration) ** 2
         return speed.seconds(float(counts[iteration]), pixels) * float(longer[iteration]) + reading_again
 
-    process = measured.process + reduced_bytes(config, facts)
+    process = measured.process + photo_copies(config, facts)
     room, most = measured.room, int(counts.max())
     footprint = Footprint(facts, process, measured.pairs, config.sh_degree, config.batch, room)
     evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))

@@ -23,7 +23,7 @@ from gsplat_edu.budget.costs import (
     Facts,
     Footprint,
     Measurements,
-    reduced_bytes,
+    photo_copies,
     step_profile,
     wanted_gaussians,
 )
@@ -377,7 +377,7 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     forecast = _predicted(request, measured, choice, config)
     found = Plan(options, by_time, forecast, profile=profile)
     at_cap = Footprint(
-        facts, process + reduced_bytes(config, facts), pairs, config.sh_degree, config.batch, request.room
+        facts, process + photo_copies(config, facts), pairs, config.sh_degree, config.batch, request.room
     ).peak(found.max_gaussians or 0, found.image_memory)
     needed = _device_sentences(request, config, choice.factor)
     return dataclasses.replace(found, sentences=(*needed, *_sentences(request, found, at_cap)))
@@ -393,7 +393,7 @@ def _within_memory(
     aim, least = int(MEMORY_SHARE * limit), 0
     for factor in factors:
         facts = request.facts.smaller(factor)
-        reduced = reduced_bytes(request.options.config, facts)
+        reduced = photo_copies(request.options.config, facts)
         config = request.config(iterations, factor, None)
         footprint = Footprint(facts, process + reduced, pairs, config.sh_degree, config.batch, request.room)
         wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import install_command
+from gsplat_edu.mesh.smooth import ROUNDS, smoothed
 from gsplat_edu.mesh.topology import (
     boundary_loops,
     component_labels,
@@ -67,17 +68,19 @@ class TidySettings:
         share: Components with a smaller share of the area are dropped; 0 keeps all.
         largest: Keep the largest component only.
         holes: Fill small holes.
+        smoothing: Rounds of `gsplat_edu.mesh.smooth.smoothed`; 0 for none.
         faces: Most faces of the result, by decimation; None leaves their number as it is.
     """
 
     share: float = SMALLEST_SHARE
     largest: bool = False
     holes: bool = True
+    smoothing: int = ROUNDS
     faces: int | None = None
 
 
 def tidied(mesh: Mesh, settings: TidySettings | None = None) -> Mesh:
-    """Clean a mesh, drop small components, fill small holes and decimate it, in this order.
+    """Clean a mesh, drop small components, fill small holes, smooth and decimate it, in this order.
 
     Args:
         mesh: The mesh, without a texture.
@@ -95,6 +98,7 @@ def tidied(mesh: Mesh, settings: TidySettings | None = None) -> Mesh:
     mesh = with_large_components(mesh, settings.share, settings.largest)
     if settings.holes:
         mesh = with_filled_holes(mesh)
+    mesh = smoothed(mesh, settings.smoothing)
     if settings.faces is not None:
         # Repairs after decimation cut specks off.
         mesh = with_large_components(decimated(mesh, settings.faces), settings.share, settings.largest)

@@ -25,6 +25,7 @@ from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
 from gsplat_edu.train.objective import make_objective
+from gsplat_edu.train.patches import neighbourhood_for
 from gsplat_edu.train.stepper import StepParts
 from gsplat_edu.train.team import ALONE, Team
 from gsplat_edu.train.trainer import Callback, Trainer
@@ -116,6 +117,8 @@ def training(
     extent = scene_extent(cameras) if start.extent is None else start.extent
     gaussians, shell = start.gaussians.to(backend.device), start.shell
     features = functools.partial(render, backend=backend)
+    view_model = make_view_model(config, cameras, extent, gaussians, backend.recolored)
+    around = neighbourhood_for(config, dataset.train, view_model, extent)
     has_depth = any(view.depth is not None for view in dataset.train)
     return Trainer(
         gaussians,
@@ -126,8 +129,8 @@ def training(
         density=make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
         callbacks=callbacks,
         parts=StepParts(
-            make_objective(config, shell, backend.loss, extent, has_depth),
-            make_view_model(config, cameras, extent, gaussians, backend.recolored),
+            make_objective(config, shell, backend.loss, extent, around, has_depth),
+            view_model,
             transients=make_transients(config, dataset.train, features),
             fused=fused,
             team=team,

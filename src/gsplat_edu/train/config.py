@@ -217,12 +217,12 @@ class TrainConfig:
         "2023, 2024",
     )
     surface: bool = number(
-        False, _flag, "Learn a surface: normals agree with the depth, and Gaussians are flat."
+        False, _flag, "Learn a surface: normals and photos agree with the depth, and Gaussians are flat."
     )
     surface_start: int = number(
         9_000,
         _whole(0),
-        "Iteration from which `surface` learns from normals and flatness.",
+        "Iteration from which `surface` learns from normals, flatness and patches.",
         "ours",
         milestone=True,
     )
@@ -230,7 +230,13 @@ class TrainConfig:
         4, _whole(1), "`surface` acts in every n-th step, with n times its weights.", "ours"
     )
     normal_weight: float = number(
-        0.04, _not_negative, "Weight of the distance between normals and those of the depth.", "2DGS"
+        0.03, _not_negative, "Weight of the distance between normals and those of the depth.", "2DGS"
+    )
+    patch_weight: float = number(
+        0.05,
+        _not_negative,
+        "Weight of patches that differ from a neighbouring photo's; 0: no patches.",
+        "ours",
     )
     flat_weight: float = number(
         0.01, _not_negative, "Weight of the mean smallest scale, as a fraction of the extent.", "ours"

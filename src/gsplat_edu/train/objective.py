@@ -23,6 +23,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.depth import DEPTH, DepthTerm
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
+from gsplat_edu.train.patches import PATCHES, Neighbourhood, PatchTerm
 from gsplat_edu.train.rendered import Rendered as Rendered
 from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
 
@@ -115,6 +116,7 @@ def make_objective(
     shell: Shell | None = None,
     loss: LossKernel | None = None,
     extent: float = 1.0,
+    around: Neighbourhood | None = None,
     has_depth: bool = False,
 ) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
@@ -122,6 +124,7 @@ def make_objective(
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
     if nothing is outside of masks + weight_e sum_outside(alpha) / (H W);
     for a surface + weight_n mean a (a - N . m) + weight_f mean(smallest scale) / extent
+    + weight_c mean min(1 - ncc, most)
     with given depth + weight_d mean rho(z / z* - 1), or for points + weight_p extent mean |1/z - 1/z*|
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
@@ -133,7 +136,11 @@ def make_objective(
         shell: Where far splats lie, whose scale is not regularised; None if there are none.
         loss: Compares images and photos; see `photo_loss`.
         extent: Size of the scene, world units.
+        around: The photos whose patches a surface compares with their neighbours'.
         has_depth: Whether views have depth (`View.depth`).
+
+    Raises:
+        ArgumentError: the configuration compares patches, but there are no photos to compare.
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
@@ -149,6 +156,12 @@ def make_objective(
         turns = Turns(config.surface_start, config.surface_every, config.batch)
         terms[NORMAL] = NormalTerm(config.normal_weight, turns)
         terms[FLAT] = FlatTerm(config.flat_weight, extent, turns, shell)
+        if config.patch_weight > 0:
+            if around is None:
+                raise ArgumentError(
+                    "around: has to be given, because patch_weight compares photos; or set it to 0"
+                )
+            terms[PATCHES] = PatchTerm(config.patch_weight, turns, around, config.seed)
     if has_depth:
         turns = Turns(0, config.depth_every, config.batch)
         terms[DEPTH] = DepthTerm(config.depth_weight, config.points_weight, extent, turns)

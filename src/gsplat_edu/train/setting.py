@@ -29,7 +29,7 @@ WITH_OPTION = frozenset(
 )
 """Settings that `gsplat-edu train` has an option for; the others are given by `--set NAME=VALUE`."""
 
-FOR_SURFACE = ("surface_start", "surface_every", "normal_weight", "flat_weight")
+FOR_SURFACE = ("surface_start", "surface_every", "normal_weight", "patch_weight", "flat_weight")
 """Settings that only a training with `surface` uses."""
 
 FOR_DEPTH = ("depth_kind", "depth_unit", "depth_weight", "points_weight", "depth_every")

@@ -27,6 +27,7 @@ from gsplat_edu.train.events import Change, Event, Losses, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
 from gsplat_edu.train.objective import make_objective
 from gsplat_edu.train.optimizer import MOMENTS
+from gsplat_edu.train.patches import neighbourhood_for
 from gsplat_edu.train.resident import make_stepper
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
@@ -114,7 +115,8 @@ class Trainer:
         self._callbacks = tuple(callbacks)
         behind, device = None if config.random_background else config.background, gaussians.means.device
         empty = config.outside_masks == "empty"
-        objective = parts.objective or make_objective(config, loss=backend.loss, extent=extent)
+        around = neighbourhood_for(config, views, parts.view_model, extent)
+        objective = parts.objective or make_objective(config, loss=backend.loss, extent=extent, around=around)
         groups = gaussian_groups(config, extent)
         self.stepper = make_stepper(gaussians, backend, groups, objective, density, parts, config.batch)
         room = self.stepper.photo_room
