@@ -4,6 +4,7 @@ import dataclasses
 import math
 import warnings
 
+import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, BackendWarning
@@ -32,6 +33,7 @@ from gsplat_edu.render import webgpu as backend_module
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.scene.given_depth import GivenDepth
 from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import StepEvent
@@ -250,16 +252,24 @@ def test_a_run_in_time_repeats_its_decisions_and_its_bits(capture, tmp_path):
         {"transients": "mask"},
         {"outside_masks": "empty"},
         {"batch": 2},
+        {"surface": True},
+        {"has_depth": True},
     ],
     ids=lambda changes: ",".join(f"{name}={value}" for name, value in changes.items()) or "plain",
 )
 def test_what_leaves_the_device_is_known_beforehand(dataset, changes):
-    config = recipe(30, **({"strategy": "fast", "max_gaussians": 120} | changes))
+    settings = {"strategy": "fast", "max_gaussians": 120} | changes
+    has_depth = settings.pop("has_depth", False)
+    config = recipe(30, **settings)
+    if has_depth:
+        depth = GivenDepth(np.zeros((1, 2)), np.ones(1))
+        dataset = dataclasses.replace(dataset, train=[v.with_depth(lambda: depth) for v in dataset.train])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BackendWarning)
         run = training(config, dataset, load_backend("webgpu"))
-    assert isinstance(run.stepper, ResidentStepper) == (leaves_device(config) is None)
-    assert (leaves_device(config) is None) == (not changes.keys() - {"strategy"})
+    reason = leaves_device(config, has_depth)
+    assert isinstance(run.stepper, ResidentStepper) == (reason is None)
+    assert (reason is None) == (not changes.keys() - {"strategy"})
 
 
 def test_auto_decides_by_real_forecasts(capture, tmp_path, monkeypatch):

@@ -115,6 +115,7 @@ class Prospect:
         image_memory: Bytes of photos kept in memory.
         eval_every: Iterations between evaluations; 0 for none.
         save_every: Iterations between checkpoints; 0 for none.
+        has_depth: Whether it learns from given depth.
     """
 
     dataset: Dataset
@@ -124,6 +125,7 @@ class Prospect:
     image_memory: int = 4 * 2**30
     eval_every: int = RunOptions.eval_every
     save_every: int = RunOptions.save_every
+    has_depth: bool = False
 
     @classmethod
     def of(cls, options: RunOptions, reader: CaptureReader) -> Prospect:
@@ -149,6 +151,7 @@ class Prospect:
             options.data_settings.image_memory,
             options.eval_every,
             options.save_every,
+            options.depth is not None,
         )
         if config.strategy in ("fast", "mcmc") and config.max_gaussians is None:
             facts = found.facts
@@ -205,7 +208,7 @@ def choose_backend(prospect: Prospect, *, allow_software: bool = False) -> Chose
 
     decision = decide(
         listed_outside(),
-        leaves_device(prospect.config),
+        leaves_device(prospect.config, prospect.has_depth),
         lambda: _failure(prospect),
         seconds,
         wanted=os.environ.get(ADAPTER_VARIABLE, ""),

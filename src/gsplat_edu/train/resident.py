@@ -114,15 +114,20 @@ def why_not(
     return None
 
 
-def leaves_device(config: TrainConfig) -> str | None:
+def leaves_device(config: TrainConfig, has_depth: bool = False) -> str | None:
     """Return the setting of a configuration that no device can do, so that its steps pass through the processor.
 
     It says beforehand what `why_not` says of the parts that a configuration leads to.
+
+    Args:
+        config: The configuration.
+        has_depth: Whether the training learns from given depth, which is no setting.
     """
     settings = {
         f"batch is {config.batch}": config.batch > 1,
         f"outside_masks is {config.outside_masks}": config.outside_masks != "ignore",
         "surface is on": config.surface,
+        "depth is given": has_depth,
     }
     for name in ("appearance", "refine", "transients"):
         value = getattr(config, name)

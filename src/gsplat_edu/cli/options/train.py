@@ -324,8 +324,8 @@ def _add_recipe(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--surface",
         action="store_true",
-        help="learn a surface, for meshes: normals and neighbouring photos that agree with the depth, and flat splats. It"
-        " costs about 0.2 dB of PSNR and half as much time again",
+        help="learn a surface, for meshes: normals and neighbouring photos that agree with the depth, and flat splats."
+        " It costs about 0.2 dB of PSNR and half as much time again",
     )
     add_settings(group)
 
