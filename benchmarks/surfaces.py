@@ -2,10 +2,11 @@
 
     python benchmarks/surfaces.py [--captures NAME ...] [--iterations N] [--seed S] [--smoke] [--out FILE.json]
 
-Captures: the textured box, and the solids with textured, plain and glossy surfaces. Each is trained by the recipe
-`fast`, from start points that are off the surface by 0.01. Median depths of the training views are compared with the
-true ones at each pixel, and as points in space with the true surface: F1 at 0.01 world units, where only surface that a
-photo sees counts for recall. Floor far from the objects is left out. Then each scene is meshed, and the mesh compared.
+Captures: the textured box, the solids with textured, plain and glossy surfaces, and a block of the procedural city
+(tests/fixtures/city.py) from the air. Each is trained by the recipe `fast`, from start points that are off the surface
+by 0.01, in the city by 0.05. Median depths of the training views are compared with the true ones at each pixel, and as
+points in space with the true surface: F1 at 0.01 world units, in the city 0.05, where only surface that a photo sees
+counts for recall. Ground far from the objects is left out. Then each scene is meshed, and the mesh compared.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ import hardware
 import numpy as np
 import torch
 
+from fixtures.city import City
+from fixtures.city_paint import PITCH, Buildings
+from fixtures.outdoors import box_hits
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.solids import Part, SolidScene
@@ -43,15 +47,15 @@ from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import SETTINGS, recipe
 
 TAU = 0.01
-"""Threshold of F1, world units."""
+"""Threshold of F1, world units. A point of the truth is seen if it is at most this far behind the true depth."""
 
-TOLERANCE = 0.01
-"""A point of the truth is seen if it is at most this far behind the true depth, world units."""
+TAU_OF_CITY = 0.05
+"""The same in the city, whose photos are taken from ten units away: a pixel covers 0.03."""
 
 POINTS = 400_000
 """Number of points from depth maps that are compared; so dense that gaps between them do not limit recall."""
 
-CAPTURES = ("box", *FINISHES)
+CAPTURES = ("box", *FINISHES, "city")
 """Names of the captures."""
 
 
@@ -64,16 +68,18 @@ class Capture:
         points: (N, 3) start points, world units.
         colors: (N, 3) their colours, 0 to 1.
         scans: True depth (H, W) and normals (H, W, 3) of each view.
-        scene: The solids.
+        truth: The true surface.
         bounds: (2, 3) corners of the box that is compared.
+        tau: Threshold of F1, and largest depth behind the true one at which a point is seen, world units.
     """
 
     train: list[View]
     points: np.ndarray
     colors: np.ndarray
     scans: list[tuple[np.ndarray, np.ndarray]]
-    scene: SolidScene
+    truth: Mesh
     bounds: np.ndarray
+    tau: float = TAU
 
     @functools.cached_property
     def cameras(self) -> list[Camera]:
@@ -90,15 +96,15 @@ class Depths(NamedTuple):
     missing: float  # fraction of the pixels with true depth that have none
 
 
-def solids_of(finish: str, size: int, count: int, seed: int) -> Capture:
-    """Make the capture of the solids with a finish."""
+def solids_of(finish: str, size: int, count: int, seed: int, step: float) -> Capture:
+    """Make the capture of the solids with a finish; `step` is the edge of the truth's triangles."""
     made = solids_capture(finish, size, count, seed=seed)
     scans = [(photo.depth, photo.normals) for photo in made.photos]
     bounds = np.array([[-1.35, -1.2, -1.35], [1.35, 0.03, 1.35]])
-    return Capture(made.views, made.points, made.colors, scans, made.scene, bounds)
+    return Capture(made.views, made.points, made.colors, scans, solids_mesh(made.scene, step), bounds)
 
 
-def box_of(size: int, count: int, seed: int) -> Capture:
+def box_of(size: int, count: int, seed: int, step: float) -> Capture:
     """Make the capture of the textured box; its truth are two blocks."""
     floor = Block(np.array([0.0, 0.05, 0.0]), np.array([4.0, 0.05, 4.0]))
     body = Block(np.array([0.0, -0.475, 0.0]), np.array([0.7, 0.525, 0.5]))
@@ -117,7 +123,56 @@ def box_of(size: int, count: int, seed: int) -> Capture:
     exact = np.concatenate(points)
     noisy = exact + START_NOISE * rng.normal(size=exact.shape)
     bounds = np.array([[-1.5, -1.1, -1.5], [1.5, 0.03, 1.5]])
-    return Capture(views, noisy, np.concatenate(colors), scans, scene, bounds)
+    return Capture(views, noisy, np.concatenate(colors), scans, solids_mesh(scene, step), bounds)
+
+
+def city_of(size: int, count: int, seed: int, step: float) -> Capture:
+    """Make the capture of a block of the city, whose truth are the faces of its boxes and the ground."""
+    del step  # its faces are flat
+    city = City(count, size, points=max(4_000 // count, 1), seed=seed)
+    views, points, colors = [], [], []
+    for index, (name, camera) in enumerate(city.cameras):
+        photo, places, paint = city.photograph(index)
+        views.append(View(camera, photo, name=name))
+        points.append(places)
+        colors.append(paint)
+    exact, rng = np.concatenate(points), np.random.default_rng(seed)
+    noisy = exact + TAU_OF_CITY * rng.normal(size=exact.shape)
+    scans = [scan_city(city.buildings, camera) for _, camera in city.cameras]
+    half = city.side / 2
+    bounds = np.array([[-half, -20.0, -half], [half, 0.1, half]])
+    truth = mesh_of_city(city.buildings, half + PITCH)
+    return Capture(views, noisy, np.concatenate(colors), scans, truth, bounds, TAU_OF_CITY)
+
+
+def scan_city(buildings: Buildings, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the exact depth (H, W) and normals (H, W, 3) of a photo's pixels; 0 where the sky is."""
+    rays = camera.rays().reshape(-1, 3)
+    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+    eyes, directions = np.broadcast_to(camera.eye, rays.shape), rays / lengths
+    with np.errstate(divide="ignore"):
+        nearest = np.where(directions[:, 1] > 1e-9, -eyes[:, 1] / directions[:, 1], np.inf)
+    normals = np.where(np.isfinite(nearest)[:, None], [0.0, -1.0, 0.0], 0.0)
+    for number in range(len(buildings.places)):
+        distance, facing = box_hits(eyes, directions, *buildings.box(number))
+        hit = distance < nearest
+        nearest, normals = np.where(hit, distance, nearest), np.where(hit[:, None], facing, normals)
+    depth = np.where(np.isfinite(nearest), nearest / lengths[:, 0], 0.0)
+    return depth.reshape(camera.H, camera.W), normals.reshape(camera.H, camera.W, 3)
+
+
+def mesh_of_city(buildings: Buildings, half: float) -> Mesh:
+    """Return walls and roofs of all boxes, and a square of ground with sides of twice `half`; faces outward."""
+    corners = buildings.corners()  # numbered by x, then bottom and top, then z: 4 i + 2 j + k
+    walls = [(0, 1, 3, 2), (5, 4, 6, 7), (4, 0, 2, 6), (1, 5, 7, 3), (2, 3, 7, 6)]
+    quads = [[8 * b + c for c in wall] for b in range(len(corners)) for wall in walls]
+    ground = half * np.array([[-1.0, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]])
+    quads.append([8 * len(corners) + c for c in (0, 1, 2, 3)])
+    faces = np.array(quads)
+    return Mesh(
+        np.concatenate([corners.reshape(-1, 3), ground]),
+        np.concatenate([faces[:, [0, 2, 1]], faces[:, [0, 3, 2]]]),
+    )
 
 
 def lifted(camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -151,7 +206,7 @@ def depths_of(capture: Capture, trainer: Any, settings: RenderSettings) -> Depth
     )
 
 
-def measure_one(capture: Capture, truth: Mesh, iterations: int, seed: int, surface: bool) -> dict[str, Any]:
+def measure_one(capture: Capture, iterations: int, seed: int, surface: bool) -> dict[str, Any]:
     """Train one scene and compare it with the truth."""
     changes: dict[str, Any] = {"surface": True} if surface else {}
     config = recipe(iterations, strategy="fast", seed=seed, **changes)
@@ -177,11 +232,11 @@ def measure_one(capture: Capture, truth: Mesh, iterations: int, seed: int, surfa
         visible_points,
         cameras=capture.cameras,
         depths=[depth for depth, _ in capture.scans],
-        tolerance=TOLERANCE,
+        tolerance=capture.tau,
     )
-    comparison = Comparison(TAU, seed=seed, bounds=capture.bounds)
-    scores = score_points(depths.points[chosen], truth, comparison, counts)
-    row |= mesh_scores(capture, truth, trainer.gaussians, settings, comparison, counts)
+    comparison = Comparison(capture.tau, seed=seed, bounds=capture.bounds)
+    scores = score_points(depths.points[chosen], capture.truth, comparison, counts)
+    row |= mesh_scores(capture, trainer.gaussians, settings, comparison, counts)
     return row | {
         "depth error mean": float(depths.errors.mean()),
         "depth error median": float(np.median(depths.errors)),
@@ -196,7 +251,6 @@ def measure_one(capture: Capture, truth: Mesh, iterations: int, seed: int, surfa
 
 def mesh_scores(
     capture: Capture,
-    truth: Mesh,
     gaussians: Gaussians,
     settings: RenderSettings,
     comparison: Comparison,
@@ -210,8 +264,10 @@ def mesh_scores(
     except ArgumentError:  # a training of a few steps has no surface
         return {"mesh faces": 0}
     seconds = time.perf_counter() - began
-    scores = score_surface(found.mesh, truth, comparison, counts)
-    at_voxel = score_surface(found.mesh, truth, dataclasses.replace(comparison, tau=found.voxel), counts)
+    scores = score_surface(found.mesh, capture.truth, comparison, counts)
+    at_voxel = score_surface(
+        found.mesh, capture.truth, dataclasses.replace(comparison, tau=found.voxel), counts
+    )
     return {
         "mesh faces": len(found.mesh.faces),
         "mesh seconds": seconds,
@@ -231,15 +287,14 @@ def measure(arguments: Any) -> dict[str, Any]:  # noqa: ANN401
     offered = any(setting.name == "surface" for setting in SETTINGS)
     if not offered:
         print("this version has no setting `surface`: trained without it only")
-    table: dict[str, Any] = {"iterations": iterations, "tau": TAU}
+    table: dict[str, Any] = {"iterations": iterations}
     for name in arguments.captures:
         began = time.perf_counter()
-        make = box_of if name == "box" else functools.partial(solids_of, name)
-        capture = make(size, count, arguments.seed)
-        truth = solids_mesh(capture.scene, step)
-        print(f"{name}: {count} photos and {truth} in {time.perf_counter() - began:.1f} s")
+        make = {"box": box_of, "city": city_of}.get(name) or functools.partial(solids_of, name)
+        capture = make(size, count, arguments.seed, step)
+        print(f"{name}: {count} photos and {capture.truth} in {time.perf_counter() - began:.1f} s")
         for surface in (False, True) if offered else (False,):
-            row = measure_one(capture, truth, iterations, arguments.seed, surface)
+            row = measure_one(capture, iterations, arguments.seed, surface)
             table[f"{name}, surface {'on' if surface else 'off'}"] = row
             print(
                 f"  surface {'on ' if surface else 'off'} "

@@ -263,7 +263,9 @@ def test_what_leaves_the_device_is_known_beforehand(dataset, changes):
     config = recipe(30, **settings)
     if has_depth:
         depth = GivenDepth(np.zeros((1, 2)), np.ones(1))
-        dataset = dataclasses.replace(dataset, train=tuple(v.with_depth(lambda: depth) for v in dataset.train))
+        dataset = dataclasses.replace(
+            dataset, train=tuple(v.with_depth(lambda: depth) for v in dataset.train)
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BackendWarning)
         run = training(config, dataset, load_backend("webgpu"))
