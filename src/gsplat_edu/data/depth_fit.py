@@ -252,18 +252,21 @@ def _no_inverse(rejected: Sequence[Rejected], enough: bool, usual: float) -> tup
 
 
 def _robust_line(x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"]) -> _Line:
-    """Fit y = scale x + shift by iteratively reweighted least squares with Huber's weights."""
+    """Fit y = scale x + shift by iteratively reweighted least squares with Huber's weights.
+
+    Sums are NumPy's own: those of a BLAS depend on its number of threads.
+    """
     weights = np.ones(len(x))
     scale = shift = 0.0
     error = math.inf
     for _ in range(ROUNDS):
         total = weights.sum()
-        mean_x, mean_y = (weights @ x) / total, (weights @ y) / total
+        mean_x, mean_y = (weights * x).sum() / total, (weights * y).sum() / total
         along = x - mean_x
-        squares = float(weights @ (along * along))
-        if squares <= 1e-12 * max(float(weights @ (x * x)), 1e-300):
+        squares = float((weights * along * along).sum())
+        if squares <= 1e-12 * max(float((weights * x * x).sum()), 1e-300):
             return _Line(0.0, float(np.median(y)), math.inf)
-        scale = float(weights @ (along * (y - mean_y))) / squares
+        scale = float((weights * along * (y - mean_y)).sum()) / squares
         shift = float(mean_y - scale * mean_x)
         off = y - scale * x - shift
         sigma = 1.48 * float(np.median(np.abs(off)))
