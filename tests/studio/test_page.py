@@ -49,9 +49,12 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
 
     tab.locator("summary", has_text="Options").click()
     tab.get_by_label("Iterations instead of a quality").fill("60")
+    tab.get_by_label("What the scene is for").select_option("for a mesh: learn surfaces")
+    tab.get_by_label("Depth to learn from").select_option("the points that photos share")
     tab.get_by_role("button", name="Start training").click()
     person.reach("#/runs/box")
     train = person.command("training of box")
+    assert "--surface --depth points" in train
     tab.get_by_role("link", name="Share it").wait_for()
     assert tab.locator(".figures-list").inner_text().split("\n")[1] == "60 of 60"
     tab.get_by_role("img", name=re.compile("^Loss: .*from")).wait_for()

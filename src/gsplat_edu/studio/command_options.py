@@ -7,6 +7,7 @@ from typing import Any
 
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import option_flag, shortened
+from gsplat_edu.data.depths import CAPTURE, POINTS
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SETTABLE, SKIES, STRATEGIES
@@ -133,6 +134,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "save_every": _whole(0, 1_000_000),
     "antialiased": _switch,
     "surface": _switch,
+    "depth": _choice(str(POINTS), str(CAPTURE)),
     "white_background": _switch,
     "random_background": _switch,
     "set": _set,

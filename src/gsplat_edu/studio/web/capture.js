@@ -20,6 +20,17 @@ const OUTSIDE = [
   ["ignore", "ignore: the masks hide something in front"],
 ];
 
+const PURPOSES = [
+  ["", "to look at"],
+  ["surface", "for a mesh: learn surfaces"],
+];
+
+const DEPTHS = [
+  ["", "none"],
+  ["points", "the points that photos share"],
+  ["capture", "the capture's own depth maps"],
+];
+
 const NUMBER_OR_AUTO = "auto|[0-9]+([.][0-9]+)?";
 
 export function capture(given) {
@@ -56,6 +67,10 @@ export function capture(given) {
   });
 }
 
+function chooser(id, choices) {
+  return h("select", { id }, choices.map(([value, text]) => h("option", { value }, text)));
+}
+
 // Choose a quality, see what it takes, and start.
 function startForm(store, entry) {
   const line = errorLine();
@@ -73,7 +88,9 @@ function startForm(store, entry) {
     time_limit: h("input", { id: "time-limit", type: "text", placeholder: "30m", autocomplete: "off" }),
     max_memory: h("input", { id: "max-memory", type: "text", placeholder: "8G", autocomplete: "off" }),
     max_gaussians: h("input", { id: "max-gaussians", type: "number", min: 1, inputmode: "numeric" }),
-    outside_masks: h("select", { id: "outside-masks" }, OUTSIDE.map(([value, text]) => h("option", { value }, text))),
+    outside_masks: chooser("outside-masks", OUTSIDE),
+    surface: chooser("surface", PURPOSES),
+    depth: chooser("depth", DEPTHS),
   };
   const labels = {
     iterations: "Iterations instead of a quality",
@@ -82,6 +99,8 @@ function startForm(store, entry) {
     max_memory: "Memory limit",
     max_gaussians: "Splats at most",
     outside_masks: "Outside of the photos' masks",
+    surface: "What the scene is for",
+    depth: "Depth to learn from",
   };
   const name = h("input", { id: "run-name", type: "text", autocomplete: "off" });
   const go = h("button", { class: "primary" }, "Start training");
@@ -120,7 +139,7 @@ function startForm(store, entry) {
             for (const [key, field] of Object.entries(fields)) {
               if (!field.value) continue;
               const number = field.type === "number" || (key === "resolution" && field.value !== "auto");
-              options[key] = number ? Number(field.value) : field.value;
+              options[key] = key === "surface" || (number ? Number(field.value) : field.value);
             }
             const to = name.value || freeName(store, "runs", entry.name);
             const { job } = await startJob(store, { command: "train", subject: entry.entry, to, options });

@@ -58,7 +58,7 @@ export function meshes(store, entry) {
     ),
     h("div", { class: "row" }, make, coarse, look),
   );
-  const hint = "Triangles of the surfaces, as a GLB for Blender, Unity and other programs. Training with the option surface makes it smoother.";
+  const hint = "Triangles of the surfaces, as a GLB for Blender, Unity and other programs. Training a scene for a mesh makes it smoother: an option of the capture's screen.";
   return {
     element: h("section", { "aria-label": "mesh" }, heading(2, "Mesh"), h("p", { class: "quiet" }, hint), form, line, job.element, preview),
     close: () => scene.close(),
