@@ -12,9 +12,9 @@ assert np.isclose(np.exp(-unbiased), 0.25)  # a quarter: such a wall is far from
 
 # %% [markdown]
 # **Exercise 2 (a function).** Write `wall_in_space(count, slant, opacity)`: float64 `Gaussians`, round and flat, with
-# the standard deviation `SIZE`, at random places of a piece of a wall that is 1.6 wide and 1 high, turned about the
-# vertical. Render it with `render_maps`. The law holds with $\kappa = 2\pi\sigma^2\rho\,o$ and $\rho$ splats per unit
-# of area. Is the planar depth still exact?
+# the standard deviation `SIZE`, on a wall through the optical axis that is turned about the vertical, at random places
+# $|s| \le 0.8$ along it and $|y| \le 0.5$. Render it with `render_maps`. The law holds with
+# $\kappa = 2\pi\sigma^2\rho\,o$ and $\rho$ splats per unit of area. Is the planar depth still exact?
 
 # %%
 from gsplat_edu.scene.gaussians import Gaussians

@@ -434,10 +434,9 @@ plt.show()
 
 # %% [markdown]
 # The bowl is the worst where it is plain or glossy. Its inside has no texture, and a shade that changes slowly fits
-# any depth; a highlight even moves with the camera, as a point off the surface would. The colours of such a dent are
-# right. The rods are thinner than the truncation: the front of one still votes behind its back, against the views that
-# see the back. What no photo sees, such as the floor's underside, is missing, and the yellow corner is seen by few
-# photos.
+# any depth; a highlight even moves with the camera, as a point off the surface would. The glossy rods have lost their
+# bar and their brace, and all rods are thinner than the truncation: the front of one still votes behind its back. What
+# no photo sees, such as the floor's underside, is missing, and the yellow corner is seen by few photos.
 #
 # ## The next failure
 #
