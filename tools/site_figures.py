@@ -54,6 +54,7 @@ FIGURES = (
         data=False,
     ),
     Figure("14_photos_to_scene", "held_out = sorted(", "wipe", "Wipe between photo and render"),
+    Figure("15_cloud_to_surface", "more splats in a wall", "wall", "Move a ray through a wall", data=False),
 )
 
 STATIC = "../_static/play/"

@@ -418,8 +418,8 @@ for name in ("composite", "composite_backward"):
 #
 # ## The next failure
 #
-# There is no next chapter, but failures remain. The first is in every scene: it is right where a camera stood. Here
-# is a view from higher up than any photo. The fog is the sky of the photos, seen from behind.
+# The first failure is in every scene: it is right where a camera stood. Here is a view from higher up than any photo.
+# The fog is the sky of the photos, seen from behind.
 
 # %%
 above = garden_camera(0.4, 1.0, frame_size)
@@ -445,4 +445,5 @@ shutil.rmtree(WORK)
 #
 # With photos of your own: `gsplat-edu sfm PHOTOS CAPTURE` finds the poses, `gsplat-edu doctor CAPTURE` says what is
 # wrong with them and how long a training takes, `gsplat-edu train CAPTURE --out RUN` trains by our
-# [fast recipe](../docs/RECIPE.md), and `gsplat-edu view RUN` shows the scene. It began with [a point](01_points.ipynb).
+# [fast recipe](../docs/RECIPE.md), and `gsplat-edu view RUN` shows the scene. [Chapter 15](15_cloud_to_surface.ipynb)
+# asks where its walls are.

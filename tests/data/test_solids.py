@@ -19,7 +19,7 @@ from gsplat_edu.data.solids_photos import (
     photograph_solids,
     solids_capture,
     solids_orbit,
-    surface_colors,
+    texture_colors,
 )
 from gsplat_edu.data.solids_shapes import Block, Bowl, Rod, Torus, gradient
 from gsplat_edu.evaluate.surface import (
@@ -312,8 +312,8 @@ def test_texture_gives_features_and_plain_gives_none():
         corners[finish] = np.mean(response > 1e-3)
     assert corners["textured"] > 0.2 and corners["plain"] < 0.05
     points = whole().surface(2_000)[0]
-    spread = surface_colors("floor", points, 1.0).std(axis=0)
-    assert np.all(spread > 0.1) and surface_colors("floor", points, 0.0).std() == pytest.approx(
+    spread = texture_colors("floor", points, 1.0).std(axis=0)
+    assert np.all(spread > 0.1) and texture_colors("floor", points, 0.0).std() == pytest.approx(
         np.std([0.55, 0.52, 0.48]), abs=1e-6
     )
 

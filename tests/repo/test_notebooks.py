@@ -241,8 +241,8 @@ def test_numbers_in_the_prose_are_printed_on_the_page(source):
                 )
 
 
-def test_fourteen_chapters():
-    assert [path.stem[:2] for path in SOURCES] == [f"{n:02d}" for n in range(1, 15)]
+def test_fifteen_chapters():
+    assert [path.stem[:2] for path in SOURCES] == [f"{n:02d}" for n in range(1, 16)]
 
 
 @CHAPTERS

@@ -274,7 +274,7 @@ def test_pictures_of_chapters_are_whole_and_large_enough_to_read(site, width, br
     _, out = site
     page = browser.new_page(viewport={"width": width, "height": 900})
     chapters = sorted((out / "notebooks").glob("*.html"))
-    assert len(chapters) == 14
+    assert len(chapters) == 15
     for path in chapters:
         page.goto(path.as_uri())
         pictures = page.evaluate(

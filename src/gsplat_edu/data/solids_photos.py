@@ -2,6 +2,8 @@
 
 A ray advances by the distance to the surface, which it cannot pass, until the distance is negligible. Training on the
 photos is an independent test, because they are not rendered from splats.
+
+Chapter: 15_cloud_to_surface.
 """
 
 from __future__ import annotations
@@ -67,7 +69,7 @@ FINISHES = {"textured": Finish(1.0, 0.0), "plain": Finish(0.0, 0.0), "glossy": F
 SHININESS = 30.0
 """Exponent of the highlight: it falls to half its peak at 12 degrees between normal and half vector."""
 
-COLORS = {
+MEAN_COLORS = {
     "floor": (0.55, 0.52, 0.48),
     "bowl": (0.75, 0.35, 0.25),
     "rods": (0.85, 0.8, 0.45),
@@ -319,7 +321,7 @@ def _shaded(
 ) -> Float32[np.ndarray, "n 3"]:
     """Return the RGB of points of one part as seen from a place."""
     normals = gradient(shape, points)
-    colors = surface_colors(name, points, finish.contrast)
+    colors = texture_colors(name, points, finish.contrast)
     colors *= (0.45 + 0.55 * np.maximum(normals @ LIGHT, 0.0)).astype(np.float32)[:, None]
     if finish.gloss:
         towards = eye - points
@@ -331,15 +333,15 @@ def _shaded(
     return colors
 
 
-def surface_colors(name: str, points: Points, contrast: float) -> Float32[np.ndarray, "n 3"]:
+def texture_colors(name: str, points: Points, contrast: float) -> Float32[np.ndarray, "n 3"]:
     """Return the RGB of points before shading: a sum of plane waves of all lengths around the object's colour.
 
     Args:
-        name: The object, a name in `COLORS`.
+        name: The object, a name in `MEAN_COLORS`.
         points: (n, 3) world units.
         contrast: 0 for the object's mean colour alone, 1 for full contrast.
     """
-    mean = np.array(COLORS[name], np.float32)
+    mean = np.array(MEAN_COLORS[name], np.float32)
     if contrast == 0:
         return np.tile(mean, (len(points), 1))
     vectors, phases, mixture = _waves(name)
@@ -352,7 +354,7 @@ def _waves(
     name: str,
 ) -> tuple[Float32[np.ndarray, "3 K"], Float32[np.ndarray, " K"], Float32[np.ndarray, "K 3"]]:
     """Return wave vectors, phases and amplitudes per channel of an object's texture."""
-    rng = np.random.default_rng(list(COLORS).index(name))
+    rng = np.random.default_rng(list(MEAN_COLORS).index(name))
     direction = rng.normal(size=(3, WAVES))
     length = 0.05 * (0.8 / 0.05) ** (np.arange(WAVES) / (WAVES - 1))
     vectors = 2 * math.pi * direction / np.linalg.norm(direction, axis=0) / length

@@ -3,6 +3,8 @@
 All distances are measured at points that are uniform over area. An error that is averaged over vertices falls when the
 wrong part of a mesh gets fewer vertices; an error averaged over area does not. `gsplat_edu.evaluate.intersections`
 counts self-intersections.
+
+Chapter: 15_cloud_to_surface.
 """
 
 from __future__ import annotations

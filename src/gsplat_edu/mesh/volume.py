@@ -2,6 +2,8 @@
 
 Source: Curless and Levoy 1996, "A Volumetric Method for Building Complex Models from Range Images"; Lorensen and Cline
 1987, "Marching Cubes"; Nießner et al. 2013, "Real-time 3D Reconstruction at Scale using Voxel Hashing".
+
+Chapter: 15_cloud_to_surface.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Patches of neighbouring photos: how well they agree when they are seen through a rendered surface."""
+"""Patches of neighbouring photos: how well they agree when they are seen through a rendered surface.
+
+Chapter: 15_cloud_to_surface.
+"""
 
 from __future__ import annotations
 

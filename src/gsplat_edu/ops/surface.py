@@ -1,4 +1,7 @@
-"""Surfaces in images: planar depth, the normals of a depth map, and how far composited normals are from them."""
+"""Surfaces in images: planar depth, the normals of a depth map, and how far composited normals are from them.
+
+Chapter: 15_cloud_to_surface.
+"""
 
 from __future__ import annotations
 

@@ -8,6 +8,8 @@ camera depth 1 from the eye meets it at the depth  d / (n . r),  d = n . (mean -
 
 Planar depth is exact where all Gaussians of a pixel lie in one plane, however oblique; the depth of the means is not.
 Source: Chen et al. 2024 (PGSR), section 4.1; Huang et al. 2024 (2DGS), eq. 13.
+
+Chapter: 15_cloud_to_surface.
 """
 
 from __future__ import annotations
