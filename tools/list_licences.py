@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "LICENCES.md"
-EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu", "mesh", "depth")
+EXTRAS = ("sfm", "studio", "heic", "cluster", "gpu", "mesh", "depth", "usd")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {
@@ -40,6 +40,7 @@ COMPATIBLE = {
     "GPL-3.0-or-later WITH GCC-exception-3.1",  # libraries of the compiler, whose exception frees what uses them
     "MPL-2.0",  # obliges only those who change the package's own files
     "OFL-1.1",  # fonts
+    "LicenseRef-TOST-1.0",  # of USD: Apache-2.0 with another paragraph on trademarks
 }
 """SPDX names of licences that a program under Apache-2.0 may depend on."""
 
@@ -50,6 +51,7 @@ NOTES = {
     "coacd": "its wheels also contain OpenVDB (MPL-2.0, since version 12 Apache-2.0), oneTBB, Boost and GCC's libgomp",
     "opencv-python-headless": "its wheels also contain FFmpeg, a library under LGPL-2.1",
     "pillow-heif": "only with the extra heic: its wheels also contain x265, and are GPL-2.0 as a whole",
+    "usd-core": "Apache-2.0 with another section on trademarks; its wheels also contain other permissive code",
     "wgpu": "its wheels also contain wgpu-native, under MIT OR Apache-2.0",
     "torch": "pip's default build for Linux adds NVIDIA's libraries under NVIDIA's terms; the CPU build does not",
 }

@@ -124,6 +124,29 @@ def test_inputs_and_outputs_are_entries_and_files_of_the_library(library):
     assert found == (("runs/a", "runs/a/edits.json"), ("runs/a/exports/x.compressed.ply",))
 
 
+def test_a_page_is_exported_with_meshes_of_its_entry(library):
+    exports = library.root / "runs" / "a" / "exports"
+    exports.mkdir()
+    files = {"surface": "a.mesh.glb", "collider": "a.collider.glb"}
+    request = {"command": "convert", "subject": "runs/a", "format": "html", "edits": True, **files}
+    inputs = ("runs/a", "runs/a/edits.json", "runs/a/exports/a.mesh.glb", "runs/a/exports/a.collider.glb")
+    assert work_of(library, request).inputs == inputs
+    (library.root / "runs" / "a" / "edits.json").touch()
+    (exports / "a.mesh.glb").touch()
+    with pytest.raises(RefusedError, match=r"collider: runs/a has no a.collider.glb; make the mesh first"):
+        begun(library, request)
+    (exports / "a.collider.glb").touch()
+    argv = begun(library, request)
+    arguments = parsed(argv)
+    assert arguments.edits == library.root / "runs" / "a" / "edits.json"
+    assert (arguments.surface, arguments.collider) == (exports / "a.mesh.glb", exports / "a.collider.glb")
+    assert arguments.verify
+    only = parsed(begun(library, {**request, "edits": False, "collider": None}))
+    assert (only.surface, only.collider, only.edits) == (exports / "a.mesh.glb", None, None)
+    (exports / "a.collider.glb").unlink()  # a record is still shown
+    assert command_line(library, work_of(library, request), Purpose.SHOW).argv == argv
+
+
 def test_a_training_resumes_once_its_run_has_begun(library):
     work = work_of(library, {"command": "train", "subject": "captures/a"})
     argv = command_line(library, work, Purpose.BEGIN).argv
@@ -274,6 +297,14 @@ def test_values_reach_the_command(library, command):
         {"command": "mesh", "subject": "runs/a", "format": "mesh.glb", "edits": True},
         {"command": "convert", "subject": "runs/a", "format": "spz", "to": "a/b"},
         {"command": "convert", "subject": "runs/a", "format": "spz", "edits": True},
+        {"command": "convert", "subject": "runs/a", "format": "html", "surface": "gone.mesh.glb"},
+        {"command": "convert", "subject": "runs/a", "format": "html", "surface": "../a.mesh.glb"},
+        {"command": "convert", "subject": "runs/a", "format": "html", "surface": ["a.mesh.glb"]},
+        {"command": "convert", "subject": "runs/a", "format": "html", "surface": "config.json"},
+        {"command": "convert", "subject": "runs/a", "format": "html", "collider": "a.collider.glb"},
+        {"command": "convert", "subject": "runs/a", "format": "spz", "surface": "a.mesh.glb"},
+        {"command": "mesh", "subject": "runs/a", "format": "mesh.glb", "surface": "a.mesh.glb"},
+        {"command": "train", "subject": "captures/a", "surface": "a.mesh.glb"},
         {"command": "clean", "subject": "scenes/a"},
     ],
     ids=str,
@@ -309,6 +340,16 @@ def test_other_requests_are_refused_in_one_line(library, request_):
         Work("convert", ("runs/a",), ("runs/a/exports/e\u0301.ply",)),
         Work("convert", ("runs/a", "scenes/a/edits.json"), ("runs/a/exports/x.ply",)),
         Work("convert", ("runs/a", "runs/a/config.json"), ("runs/a/exports/x.ply",)),
+        Work("convert", ("runs/a", "scenes/a/exports/x.mesh.glb"), ("runs/a/exports/x.html",)),
+        Work("convert", ("runs/a", "runs/a/x.mesh.glb"), ("runs/a/exports/x.html",)),
+        Work("convert", ("runs/a", "runs/a/exports/../x.mesh.glb"), ("runs/a/exports/x.html",)),
+        Work("convert", ("runs/a", "runs/a/exports/x.mesh.glb"), ("runs/a/exports/x.ply",)),
+        Work("convert", ("runs/a", "/etc/x.mesh.glb"), ("runs/a/exports/x.html",)),
+        Work(
+            "convert",
+            ("runs/a", "runs/a/exports/x.mesh.glb", "runs/a/exports/y.mesh.glb"),
+            ("runs/a/exports/x.html",),
+        ),
         Work("render", ("runs/a",), ("runs/a/exports/x.ply",)),
         Work("render", ("runs/a",), ("runs/a/exports/x.mp4",), {"resume": True}),
     ],

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from gsplat_edu.io.mesh_files import read_mesh, write_mesh
 from gsplat_edu.scene.mesh import Mesh
@@ -53,6 +54,55 @@ def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library,
     assert download.value.suggested_filename == "wall.mesh.glb"
     stored = (wall_entry / "exports" / "wall.mesh.glb").read_bytes()
     assert download.value.path().read_bytes() == stored
+
+
+def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_entry):
+    exports = wall_entry / "exports"
+    exports.mkdir()
+    person = visitor()
+    tab = person.tab
+    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall/share")
+    tab.get_by_label("Title and name of the file").fill("plain")
+    box = tab.get_by_label("show the mesh")
+    tab.get_by_role("button", name="Export").click()
+    listed = tab.locator(".exports li")
+    listed.filter(has_text="plain.html").wait_for(timeout=180_000)
+    assert not box.is_visible()  # there is no mesh
+    assert not page_has(tab, exports / "plain.html", "viewer.meshes")
+
+    corners = np.array([[-1.5, -1, 0], [1.5, -1, 0], [0, 1, 0.2], [0, 1, 1]])
+    faces = np.array([[0, 1, 2], [0, 1, 3]])
+    write_mesh(exports / "wall.mesh.glb", Mesh(corners, faces))
+    write_mesh(exports / "wall.collider.glb", Mesh(corners, faces[:1]))
+    size = sum((exports / f"wall.{name}.glb").stat().st_size for name in ("mesh", "collider"))
+    tab.reload()
+    box.wait_for()
+    said = tab.locator("label.check", has=box).text_content()
+    assert re.search(r"show the mesh and the collider beside the splats \(about ([\d.]+) kB more\)", said), (
+        said
+    )
+    assert float(re.search(r"([\d.]+) kB", said)[1]) == pytest.approx(size / 1000, rel=0.06)
+    tab.get_by_label("SPZ").first.check()
+    assert not box.is_visible()  # only a page shows a mesh
+    tab.get_by_label("HTML page").check()
+    box.check()
+    tab.get_by_label("Title and name of the file").fill("both")
+    tab.get_by_role("button", name="Export").click()
+    listed.filter(has_text="both.html").wait_for(timeout=180_000)
+    command = person.command("export of both.html")
+    assert "--surface" in command and command.split()[-1] == "--verify"
+    assert page_has(tab, exports / "both.html", "viewer.meshes.surface.faces.length === 6")
+    assert page_has(tab, exports / "both.html", "viewer.meshes.collider.faces.length === 3")
+
+
+def page_has(tab, path, what):
+    """Open an exported page and return whether an expression is true there."""
+    other = tab.context.new_page()
+    other.goto(path.as_uri())
+    other.wait_for_selector("#message", state="hidden")
+    found = other.evaluate(f"Boolean({what})")
+    other.close()
+    return found
 
 
 def test_a_page_shows_only_exported_meshes(page, studio, tmp_path):

@@ -167,6 +167,22 @@ def test_a_glb_is_drawn_as_a_ray_caster_draws_it(opened, tmp_path, make, steps):
     assert silhouette[always].mean() > 0.995  # a colour may be that of the background
 
 
+@pytest.mark.parametrize("make", [ball, painted_ball, uncolored])
+def test_the_back_of_a_face_is_darker(opened, make):
+    front, mesh = drawn(opened(make())).astype(np.float64), make()
+    texture = mesh.texture and Texture(mesh.texture.image, mesh.texture.uvs[:, ::-1])
+    back = drawn(opened(Mesh(mesh.vertices, mesh.faces[:, ::-1], mesh.colors, texture)))
+    rows, columns = np.indices((VIEW.H, VIEW.W)).reshape(2, -1).astype(np.float64)
+    inside = np.ones((VIEW.H, VIEW.W), bool)  # pixels whose corners all see the mesh
+    for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
+        directions = rays(VIEW, columns + dx, rows + dy)
+        face, _, _ = cast(mesh, np.broadcast_to(VIEW.eye, directions.shape), directions)
+        inside &= (face >= 0).reshape(inside.shape)
+    assert inside.sum() > 1000
+    # samples and their mean are rounded to 1/255: the front's twice, and the back's twice
+    assert abs(back - 0.4 * front)[inside].max() <= 1.4 + 1e-9
+
+
 def test_the_line_has_splats_on_its_left_and_the_mesh_on_its_right(opened):
     seen = opened(ball(), width=320, height=240)
     tab = seen.tab

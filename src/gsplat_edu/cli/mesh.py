@@ -20,6 +20,7 @@ from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points,
 from gsplat_edu.evaluate.topology import Topology, topology
 from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.mesh_glb import write_parts
+from gsplat_edu.io.mesh_usd import require_usd
 from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
 from gsplat_edu.mesh.convex import convex_parts, farthest_outside
@@ -47,6 +48,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Make the mesh, write it, and say how far it can be trusted."""
     console, backend = Terminal(), load_backend(arguments.backend)
     check_writable("OUT", arguments.out)
+    if arguments.out.suffix.lower() == ".usdz":
+        require_usd()  # before the work of minutes
     truth = None if arguments.truth is None else read_mesh(arguments.truth)
     source, dataset = open_source(arguments.source), None
     if arguments.texture:

@@ -1,6 +1,7 @@
 """The registry of all mesh formats, by file suffix.
 
-PLY and OBJ hold a mesh in the scene's own coordinates. glTF prescribes axes and a unit: see `gsplat_edu.io.mesh_glb`.
+PLY and OBJ hold a mesh in the scene's own coordinates. glTF and USD have axes and a unit of their own: see
+`gsplat_edu.io.mesh_glb` and `gsplat_edu.io.mesh_usd`.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ class MeshFormat:
 
     Args:
         suffix: Suffix of its files, in lower case.
-        reader: Module of `gsplat_edu.io` with `read(path) -> StoredMesh`.
+        reader: Module of `gsplat_edu.io` with `read(path) -> StoredMesh`; empty if the format is only written.
         writer: Module of `gsplat_edu.io` with `write`.
         name: Its common name.
         texture: Whether it can store a texture.
         colors_with_texture: Whether it can store colours of vertices beside a texture.
         doubles: Whether it stores coordinates as float64.
+        jpeg: Whether it can store the texture as JPEG.
     """
 
     suffix: str
@@ -41,19 +43,29 @@ class MeshFormat:
     texture: bool = True
     colors_with_texture: bool = True
     doubles: bool = True
+    jpeg: bool = False
 
     def read(self, path: Path) -> StoredMesh:
         """Read a file of the format; see `read_mesh`."""
+        if not self.reader:
+            raise ArgumentError(f"{path}: {self.name} is written, not read; give a .glb, .ply or .obj")
         stored: StoredMesh = importlib.import_module(f"gsplat_edu.io.{self.reader}").read(path)
         return stored
 
 
 MESH_FORMATS = (
     MeshFormat(
-        ".glb", "mesh_glb_reading", "mesh_glb", "binary glTF", colors_with_texture=False, doubles=False
+        ".glb",
+        "mesh_glb_reading",
+        "mesh_glb",
+        "binary glTF",
+        colors_with_texture=False,
+        doubles=False,
+        jpeg=True,
     ),
     MeshFormat(".ply", "mesh_ply", "mesh_ply", "PLY", texture=False),
     MeshFormat(".obj", "mesh_obj", "mesh_obj", "Wavefront OBJ"),
+    MeshFormat(".usdz", "", "mesh_usd", "USDZ", colors_with_texture=False, doubles=False, jpeg=True),
 )
 
 
@@ -117,7 +129,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
         The mesh, in this package's axes if the format prescribes axes (glTF), otherwise in those of the file.
 
     Raises:
-        ArgumentError: the name has no suffix of a mesh format, or the unit is unknown.
+        ArgumentError: the name has no suffix of a mesh format that is read, or the unit is unknown.
         SceneFormatError: the file does not match its suffix, has no faces, or is damaged.
         NotEnoughMemoryError: the file does not fit into memory.
         OSError: the file cannot be read.
@@ -140,12 +152,12 @@ def write_mesh(path: str | Path, mesh: Mesh, unit: str | None = None, jpeg: int 
     Args:
         path: The file.
         mesh: The mesh, in this package's axes, with at least one face.
-        unit: Unit of its coordinates, "m", "cm" or "mm"; None if unknown. glTF gets metres, the others a comment.
-        jpeg: Quality of the texture in a binary glTF as JPEG, 1 to 95; None writes PNG, which loses nothing.
+        unit: Unit of its coordinates, "m", "cm" or "mm"; None if unknown. glTF and USDZ get metres, others a comment.
+        jpeg: Quality of the texture in a binary glTF or USDZ as JPEG, 1 to 95; None writes PNG, which loses nothing.
 
     Raises:
         ArgumentError: the name has no suffix of a mesh format, the mesh has no faces or does not fit into the format,
-            the unit is unknown, or the quality is out of range.
+            the unit is unknown, the quality is out of range, or usd-core is not installed for a USDZ.
         OSError: a file cannot be written. Existing files stay unchanged.
     """
     found = mesh_format_of(path)
@@ -156,7 +168,7 @@ def write_mesh(path: str | Path, mesh: Mesh, unit: str | None = None, jpeg: int 
     if jpeg is not None and not 1 <= jpeg <= 95:
         raise ArgumentError(f"jpeg: is {jpeg}, but must be from 1 to 95")
     module = importlib.import_module(f"gsplat_edu.io.{found.writer}")
-    if found.suffix == ".glb":
+    if found.jpeg:
         module.write(Path(path), mesh, unit, jpeg)
     else:
         module.write(Path(path), mesh, unit)

@@ -30,7 +30,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.glb_container import write_container
 from gsplat_edu.io.mesh_image import encoded
-from gsplat_edu.io.mesh_parts import METRES, split_at_seams
+from gsplat_edu.io.mesh_parts import METRES, split_at_seams, turned_positions, vertex_normals
 from gsplat_edu.scene.mesh import Mesh
 
 TRIANGLES, FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 4, 5126, 5123, 5125
@@ -61,8 +61,8 @@ def linear(srgb: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
 def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
     origin, faces, uvs = split_at_seams(mesh)
-    positions = _positions(path, mesh.vertices[origin], unit)
-    normals = _vertex_normals(mesh)[origin] * np.array(POSITION_SIGNS) + 0.0
+    positions = turned_positions(path, mesh.vertices[origin], unit, "glTF")
+    normals = vertex_normals(mesh)[origin] * np.array(POSITION_SIGNS) + 0.0
     file = _Document()
     attributes = {"POSITION": file.attribute(positions, bounds=True)}
     attributes["NORMAL"] = file.attribute(normals.astype("<f4"))
@@ -110,7 +110,9 @@ def write_parts(path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str |
     meshes: list[dict[str, Any]] = []
     nodes: list[dict[str, Any]] = []
     for name, mesh in parts:
-        attributes = {"POSITION": file.attribute(_positions(path, mesh.vertices, unit), bounds=True)}
+        attributes = {
+            "POSITION": file.attribute(turned_positions(path, mesh.vertices, unit, "glTF"), bounds=True)
+        }
         primitive = {"attributes": attributes, "indices": file.indices(mesh.faces), "mode": TRIANGLES}
         nodes.append({"name": name, "mesh": len(meshes)})
         meshes.append({"name": name, "primitives": [primitive]})
@@ -118,30 +120,6 @@ def write_parts(path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str |
     if unit is not None:
         file.document["asset"]["extras"] = {"unit": "m"}
     file.write(path, f"{len(parts):,} parts")
-
-
-def _positions(
-    path: Path, vertices: Float64[np.ndarray, "V 3"], unit: str | None
-) -> Float32[np.ndarray, "V 3"]:
-    """Return positions in glTF's axes and unit."""
-    turned = vertices * np.array(POSITION_SIGNS) * METRES.get(unit or "m", 1.0) + 0.0  # no -0.0
-    with np.errstate(over="ignore"):
-        positions: Float32[np.ndarray, "V 3"] = turned.astype("<f4")
-    if not np.isfinite(positions).all():
-        raise ArgumentError(f"{path}: a coordinate is beyond float32, which glTF uses; write a .ply")
-    return positions
-
-
-def _vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
-    """Return normals of length 1, averaged over the faces of a vertex by area; of unused vertices, the z axis."""
-    sums = np.zeros_like(mesh.vertices)
-    facing = mesh.face_normals()
-    for corner in range(3):
-        for axis in range(3):
-            sums[:, axis] += np.bincount(mesh.faces[:, corner], facing[:, axis], len(sums))
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    usable = lengths[:, 0] > np.finfo(np.float64).tiny
-    return np.where(usable[:, None], sums / np.where(usable[:, None], lengths, 1.0), [0.0, 0.0, 1.0])
 
 
 def _wide_colors(colors: Float32[np.ndarray, "V 3"]) -> UInt16[np.ndarray, "V 4"]:

@@ -1,4 +1,4 @@
-"""Make a mesh of the polygons that a file of any program holds, or say in one line what is wrong with them."""
+"""What mesh formats share: polygons of a file become a mesh or one line says what is wrong, and parts of writers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import NoReturn
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE
+from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.polygons import triangles_of
 
@@ -206,3 +207,37 @@ def split_at_seams(
     corners, uvs = mesh.faces.ravel(), mesh.texture.uvs.reshape(-1, 2)
     first, group = distinct_rows(corners, uvs[:, 0], uvs[:, 1])
     return corners[first], group.reshape(-1, 3), uvs[first]
+
+
+def turned_positions(
+    path: Path, vertices: Float64[np.ndarray, "V 3"], unit: str | None, named: str
+) -> Float32[np.ndarray, "V 3"]:
+    """Return positions whose y points up, in metres if the unit is known.
+
+    Args:
+        path: The file to write, for messages.
+        vertices: (V, 3) coordinates in this package's axes.
+        unit: Their unit, "m", "cm" or "mm"; None if unknown, which leaves their size.
+        named: The format's name, for messages.
+
+    Raises:
+        ArgumentError: a coordinate is beyond float32.
+    """
+    turned = vertices * np.array(POSITION_SIGNS) * METRES.get(unit or "m", 1.0) + 0.0  # no -0.0
+    with np.errstate(over="ignore"):
+        positions: Float32[np.ndarray, "V 3"] = turned.astype("<f4")
+    if not np.isfinite(positions).all():
+        raise ArgumentError(f"{path}: a coordinate is beyond float32, which {named} uses; write a .ply")
+    return positions
+
+
+def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
+    """Return normals of length 1, averaged over the faces of a vertex by area; of unused vertices, the z axis."""
+    sums = np.zeros_like(mesh.vertices)
+    facing = mesh.face_normals()
+    for corner in range(3):
+        for axis in range(3):
+            sums[:, axis] += np.bincount(mesh.faces[:, corner], facing[:, axis], len(sums))
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    usable = lengths[:, 0] > np.finfo(np.float64).tiny
+    return np.where(usable[:, None], sums / np.where(usable[:, None], lengths, 1.0), [0.0, 0.0, 1.0])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.base.text import legible, shortened
+from gsplat_edu.base.text import legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.command_options import (
@@ -40,6 +40,9 @@ FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html")
 SURFACE, COLLIDER = "mesh.glb", "collider.glb"
 """Endings of exported meshes."""
 
+MESHES = {"surface": SURFACE, "collider": COLLIDER}
+"""Exported meshes that a page can show, by their names in a request, and the endings of their files."""
+
 Line = list[str | Path]
 """Words of a command line; every path of the library is a Path, and is checked before it becomes a word."""
 
@@ -65,10 +68,9 @@ class _Asked:
 
     def source(self) -> tuple[str, Path]:
         """Return kind and path of the entry that is read."""
-        inputs, work = self.work.inputs, self.work
-        edits = inputs[1:]
-        if not inputs or (edits and not (self.command.edits and edits == (f"{inputs[0]}/{EDITS}",))):
-            raise RefusedError(f"inputs: are not what {work.command} reads: an entry, and perhaps its edits")
+        inputs = self.work.inputs
+        if not inputs or inputs != (inputs[0], *self._along().values()):
+            raise RefusedError(f"inputs: are not what {self.work.command} reads: {self.command.reading}")
         kind, place = _entry_at(self.library, "inputs", inputs[0], self.command.reads)
         if self.purpose is Purpose.SHOW:
             return kind, place
@@ -76,6 +78,21 @@ class _Asked:
         if kind == "photos" and not any(True for _ in files_within(entry)):
             raise conflict(f"{inputs[0]}: is empty; add photos first")
         return kind, entry
+
+    def _along(self) -> dict[str, str]:
+        """Return the files of the entry that are read along with it, those that the command may read."""
+        entry, along, found = self.work.inputs[0], self.work.inputs[1:], {}
+        if self.command.edits and f"{entry}/{EDITS}" in along:
+            found["edits"] = f"{entry}/{EDITS}"
+        for name, ending in MESHES.items() if self._writes_page() else ():
+            meshes = [place for place in along if place.endswith(f".{ending}")]
+            if meshes and (name == "surface" or "surface" in found):
+                found[name] = meshes[0]
+        return found
+
+    def _writes_page(self) -> bool:
+        """Return whether the work writes a page, which can show meshes."""
+        return self.work.command == "convert" and all(place.endswith(".html") for place in self.work.outputs)
 
     def scene(self) -> Path:
         """Return what convert and render read."""
@@ -131,14 +148,31 @@ class _Asked:
 
     def edits(self) -> Line:
         """Return the words that apply the edits of the entry that is read."""
-        if len(self.work.inputs) == 1:
-            return []
         kind, entry = self.source()
+        if "edits" not in self._along():
+            return []
         if self.purpose is not Purpose.SHOW and not (entry / EDITS).is_file():
             raise RefusedError(
                 f"edits: {kind}/{entry.name} has none; edit the scene first, or leave them out"
             )
         return ["--edits", entry / EDITS]
+
+    def meshes(self) -> Line:
+        """Return the words that put exported meshes of the entry that is read into a page."""
+        kind, entry = self.source()
+        words: Line = []
+        for name, place in self._along().items():
+            if name not in MESHES:
+                continue
+            folder = f"{self.work.inputs[0]}/{EXPORTS}/"
+            file = checked_name(name, place.removeprefix(folder), LONGEST_FILE)
+            if place != f"{folder}{file}":
+                raise RefusedError(f"{name}: {shortened(place)!r} is not a mesh in {folder}")
+            path = entry / EXPORTS / file
+            if self.purpose is not Purpose.SHOW and not path.is_file():
+                raise RefusedError(f"{name}: {kind}/{entry.name} has no {file}; make the mesh first")
+            words += [option_flag(name), path]
+        return words
 
 
 def _place_of(library: Library, what: str, given: str, kinds: tuple[str, ...]) -> tuple[str, Path]:
@@ -209,7 +243,10 @@ def _clean(asked: _Asked) -> Line:
 
 
 def _convert(asked: _Asked) -> Line:
-    return [asked.scene(), asked.exported(), *asked.options(), *asked.edits(), "--verify"]
+    return [
+        *(asked.scene(), asked.exported(), *asked.options(), *asked.edits(), *asked.meshes()),
+        "--verify",
+    ]
 
 
 def _render(asked: _Asked) -> Line:
@@ -248,6 +285,12 @@ class _Command:
     edits: bool = False
     without_options: tuple[str, ...] = ()
 
+    @property
+    def reading(self) -> str:
+        """Say what the command reads."""
+        more = ", and perhaps its edits" if self.edits else ""
+        return f"an entry{more}" + (", and for a page its meshes" if "html" in self.forms else "")
+
 
 COMMANDS: Mapping[str, _Command] = {
     "sfm": _Command(_sfm, "poses of INPUT", SFM_OPTIONS, ("photos",), "captures"),
@@ -280,7 +323,7 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
     """
     name = request.get("command")
     command = _command_of(name if isinstance(name, str) else str(name))
-    known = {"command", "subject", "to", "options", "format", "edits", "resume"}
+    known = {"command", "subject", "to", "options", "format", "edits", "resume", *MESHES}
     if unknown := sorted(set(request) - known):
         raise RefusedError(f"{shortened(unknown[0])}: is not known; see docs/STUDIO.md")
     _, path = _place_of(library, "subject", str(request.get("subject")), command.reads)
@@ -302,8 +345,11 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
                 f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(command.forms)}"
             )
         outputs = (f"{subject}/{EXPORTS}/{legible(checked_name('to', to or entry))}.{form}",)
-    inputs = (subject, f"{subject}/{EDITS}") if request.get("edits") is True else (subject,)
-    return Work(str(name), inputs, outputs, options)
+    inputs = [subject, *([f"{subject}/{EDITS}"] if request.get("edits") is True else [])]
+    for mesh in MESHES:
+        if request.get(mesh) is not None:
+            inputs.append(f"{subject}/{EXPORTS}/{checked_name(mesh, request[mesh], LONGEST_FILE)}")
+    return Work(str(name), tuple(inputs), outputs, options)
 
 
 def command_line(library: Library, work: Work, purpose: Purpose) -> Rendered:

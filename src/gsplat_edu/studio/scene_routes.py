@@ -22,7 +22,7 @@ from gsplat_edu.jobs.events import Metric
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import State
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.studio.commands import COLLIDER, EDITS, EXPORTS, FORMATS, SURFACE, scene_of
+from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, MESHES, scene_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
@@ -32,10 +32,7 @@ from gsplat_edu.studio.state import Studio
 KEPT_PAGES = 12
 """Pages in the cache."""
 
-MESHES = ("surface", "collider")
-"""Parameters of a page's address that name exported meshes."""
-
-ENDINGS = sorted((*FORMATS, SURFACE, COLLIDER), key=len)[::-1]
+ENDINGS = sorted((*FORMATS, *MESHES.values()), key=len)[::-1]
 """Endings of exported files, longest first."""
 
 BINARY = "application/octet-stream"
@@ -102,7 +99,7 @@ def _mesh_file(entry: Path, request: Request, parameter: str) -> Path | None:
         return None
     name = checked_name(parameter, given, LONGEST_FILE)
     path = below(entry, Path(EXPORTS, name), parameter)
-    if not name.endswith((f".{SURFACE}", f".{COLLIDER}")) or not path.is_file():
+    if not name.endswith(tuple(f".{ending}" for ending in MESHES.values())) or not path.is_file():
         raise not_found(f"{entry.name}/{EXPORTS}/{name}")
     return path
 
@@ -147,14 +144,7 @@ def _exports(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
     for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else ():
         if path.name[0] == "." or path.is_symlink() or not path.is_file():
             continue
-        form = next(
-            (
-                form
-                for form in sorted((*FORMATS, SURFACE, COLLIDER), key=len)[::-1]
-                if path.name.endswith(f".{form}")
-            ),
-            None,
-        )
+        form = next((form for form in ENDINGS if path.name.endswith(f".{form}")), None)
         facts = path.stat()
         found.append(
             {

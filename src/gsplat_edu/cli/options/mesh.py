@@ -11,8 +11,11 @@ from gsplat_edu.cli.arguments import add_backend, bytes_text, numbers_text, whol
 
 EXAMPLE = "example: gsplat-edu mesh runs/plush plush.glb --faces 50000"
 
-SUFFIXES = (".glb", ".ply", ".obj")
-"""Formats of a mesh, as in `gsplat_edu.io.mesh_files`, which imports NumPy."""
+READ = (".glb", ".ply", ".obj")
+"""Suffixes of meshes that are read, as in `gsplat_edu.io.mesh_files`, which imports NumPy."""
+
+SUFFIXES = (*READ, ".usdz")
+"""Suffixes of meshes that are written."""
 
 TEXTURE_FACES = 50_000
 """Faces of a mesh with a texture unless --faces gives another number: the layout of more takes minutes."""
@@ -34,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "out",
         type=Path,
         metavar="OUT",
-        help=f"mesh to write; its suffix selects the format: {', '.join(SUFFIXES)}",
+        help=f"mesh to write; its suffix selects the format: {', '.join(SUFFIXES)} (extra usd)",
     )
     parser.add_argument(
         "--voxel",
@@ -140,8 +143,8 @@ def check(arguments: argparse.Namespace) -> None:
         raise ArgumentError("--tau: is for --truth; give the true surface, or leave it out")
     if arguments.truth is not None and not arguments.truth.is_file():
         raise ArgumentError(f"--truth: {arguments.truth} does not exist; give a mesh file")
-    if arguments.truth is not None and arguments.truth.suffix.lower() not in SUFFIXES:
-        raise ArgumentError(f"--truth: {arguments.truth} is no mesh; known formats are {', '.join(SUFFIXES)}")
+    if arguments.truth is not None and arguments.truth.suffix.lower() not in READ:
+        raise ArgumentError(f"--truth: {arguments.truth} is no mesh; known formats are {', '.join(READ)}")
     if arguments.bounds is not None:
         low, high = arguments.bounds[:3], arguments.bounds[3:]
         if any(a >= b for a, b in zip(low, high, strict=True)):

@@ -4,7 +4,7 @@ import { at, get, remove } from "./api.js";
 import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put } from "./dom.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
-import { meshes } from "./mesh.js";
+import { meshes, newestOf } from "./mesh.js";
 
 const FORMATS = [
   ["html", "HTML page", "one file that shows the scene in any browser, also offline"],
@@ -23,6 +23,8 @@ export function share({ place, store, entry }) {
   const title = h("input", { id: "title", type: "text", required: true, value: entry.name, autocomplete: "off" });
   const edits = h("input", { type: "checkbox", checked: true });
   const withEdits = h("label", { class: "check", hidden: true }, edits, " apply the edits");
+  const surface = h("input", { type: "checkbox" });
+  const withMesh = h("label", { class: "check", hidden: true }, surface, h("span", {}));
   const note = h("p", { class: "quiet" });
   const choices = FORMATS.map(([value, name, hint], index) => {
     const input = h("input", { type: "radio", name: "format", value, checked: index === 0, onchange: () => explain() });
@@ -36,26 +38,33 @@ export function share({ place, store, entry }) {
   const none = h("p", { class: "quiet" }, "Nothing is exported yet.");
   const mesh = meshes(store, entry);
   let [read, now] = ["", entry];
+  let shown = {}; // the newest surface and collider, which a page can show
 
   const start = (more) => {
     const edited = now.edited && edits.checked;
     return startJob(store, { subject: entry.entry, to: title.value, ...(edited ? { edits: true } : {}), ...more });
   };
 
+  const isPage = () => new FormData(form).get("format") === "html";
+
   function explain() {
-    const page = new FormData(form).get("format") === "html";
+    const page = isPage();
+    withMesh.hidden = !page || !shown.surface;
     put(note, page ? "The title is the page's heading. Start view, named views and camera path come from the edits: set them under Edit and save." : "");
   }
 
   form.append(
     h("fieldset", {}, h("legend", {}, "Format"), h("div", { class: "choices" }, choices)),
-    h("p", { class: "row" }, h("label", { for: "title" }, "Title and name of the file"), title, withEdits),
+    h("p", { class: "row" }, h("label", { for: "title" }, "Title and name of the file"), title, withEdits, withMesh),
     note,
     h("div", { class: "row" }, make, film),
   );
   form.addEventListener("submit", (event) => {
     event.preventDefault();
-    attempt(make, line, () => start({ command: "convert", format: new FormData(form).get("format") }));
+    const format = new FormData(form).get("format");
+    const files = isPage() && shown.surface && surface.checked ? Object.entries(shown).filter(([, found]) => found) : [];
+    const along = Object.fromEntries(files.map(([name, { file }]) => [name, file]));
+    attempt(make, line, () => start({ command: "convert", format, ...along }));
   });
   explain();
   place.append(
@@ -86,6 +95,11 @@ export function share({ place, store, entry }) {
   function show(exports) {
     none.hidden = exports.length > 0;
     mesh.show(exports);
+    shown = { surface: newestOf(exports, "mesh.glb"), collider: newestOf(exports, "collider.glb") };
+    const size = Object.values(shown).reduce((sum, found) => sum + (found?.bytes ?? 0), 0);
+    const what = shown.collider ? "mesh and the collider" : "mesh";
+    put(withMesh.lastChild, ` show the ${what} beside the splats (about ${bytes(size)} more)`);
+    explain();
     const newest = [...exports].sort((a, b) => b.modified - a.modified);
     keyed(list, newest, ({ file, modified, job: by }) => `${file} ${modified} ${by}`, item, (element, { file, bytes: size, psnr }) => {
       const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;

@@ -1,0 +1,166 @@
+"""Meshes as USDZ: a package of USD that phones, Blender and other programs open.
+
+A USDZ is a ZIP archive without compression, whose files begin at multiples of 64 bytes, so that programs map them into
+memory. The first file, a binary layer of USD (usd-core writes it), holds the mesh, and a texture lies beside it. The
+layer's axes and unit are those of glTF (`gsplat_edu.io.mesh_glb`): y points up, and a known unit becomes the metre.
+Points are float32, which is all that a mesh of USD has.
+
+Colours of vertices are linear in USD (displayColor), and left out beside a texture, as in glTF. A texture stays sRGB,
+as the diffuse colour of a UsdPreviewSurface. USD has no unlit material, so a viewer adds its own light to the photos'.
+The layer stores texture coordinates per corner of a face, so no vertex is repeated. They begin at the bottom left.
+
+Source: Pixar, "Usdz File Format Specification"; "UsdPreviewSurface Specification".
+"""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.text import install_command
+from gsplat_edu.io.axes import POSITION_SIGNS
+from gsplat_edu.io.mesh_glb import linear
+from gsplat_edu.io.mesh_image import encoded
+from gsplat_edu.io.mesh_parts import turned_positions, vertex_normals
+from gsplat_edu.scene.mesh import Mesh
+
+LAYER = "mesh.usdc"
+"""Name of the layer in the package."""
+
+ALIGNMENT = 64
+"""A file's content begins at a multiple of this, bytes."""
+
+LOCAL_HEADER = 30
+"""Bytes of the header before a file's name, in a ZIP archive."""
+
+PADDING = struct.Struct("<HH")
+"""Header of a field of zeros before a file's content: an identifier that no program assigns, and their number."""
+
+PADDING_ID = 0x1986
+
+EARLIEST = (1980, 1, 1, 0, 0, 0)
+"""Time of the files in the package: constant, so that the same mesh gives the same bytes."""
+
+LARGEST = 0xFFFFFFFF
+"""Bytes of a ZIP archive without extensions, which USDZ excludes."""
+
+
+def require_usd() -> None:
+    """Check that usd-core is there.
+
+    Raises:
+        ArgumentError: it is not installed.
+    """
+    try:
+        import pxr.Usd  # noqa: F401
+    except ImportError:
+        raise ArgumentError(
+            f".usdz: needs usd-core, which is not installed: {install_command('usd')}"
+        ) from None
+
+
+def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
+    """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
+    require_usd()
+    files, image = [], ""
+    if mesh.texture is not None:
+        image = "texture.png" if jpeg is None else "texture.jpg"
+        files.append((image, encoded(mesh.texture.image, jpeg)))
+    files.insert(0, (LAYER, _layer(path, mesh, unit, image)))
+    size = sum(len(data) + 4 * ALIGNMENT for _, data in files)
+    if size > LARGEST:
+        raise ArgumentError(f"{path}: {len(mesh.faces):,} faces do not fit into USDZ's 4 GiB; write a .ply")
+    with written_aside(path) as aside:
+        _pack(aside, files)
+
+
+def _pack(path: Path, files: list[tuple[str, bytes]]) -> None:
+    """Write an uncompressed archive of files, each aligned by a field of zeros in its header."""
+    offset = 0
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=False) as archive:
+        for name, data in files:
+            entry = zipfile.ZipInfo(name, EARLIEST)
+            entry.create_system = 0  # otherwise it would say on which system it was written
+            offset += LOCAL_HEADER + len(name) + PADDING.size
+            zeros = -offset % ALIGNMENT
+            entry.extra = PADDING.pack(PADDING_ID, zeros) + bytes(zeros)
+            archive.writestr(entry, data)
+            offset += zeros + len(data)
+
+
+def _layer(path: Path, mesh: Mesh, unit: str | None, image: str) -> bytes:
+    """Return the layer; `image` is the name of the texture in the package, empty without one."""
+    from pxr import Usd, UsdGeom, Vt
+
+    points = turned_positions(path, mesh.vertices, unit, "USD")
+    stage = Usd.Stage.CreateInMemory(LAYER)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, "/scene")
+    stage.SetDefaultPrim(root.GetPrim())
+    surface = UsdGeom.Mesh.Define(stage, "/scene/surface")
+    surface.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    surface.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+    surface.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    surface.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.ravel().astype(np.int32)))
+    normals = vertex_normals(mesh) * np.array(POSITION_SIGNS) + 0.0
+    surface.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
+    surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    surface.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)  # otherwise viewers would round the mesh off
+    surface.CreateDoubleSidedAttr(True)
+    if mesh.texture is not None:
+        _add_texture(stage, surface, mesh.texture.uvs, image)
+    elif mesh.colors is not None:
+        colors = linear(np.clip(mesh.colors, 0.0, 1.0)).astype(np.float32)
+        shown = surface.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        shown.Set(Vt.Vec3fArray.FromNumpy(colors))
+    with TemporaryDirectory() as folder:
+        file = Path(folder, LAYER)
+        stage.GetRootLayer().Export(str(file))
+        return file.read_bytes()
+
+
+def _add_texture(stage: Any, surface: Any, uvs: np.ndarray, image: str) -> None:  # noqa: ANN401
+    """Add texture coordinates and a material whose diffuse colour is the image."""
+    from pxr import Sdf, UsdGeom, UsdShade, Vt
+
+    types = Sdf.ValueTypeNames
+    upward = uvs.reshape(-1, 2).copy()
+    upward[:, 1] = 1.0 - upward[:, 1]
+    api = UsdGeom.PrimvarsAPI(surface)
+    coordinates = api.CreatePrimvar("st", types.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(upward))
+    material = UsdShade.Material.Define(stage, "/scene/photos")
+
+    def node(name: str, kind: str, inputs: dict[str, tuple[Any, Any]]) -> Any:  # noqa: ANN401
+        shader = UsdShade.Shader.Define(stage, f"/scene/photos/{name}")
+        shader.CreateIdAttr(kind)
+        for key, (of_type, value) in inputs.items():
+            shader.CreateInput(key, of_type).Set(value)
+        return shader
+
+    place = node("place", "UsdPrimvarReader_float2", {"varname": (types.String, "st")})
+    texture = node(
+        "image",
+        "UsdUVTexture",
+        {
+            "file": (types.Asset, image),
+            "sourceColorSpace": (types.Token, "sRGB"),
+            "wrapS": (types.Token, "clamp"),
+            "wrapT": (types.Token, "clamp"),
+        },
+    )
+    texture.CreateInput("st", types.Float2).ConnectToSource(place.CreateOutput("result", types.Float2))
+    matte = {"roughness": (types.Float, 1.0), "metallic": (types.Float, 0.0)}
+    look = node("look", "UsdPreviewSurface", matte)
+    color = texture.CreateOutput("rgb", types.Float3)
+    look.CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
+    material.CreateSurfaceOutput().ConnectToSource(look.CreateOutput("surface", types.Token))
+    UsdShade.MaterialBindingAPI.Apply(surface.GetPrim()).Bind(material)
