@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import install_command
+from gsplat_edu.mesh.depths import camera_points
 from gsplat_edu.mesh.raster import boxes
 from gsplat_edu.mesh.topology import vertex_normals
 from gsplat_edu.scene.camera import Camera
@@ -214,7 +215,7 @@ def _looked_up(
         settings: Limits.
     """
     camera, depth = view.camera, view.depth
-    local = (points - camera.eye) @ camera.R.T
+    local = camera_points(points, camera)
     z = local[:, 2]
     safe = np.where(z > 0.0, z, 1.0)
     u = camera.fx * local[:, 0] / safe + camera.cx

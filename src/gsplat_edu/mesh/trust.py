@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from gsplat_edu.evaluate.intersections import Intersections, self_intersections
 from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points
 from gsplat_edu.evaluate.topology import Topology, topology
-from gsplat_edu.mesh.depths import DepthView
+from gsplat_edu.mesh.depths import DepthView, camera_points
 from gsplat_edu.mesh.extract import MeshResult
 from gsplat_edu.scene.mesh import Mesh
 
@@ -109,7 +109,7 @@ def seen_by(mesh: Mesh, views: Sequence[DepthView], tolerance: float) -> Seen:
     """
     count, total = np.zeros(len(mesh.vertices), dtype=np.int64), np.zeros(len(mesh.vertices))
     for view in views:
-        u, v, z = view.camera.project(view.camera.world_to_cam(mesh.vertices))
+        u, v, z = view.camera.project(camera_points(mesh.vertices, view.camera))
         H, W = view.depth.shape
         with np.errstate(invalid="ignore"):
             at = np.flatnonzero((z > 0) & (u > -0.5) & (v > -0.5) & (u < W - 0.5) & (v < H - 0.5))
