@@ -1,12 +1,18 @@
 """How far from the true surface are the depths of trained scenes, with and without the setting `surface`?
 
-    python benchmarks/surfaces.py [--captures NAME ...] [--iterations N] [--seed S] [--smoke] [--out FILE.json]
+    python benchmarks/surfaces.py [--captures NAME ...] [--iterations N] [--seed S] [--ball] [--smoke] [--out FILE.json]
 
 Captures: the textured box, the solids with textured, plain and glossy surfaces, and a block of the procedural city
 (tests/fixtures/city.py) from the air. Each is trained by the recipe `fast`, from start points that are off the surface
 by 0.01, in the city by 0.05. Median depths of the training views are compared with the true ones at each pixel, and as
 points in space with the true surface: F1 at 0.01 world units, in the city 0.05, where only surface that a photo sees
 counts for recall. Ground far from the objects is left out. Then each scene is meshed, and the mesh compared.
+Last, the mesh gets a texture of the photos. It is drawn from held-out cameras between the training's, and compared with
+their photos at the pixels that it covers, beside renders of the splats at the same pixels.
+
+    python benchmarks/surfaces.py --ball
+
+places a coloured ball in three of the training photos. It shows what something that moved does to the texture.
 """
 
 from __future__ import annotations
@@ -15,6 +21,7 @@ import dataclasses
 import functools
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,12 +36,22 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.solids import Part, SolidScene
 from gsplat_edu.data.solids_mesh import solids_mesh
-from gsplat_edu.data.solids_photos import FINISHES, START_NOISE, scan_solids, solids_capture
+from gsplat_edu.data.solids_photos import (
+    FINISHES,
+    START_NOISE,
+    photograph_solids,
+    scan_solids,
+    solids_capture,
+    solids_orbit,
+)
 from gsplat_edu.data.solids_shapes import Block
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.surface import Comparison, Counts, score_points, score_surface, visible_points
-from gsplat_edu.mesh.extract import extract_mesh
+from gsplat_edu.mesh.extract import MeshResult, extract_mesh
+from gsplat_edu.mesh.raster import Raster, picture, rasterized
+from gsplat_edu.mesh.texture import TextureSettings, TextureView, textured
+from gsplat_edu.mesh.tidy import TidySettings, tidied
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.maps import render_maps
@@ -55,6 +72,23 @@ TAU_OF_CITY = 0.05
 POINTS = 400_000
 """Number of points from depth maps that are compared; so dense that gaps between them do not limit recall."""
 
+HELD_OUT = 8
+"""Number of cameras that the texture is compared from."""
+
+TEXTURE_FACES = 50_000
+"""Faces of a mesh with a texture, as those of `gsplat-edu mesh --texture`."""
+
+TEXTURES = {
+    "best of three": TextureSettings(),
+    "best photo": TextureSettings(best=1),
+    "median of three": TextureSettings(median=True),
+    "median of five": TextureSettings(best=5, median=True),
+}
+"""Textures that are compared."""
+
+BALL = np.array([0.0, -0.45, -0.75]), 0.3, np.array([0.95, 0.1, 0.8])
+"""Centre, radius and colour of the ball of --ball, world units and 0 to 1."""
+
 CAPTURES = ("box", *FINISHES, "city")
 """Names of the captures."""
 
@@ -71,6 +105,7 @@ class Capture:
         truth: The true surface.
         bounds: (2, 3) corners of the box that is compared.
         tau: Threshold of F1, and largest depth behind the true one at which a point is seen, world units.
+        held_out: Views between those of the training, from which textures are compared.
     """
 
     train: list[View]
@@ -80,6 +115,7 @@ class Capture:
     truth: Mesh
     bounds: np.ndarray
     tau: float = TAU
+    held_out: Sequence[View] = ()
 
     @functools.cached_property
     def cameras(self) -> list[Camera]:
@@ -101,7 +137,10 @@ def solids_of(finish: str, size: int, count: int, seed: int, step: float) -> Cap
     made = solids_capture(finish, size, count, seed=seed)
     scans = [(photo.depth, photo.normals) for photo in made.photos]
     bounds = np.array([[-1.35, -1.2, -1.35], [1.35, 0.03, 1.35]])
-    return Capture(made.views, made.points, made.colors, scans, solids_mesh(made.scene, step), bounds)
+    between = between_views(solids_orbit(2 * count, (size, 3 * size // 4)))
+    held_out = [View(c, photograph_solids(made.scene, c, finish).image, name="between") for c in between]
+    truth = solids_mesh(made.scene, step)
+    return Capture(made.views, made.points, made.colors, scans, truth, bounds, held_out=held_out)
 
 
 def box_of(size: int, count: int, seed: int, step: float) -> Capture:
@@ -123,7 +162,10 @@ def box_of(size: int, count: int, seed: int, step: float) -> Capture:
     exact = np.concatenate(points)
     noisy = exact + START_NOISE * rng.normal(size=exact.shape)
     bounds = np.array([[-1.5, -1.1, -1.5], [1.5, 0.03, 1.5]])
-    return Capture(views, noisy, np.concatenate(colors), scans, solids_mesh(scene, step), bounds)
+    between = between_views(box_orbit(2 * count, size=(size, 3 * size // 4)))
+    held_out = [View(camera, photograph_box(camera), name="between") for camera in between]
+    truth = solids_mesh(scene, step)
+    return Capture(views, noisy, np.concatenate(colors), scans, truth, bounds, held_out=held_out)
 
 
 def city_of(size: int, count: int, seed: int, step: float) -> Capture:
@@ -173,6 +215,29 @@ def mesh_of_city(buildings: Buildings, half: float) -> Mesh:
         np.concatenate([corners.reshape(-1, 3), ground]),
         np.concatenate([faces[:, [0, 2, 1]], faces[:, [0, 3, 2]]]),
     )
+
+
+def between_views(cameras: list[Camera]) -> list[Camera]:
+    """Return at most `HELD_OUT` of the odd ones among twice as many cameras as the training has."""
+    odd = cameras[1::2]
+    return odd[:: max(len(odd) // HELD_OUT, 1)][:HELD_OUT]
+
+
+def with_ball(capture: Capture) -> Capture:
+    """Return the capture with a ball in three of its photos; depths and held-out photos do not show it."""
+    (centre, radius, color), views = BALL, list(capture.train)
+    for index in range(0, len(views), -(-len(views) // 3)):
+        camera, image = views[index].camera, views[index].image.copy()
+        rays = camera.rays()
+        away = camera.eye - centre
+        a, b = (rays * rays).sum(axis=-1), (rays * away).sum(axis=-1)
+        inside = b * b - a * (away @ away - radius * radius)
+        depth = (-b - np.sqrt(np.maximum(inside, 0.0))) / a
+        behind = capture.scans[index][0]
+        hit = (inside > 0) & ((behind == 0) | (depth < behind))
+        image[hit] = np.rint(255.0 * color)
+        views[index] = View(camera, image, name=views[index].name)
+    return dataclasses.replace(capture, train=views)
 
 
 def lifted(camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -268,7 +333,7 @@ def mesh_scores(
     at_voxel = score_surface(
         found.mesh, capture.truth, dataclasses.replace(comparison, tau=found.voxel), counts
     )
-    return {
+    return texture_scores(capture, found, gaussians, settings) | {
         "mesh faces": len(found.mesh.faces),
         "mesh seconds": seconds,
         "mesh voxel": found.voxel,
@@ -278,6 +343,42 @@ def mesh_scores(
         "mesh completeness": scores.distances.completeness,
         "mesh normals, degrees": scores.normal_degrees,
     }
+
+
+def texture_scores(
+    capture: Capture, found: MeshResult, gaussians: Gaussians, settings: RenderSettings
+) -> dict[str, Any]:
+    """Paint the mesh, and compare it with held-out photos at the pixels that it covers, beside the splats."""
+    if not capture.held_out:
+        return {}
+    mesh = tidied(found.mesh, TidySettings(faces=TEXTURE_FACES, smoothing=0))  # it is smooth already
+    photos = {view.name: view.image for view in capture.train}
+    views = [TextureView(view.camera, photos[view.name], view.depth) for view in found.views]
+    rasters = [rasterized(mesh, view.camera) for view in capture.held_out]
+    shown = functools.partial(render, settings=settings, backend="cpu")
+    renders = [
+        255.0 * shown(gaussians, view.camera).image.detach().clamp(0, 1).numpy() for view in capture.held_out
+    ]
+    row = {
+        "covered": float(np.mean([raster.covered.mean() for raster in rasters])),
+        "splats there, dB": covered_psnr(capture.held_out, rasters, renders),
+    }
+    for name, texture in TEXTURES.items():
+        began = time.perf_counter()
+        painted = textured(mesh, views, texture)
+        drawn = [picture(painted, raster, (0, 0, 0)) for raster in rasters]
+        row[f"texture, {name}, dB"] = covered_psnr(capture.held_out, rasters, drawn)
+        row[f"texture, {name}, seconds"] = time.perf_counter() - began
+    return row
+
+
+def covered_psnr(views: Sequence[View], rasters: list[Raster], images: list[np.ndarray]) -> float:
+    """Return the PSNR of images at the pixels that the mesh covers, of all views together, dB."""
+    squares = [
+        ((image.astype(np.float64) - view.image)[raster.covered] ** 2).ravel()
+        for view, raster, image in zip(views, rasters, images, strict=True)
+    ]
+    return float(10.0 * np.log10(255.0**2 / np.concatenate(squares).mean()))
 
 
 def measure(arguments: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -292,6 +393,8 @@ def measure(arguments: Any) -> dict[str, Any]:  # noqa: ANN401
         began = time.perf_counter()
         make = {"box": box_of, "city": city_of}.get(name) or functools.partial(solids_of, name)
         capture = make(size, count, arguments.seed, step)
+        if arguments.ball and name != "city":  # its place is among the solids
+            capture = with_ball(capture)
         print(f"{name}: {count} photos and {capture.truth} in {time.perf_counter() - began:.1f} s")
         for surface in (False, True) if offered else (False,):
             row = measure_one(capture, iterations, arguments.seed, surface)
@@ -309,6 +412,7 @@ def main() -> int:
     parser.add_argument("--captures", nargs="+", choices=CAPTURES, default=CAPTURES, help="default: all")
     parser.add_argument("--iterations", type=int, default=2_000, help="steps (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed (default: %(default)s)")
+    parser.add_argument("--ball", action="store_true", help="place a ball in three of the photos")
     parser.add_argument("--threads", type=int, help="threads (default: torch's choice)")
     arguments = parser.parse_args()
     if arguments.threads is not None:

@@ -12,8 +12,9 @@ from gsplat_edu.base.threads import one_thread
 from gsplat_edu.evaluate.surface import Comparison, score_surface
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.mesh.depths import checked, neighbours_of, render_depths
-from gsplat_edu.mesh.extract import MeshSettings, default_voxel, extract_mesh, views_of_vertices
+from gsplat_edu.mesh.extract import MeshSettings, default_voxel, extract_mesh
 from gsplat_edu.mesh.tidy import TidySettings
+from gsplat_edu.mesh.trust import seen_by
 from gsplat_edu.render.settings import RenderSettings
 from splat_ball import RADIUS, ball
 
@@ -75,7 +76,7 @@ def test_scores_against_the_truth_and_views_of_each_vertex(result):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     scores = score_surface(result.mesh, (RADIUS * normals, normals), Comparison(result.voxel, samples=20_000))
     assert scores.distances.f1 > 0.9 and scores.normal_degrees < 12
-    views = views_of_vertices(result.mesh, result.views, result.truncation)
+    views = seen_by(result.mesh, result.views, result.truncation).views
     assert np.median(views) >= 5 and views.min() >= 1
 
 

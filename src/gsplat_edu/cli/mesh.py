@@ -6,18 +6,21 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
+from gsplat_edu.base.locks import locked
 from gsplat_edu.base.text import short_number, spelled_bytes
 from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS, TEXTURE_FACES
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
-from gsplat_edu.evaluate.intersections import Intersections, self_intersections
-from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points, score_surface
-from gsplat_edu.evaluate.topology import Topology, topology
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.evaluate.intersections import Intersections
+from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_surface
+from gsplat_edu.evaluate.topology import Topology
 from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.mesh_glb import write_parts
 from gsplat_edu.io.mesh_usd import require_usd
@@ -25,20 +28,23 @@ from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
 from gsplat_edu.mesh.convex import convex_parts, farthest_outside
 from gsplat_edu.mesh.depths import render_depths
-from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh, views_of_vertices
+from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh
 from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings
+from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust, trust_of
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import open_subject
+from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.runs.meshes import KINDS, MadeMesh, write_mesh_record
 from gsplat_edu.runs.painting import painted
-from gsplat_edu.runs.source import NamedCamera, Source, open_source
+from gsplat_edu.runs.source import NamedCamera, Source, open_source, run_of
 from gsplat_edu.scene.mesh import Mesh
 
 ORBIT_VIEWS, ORBIT_SIZE = 48, 800
 """Cameras around a scene that comes without any, and the longer side of their images, px."""
 
-FEW_VIEWS = 3
-"""A part of the surface that fewer views see is uncertain."""
+PATIENCE = 10.0
+"""Seconds to wait for another process that writes to the run."""
 
 MOST_HELD_OUT = 8
 """Largest number of held-out views whose depth is compared with the mesh."""
@@ -59,6 +65,33 @@ def run(arguments: argparse.Namespace) -> None:
             console.print(str(note), soft_wrap=True)
     cameras = _cameras(source, console)
     settings = _settings(arguments, source, cameras, backend)
+    result = _extracted(source, cameras, backend, settings, console)
+    for sentence in result.notes:
+        console.print(sentence, soft_wrap=True)
+    mesh = result.mesh if dataset is None else painted(result.mesh, dataset, result.views)
+    facts = _written(arguments, mesh, result, source, console)
+    scores = None
+    if truth is not None:
+        comparison = Comparison(arguments.tau or result.voxel)
+        scores = score_surface(_moved(mesh, source.origin), truth, comparison)
+    held_out = [(name, camera) for name, camera in source.cameras if name in source.held_out]
+    others = render_depths(source.scene.gaussians, held_out[:MOST_HELD_OUT], source.settings, backend)
+    trust = trust_of(result, others, scores)
+    console.print(*_trust(trust), sep="\n", soft_wrap=True)
+    if scores is not None:
+        console.print(*_compared(scores, source.scene.unit or "world units"), sep="\n", soft_wrap=True)
+    kind = "collider" if arguments.collider else "mesh"
+    _record(MadeMesh(kind, mesh, result, trust, facts), source, dataset, console)
+
+
+def _extracted(
+    source: Source,
+    cameras: Sequence[NamedCamera],
+    backend: Backend,
+    settings: MeshSettings,
+    console: Terminal,
+) -> MeshResult:
+    """Make the mesh, with a bar that shows its progress."""
     columns = (
         Field("{task.description}"),
         BarColumn(bar_width=16),
@@ -71,30 +104,53 @@ def run(arguments: argparse.Namespace) -> None:
         def progress(what: str, done: int, total: int) -> None:
             bar.update(task, description=what, completed=done, total=total)
 
-        result = extract_mesh(source.scene.gaussians, cameras, source.settings, backend, settings, progress)
-    for sentence in result.notes:
-        console.print(sentence, soft_wrap=True)
-    mesh = result.mesh
-    if dataset is not None:
-        mesh = painted(mesh, dataset, result.views)
-        if not mesh_format_of(arguments.out).colors_with_texture:
-            mesh = replace(mesh, colors=None)  # the texture has a colour for every place
+        return extract_mesh(source.scene.gaussians, cameras, source.settings, backend, settings, progress)
+
+
+def _written(
+    arguments: argparse.Namespace, mesh: Mesh, result: MeshResult, source: Source, console: Terminal
+) -> dict[str, Any]:
+    """Write the mesh in the coordinates of the capture, and return the facts of its record."""
+    unit = source.scene.unit
+    if mesh.texture is not None and not mesh_format_of(arguments.out).colors_with_texture:
+        mesh = replace(mesh, colors=None)  # the texture has a colour for every place
     mesh = _moved(mesh, source.origin)
+    facts: dict[str, Any] = {"file": str(arguments.out), "unit": unit}
     if arguments.collider == "convex":
-        _write_convex(arguments.out, mesh, source.scene.unit, console)
+        facts |= _write_convex(arguments.out, mesh, unit, console)
     else:
-        for loss in mesh_losses(arguments.out, mesh, source.scene.unit):
+        for loss in mesh_losses(arguments.out, mesh, unit):
             console.print(loss, soft_wrap=True)
-        write_mesh(arguments.out, mesh, source.scene.unit)
-    emitter.report_output(arguments.out)
-    unit = source.scene.unit or "world units"
-    if arguments.collider != "convex":
+        write_mesh(arguments.out, mesh, unit)
         counted = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
-        console.print(f"wrote {arguments.out}: {counted}; {_volume(result, unit)}", soft_wrap=True)
-    console.print(*_trust(result, source, backend), sep="\n", soft_wrap=True)
-    if truth is not None:
-        comparison = Comparison(arguments.tau or result.voxel)
-        console.print(*_compared(score_surface(mesh, truth, comparison), unit), sep="\n", soft_wrap=True)
+        volume = _volume(result, unit or "world units")
+        console.print(f"wrote {arguments.out}: {counted}; {volume}", soft_wrap=True)
+    emitter.report_output(arguments.out)
+    return facts
+
+
+def _record(made: MadeMesh, source: Source, dataset: Dataset | None, console: Terminal) -> None:
+    """Write what is known of a run's mesh into the run and its report; nothing for a scene without a run."""
+    run = run_of(source.path)
+    if run is None:
+        return
+
+    def say(sentence: str) -> None:
+        console.print(sentence, soft_wrap=True)
+
+    def opened() -> Dataset:
+        return run_dataset(run.read_config()) if dataset is None else dataset
+
+    iterations = int(source.path.parent.name.removeprefix("iteration_"))
+    made = replace(made, facts={**made.facts, "iterations": iterations})
+    try:
+        with locked("RUN", run.path, "gsplat-edu mesh", say, PATIENCE):
+            reported = write_mesh_record(run, made, opened, source.settings.background)
+    except ArgumentError as error:  # a training runs, or the folder is not writable
+        say(f"the mesh is not added to the run's report: {error}")
+        return
+    where = f'{run.report}, section "{KINDS[made.kind]}"'
+    say(f"wrote what is known of it to {where if reported else f'{run.meshes}; eval adds it to a report'}")
 
 
 def _volume(result: MeshResult, unit: str) -> str:
@@ -102,15 +158,17 @@ def _volume(result: MeshResult, unit: str) -> str:
     return f"voxels of {short_number(result.voxel, 3)} {unit}, volume of {spelled_bytes(result.volume_bytes)}"
 
 
-def _write_convex(out: Path, mesh: Mesh, unit: str | None, console: Terminal) -> None:
-    """Write convex parts of the mesh, and say how much of it they leave out."""
+def _write_convex(out: Path, mesh: Mesh, unit: str | None, console: Terminal) -> dict[str, Any]:
+    """Write convex parts of the mesh, say how much of it they leave out, and return both for its record."""
     parts = convex_parts(mesh)
     write_parts(out, [(f"collider_{number}", part) for number, part in enumerate(parts)], unit)
-    outside = short_number(farthest_outside(mesh.vertices, parts), 2)
+    farthest = farthest_outside(mesh.vertices, parts)
+    outside = short_number(farthest, 2)
     triangles = sum(len(part.faces) for part in parts)
     counted = f"{len(parts)} convex part{'s' * (len(parts) != 1)}, {triangles:,} triangles"
     left_out = f"a vertex of the coarse mesh lies at most {outside} {unit or 'world units'} outside of them"
     console.print(f"wrote {out}: {counted}; {left_out}", soft_wrap=True)
+    return {"convex_parts": len(parts), "outside": farthest}
 
 
 def _cameras(source: Source, console: Terminal) -> Sequence[NamedCamera]:
@@ -154,30 +212,15 @@ def _moved(mesh: Mesh, origin: tuple[float, float, float]) -> Mesh:
     return mesh if origin == ORIGIN else replace(mesh, vertices=mesh.vertices + np.array(origin))
 
 
-def _trust(result: MeshResult, source: Source, backend: Backend) -> list[str]:
+def _trust(trust: MeshTrust) -> list[str]:
     """Say what of the mesh few views saw, how held-out views agree with it, and where it is open."""
-    views = views_of_vertices(result.mesh, result.views, result.truncation)
-    certain = short_number(100 * float((views >= FEW_VIEWS).mean()), 3)
-    said = [f"{certain} % of the vertices are seen by {FEW_VIEWS} views or more"]
-    held_out = [(name, camera) for name, camera in source.cameras if name in source.held_out]
-    said += _held_out(result, source, held_out[:MOST_HELD_OUT], backend)
-    return [*said, _shape(topology(result.mesh)), _intersecting(self_intersections(result.mesh))]
-
-
-def _held_out(
-    result: MeshResult, source: Source, cameras: Sequence[NamedCamera], backend: Backend
-) -> list[str]:
-    """Compare the mesh with the depths of views that it was not made from."""
-    points = []
-    for view in render_depths(source.scene.gaussians, cameras, source.settings, backend):
-        rows, columns = np.nonzero(view.depth[::4, ::4])
-        depth = view.depth[::4, ::4][rows, columns]
-        points.append(view.camera.eye + depth[:, None] * view.camera.rays()[::4, ::4][rows, columns])
-    if not points or not sum(map(len, points)):
-        return []
-    scores = score_points(np.concatenate(points), result.mesh, Comparison(result.voxel))
-    within = short_number(100 * scores.precision, 3)
-    return [f"{within} % of the depths of {len(cameras)} held-out views lie within a voxel of the mesh"]
+    certain = short_number(100 * trust.certain, 3)
+    said = [f"{certain} % of the area is seen by {FEW_VIEWS} views or more"]
+    if trust.held_out is not None:
+        within = short_number(100 * trust.held_out.within, 3)
+        views = trust.held_out.views
+        said.append(f"{within} % of the depths of {views} held-out views lie within a voxel of the mesh")
+    return [*said, _shape(trust.shape), _intersecting(trust.intersections)]
 
 
 def _shape(shape: Topology) -> str:

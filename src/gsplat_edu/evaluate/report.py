@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import math
@@ -27,7 +26,17 @@ from gsplat_edu.evaluate.block_figures import blocks_table, cells_figure
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.images import small_jpeg
 from gsplat_edu.evaluate.masked import MaskedPicture, masked_figures
+from gsplat_edu.evaluate.mesh_report import MeshEntry, mesh_section
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
+from gsplat_edu.evaluate.report_parts import (
+    bullets,
+    facts_table,
+    folded,
+    jpeg_image,
+    scrolling,
+    section,
+    slider_pair,
+)
 
 PICTURES = 8
 """Most test views shown in a report."""
@@ -165,6 +174,7 @@ class Report:
         pictures: Pictures of test views. At most 8 are shown, the best and the worst among them.
         masked: Pictures of photos with parts that were masked as moving.
         notes: Notes for the reader, one sentence each.
+        meshes: What is known of the meshes of the scene.
         machine: Facts about the machine; by default, this one.
     """
 
@@ -176,6 +186,7 @@ class Report:
     pictures: Sequence[Picture] = ()
     masked: Sequence[MaskedPicture] = ()
     notes: Sequence[str] = ()
+    meshes: Sequence[MeshEntry] = ()
     machine: Mapping[str, str] = field(default_factory=machine_facts)
 
 
@@ -204,13 +215,14 @@ def write_report(path: Path, report: Report) -> None:
         f'<p class="verdict">{html.escape(verdict(report.metrics, report.scores))}</p>\n',
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
-        _section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
-        _section("Blocks", cells),
+        section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
+        section("Blocks", cells),
         _views(report.scores, report.pictures),
-        _section("Masked things that moved", masked_figures(report.masked)),
+        section("Masked things that moved", masked_figures(report.masked)),
+        mesh_section(report.meshes),
         _exports(report.metrics.get("exports")),
-        _section("Notes", _list(report.notes)),
-        _section("Configuration", _folded("all settings of this run", _facts(_flat(config)))),
+        section("Notes", bullets(report.notes)),
+        section("Configuration", folded("all settings of this run", facts_table(_flat(config)))),
         *_machines(report),
     ]
     title = html.escape(report.title)
@@ -298,10 +310,10 @@ def _machines(report: Report) -> list[str]:
     trained = report.config.get("machine")
     trained = {key: _plain(value) for key, value in trained.items()} if isinstance(trained, Mapping) else {}
     if not trained or trained == dict(report.machine):
-        return [_section("Machine", _facts(report.machine))]
+        return [section("Machine", facts_table(report.machine))]
     return [
-        _section("Training machine", _facts(trained)),
-        _section("Evaluation machine", _facts(report.machine)),
+        section("Training machine", facts_table(trained)),
+        section("Evaluation machine", facts_table(report.machine)),
     ]
 
 
@@ -315,7 +327,7 @@ def _headline(metrics: Mapping[str, Any]) -> str:
             *(_score(key, means.get(key)) for key, _ in SCORES),
         ]
         rows.append(f"<tr><th>{name}</th>{_numbers(cells)}</tr>")
-    table = _table(f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>")
+    table = scrolling(f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>")
     singles = {
         NAMES.get(key, key.replace("_", " ")): _single(key, value)
         for key, value in metrics.items()
@@ -327,7 +339,7 @@ def _headline(metrics: Mapping[str, Any]) -> str:
         "A held-out photo may be brighter or darker than the scene: the last column covers its right half, after one "
         "gain per colour channel was fitted on its left half."
     )
-    return _section("Result", f'{table if rows else ""}<p class="quiet">{how}</p>\n{_facts(singles)}')
+    return section("Result", f'{table if rows else ""}<p class="quiet">{how}</p>\n{facts_table(singles)}')
 
 
 def _exports(exports: object) -> str:
@@ -342,8 +354,8 @@ def _exports(exports: object) -> str:
     titles = ("PSNR (dB)", "lowest (dB)", "worst view", "views", "bytes")
     head = "".join(f'<th class="n">{title}</th>' for title in titles)
     how = "Each file was read back and its renders were compared with the trained scene's. Equal renders have 100 dB."
-    table = _table(f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>")
-    return _section("Exports", f'{table}<p class="quiet">{how}</p>\n' if rows else "")
+    table = scrolling(f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>")
+    return section("Exports", f'{table}<p class="quiet">{how}</p>\n' if rows else "")
 
 
 def _numbers(cells: Sequence[str]) -> str:
@@ -352,7 +364,7 @@ def _numbers(cells: Sequence[str]) -> str:
 
 def _views(scores: Sequence[ImageScore], pictures: Sequence[Picture]) -> str:
     if not scores:
-        return _section("Test views", '<p class="quiet">No view was held out for testing.</p>\n')
+        return section("Test views", '<p class="quiet">No view was held out for testing.</p>\n')
     high, low = best(scores), worst(scores)
     said = (
         f"<p>Best: {html.escape(high.name)} ({_score('psnr', high.psnr)} dB). "
@@ -371,7 +383,7 @@ def _views(scores: Sequence[ImageScore], pictures: Sequence[Picture]) -> str:
         for score in scores
     )
     table = f"<table><thead><tr><th>view</th>{head}</tr></thead><tbody>{rows}</tbody></table>"
-    return _section("Test views", f"{said}{''.join(figures)}{_folded('all views', _table(table))}")
+    return section("Test views", f"{said}{''.join(figures)}{folded('all views', scrolling(table))}")
 
 
 def _chosen(pictures: Sequence[Picture], keep: Sequence[str]) -> list[Picture]:
@@ -387,44 +399,11 @@ def _figure(picture: Picture, score: ImageScore | None) -> str:
     """Lay the photo over the render with a slider between them; put the difference beside them."""
     (render, below), (photo, above), (difference, apart) = picture.panels
     name = html.escape(picture.name)
-    pair = (
-        f'<div class="pair">{_image(photo, above)}{_image(render, below)}'
-        f'<span class="left">{photo}</span><span class="right">{render}</span>'
-        f'<input type="range" min="0" max="100" value="50"'
-        f' aria-label="{name}: {photo} on the left, {render} on the right"></div>'
-    )
-    beside = f'<div class="difference">{_image(difference, apart)}</div>'
+    pair = slider_pair(picture.name, (photo, above), (render, below))
+    beside = f'<div class="difference">{jpeg_image(difference, apart)}</div>'
     numbers = f": PSNR {_score('psnr', score.psnr)} dB, SSIM {_score('ssim', score.ssim)}" if score else ""
     caption = f'{name}{numbers} <span class="quiet">(drag or use the arrow keys; right or below: {difference})</span>'
     return f"<figure><div>{pair}{beside}</div><figcaption>{caption}</figcaption></figure>\n"
-
-
-def _image(title: str, data: bytes) -> str:
-    source = base64.b64encode(data).decode("ascii")
-    return f'<img alt="{html.escape(title)}" src="data:image/jpeg;base64,{source}">'
-
-
-def _section(title: str, body: str) -> str:
-    return f"<h2>{html.escape(title)}</h2>\n{body}" if body else ""
-
-
-def _folded(summary: str, body: str) -> str:
-    return f"<details><summary>{html.escape(summary)}</summary>\n{body}</details>\n" if body else ""
-
-
-def _table(table: str) -> str:
-    """Wrap a table so that it scrolls on its own where it is wider than the screen."""
-    return f'<div class="table">{table}</div>\n'
-
-
-def _list(sentences: Sequence[str]) -> str:
-    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
-    return f"<ul>{items}</ul>\n" if items else ""
-
-
-def _facts(facts: Mapping[str, str]) -> str:
-    rows = "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())
-    return _table(f"<table><tbody>{rows}</tbody></table>") if rows else ""
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError, NotEnoughMemoryError
 from gsplat_edu.base.text import short_number
@@ -229,22 +229,3 @@ def _sentences(counts: DepthCounts) -> list[str]:
         for number, reason in reasons
         if number
     ]
-
-
-def views_of_vertices(mesh: Mesh, views: Sequence[DepthView], tolerance: float) -> Int64[np.ndarray, " V"]:
-    """Return how many depth maps show each vertex.
-
-    Args:
-        mesh: The mesh.
-        views: The depth maps.
-        tolerance: Largest difference of depth, world units.
-    """
-    count = np.zeros(len(mesh.vertices), dtype=np.int64)
-    for view in views:
-        u, v, z = view.camera.project(view.camera.world_to_cam(mesh.vertices))
-        H, W = view.depth.shape
-        with np.errstate(invalid="ignore"):
-            at = np.flatnonzero((z > 0) & (u > -0.5) & (v > -0.5) & (u < W - 0.5) & (v < H - 0.5))
-        depth = view.depth[np.rint(v[at]).astype(int), np.rint(u[at]).astype(int)]
-        count[at] += (depth > 0) & (np.abs(depth - z[at]) < tolerance)
-    return count

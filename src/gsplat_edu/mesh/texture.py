@@ -10,7 +10,7 @@ The layout is made by xatlas, which takes long for many faces: decimate first.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,8 @@ from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import install_command
+from gsplat_edu.mesh.depths import camera_points
+from gsplat_edu.mesh.raster import boxes
 from gsplat_edu.mesh.topology import vertex_normals
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.mesh import Mesh, Texture
@@ -163,7 +165,8 @@ def _texels(
     """Return for each texel whose centre lies in a face: the face, the weights of its corners, and its place."""
     corners = uvs.astype(np.float64) * [width, height] - 0.5  # centres of texels are whole numbers
     owner = np.full(height * width, len(uvs), dtype=np.int64)
-    for faces, places in _boxes(corners, height, width):
+    low, high = corners.min(axis=1) - EDGE, corners.max(axis=1) + EDGE
+    for faces, places in boxes(low, high, height, width):
         weights = _weights(corners[faces], np.stack([places % width, places // width], axis=1))
         inside = (weights >= -EDGE).all(axis=1)
         np.minimum.at(owner, places[inside], faces[inside])  # on a shared edge, the first face
@@ -171,28 +174,6 @@ def _texels(
     face = owner[place]
     weights = _weights(corners[face], np.stack([place % width, place // width], axis=1))
     return face, weights, place
-
-
-def _boxes(
-    corners: Float64[np.ndarray, "F 3 2"], height: int, width: int
-) -> Iterator[tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " N"]]]:
-    """Yield faces and texels of their bounding boxes, about ROWS pairs at a time."""
-    low = np.clip(np.ceil(corners.min(axis=1) - EDGE), 0, [width, height]).astype(np.int64)
-    high = np.clip(np.floor(corners.max(axis=1) + EDGE), -1, [width - 1, height - 1]).astype(np.int64)
-    sides = np.maximum(high - low + 1, 0)
-    counts = sides.prod(axis=1)
-    ends = np.cumsum(counts)
-    start = 0
-    while start < len(counts):
-        stop = max(start + 1, int(np.searchsorted(ends, ends[start] - counts[start] + ROWS, side="right")))
-        faces = np.repeat(np.arange(start, stop), counts[start:stop])
-        within = np.arange(len(faces)) - np.repeat(
-            ends[start:stop] - counts[start:stop] - (ends[start] - counts[start]), counts[start:stop]
-        )
-        columns = low[faces, 0] + within % sides[faces, 0]
-        rows = low[faces, 1] + within // sides[faces, 0]
-        yield faces, rows * width + columns
-        start = stop
 
 
 def _weights(
@@ -234,7 +215,7 @@ def _looked_up(
         settings: Limits.
     """
     camera, depth = view.camera, view.depth
-    local = (points - camera.eye) @ camera.R.T
+    local = camera_points(points, camera)
     z = local[:, 2]
     safe = np.where(z > 0.0, z, 1.0)
     u = camera.fx * local[:, 0] / safe + camera.cx

@@ -17,6 +17,7 @@ from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summa
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.runs.meshes import mesh_entries
 from gsplat_edu.runs.transients import masked_pictures
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
@@ -73,7 +74,7 @@ def evaluate_run(
 ) -> Evaluation:
     """Score a scene and write metrics.json, renders/test/NAME.png (photo | render) and report.html.
 
-    Other keys of an existing metrics.json are kept.
+    Other keys of an existing metrics.json are kept, and the report shows what is known of the run's meshes.
 
     Args:
         folder: The run's folder; its config and log go into the report.
@@ -115,7 +116,7 @@ def evaluate_run(
     masked = masked_pictures(folder, metrics, judged.train, gaussians, render, judged.background)
     title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
     notes = [str(note) for note in judged.notes]
-    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes)
+    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, mesh_entries(folder))
     write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated

@@ -24,6 +24,10 @@ def _text(value: object) -> bool:
     return isinstance(value, str)
 
 
+def _texts(value: object) -> bool:
+    return isinstance(value, list) and all(map(_text, value))
+
+
 def _section(value: object) -> bool:
     return isinstance(value, dict)
 
@@ -40,6 +44,7 @@ KINDS: Mapping[Check, str] = {
     _whole: "a whole number",
     _number: "a number",
     _text: "text",
+    _texts: "a list of texts",
     _section: "an object",
     _numbers: "an object of numbers",
     _place: "three numbers",
@@ -89,12 +94,33 @@ METRICS: Mapping[str, Check] = {
 }
 
 
+MESH: Mapping[str, Check] = {
+    "file": _text,
+    "unit": _text,
+    "notes": _texts,
+    "pictures": _texts,
+    "rendered": _texts,
+    "size": _place,
+    "held_out": _numbers,
+    "intersections": _numbers,
+    "truth": _numbers,
+    "left_out": _numbers,
+    **dict.fromkeys(("area", "voxel", "certain", "spread", "outside"), _number),
+    **dict.fromkeys(
+        ("iterations", "triangles", "vertices", "convex_parts", "volume_bytes", "few_views"), _whole
+    ),
+    **dict.fromkeys(("parts", "boundary_edges", "holes"), _whole),
+}
+"""The record of a mesh, as `gsplat_edu.runs.meshes.record_of` collects it."""
+
+
 def checked(contents: dict[str, Any], fields: Mapping[str, Check], where: str) -> dict[str, Any]:
     """Check the types of the fields that this program reads, and return the contents.
 
     Args:
         contents: The file's object.
-        fields: `CONFIG`, `LOG` or `METRICS`; a dot separates a section from its field. Fields may be missing or null.
+        fields: `CONFIG`, `LOG`, `METRICS` or `MESH`; a dot separates a section from its field. Fields may be missing or
+            null.
         where: The file, with the line number for log.jsonl.
 
     Raises:

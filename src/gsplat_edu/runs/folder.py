@@ -5,6 +5,7 @@
     metrics.json                                  the scores: {"test": {...}, "train": {...}, "num_gaussians": ...}
     cameras.json                                  the cameras, in the format of Inria's viewers
     point_cloud/iteration_N/point_cloud.ply       the scene after N iterations
+    mesh.json                                     what is known of the meshes made of the scene
     photos.json                                   size and digest of every photo's file when the run started
     checkpoints/                                  states to resume from
     renders/                                      pictures
@@ -33,7 +34,7 @@ from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import as_file_name
 from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.fields import CONFIG, LOG, METRICS, checked
+from gsplat_edu.runs.fields import CONFIG, LOG, MESH, METRICS, checked
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
 
@@ -74,6 +75,11 @@ class RunFolder:
     def photos(self) -> Path:
         """Size and digest of every photo's file."""
         return self.path / "photos.json"
+
+    @property
+    def meshes(self) -> Path:
+        """What is known of the meshes made of the scene."""
+        return self.path / "mesh.json"
 
     @property
     def renders(self) -> Path:
@@ -142,6 +148,26 @@ class RunFolder:
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Write the scores; errors as for `write_config`."""
         write_json(self.metrics, metrics)
+
+    def read_meshes(self) -> dict[str, Any]:
+        """Read what is known of the meshes, by their kind; empty if there are none.
+
+        Raises:
+            CheckpointError: the file is damaged.
+        """
+        if not self.meshes.is_file():
+            return {}
+        kinds = _read_object(self.meshes)
+        for kind, record in kinds.items():
+            where = f"{self.meshes}: {kind}"
+            if not isinstance(record, dict):
+                raise CheckpointError(f"{where}: is not an object; fix or remove the file")
+            checked(record, MESH, where)
+        return kinds
+
+    def write_meshes(self, meshes: dict[str, Any]) -> None:
+        """Write what is known of the meshes; errors as for `write_config`."""
+        write_json(self.meshes, meshes)
 
     def read_photos(self) -> dict[str, Any] | None:
         """Read the photos' digests at the start of the run; None if an older version started it without photos.json.

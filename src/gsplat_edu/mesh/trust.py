@@ -1,0 +1,141 @@
+"""How far a mesh can be trusted: who saw it, how well the depth maps agree, where it is open, what intersects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsplat_edu.evaluate.intersections import Intersections, self_intersections
+from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points
+from gsplat_edu.evaluate.topology import Topology, topology
+from gsplat_edu.mesh.depths import DepthView, camera_points
+from gsplat_edu.mesh.extract import MeshResult
+from gsplat_edu.scene.mesh import Mesh
+
+FEW_VIEWS = 3
+"""A part of the surface that fewer views see is uncertain."""
+
+EVERY = 4
+"""Every so manieth column and row of a held-out depth map is compared with the mesh."""
+
+
+class Seen(NamedTuple):
+    """What the depth maps say of each vertex.
+
+    Args:
+        views: (V,) number of depth maps that show it.
+        error: (V,) mean |difference| between its depth and those of the maps that show it, world units; infinite if
+            none does.
+    """
+
+    views: Int64[np.ndarray, " V"]
+    error: Float64[np.ndarray, " V"]
+
+
+@dataclass(frozen=True)
+class HeldOutDepths:
+    """The depths of views that the mesh was not made from.
+
+    Args:
+        views: Number of views.
+        within: Fraction of their depths that lie within a voxel of the mesh, 0 to 1.
+    """
+
+    views: int
+    within: float
+
+
+@dataclass(frozen=True, eq=False)
+class MeshTrust:
+    """What is known of a mesh's accuracy.
+
+    Args:
+        seen: What the depth maps say of each vertex.
+        certain: Fraction of the area that `FEW_VIEWS` views or more see, 0 to 1.
+        spread: Mean of `Seen.error` over the area that any view sees, world units; None if none sees any.
+        held_out: Agreement with held-out views; None if none shows a surface.
+        shape: Connectivity and area.
+        intersections: Triangles that pass through others.
+        scores: Comparison with the truth; None without one.
+    """
+
+    seen: Seen
+    certain: float
+    spread: float | None
+    held_out: HeldOutDepths | None
+    shape: Topology
+    intersections: Intersections
+    scores: SurfaceScores | None = None
+
+
+def trust_of(
+    result: MeshResult, held_out: Sequence[DepthView], scores: SurfaceScores | None = None
+) -> MeshTrust:
+    """Collect what is known of a mesh's accuracy.
+
+    Args:
+        result: The mesh and the depth maps that it was made from.
+        held_out: Depth maps of other views.
+        scores: Comparison with the truth, if there is one.
+    """
+    seen = seen_by(result.mesh, result.views, result.truncation)
+    areas = _areas_of_vertices(result.mesh)
+    known = areas * (seen.views > 0)
+    spread = None
+    if known.any():
+        spread = float((known * np.where(seen.views > 0, seen.error, 0.0)).sum() / known.sum())
+    return MeshTrust(
+        seen,
+        float((areas * (seen.views >= FEW_VIEWS)).sum() / (areas.sum() or 1.0)),
+        spread,
+        _agreement(result, held_out),
+        topology(result.mesh),
+        self_intersections(result.mesh),
+        scores,
+    )
+
+
+def seen_by(mesh: Mesh, views: Sequence[DepthView], tolerance: float) -> Seen:
+    """Count the depth maps that show each vertex, and measure how far they are from it.
+
+    Args:
+        mesh: The mesh.
+        views: The depth maps.
+        tolerance: A map shows a vertex if its depth there differs by less than this, world units.
+    """
+    count, total = np.zeros(len(mesh.vertices), dtype=np.int64), np.zeros(len(mesh.vertices))
+    for view in views:
+        u, v, z = view.camera.project(camera_points(mesh.vertices, view.camera))
+        H, W = view.depth.shape
+        with np.errstate(invalid="ignore"):
+            at = np.flatnonzero((z > 0) & (u > -0.5) & (v > -0.5) & (u < W - 0.5) & (v < H - 0.5))
+        depth = view.depth[np.rint(v[at]).astype(int), np.rint(u[at]).astype(int)].astype(np.float64)
+        apart = np.abs(depth - z[at])
+        shown = (depth > 0) & (apart < tolerance)
+        count[at] += shown
+        total[at] += np.where(shown, apart, 0.0)
+    return Seen(count, np.where(count > 0, total / np.maximum(count, 1), np.inf))
+
+
+def _areas_of_vertices(mesh: Mesh) -> Float64[np.ndarray, " V"]:
+    """Return a third of the area of the faces around each vertex."""
+    thirds = np.linalg.norm(mesh.face_normals(), axis=1) / 6.0
+    return np.bincount(mesh.faces.ravel(), np.repeat(thirds, 3), minlength=len(mesh.vertices))
+
+
+def _agreement(result: MeshResult, views: Sequence[DepthView]) -> HeldOutDepths | None:
+    """Compare the mesh with the depths of views that it was not made from."""
+    points = []
+    for view in views:
+        depth = view.depth[::EVERY, ::EVERY]
+        rows, columns = np.nonzero(depth)
+        rays = view.camera.rays()[::EVERY, ::EVERY][rows, columns]
+        points.append(view.camera.eye + depth[rows, columns][:, None] * rays)
+    if not sum(map(len, points)):
+        return None
+    scores = score_points(np.concatenate(points), result.mesh, Comparison(result.voxel))
+    return HeldOutDepths(len(views), scores.precision)

@@ -1,0 +1,187 @@
+"""What `gsplat-edu mesh` leaves in a run: the record, the pictures, and the section of the report."""
+
+import functools
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu import Camera, write_scene
+from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.locks import locked
+from gsplat_edu.cli.main import main
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.writers import write_transforms
+from gsplat_edu.evaluate.mesh_report import BEGIN, END, MeshEntry, mesh_section
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.evaluation import ScoredViews, evaluate_run
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.scene.views import View
+from splat_ball import ball
+
+COUNT, SIZE = 16, 96
+RENDER = functools.partial(render, settings=RenderSettings(jacobian_limit=1.3, depth=False), backend="cpu")
+
+
+def photographs():
+    """Return renders of the ball from all sides."""
+    index = np.arange(COUNT) + 0.5
+    y, turn = 0.9 * (1 - 2 * index / COUNT), np.pi * (1 + 5**0.5) * index
+    ring = np.sqrt(1 - y * y)
+    eyes = 3.0 * np.stack([ring * np.cos(turn), y, ring * np.sin(turn)], axis=1)
+    for number, eye in enumerate(eyes):
+        camera = Camera.looking_at(eye, (0, 0, 0), 1.4 * SIZE, 1.4 * SIZE, SIZE, SIZE)
+        image = RENDER(ball(), camera).image.clamp(0, 1).numpy()
+        yield View(camera, np.rint(255 * image).astype(np.uint8), name=f"{number:02d}.png")
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """Return a run of the ball that was evaluated."""
+    home = tmp_path_factory.mktemp("meshes")
+    write_transforms(home / "capture", list(photographs()), ball().means.numpy(), np.full((3_000, 3), 0.5))
+    dataset = load_dataset(home / "capture", DataSettings(test_every=8))
+    folder = RunFolder(home / "run")
+    folder.write_config(
+        {
+            "data": {"path": str(home / "capture"), "test_every": 8},
+            "render": {"jacobian_limit": 1.3},
+            "origin": dataset.origin.tolist(),
+        }
+    )
+    write_scene(folder.scene(7), ball())
+    folder.write_cameras(dataset.train, dataset.test, dataset.origin)
+    evaluate_run(folder, ScoredViews(dataset.test, dataset.train), ball(), RENDER)
+    return folder
+
+
+@pytest.fixture
+def run(evaluated, tmp_path):
+    shutil.copytree(evaluated.path, tmp_path / "run")
+    return RunFolder(tmp_path / "run")
+
+
+def mesh(run, *words):
+    out = run.path.parent / "ball.ply"
+    assert main(["mesh", str(run.path), str(out), "--voxel", "0.06", "--backend", "cpu", *words]) == 0
+    return out
+
+
+def test_the_record_says_what_is_printed(run, capsys):
+    out = mesh(run)
+    assert (
+        main(["mesh", str(run.path), str(out.with_suffix(".obj")), "--voxel", "0.06", "--truth", str(out)])
+        == 0
+    )
+    said = capsys.readouterr().out
+    record = json.loads(run.meshes.read_text())["mesh"]
+    assert record["file"].endswith("ball.obj") and record["iterations"] == 7 and record["unit"] is None
+    assert f"{record['vertices']:,} vertices, {record['triangles']:,} triangles" in said
+    assert f"{100 * record['certain']:.3g} % of the area" in said
+    assert f"{100 * record['held_out']['within']:.3g} % of the depths of 2 held-out views" in said
+    assert record["held_out"]["views"] == 2 and record["parts"] == 1 and record["boundary_edges"] == 0
+    assert f"F1 {record['truth']['f1']:.3f}" in said and record["truth"]["f1"] > 0.99
+    np.testing.assert_allclose(record["size"], 1.65, atol=0.1)
+    assert 0 < record["spread"] < 0.06 and record["intersections"]["found"] == 0
+    assert record["left_out"]["pixels"] == 14 * SIZE * SIZE
+    page = run.report.read_text("utf-8")
+    for row in ("area seen by 3 views or more", "none: it is closed", "after 7 iterations", "<th>F1</th>"):
+        assert page.count(row) == 1, row
+
+
+def test_pictures_show_the_photo_the_mesh_and_the_evidence(run):
+    mesh(run)
+    record = run.read_meshes()["mesh"]
+    assert len(record["pictures"]) == 2 and record["rendered"] == []
+    taken = {f"images/{view.name}": view for view in photographs()}
+    axes = []
+    for number, name in enumerate(record["pictures"]):
+        panels = {
+            key: np.array(Image.open(run.renders / "mesh" / f"mesh_{number}_{key}.jpg")).astype(float)
+            for key in ("photo", "mesh", "views", "agreement")
+        }
+        photo = taken[name].image
+        axes.append(taken[name].camera.R[2])
+        on_ball = photo.max(axis=-1) > 100
+        # The stripes blur at their edges by the size of a voxel.
+        assert np.abs(panels["photo"] - photo)[on_ball].mean() < 8
+        assert np.median(np.abs(panels["mesh"] - photo)[on_ball]) < 25
+        assert (panels["mesh"][0, 0] > 225).all() and (panels["views"][0, 0] > 225).all()
+        # Viridis from violet to yellow: what every view sees has more green than what none does.
+        middle = (slice(40, 56), slice(40, 56))
+        assert panels["views"][middle][..., 1].mean() > 75
+    assert axes[0] @ axes[1] < -0.5  # from opposite sides
+
+
+def test_a_new_evaluation_keeps_the_section_and_a_new_mesh_replaces_it(run, evaluated):
+    before = run.report.read_text("utf-8")
+    assert BEGIN + END in before
+    mesh(run)
+    page = run.report.read_text("utf-8")
+    start, stop = page.index(BEGIN), page.index(END)
+    assert page[:start] + page[stop:] == before.replace(BEGIN, "")  # nothing else has changed
+    assert page[start:stop].count("<img") == 8
+    dataset = load_dataset(evaluated.path.parent / "capture", DataSettings(test_every=8))
+    evaluate_run(run, ScoredViews(dataset.test), ball(), RENDER)
+    again = run.report.read_text("utf-8")
+    assert page[start:stop] in again and again.count("<h2>Mesh</h2>") == 1
+    mesh(run, "--collider")
+    both = run.report.read_text("utf-8")
+    assert page[start:stop] in both and both.count("<h2>Collider</h2>") == 1
+    assert set(run.read_meshes()) == {"mesh", "collider"}
+
+
+def test_a_report_of_an_older_version_and_no_report(run, capsys):
+    old = run.report.read_text("utf-8").replace(BEGIN + END, "")
+    run.report.write_text(old, "utf-8")
+    mesh(run)
+    page = run.report.read_text("utf-8")
+    assert page.replace(page[page.index(BEGIN) : page.index(END) + len(END)], "") == old
+    run.report.unlink()
+    mesh(run)
+    assert "mesh.json; eval adds it to a report" in capsys.readouterr().out and not run.report.exists()
+
+
+def test_without_the_photos_the_pictures_say_that_they_are_renders(run):
+    config = run.read_config()
+    config["data"]["path"] = str(run.path / "gone")
+    run.write_config(config)
+    mesh(run)
+    assert run.read_meshes()["mesh"]["rendered"] == run.read_meshes()["mesh"]["pictures"]
+    assert run.report.read_text("utf-8").count("render of the splats</span>") == 2
+
+
+def test_a_run_in_use_keeps_its_files_and_the_mesh_is_written(run, capsys, monkeypatch):
+    monkeypatch.setattr("gsplat_edu.cli.mesh.PATIENCE", 0.0)
+    before = run.report.read_bytes()
+    with locked("RUN", run.path, "a training", print):
+        out = mesh(run)
+    assert "the mesh is not added to the run's report" in capsys.readouterr().out and out.is_file()
+    assert run.report.read_bytes() == before and not run.meshes.exists()
+
+
+@pytest.mark.parametrize(
+    ("record", "said"),
+    [
+        ([], "is not a JSON object"),
+        ({"mesh": 3}, "mesh.json: mesh: is not an object"),
+        ({"mesh": {"triangles": "many"}}, "triangles is many, but has to be a whole number"),
+        ({"mesh": {"truth": {"f1": "1"}}}, "has to be an object of numbers"),
+        ({"mesh": {"pictures": [1]}}, "has to be a list of texts"),
+    ],
+)
+def test_a_damaged_record_is_one_line(run, record, said):
+    run.meshes.write_text(json.dumps(record))
+    with pytest.raises(CheckpointError, match=said):
+        run.read_meshes()
+
+
+def test_texts_of_a_record_are_escaped_and_never_formatted():
+    record = {"file": "<b>{0.__class__}</b>", "unit": "{}<i>", "voxel": 0.5, "notes": ["<script>x</script>"]}
+    page = mesh_section([MeshEntry("Mesh", record)])
+    assert "&lt;b&gt;{0.__class__}&lt;/b&gt;" in page and "0.5 {}&lt;i&gt;" in page
+    assert "<script>" not in page and "<i>" not in page
+    assert mesh_section([MeshEntry("Mesh", {})]) == BEGIN + END
