@@ -365,7 +365,7 @@ def texture_scores(
     }
     for name, texture in TEXTURES.items():
         began = time.perf_counter()
-        painted = textured(mesh, views, texture)
+        painted = textured(mesh, views, dataclasses.replace(texture, size=4 * views[0].camera.W))
         drawn = [picture(painted, raster, (0, 0, 0)) for raster in rasters]
         row[f"texture, {name}, dB"] = covered_psnr(capture.held_out, rasters, drawn)
         row[f"texture, {name}, seconds"] = time.perf_counter() - began
