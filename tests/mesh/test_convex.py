@@ -15,6 +15,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.io.mesh_files import read_mesh
 from gsplat_edu.io.mesh_glb import write_parts
+from gsplat_edu.mesh.coacd_process import cut
 from gsplat_edu.mesh.convex import ConvexSettings, convex_parts, farthest_outside
 from gsplat_edu.scene.mesh import Mesh
 from known_surfaces import torus
@@ -104,6 +105,33 @@ def test_the_file_has_a_node_for_each_part_and_the_same_bytes_for_any_threads(pa
         environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "PYTHONPATH": paths}
         subprocess.run([sys.executable, "-c", program, again], env=environment, check=True, timeout=300)
         assert hashlib.sha256(again.read_bytes()).digest() == hashlib.sha256(data).digest()
+
+
+def test_a_failure_of_coacd_is_one_line_and_not_the_end_of_the_program():
+    with pytest.raises(ArgumentError, match=r"cannot cut this mesh \(exit code 1: TypeError.*unknown"):
+        cut(RING, {"unknown": 1})
+
+
+def test_islands_beside_a_torn_hole():
+    """CoACD 1.0.14 ends its process at this ball by a segmentation fault."""
+    polar, around = np.meshgrid(np.linspace(0.12, 0.88, 14) * np.pi, np.arange(16) * np.pi / 8, indexing="ij")
+    places = [np.sin(polar) * np.cos(around), -np.cos(polar), np.sin(polar) * np.sin(around)]
+    first = 16 * np.arange(13)[:, None] + np.arange(16)
+    after = 16 * np.arange(13)[:, None] + (np.arange(16) + 1) % 16
+    corners = [(first, after, first + 16), (after, after + 16, first + 16)]
+    faces = np.stack([np.stack(three, axis=-1) for three in corners], axis=2).reshape(-1, 3)
+    ball = Mesh(np.stack(places, axis=-1).reshape(-1, 3), faces)
+    if (ball.face_normals() * ball.corners.mean(axis=1)).sum() < 0:
+        ball = Mesh(ball.vertices, faces[:, ::-1].copy())
+    middles = np.abs(ball.corners.mean(axis=1)[:, 1])
+    kept = (middles < 0.93 * middles.max()) | (np.random.default_rng(0).random(len(middles)) > 0.5)
+    torn = Mesh(ball.vertices, ball.faces[kept]).used()
+    try:
+        parts = convex_parts(torn)
+    except ArgumentError as error:
+        assert "write a collider of triangles" in str(error)
+    else:
+        assert farthest_outside(torn.vertices, parts) < 0.2
 
 
 def test_refusals(tmp_path, monkeypatch):

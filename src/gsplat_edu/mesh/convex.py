@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 from jaxtyping import Float64
@@ -23,6 +24,7 @@ from gsplat_edu.base.text import install_command
 from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.evaluate.surface import triangle_distances
 from gsplat_edu.evaluate.topology import topology
+from gsplat_edu.mesh.coacd_process import cut
 from gsplat_edu.mesh.topology import boundary_loops, edge_ends, separated
 from gsplat_edu.scene.mesh import Mesh
 
@@ -74,32 +76,30 @@ def convex_parts(mesh: Mesh, settings: ConvexSettings | None = None) -> list[Mes
         settings: How far it is cut; None for the defaults.
 
     Raises:
-        ArgumentError: CoACD is not installed, or the mesh has no faces, or is so flat that no part has a volume.
+        ArgumentError: CoACD is not installed or fails, or the mesh has no faces, or is so flat that no part has a
+            volume.
     """
     settings = ConvexSettings() if settings is None else settings
     if not len(mesh.faces):
         raise ArgumentError("mesh: has no faces to cut into convex parts")
-    try:
-        import coacd
-    except ImportError:
-        raise ArgumentError(
-            f"convex parts: need coacd, which is not installed: {install_command('mesh')}"
-        ) from None
+    if find_spec("coacd") is None:
+        raise ArgumentError(f"convex parts: need coacd, which is not installed: {install_command('mesh')}")
     solid, closed = _solid(separated(mesh))
     centre = solid.vertices.mean(axis=0)
     scale = float(np.abs(solid.vertices - centre).max()) or 1.0
-    coacd.set_log_level("off")
-    pieces = coacd.run_coacd(
-        coacd.Mesh((solid.vertices - centre) / scale, solid.faces),
-        threshold=settings.concavity,
-        preprocess_mode="off" if closed else "on",
-        preprocess_resolution=SHELL_CELLS,
-        decimate=True,
-        max_ch_vertex=settings.vertices,
-        seed=settings.seed,
-        **SEARCH,
+    pieces = cut(
+        Mesh((solid.vertices - centre) / scale, solid.faces),
+        {
+            "threshold": settings.concavity,
+            "preprocess_mode": "off" if closed else "on",
+            "preprocess_resolution": SHELL_CELLS,
+            "decimate": True,
+            "max_ch_vertex": settings.vertices,
+            "seed": settings.seed,
+            **SEARCH,
+        },
     )
-    hulls = [_hull(np.asarray(points, np.float64) * scale + centre) for points, _ in pieces]
+    hulls = [_hull(points * scale + centre) for points in pieces]
     parts = [hull for hull in hulls if hull is not None]
     if not parts:
         raise ArgumentError(
