@@ -220,15 +220,15 @@ plt.show()
 # glossy one a highlight that moves with the camera. Training on colours alone has the same weakness, and a use for it:
 # splats that spread along the ray can fake highlights and fine texture. The surface becomes a thick layer.
 #
-# The remedy of Huang et al. 2024 (2DGS), `--surface` of `gsplat-edu train`, asks that two normals agree. One is
-# $N = \sum w_i n_i$, the other is the normal $m$ of the depth map, from the cross product of its differences. With
+# `--surface` of `gsplat-edu train` adds this loss of patches and, after Huang et al. 2024 (2DGS), one of normals. One
+# normal is $N = \sum w_i n_i$, the other is $m$ of the depth map, from the cross product of its differences. With
 # $a = \sum w_i$, the loss of a pixel ([gsplat_edu.ops.surface](../src/gsplat_edu/ops/surface.py)) is
 #
 # $$ a\,(a - N \cdot m) . $$
 #
 # $|N| \le a$ by the triangle inequality, with equality if and only if all $n_i$ are equal; then $N \cdot m = a$ if and
 # only if they equal $m$. So the loss is never negative, and it is 0 only if all splats of a pixel face the way the
-# depth map runs. It does not know where the surface is. The photos do, once splats no longer hide behind each other.
+# depth map runs. It does not know where the surface is. Photos and patches do, once splats no longer hide others.
 
 
 # %%
@@ -256,7 +256,7 @@ def trained(finish, surface):
     )
 
 
-runs = {"photos alone": trained("textured", False), "with normals": trained("textured", True)}
+runs = {"photos alone": trained("textured", False), "with a surface": trained("textured", True)}
 fig, axes = plt.subplots(2, 3, figsize=(13, 6.8), layout="constrained")
 for row, (name, run) in zip(axes, runs.items(), strict=True):
     far = {kind: np.nanmean(np.abs(values)) for kind, values in run.errors.items()}
@@ -362,7 +362,10 @@ for what, depths in (("exact", exact_depths), ("trained", [view.depth for view i
 # > **Predict.** Which objects end up furthest from the truth: textured, plain or glossy ones?
 
 # %%
-runs["plain, with normals"], runs["glossy, with normals"] = trained("plain", True), trained("glossy", True)
+runs["plain, with a surface"], runs["glossy, with a surface"] = (
+    trained("plain", True),
+    trained("glossy", True),
+)
 BOX = np.array([[-1.4, -1.2, -1.4], [1.4, 0.2, 1.4]])  # without the rim of the floor
 
 
@@ -399,7 +402,7 @@ for ax, (name, (_, away)) in zip(axes.flat, samples.items(), strict=True):
     ax.set(title=f"{name}: {away.mean():.4f} off on average", xticks=[], yticks=[])
 fig.colorbar(shown, ax=axes, label="distance from the true surface, world units")
 plt.show()
-assert SHORT or samples["with normals"][1].mean() < samples["photos alone"][1].mean()
+assert SHORT or samples["with a surface"][1].mean() < samples["photos alone"][1].mean()
 
 # %% [markdown]
 # Distances to the truth do not notice what is missing. So go the other way: sample the truth, and ask which part of it
@@ -420,7 +423,7 @@ for name, (points, _) in samples.items():
     print(f"{name:24}" + "".join(f"{100 * share:8.1f}" for share in found[name].values()))
 print(f"no photo sees {100 * (~seen).mean():.1f} % of the true surface")
 assert all(table["unseen"] < 0.5 for table in found.values())
-assert SHORT or found["with normals"]["rods"] < found["with normals"]["torus"]
+assert SHORT or found["with a surface"]["rods"] < found["with a surface"]["torus"]
 
 below = Camera.looking_at([0.9, 2.2, -2.6], [0, -0.1, 0], fx=500, fy=500, H=350, W=500)
 close = Camera.looking_at([0.5, -1.1, -2.4], [0.6, -0.35, -0.6], fx=640, fy=640, H=350, W=500)
@@ -428,7 +431,7 @@ fig, axes = plt.subplots(1, 3, figsize=(13, 3.6), layout="constrained")
 axes[0].imshow(photograph_solids(solid, close, "glossy").image)
 axes[0].set(title="the rods, in truth", xticks=[], yticks=[])
 for ax, camera, title in zip(axes[1:], (close, below), ("the glossy mesh", "from below"), strict=True):
-    ax.imshow(drawn(runs["glossy, with normals"], camera))
+    ax.imshow(drawn(runs["glossy, with a surface"], camera))
     ax.set(title=title, xticks=[], yticks=[])
 plt.show()
 
@@ -444,6 +447,6 @@ plt.show()
 # the photos. Hair, leaves and glass have no surface to find. And photos made splats, splats made depths, depths made
 # triangles: no error of the mesh flows back.
 #
-# With a capture of your own, `gsplat-edu train CAPTURE --out RUN --surface` trains with the normals of this page,
+# With a capture of your own, `gsplat-edu train CAPTURE --out RUN --surface` trains with both losses of this page,
 # `gsplat-edu mesh RUN mesh.glb --texture` makes the mesh, and `--truth SCAN` measures it
 # ([GUIDE.md](../docs/GUIDE.md)). It began with [a point](01_points.ipynb).

@@ -1,6 +1,6 @@
 """The process in which CoACD cuts a mesh: CoACD may end the process that calls it, as at islands beside a torn hole.
 
-    python -m gsplat_edu.mesh.coacd_process SOLID.npz PARTS.npz OPTIONS
+    python -m gsplat_edu.mesh.coacd_process SOLID PARTS OPTIONS
 
 `cut` starts it.
 """
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from safetensors.numpy import load_file, save_file
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.scene.mesh import Mesh
@@ -36,8 +37,8 @@ def cut(solid: Mesh, options: Mapping[str, Any]) -> list[Float64[np.ndarray, "N 
         ArgumentError: CoACD failed.
     """
     with tempfile.TemporaryDirectory() as folder:
-        given, found = Path(folder) / "solid.npz", Path(folder) / "parts.npz"
-        np.savez(given, vertices=solid.vertices, faces=solid.faces)
+        given, found = Path(folder) / "solid", Path(folder) / "parts"
+        save_file({"vertices": solid.vertices.copy(), "faces": solid.faces.copy()}, given)
         command = [
             sys.executable,
             "-m",
@@ -55,19 +56,21 @@ def cut(solid: Mesh, options: Mapping[str, Any]) -> list[Float64[np.ndarray, "N 
                 f"convex parts: CoACD cannot cut this mesh ({why}{last}); write a collider of triangles, or keep only"
                 " the large parts of the mesh"
             )
-        with np.load(found, allow_pickle=False) as parts:
-            return [np.asarray(parts[name], np.float64).reshape(-1, 3) for name in parts.files]
+        parts = load_file(found)
+        return [parts[str(number)].reshape(-1, 3) for number in range(len(parts))]
 
 
 def main(given: str, found: str, options: str) -> None:
     """Cut the mesh of a file, and write the parts' corners."""
     import coacd
 
-    with np.load(given, allow_pickle=False) as solid:
-        mesh = coacd.Mesh(solid["vertices"], solid["faces"])
+    solid = load_file(given)
+    mesh = coacd.Mesh(solid["vertices"], solid["faces"])
     coacd.set_log_level("off")
     parts = coacd.run_coacd(mesh, **json.loads(options))
-    np.savez(found, *(np.asarray(points, np.float64) for points, _ in parts))
+    save_file(
+        {str(n): np.ascontiguousarray(points, np.float64) for n, (points, _) in enumerate(parts)}, found
+    )
 
 
 if __name__ == "__main__":
