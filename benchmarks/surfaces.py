@@ -351,7 +351,13 @@ def texture_scores(
     """Paint the mesh, and compare it with held-out photos at the pixels that it covers, beside the splats."""
     if not capture.held_out:
         return {}
-    mesh = tidied(found.mesh, TidySettings(faces=TEXTURE_FACES, smoothing=0))  # it is smooth already
+    near = inside(found.mesh.corners.reshape(-1, 3), capture.bounds).reshape(-1, 3).all(axis=1)
+    cut = Mesh(
+        found.mesh.vertices, found.mesh.faces[near], found.mesh.colors
+    ).used()  # the backdrop hides objects
+    if not len(cut.faces):
+        return {}
+    mesh = tidied(cut, TidySettings(faces=TEXTURE_FACES, smoothing=0))  # it is smooth already
     photos = {view.name: view.image for view in capture.train}
     views = [TextureView(view.camera, photos[view.name], view.depth) for view in found.views]
     rasters = [rasterized(mesh, view.camera) for view in capture.held_out]
