@@ -20,7 +20,7 @@ FEW_VIEWS = 3
 """A part of the surface that fewer views see is uncertain."""
 
 EVERY = 4
-"""Every so manieth column and row of a held-out depth map is compared with the mesh."""
+"""Every fourth column and row of a held-out depth map is compared with the mesh."""
 
 
 class Seen(NamedTuple):
