@@ -39,14 +39,8 @@ def cut(solid: Mesh, options: Mapping[str, Any]) -> list[Float64[np.ndarray, "N 
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "solid", Path(folder) / "parts"
         save_file({"vertices": solid.vertices.copy(), "faces": solid.faces.copy()}, given)
-        command = [
-            sys.executable,
-            "-m",
-            "gsplat_edu.mesh.coacd_process",
-            given,
-            found,
-            json.dumps(dict(options)),
-        ]
+        command = [sys.executable, "-m", "gsplat_edu.mesh.coacd_process", str(given), str(found)]
+        command.append(json.dumps(dict(options)))
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
         if done.returncode or not found.is_file():
             said = done.stderr.decode(errors="replace").strip().splitlines()
