@@ -362,10 +362,7 @@ for what, depths in (("exact", exact_depths), ("trained", [view.depth for view i
 # > **Predict.** Which objects end up furthest from the truth: textured, plain or glossy ones?
 
 # %%
-runs["plain, with a surface"], runs["glossy, with a surface"] = (
-    trained("plain", True),
-    trained("glossy", True),
-)
+runs |= {f"{finish}, with a surface": trained(finish, True) for finish in ("plain", "glossy")}
 BOX = np.array([[-1.4, -1.2, -1.4], [1.4, 0.2, 1.4]])  # without the rim of the floor
 
 

@@ -1,6 +1,7 @@
 """A mesh is made, shown beside the splats and downloaded in the studio's page."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -58,6 +59,7 @@ def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library,
 
 def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_entry):
     exports = wall_entry / "exports"
+    shutil.rmtree(exports, ignore_errors=True)  # of another test of this library
     exports.mkdir()
     person = visitor()
     tab = person.tab

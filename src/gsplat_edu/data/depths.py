@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from gsplat_edu.base.constants import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import short_number
 from gsplat_edu.data.capture import Frame, fits_camera, is_folder
@@ -42,7 +43,7 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.given_depth import GivenDepth
 from gsplat_edu.scene.intrinsics import Intrinsics
 
-POINTS, CAPTURE = Path("points"), Path("capture")
+POINTS, CAPTURE = Path(POINTS_AS_DEPTH), Path(CAPTURE_AS_DEPTH)
 """Sources of depth that are no folders: the points in COLMAP's tracks, and the maps that transforms.json names."""
 
 JUMP = 0.05

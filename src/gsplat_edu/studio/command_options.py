@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gsplat_edu.base.constants import AUTO
+from gsplat_edu.base.constants import AUTO, CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.base.text import option_flag, shortened
-from gsplat_edu.data.depths import CAPTURE, POINTS
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SETTABLE, SKIES, STRATEGIES
@@ -134,7 +133,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "save_every": _whole(0, 1_000_000),
     "antialiased": _switch,
     "surface": _switch,
-    "depth": _choice(str(POINTS), str(CAPTURE)),
+    "depth": _choice(POINTS_AS_DEPTH, CAPTURE_AS_DEPTH),
     "white_background": _switch,
     "random_background": _switch,
     "set": _set,
