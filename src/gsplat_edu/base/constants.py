@@ -118,10 +118,6 @@ SH_MAX_DEGREE: Final = 3
 AUTO: Final = "auto"
 """Value of an option or a field that leaves the choice to the program, which decides by the photos."""
 
-POINTS_AS_DEPTH: Final = "points"
-CAPTURE_AS_DEPTH: Final = "capture"
-"""Values of `--depth` that are no folder: the points in COLMAP's tracks, and the maps that the capture names."""
-
 LOOPBACK: Final = "127.0.0.1"
 """IPv4 address of this computer, reachable from this computer only. Source: RFC 1122, section 3.2.1.3."""
 

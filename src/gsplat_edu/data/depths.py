@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.base.constants import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import short_number
 from gsplat_edu.data.capture import Frame, fits_camera, is_folder
@@ -40,7 +39,7 @@ from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.sparse_depth import sparse_depth, tracked_points
 from gsplat_edu.data.tracks import visible_points
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.scene.given_depth import GivenDepth
+from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH, GivenDepth
 from gsplat_edu.scene.intrinsics import Intrinsics
 
 POINTS, CAPTURE = Path(POINTS_AS_DEPTH), Path(CAPTURE_AS_DEPTH)

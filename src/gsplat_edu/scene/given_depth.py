@@ -10,6 +10,9 @@ from jaxtyping import Float32
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, float64_array
 
+POINTS_AS_DEPTH, CAPTURE_AS_DEPTH = "points", "capture"
+"""Sources of depth that are no folder: the points in COLMAP's tracks, and the maps that the capture names."""
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class GivenDepth:

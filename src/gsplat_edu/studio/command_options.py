@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gsplat_edu.base.constants import AUTO, CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import option_flag, shortened
+from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SETTABLE, SKIES, STRATEGIES
