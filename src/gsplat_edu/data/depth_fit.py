@@ -141,21 +141,21 @@ def fit_depths(
     every = Matches(*(np.concatenate(column) for column in zip(*matches.values(), strict=True)))
     ratio, length = np.log(every.depths / every.values), np.log(every.lengths)
     line = _robust_line(length, ratio)
-    told = line.error < CERTAIN
-    says = RAY if told and line.scale < -0.5 else Z
-    certain, power = told or kind != AUTO_KIND, 1.0 if (says if kind == AUTO_KIND else kind) == RAY else 0.0
+    points_tell = line.error < CERTAIN
+    kind_of_points = RAY if points_tell and line.scale < -0.5 else Z
+    named = None if kind == AUTO_KIND else kind
+    power = 1.0 if (named or kind_of_points) == RAY else 0.0
     level = float(np.median(ratio + power * length))
     found, spread = math.exp(level), _relative(ratio + power * length - level)
     if spread > SPREAD:
         raise DepthMisfitError(where, *_neither(matches, spread))
-    if kind != AUTO_KIND and told and says != kind:
+    if named is not None and points_tell and kind_of_points != named:
         names = {Z: "camera depth (z)", RAY: "lengths of rays"}
         raise DepthMisfitError(
             where,
-            f"its values are {names[says]}, not {names[kind]}: {count:,} points agree",
+            f"its values are {names[kind_of_points]}, not {names[named]}: {count:,} points agree",
             "leave depth_kind out",
         )
-    kind = says if kind == AUTO_KIND else kind
     if unit > 0 and abs(math.log(found / unit)) > UNIT_OFF:
         times = short_number(max(found / unit, unit / found), 3)
         larger = "large" if unit > found else "small"
@@ -170,7 +170,8 @@ def fit_depths(
     }
     photos = {name: PhotoFit(used) for name, reason in reasons.items() if reason is None}
     rejected = tuple(Rejected(name, reason) for name, reason in reasons.items() if reason is not None)
-    return DepthFit(kind, used, count, spread, certain, photos, rejected)
+    certain = points_tell or named is not None
+    return DepthFit(named or kind_of_points, used, count, spread, certain, photos, rejected)
 
 
 def _unchecked(matches: Mapping[str, Matches], count: int, kind: str, unit: float, where: str) -> DepthFit:

@@ -233,11 +233,7 @@ def turned_positions(
 
 def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
     """Return normals of length 1, averaged over the faces of a vertex by area; of unused vertices, the z axis."""
-    sums = np.zeros_like(mesh.vertices)
-    facing = mesh.face_normals()
-    for corner in range(3):
-        for axis in range(3):
-            sums[:, axis] += np.bincount(mesh.faces[:, corner], facing[:, axis], len(sums))
+    sums = mesh.summed_normals()
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
     usable = lengths[:, 0] > np.finfo(np.float64).tiny
     return np.where(usable[:, None], sums / np.where(usable[:, None], lengths, 1.0), [0.0, 0.0, 1.0])

@@ -259,9 +259,4 @@ def unit(vectors: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
 
 def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "V 3"]:
     """Return normals of vertices, averaged over their faces by area, of length 1; zero at unused vertices."""
-    sums = np.zeros_like(mesh.vertices)
-    normals = mesh.face_normals()
-    for corner in range(3):
-        for axis in range(3):
-            sums[:, axis] += np.bincount(mesh.faces[:, corner], normals[:, axis], len(sums))
-    return unit(sums)
+    return unit(mesh.summed_normals())

@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
-from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, whole_number
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.ops.surface import check_maps
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import Photo
 
@@ -86,9 +86,10 @@ class Grid(NamedTuple):
     first_u: int = 0
     first_v: int = 0
 
-    def size(self, H: int, W: int) -> int:
-        """Return how many pixels of an image the grid has."""
-        return len(range(self.first_v, H, self.stride)) * len(range(self.first_u, W, self.stride))
+    def each(self, weight: float, H: int, W: int) -> float:
+        """Return the factor of a patch if the mean over all pixels of the grid in an image has this weight."""
+        count = len(range(self.first_v, H, self.stride)) * len(range(self.first_u, W, self.stride))
+        return weight / max(count, 1)
 
 
 class PatchLoss(NamedTuple):
@@ -135,22 +136,15 @@ def patch_error(
 
     Source: Chen et al. 2024 (PGSR), eq. 13.
     """
-    H, W = photo.camera.H, photo.camera.W
-    check_shape("normals", normals.shape, (H, W, 3), {})
-    for name, given in (("depth", depth), ("alpha", alpha)):
-        check_shape(name, given.shape, (H, W), {})
-        if (given.dtype, given.device) != (normals.dtype, normals.device):
-            wanted = f"{normals.dtype} on {normals.device}"
-            raise ArgumentError(f"{name}: is {given.dtype} on {given.device}, but normals are {wanted}")
+    check_maps(normals, depth, alpha, photo.camera)
     whole_number("stride", grid.stride, 1)
     whole_number("first_u", grid.first_u, 0)
     whole_number("first_v", grid.first_v, 0)
-    scale = weight / max(grid.size(H, W), 1)
     if normals.device.type != "cpu" or normals.dtype not in SUFFIXES:
         return patch_error_in_torch(normals, depth, alpha, photo, other, grid, weight)
     learning: list[int] = []
     value: Tensor = _PatchError.apply(  # type: ignore[no-untyped-call]
-        normals, depth, alpha, photo, other, (grid, scale), learning
+        normals, depth, alpha, photo, other, (grid, weight), learning
     )
     return PatchLoss(value, learning[0])
 
@@ -199,7 +193,7 @@ def patch_error_in_torch(
     lengths = squares.where(held, 1.0).sqrt()
     error = 1 - (own * seen).sum(dim=1) / (lengths[0] * lengths[1])
     bounded = error.clamp(max=MOST).where(held, 0.0)
-    value = weight / max(grid.size(H, W), 1) * bounded.sum()
+    value = grid.each(weight, H, W) * bounded.sum()
     return PatchLoss(value, int((held & (error < MOST)).sum()))
 
 
@@ -258,7 +252,7 @@ class _PatchError(torch.autograd.Function):
     ) -> Tensor:
         given = [tensor.detach().contiguous() for tensor in (normals, depth, alpha)]
         gradients = [reusable_tensor(tensor.shape, tensor) for tensor in given]
-        names, (grid, scale) = ("normals", "depth", "alpha"), placed
+        names, (grid, weight) = ("normals", "depth", "alpha"), placed
         turn, shift = relative_pose(photo.camera, other.camera)
         value, count = kernel("patches_f", normals.dtype)(
             **{name: native_array(tensor) for name, tensor in zip(names, given, strict=True)},
@@ -270,7 +264,7 @@ class _PatchError(torch.autograd.Function):
             shift=shift.tolist(),
             radius=RADIUS,
             **grid._asdict(),
-            scale=scale,
+            scale=grid.each(weight, photo.camera.H, photo.camera.W),
             most=MOST,
             least_alpha=LEAST_ALPHA,
             least_cosine=LEAST_COSINE,

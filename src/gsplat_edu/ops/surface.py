@@ -76,6 +76,21 @@ def normals_of_depth(depth: Float[Tensor, "H W"], rays: Float[Tensor, "H W 3"]) 
     return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1))
 
 
+def check_maps(normals: Tensor, depth: Tensor, alpha: Tensor, camera: Camera) -> None:
+    """Check the maps of a camera's surface: normals (H, W, 3), depth and alpha (H, W), of one dtype and device.
+
+    Raises:
+        ShapeError: a size differs from the camera's.
+        ArgumentError: dtypes or devices differ.
+    """
+    check_shape("normals", normals.shape, (camera.H, camera.W, 3), {})
+    for name, given in (("depth", depth), ("alpha", alpha)):
+        check_shape(name, given.shape, (camera.H, camera.W), {})
+        if (given.dtype, given.device) != (normals.dtype, normals.device):
+            wanted = f"{normals.dtype} on {normals.device}"
+            raise ArgumentError(f"{name}: is {given.dtype} on {given.device}, but normals are {wanted}")
+
+
 def normal_error(
     normals: Float[Tensor, "H W 3"],
     depth: Float[Tensor, "H W"],
@@ -105,12 +120,7 @@ def normal_error(
 
     Source: Huang et al. 2024 (2DGS), eq. 14.
     """
-    check_shape("normals", normals.shape, (camera.H, camera.W, 3), {})
-    for name, given in (("depth", depth), ("alpha", alpha)):
-        check_shape(name, given.shape, (camera.H, camera.W), {})
-        if (given.dtype, given.device) != (normals.dtype, normals.device):
-            wanted = f"{normals.dtype} on {normals.device}"
-            raise ArgumentError(f"{name}: is {given.dtype} on {given.device}, but normals are {wanted}")
+    check_maps(normals, depth, alpha, camera)
     in_range("weight", weight, 0.0)
     if normals.device.type != "cpu" or normals.dtype not in SUFFIXES:
         return normal_error_in_torch(normals, depth, alpha, camera, weight)

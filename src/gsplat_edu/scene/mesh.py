@@ -73,6 +73,14 @@ class Mesh:
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return np.asarray(np.cross(b - a, c - a))
 
+    def summed_normals(self) -> Float64[np.ndarray, "V 3"]:
+        """Return the sum of `face_normals` over the faces of each vertex; zero at unused vertices."""
+        sums, normals = np.zeros_like(self.vertices), self.face_normals()
+        for corner in range(3):
+            for axis in range(3):
+                sums[:, axis] += np.bincount(self.faces[:, corner], normals[:, axis], len(sums))
+        return sums
+
     def used(self) -> Mesh:
         """Return the mesh without the vertices that no face names; the order of the others stays."""
         kept = np.zeros(len(self.vertices), dtype=bool)
