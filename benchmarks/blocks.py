@@ -4,10 +4,11 @@
                                 [--keep FOLDER] [--smoke] [--out FILE.json]
 
 Without CAPTURE, writes a procedural city (tests/fixtures/city.py) from the air. The capture is trained as a whole,
-and in blocks, of which the coarse model takes a quarter of the iterations and the blocks share the rest, so both
-trainings have equally many in total. Every eighth photo is held out. The strips lie along the cuts. The depth of the
-merged scene determines their pixels, for both scenes, and their PSNR is that of all these pixels together. Other
-options go to all trainings.
+and in blocks. The coarse model takes `COARSE` of the iterations. The blocks share the others: each photo is visited
+equally often in each of its blocks, and so often that as many pixels count in total as in the training of the whole.
+(A photo that shows two cells is visited in both blocks, where the other cell's pixels neither count nor are drawn.)
+Every eighth photo is held out. The strips lie along the cuts. The depth of the merged scene determines their pixels,
+for both scenes, and their PSNR is that of all these pixels together. Other options go to all trainings.
 
 Each command runs in a process of its own, whose processor time and peak memory are measured. The overhead is the
 processor time of splitting (without the coarse training), of merging and writing, and of a local Dask cluster of two
@@ -37,8 +38,9 @@ from gsplat_edu.blocks.merge import finished_blocks, merged
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
 from gsplat_edu.blocks.split import SplitOptions, coarse_scene, split_capture
-from gsplat_edu.blocks.task import block_options
+from gsplat_edu.blocks.task import block_options, pixels_of_block
 from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.io.ply import save_ply
@@ -51,7 +53,7 @@ COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 CLUSTER = "import sys; sys.path.insert(0, sys.argv[1]); import blocks; blocks.schedule(sys.argv[2], int(sys.argv[3]))"
 
-COARSE = 0.25
+COARSE = 0.04
 """Fraction of all iterations for the coarse model."""
 
 
@@ -127,10 +129,10 @@ def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: AN
     if not (whole / "report.html").is_file():
         words = ["train", data, "--out", whole, "--iterations", given.iterations, *recipe]
         costs["unsplit"] = measured(*words)
-    words = ["--blocks", given.blocks, "--iterations", each, "--coarse-iterations", coarse]
+    words = ["--blocks", given.blocks, "--iterations", max(each, 1), "--coarse-iterations", coarse]
     words += ["--min-views", given.min_views, *recipe]
     costs["coarse and split"] = measured("train", data, "--out", parts.path, "--until", "split", *words)
-    plan = BlockPlan.read(parts.path)
+    plan, counted = shared_visits(parts, given.iterations - coarse)
     found = len(plan.blocks)
     for number in range(found):
         costs[f"block {number}"] = measured("block", parts.path, number)
@@ -145,13 +147,44 @@ def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: AN
     )
     return {
         "photos": sum(len(part) for part in _views(plan)),
-        "iterations": {"unsplit": given.iterations, "coarse": coarse, "each block": each},
+        "iterations": {
+            "unsplit": given.iterations,
+            "coarse": coarse,
+            "blocks": [block.iterations for block in plan.blocks],
+        },
+        "share of the pixels that counts": counted,
         "training views": [len(block.train) for block in plan.blocks],
         "processor seconds": seconds,
         "largest memory (MiB)": {name: cost[1] for name, cost in costs.items()},
         "overhead": (seconds["splitting"] + seconds["merging"] + seconds.get("cluster", 0.0)) / trained,
         "scores": compared(whole, parts.path, folder / "seam.png"),
     }
+
+
+def shared_visits(parts: BlocksFolder, iterations: int) -> tuple[BlockPlan, list[float]]:
+    """Give each block its length, so that the pixels that count are those of so many whole photos in all.
+
+    Returns:
+        The changed plan, and by block the share of its photos' pixels that counts.
+    """
+    plan, shares = BlockPlan.read(parts.path), []
+    for number in range(len(plan.blocks)):
+        options = block_options(parts, plan, number)
+        dataset = load_dataset(options.data, options.data_settings)
+        counted = pixels_of_block(parts, plan, number, options)
+        shares.append(float(np.mean([counted.mask(view.camera).mean() for view in dataset.train])))
+    visits = iterations / sum(
+        share * len(block.train) for share, block in zip(shares, plan.blocks, strict=True)
+    )
+    lengths = [max(round(visits * len(block.train)), 1) for block in plan.blocks]
+    changed = replace(
+        plan,
+        blocks=tuple(
+            replace(block, iterations=length) for block, length in zip(plan.blocks, lengths, strict=True)
+        ),
+    )
+    changed.write(parts.path)
+    return changed, shares
 
 
 def overheads(parts: BlocksFolder, split: SplitOptions) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """How fast does the page draw without a graphics processor?
 
-    python benchmarks/page.py [SCENE ...] [--seconds S] [--pictures FOLDER] [--smoke] [--out FILE.json]
+    python benchmarks/page.py [SCENE ...] [--cameras N] [--seconds S] [--pictures FOLDER] [--smoke] [--out FILE.json]
 
 Without scenes, makes two of 200,000 and 1,000,000 splats with harmonics of degree 3: an object on a floor. Serves
 each by `gsplat-edu view` and opens the page in a headless Chromium that draws in software, in windows of a laptop's
@@ -11,6 +11,8 @@ and of a phone's size. Prints, for each,
 - the time per picture that a user sees while the mouse turns the view, median and longest, and the processor time of
   the browser for each;
 - the seconds from the last movement to the complete picture.
+
+--cameras N measures the page of a capture of N cameras and 200,000 points instead of scenes.
 
 --pictures writes a screenshot taken while the view turns, and one at rest. --smoke serves and requests the page of a
 tiny scene, without a browser.
@@ -34,12 +36,16 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import hardware
+import numpy as np
 import torch
 from live import FLAGS, browser_seconds
 
+from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 COUNTS = (200_000, 1_000_000)
 WINDOWS = {"laptop": (1280, 720), "phone": (390, 844)}
@@ -58,6 +64,39 @@ SHOWN = """() => {
   };
 }"""
 """Script that records when each picture is on the screen."""
+
+
+SHOWN_CAPTURE = """() => {
+  window.shown = [];
+  const draw = viewer.draw.bind(viewer);
+  viewer.draw = (camera, points) => {
+    draw(camera, points);
+    viewer.renderer.finish();
+    shown.push(performance.now());
+  };
+}"""
+"""The same for the page of a capture, which waits for each of its pictures."""
+
+POINTS = 200_000
+"""Points of a capture."""
+
+
+def write_capture(folder: Path, count: int) -> None:
+    """Write a capture of cameras on a spiral around a cloud of points, with photos of 64 x 48 px.
+
+    Args:
+        folder: Where to write it.
+        count: Number of cameras.
+    """
+    rng = np.random.default_rng(0)
+    pixels = np.full((48, 64, 3), 90, np.uint8)
+    views = []
+    for i in range(count):
+        turn, height = 40.0 * math.pi * i / count, 2.0 - 4.0 * i / count
+        eye = (4.0 * math.sin(turn), height, -4.0 * math.cos(turn))
+        views.append(View(Camera.looking_at(eye, (0, 0, 0), 60, 60, 48, 64), pixels, name=f"{i:05d}.png"))
+    points = rng.normal(size=(POINTS, 3))
+    write_transforms(folder, views, points, rng.uniform(size=(POINTS, 3)))
 
 
 def room(count: int, seed: int = 0) -> Gaussians:
@@ -98,7 +137,7 @@ def served(scene: Path) -> Iterator[str]:
     words = [sys.executable, "-m", "gsplat_edu", "view", str(scene), "--port", "0", "--no-open"]
     server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:
-        found = None
+        found = None  # the line with the address
         while found is None:
             line = server.stdout.readline() if server.stdout else ""
             if not line:
@@ -160,7 +199,8 @@ def measured(opened: Any, url: str, window: tuple[int, int], seconds: float, pic
     until(tab, "window.viewer?.isWhole === true")
     tab.evaluate("viewer.renderer.finish()")
     whole = time.perf_counter() - began
-    tab.evaluate(SHOWN)
+    is_capture = tab.evaluate("!viewer.put")
+    tab.evaluate(SHOWN_CAPTURE if is_capture else SHOWN)
     used = browser_seconds()
     while_turning = pictures and pictures.with_name(f"{pictures.name}-turning.png")
     turned(tab, seconds, while_turning)
@@ -173,7 +213,7 @@ def measured(opened: Any, url: str, window: tuple[int, int], seconds: float, pic
     if pictures:
         tab.screenshot(path=pictures.with_name(f"{pictures.name}-rest.png"))
     apart = [later - earlier for earlier, later in itertools.pairwise(shown)]
-    detail = tab.evaluate("viewer.pace.detail")
+    detail = tab.evaluate("viewer.put ? viewer.pace.detail : { points: viewer.moving }")
     tab.close()
     return {
         "first": first,
@@ -191,12 +231,16 @@ def main() -> None:
     """Measure, print and write the JSON."""
     parser = hardware.parser("The page: frames without a graphics processor.")
     parser.add_argument("scenes", type=Path, nargs="*")
+    parser.add_argument("--cameras", type=int, help="of a capture to measure instead of scenes")
     parser.add_argument("--seconds", type=float, default=8.0, help="of turning")
     parser.add_argument("--pictures", type=Path, help="folder for screenshots")
     arguments = parser.parse_args()
     results: dict[str, Any] = {}
     with TemporaryDirectory() as scratch, browser(arguments.smoke) as opened:
         scenes = arguments.scenes
+        if arguments.cameras:
+            scenes = [Path(scratch) / f"{arguments.cameras} cameras"]
+            write_capture(scenes[0], arguments.cameras)
         if not scenes:
             scenes = [Path(scratch) / f"{count}.ply" for count in ((300,) if arguments.smoke else COUNTS)]
             for path in scenes:

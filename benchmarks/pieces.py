@@ -46,8 +46,8 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.scene.camera import scene_extent
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.rig import scene_extent
 from gsplat_edu.train.capacity import planned_gaussians
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.density.fast import PlannedDensity

@@ -92,6 +92,7 @@ def frame_seconds(
             alpha_max=ALPHA_MAX,
             pixel_stop=False,
         ),
+        needed=None,
         threads=threads,
     )
     frame.composite(images=to.images, features=None)

@@ -36,7 +36,7 @@ from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.scene.camera import point_nearest_axes, scene_extent
+from gsplat_edu.scene.rig import point_nearest_axes, scene_extent
 from gsplat_edu.sfm.triangulate import triangulate
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import recipe

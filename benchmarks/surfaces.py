@@ -81,8 +81,6 @@ TEXTURE_FACES = 50_000
 TEXTURES = {
     "best of three": TextureSettings(),
     "best photo": TextureSettings(best=1),
-    "median of three": TextureSettings(median=True),
-    "median of five": TextureSettings(best=5, median=True),
 }
 """Textures that are compared."""
 

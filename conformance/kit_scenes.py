@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from gsplat_edu import look_at, quat_to_R
+from run import PINHOLE
 
 Arrays = dict[str, Any]
 
 
-def _single(array: object) -> np.ndarray:
+def single(array: object) -> np.ndarray:
+    """Round to float32."""
     return np.asarray(array, np.float32).astype(np.float64)
 
 
@@ -32,7 +34,7 @@ def pinhole(width: int = 24, height: int = 20, **changes: object) -> Arrays:
         "height": height,
     } | changes
     numbers = {name: float(np.float32(found[name])) for name in ("fx", "fy", "cx", "cy")}
-    return found | numbers | {name: _single(found[name]) for name in ("R", "eye")}
+    return PINHOLE | found | numbers | {name: single(found[name]) for name in ("R", "eye")}
 
 
 STRAIGHT = {"R": np.eye(3), "eye": (0.0, 0.0, -3.0)}
@@ -49,7 +51,7 @@ def given(**changes: object) -> Arrays:
         "alpha_max": 0.99,
         "z_near": 0.05,
     } | changes
-    return found | {"background": _single(found["background"])}
+    return found | {"background": single(found["background"])}
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def random(n: int, seed: int, channels: int = 2, coefficients: int = 1, **change
         "logit_opacities": rng.normal(size=n) * 1.5,
         "features": rng.normal(size=(n, channels)),
     } | changes
-    return {name: _single(array) for name, array in found.items()}
+    return {name: single(array) for name, array in found.items()}
 
 
 def wide(n: int, seed: int, channels: int = 5, **changes: object) -> Arrays:
@@ -112,7 +114,8 @@ def wide(n: int, seed: int, channels: int = 5, **changes: object) -> Arrays:
     return random(n, seed + 100, channels, **found)
 
 
-def _scales(n: int, seed: int, middle: float, spread: float = 0.4) -> np.ndarray:
+def scales(n: int, seed: int, middle: float, spread: float = 0.4) -> np.ndarray:
+    """Return the logarithms of n scales around a middle."""
     return middle + np.random.default_rng(seed).uniform(-spread, spread, (n, 3))
 
 
@@ -177,7 +180,7 @@ def _unnormalised() -> np.ndarray:
 
 
 def plans() -> tuple[Plan, ...]:
-    """Return all plans."""
+    """Return the plans of pinholes; `kit_lenses` has all."""
     parts = (_formulas, _opacities, _hard, _placed, _sizes, _smooth, _pieces, _more_gradients)
     return tuple(plan for part in parts for plan in part())
 
@@ -231,14 +234,14 @@ def _opacities() -> tuple[Plan, ...]:
             "smaller_than_a_pixel",
             "Points, whose ellipses are the dilation alone.",
             "0.3 px² is added to both diagonal entries of the covariance in the image.",
-            random(60, 4, log_scales=_scales(60, 4, -8.0)),
+            random(60, 4, log_scales=scales(60, 4, -8.0)),
             pinhole(),
         ),
         Plan(
             "antialiased",
             "Opacities compensated for the dilation, on Gaussians from points to 10 px.",
             "The factor is sqrt(det before / det after dilation), applied to the opacity before clamp and cut-off.",
-            random(40, 101, log_scales=_scales(40, 101, -2.8, 1.6)),
+            random(40, 101, log_scales=scales(40, 101, -2.8, 1.6)),
             pinhole(),
             given(antialiased=True),
         ),
@@ -246,14 +249,14 @@ def _opacities() -> tuple[Plan, ...]:
             "alpha_clamp",
             "Opaque Gaussians whose alpha is clamped around their centres.",
             "alpha is at most alpha_max = 0.99, and an opaque ellipse ends at 1/255, beyond 3 standard deviations.",
-            random(3, 36, log_scales=_scales(3, 36, -1.0), logit_opacities=np.full(3, 8.0)),
+            random(3, 36, log_scales=scales(3, 36, -1.0), logit_opacities=np.full(3, 8.0)),
             pinhole(),
         ),
         Plan(
             "clamp_at_0.999",
             "The same with alpha_max = 0.999, as in gsplat.",
             "alpha_max is a setting.",
-            random(3, 36, log_scales=_scales(3, 36, -1.0), logit_opacities=np.full(3, 8.0)),
+            random(3, 36, log_scales=scales(3, 36, -1.0), logit_opacities=np.full(3, 8.0)),
             pinhole(16, 16),
             given(alpha_max=0.999),
         ),
@@ -261,7 +264,7 @@ def _opacities() -> tuple[Plan, ...]:
             "nearly_transparent",
             "Opacities around 1/255, at which alpha is cut off.",
             "alpha below 1/255 is zero, exactly; opacities are sigmoids.",
-            random(60, 6, log_scales=_scales(60, 6, -1.5), logit_opacities=np.linspace(-5.54, -5.0, 60)),
+            random(60, 6, log_scales=scales(60, 6, -1.5), logit_opacities=np.linspace(-5.54, -5.0, 60)),
             pinhole(),
         ),
     )
@@ -281,7 +284,7 @@ def _hard() -> tuple[Plan, ...]:
             "ties_in_depth",
             "Two groups of 12 Gaussians with equal depths, stored far group first.",
             "Compositing is near to far by the camera z of the mean; equal depths keep the order of the input.",
-            random(24, 7, means=_tied(), log_scales=_scales(24, 7, -1.4)),
+            random(24, 7, means=_tied(), log_scales=scales(24, 7, -1.4)),
             pinhole(**STRAIGHT),
             exact_depths=True,
         ),
@@ -296,7 +299,7 @@ def _hard() -> tuple[Plan, ...]:
             "larger_than_the_image",
             "Gaussians larger than the image.",
             "A large ellipse is dropped or cut: it reaches every pixel with alpha >= 1/255.",
-            random(10, 3, log_scales=_scales(10, 3, 0.8), logit_opacities=np.full(10, -0.8)),
+            random(10, 3, log_scales=scales(10, 3, 0.8), logit_opacities=np.full(10, -0.8)),
             pinhole(),
         ),
     )
@@ -309,7 +312,7 @@ def _placed() -> tuple[Plan, ...]:
             "off_screen_centres",
             "Means beside the image, whose ellipses reach into it; the Jacobian is clamped.",
             "x/z and y/z inside J are clamped to jacobian_limit times half the image about its centre (not about cx).",
-            random(15, 12, means=_beside(), log_scales=_scales(15, 12, -0.4)),
+            random(15, 12, means=_beside(), log_scales=scales(15, 12, -0.4)),
             pinhole(),
             given(jacobian_limit=1.3),
         ),
@@ -317,7 +320,7 @@ def _placed() -> tuple[Plan, ...]:
             "off_screen_unclamped",
             "The same with the unclamped Jacobian.",
             "jacobian_limit = None means no clamp.",
-            random(15, 12, means=_beside(), log_scales=_scales(15, 12, -0.4)),
+            random(15, 12, means=_beside(), log_scales=scales(15, 12, -0.4)),
             pinhole(),
         ),
         Plan(
@@ -333,7 +336,7 @@ def _placed() -> tuple[Plan, ...]:
             "opaque_tiles_stop",
             "Opaque layers: T falls below 1e-4 in whole tiles, where a renderer may stop or continue.",
             "Stopping before the Gaussian that takes T below 1e-4, or at a larger T, leaves out what is still visible.",
-            random(40, 101, log_scales=_scales(40, 101, -0.5), logit_opacities=np.full(40, 3.0)),
+            random(40, 101, log_scales=scales(40, 101, -0.5), logit_opacities=np.full(40, 3.0)),
             pinhole(),
             stops=True,
         ),
@@ -361,7 +364,7 @@ def _sizes() -> tuple[Plan, ...]:
             "one_pixel",
             "An image of 1 x 1 px.",
             "Pixels of partial tiles are lost.",
-            random(20, 8, log_scales=_scales(20, 8, -1.0), logit_opacities=np.full(20, -2.0)),
+            random(20, 8, log_scales=scales(20, 8, -1.0), logit_opacities=np.full(20, -2.0)),
             pinhole(1, 1),
             given(jacobian_limit=1.3),
         ),
@@ -435,7 +438,7 @@ def _pieces() -> tuple[Plan, ...]:
             "gradient_jacobian_clamp",
             "Means beside the image, some beyond the clamp of the Jacobian.",
             "A clamped x/z has no gradient in the mean; the bound itself moves with fx, fy, cx and cy.",
-            wide(6, 3, channels=2, means=beside, log_scales=_scales(6, 40, 0.3)),
+            wide(6, 3, channels=2, means=beside, log_scales=scales(6, 40, 0.3)),
             pinhole(11, 9),
             given(jacobian_limit=1.3),
             gradients=True,
@@ -444,9 +447,7 @@ def _pieces() -> tuple[Plan, ...]:
             "gradient_alpha_clamp",
             "Some alphas are clamped at 0.99.",
             "A clamped alpha has gradient zero in everything it is made of.",
-            wide(
-                4, 100, channels=2, log_scales=_scales(4, 100, -0.6), logit_opacities=(6.0, -1.0, 0.5, -0.5)
-            ),
+            wide(4, 100, channels=2, log_scales=scales(4, 100, -0.6), logit_opacities=(6.0, -1.0, 0.5, -0.5)),
             pinhole(11, 9),
             gradients=True,
         ),

@@ -23,12 +23,16 @@ from gsplat_edu import Camera, build_cov3d_batch, project_cov3d, quat_to_R_batch
 from gsplat_edu.base.constants import ALPHA_MIN, SH_OFFSET
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.render.numpy_reference import project
+from gsplat_edu.render.numpy_reference import screen_splats
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussian_math import opacity_compensation
 from gsplat_edu.scene.gaussians import Gaussians
-from kit_scenes import Arrays, Plan, plans
-from run import CASES, EPSILON, INPUT_ROUNDINGS, T_STOP, load_cases, tolerance
+from gsplat_edu.scene.projection import Distortion, Projection
+from gsplat_edu.scene.shutter import RollingShutter, readout_pace
+from gsplat_edu.scene.sight import seam_shift
+from kit_lenses import plans
+from kit_scenes import Arrays, Plan
+from run import CASES, EPSILON, INPUT_ROUNDINGS, PINHOLE, T_STOP, load_cases, tolerance
 
 DRAWS = 8
 """Perturbations of the inputs from which a sensitivity is measured."""
@@ -51,12 +55,31 @@ INPUTS = (
     "R",
     "eye",
     *INTRINSICS,
+    "distortion",
+    "turn",
+    "shift",
 )
+
+COEFFICIENT_UNITS = 4.0 ** -np.array((1, 2, 3, 4, 5, 6, 1, 2, 3, 0, 0, 0, 1, 0, 1))
+"""Units of the steps in coefficients of a distortion: past 90 degrees, k6 multiplies an angle to the power of 13."""
+
+
+def camera_inputs(plan: Plan) -> list[str]:
+    """Return the names of the camera's differentiable inputs: those of lens and shutter only where it has them."""
+    sphere = plan.camera["projection"] == "equirectangular"
+    names = ["R", "eye", *(INTRINSICS[2:] if sphere else INTRINSICS)]
+    names += ["distortion"] if np.any(plan.camera["distortion"]) else []
+    return names + (["turn", "shift"] if _moves(plan.camera) else [])
+
+
+def _moves(camera: Arrays) -> bool:
+    """Return whether a camera moves while it is read, or while it is exposed."""
+    return camera["readout"] != "none" or camera["exposure"] > 0
 
 
 def flat_inputs(plan: Plan) -> Arrays:
     """Return all differentiable inputs by name, as float64 arrays."""
-    numbers = {name: np.asarray(plan.camera[name], np.float64) for name in ("R", "eye", *INTRINSICS)}
+    numbers = {name: np.asarray(plan.camera[name], np.float64) for name in camera_inputs(plan)}
     return plan.gaussians | {"background": plan.settings["background"]} | numbers
 
 
@@ -65,36 +88,60 @@ def flat_inputs(plan: Plan) -> Arrays:
 
 def colours(plan: Plan, x: Arrays) -> np.ndarray:
     """Return the colours before the floor: sum_i b_i(d) sh_i + 0.5."""
-    offset = x["means"] - x["eye"]
+    offset, _ = _seen(plan, _camera(plan, x), x)
     used = min(x["sh"].shape[1], (plan.settings["sh_degree"] + 1) ** 2)
     basis = sh_basis(offset / np.linalg.norm(offset, axis=-1, keepdims=True))[:, :used]
     return np.einsum("nk,nkc->nc", basis, x["sh"][:, :used]) + SH_OFFSET
 
 
 def _camera(plan: Plan, x: Arrays) -> Camera:
-    numbers = [float(x[name]) for name in INTRINSICS]
-    return Camera(x["R"], x["eye"], *numbers, H=plan.camera["height"], W=plan.camera["width"])
+    given = plan.camera | x
+    numbers = [float(given[name]) for name in INTRINSICS]
+    camera = Camera(x["R"], x["eye"], *numbers, H=given["height"], W=given["width"])
+    distortion = None
+    if np.any(given["distortion"]):
+        distortion = Distortion(tuple(given["distortion"].tolist()), given["radial_first"])
+    motion = given["turn"], given["shift"], given["readout"], given["exposure"]
+    shutter = RollingShutter(*motion) if _moves(given) else None
+    return camera.through(Projection(given["projection"], distortion), shutter)
+
+
+def _seen(plan: Plan, camera: Camera, x: Arrays) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions from the camera to the means, of any length, and depths; 1 and 0 for means it does not see."""
+    if camera.pinhole:
+        return x["means"] - x["eye"], camera.world_to_cam(x["means"])[:, 2]
+    seen = camera.sight(x["means"], plan.settings["z_near"])
+    directions = np.stack(np.broadcast_arrays(*seen.direction), axis=-1)
+    return np.where(seen.valid[:, None], directions, 1.0), np.where(seen.valid, seen.depth, 0.0)
 
 
 def _activated(plan: Plan, x: Arrays) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray]:
-    """Return camera, covariances, opacities as composited, and means in camera coordinates."""
+    """Return camera, covariances, opacities as composited, and depths."""
     camera = _camera(plan, x)
     covs = build_cov3d_batch(np.exp(x["log_scales"]), quat_to_R_batch(x["quats"]))
     opacities = 1 / (1 + np.exp(-x["logit_opacities"]))
-    means_cam = camera.world_to_cam(x["means"])
+    _, depths = _seen(plan, camera, x)
     if plan.settings["antialiased"]:
-        front = means_cam[:, 2] > plan.settings["z_near"]
-        limit = plan.settings["jacobian_limit"]
-        opacities[front] *= opacity_compensation(
-            project_cov3d(covs[front], means_cam[front], camera, jacobian_limit=limit)
-        )
-    return camera, covs, opacities, means_cam
+        front = np.flatnonzero(depths > plan.settings["z_near"])
+        opacities[front] *= opacity_compensation(_flat(plan, camera, x["means"][front], covs[front]))
+    return camera, covs, opacities, depths
+
+
+def _flat(plan: Plan, camera: Camera, means: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    """Return the covariances in the image before the dilation, of means that the camera sees."""
+    limit = plan.settings["jacobian_limit"]
+    if camera.pinhole:
+        return project_cov3d(covs, camera.world_to_cam(means), camera, jacobian_limit=limit)
+    rows = np.stack(
+        [np.stack(row, axis=-1) for row in camera.sight(means, jacobian_limit=limit).jacobian], axis=-2
+    )
+    return np.asarray(rows @ covs @ np.swapaxes(rows, -1, -2))
 
 
 def composited(plan: Plan, x: Arrays, stop: str = "tile") -> Arrays:
     """Return image, transmittance, depth and features of the NumPy reference."""
-    camera, covs, opacities, means_cam = _activated(plan, x)
-    columns = np.concatenate([np.maximum(colours(plan, x), 0.0), means_cam[:, 2:], x["features"]], axis=1)
+    camera, covs, opacities, depths = _activated(plan, x)
+    columns = np.concatenate([np.maximum(colours(plan, x), 0.0), depths[:, None], x["features"]], axis=1)
     columns = np.pad(columns, ((0, 0), (0, -columns.shape[1] % 3)))
     options = {
         "z_near": plan.settings["z_near"],
@@ -117,16 +164,31 @@ def composited(plan: Plan, x: Arrays, stop: str = "tile") -> Arrays:
     }
 
 
-def alphas(plan: Plan, x: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return order (M,), depths (M,) and alphas (M, H, W) before clamp and cut-off, near to far."""
-    camera, covs, opacities, means_cam = _activated(plan, x)
-    order, means2d, cov2d = project(
+def alphas(plan: Plan, x: Arrays, by_pixel: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return order (M,), depths (M,) and alphas (M, H, W) before clamp and cut-off, near to far.
+
+    Args:
+        plan: The case.
+        x: Its inputs.
+        by_pixel: Whether each pixel of a panorama sees the nearest copy of a mean; otherwise, each tile does.
+    """
+    camera, covs, opacities, depths = _activated(plan, x)
+    order, means2d, cov2d, factor = screen_splats(
         camera, x["means"], covs, plan.settings["z_near"], plan.settings["jacobian_limit"]
     )
     rows, columns = np.mgrid[: camera.H, : camera.W]
     d = np.stack([columns, rows], axis=-1) - means2d[:, None, None]
+    if camera.projection.kind == "equirectangular":
+        d[..., 0] -= (
+            (camera.W * np.round(d[..., 0] / camera.W)) if by_pixel else _tile_copies(camera, means2d)
+        )
     power = -0.5 * np.einsum("nyxi,nij,nyxj->nyx", d, np.linalg.inv(cov2d), d)
-    return order, means_cam[order, 2], opacities[order, None, None] * np.exp(power)
+    return order, depths[order], (factor * opacities[order])[:, None, None] * np.exp(power)
+
+
+def _tile_copies(camera: Camera, means2d: np.ndarray) -> np.ndarray:
+    """Return the whole turns, px, by which a panorama's tiles of 16 columns see each mean moved."""
+    return seam_shift(np.arange(camera.W), means2d[:, :1], camera.W)[:, None, :]
 
 
 def transmittances(plan: Plan, raw: np.ndarray) -> np.ndarray:
@@ -155,12 +217,18 @@ def outputs(plan: Plan, x: Arrays) -> Arrays:
 
 def _dense(plan: Plan, x: Arrays, *, tracked: bool) -> tuple[Any, dict[str, torch.Tensor]]:
     leaves = {name: torch.tensor(array, requires_grad=tracked) for name, array in x.items()}
+    still = "turn" not in leaves
     camera = CameraTensors(
         leaves["R"],
         leaves["eye"],
-        torch.stack([leaves[name] for name in INTRINSICS]),
+        torch.stack([leaves.get(n, torch.tensor(plan.camera[n], dtype=torch.float64)) for n in INTRINSICS]),
         plan.camera["height"],
         plan.camera["width"],
+        _camera(plan, x).projection,
+        leaves.get("distortion"),
+        None if still else torch.cat([leaves["turn"], leaves["shift"]]),
+        "down" if still else plan.camera["readout"],
+        plan.camera["exposure"],
     )
     gaussians = Gaussians(
         means=leaves["means"],
@@ -200,12 +268,14 @@ def gradients(plan: Plan, x: Arrays, upstream: Arrays) -> Arrays:
 
 def _magnitudes(x: Arrays, exact_depths: bool) -> Arrays:
     """Return the number whose rounding enters each input: its size, or that of what it is added to or multiplied by."""
+    x = dict.fromkeys(INPUTS, np.zeros(())) | x  # those that the camera lacks are not used
     found = {name: np.abs(x[name]) for name in ("sh", "features", "background", "fx", "fy")}
     found["means"] = np.abs(x["means"]) + np.abs(x["eye"])
     found["quats"] = np.linalg.norm(x["quats"], axis=-1, keepdims=True) + np.zeros(4)
     found |= {name: np.maximum(np.abs(x[name]), 1.0) for name in ("log_scales", "logit_opacities")}
     found |= {name: np.maximum(np.abs(x[name]), 1.0) for name in ("cx", "cy")}
     found |= {"R": np.ones((3, 3)), "eye": np.abs(x["eye"])}
+    found |= {name: np.abs(x[name]) for name in ("distortion", "turn", "shift")}
     if exact_depths:
         found["means"][:, 2] = 0.0
         found["R"], found["eye"] = np.zeros((3, 3)), np.zeros(3)
@@ -217,7 +287,7 @@ def perturbed(plan: Plan, step: float) -> Iterator[Arrays]:
     rng, x = np.random.default_rng(0), flat_inputs(plan)
     magnitudes = _magnitudes(x, plan.exact_depths)
     for _ in range(DRAWS):
-        yield {n: x[n] + step * rng.choice([-1.0, 1.0], x[n].shape) * magnitudes[n] for n in INPUTS}
+        yield {n: x[n] + step * rng.choice([-1.0, 1.0], x[n].shape) * magnitudes[n] for n in INPUTS if n in x}
 
 
 def sensitivities(plan: Plan, upstream: Arrays) -> Arrays:
@@ -269,7 +339,10 @@ def build(plan: Plan) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         names = ("image", "transmittance", "depth", "features")
         upstream = {name: rng.normal(size=truth[name].shape) for name in names}
     arrays = {f"gaussians.{name}": array for name, array in plan.gaussians.items()}
-    arrays |= {f"camera.{name}": plan.camera[name] for name in ("R", "eye")}
+    others = [name for name in PINHOLE if not np.array_equal(plan.camera[name], PINHOLE[name])]
+    vectors = ["R", "eye", *(name for name in others if isinstance(PINHOLE[name], np.ndarray))]
+    numbers = [name for name in plan.camera if name not in PINHOLE or name in others]
+    arrays |= {f"camera.{name}": plan.camera[name] for name in vectors}
     arrays["settings.background"] = plan.settings["background"]
     arrays |= {f"truth.{name}": array for name, array in truth.items()}
     arrays |= {f"upstream.{name}": array for name, array in upstream.items()}
@@ -280,7 +353,7 @@ def build(plan: Plan) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         "name": plan.name,
         "shows": plan.shows,
         "hint": plan.hint,
-        "camera": {name: value for name, value in plan.camera.items() if name not in ("R", "eye")},
+        "camera": {name: plan.camera[name] for name in numbers if name not in vectors},
         "settings": {name: value for name, value in plan.settings.items() if name != "background"},
         "stopped": _stopped(plan, x) if plan.stops else {},
     }
@@ -292,7 +365,7 @@ def _stopped(plan: Plan, x: Arrays) -> dict[str, float]:
     largest = {
         "image": max(colours(plan, x).max(), x["background"].max()),
         "transmittance": 1.0,
-        "depth": _camera(plan, x).world_to_cam(x["means"])[:, 2].max(),
+        "depth": _seen(plan, _camera(plan, x), x)[1].max(),
         "features": np.abs(x["features"]).max(),
     }
     return {name: T_STOP * float(value) for name, value in largest.items()}
@@ -318,12 +391,34 @@ def verify(plan: Plan, *, every: int = 1) -> None:
             assert np.array_equal(value, base[name]), f"{plan.name}: rounding decides {name}"
     T = transmittances(plan, alphas(plan, x)[2])[-1]
     assert plan.stops == bool((T < 2 * T_STOP).any()), f"{plan.name}: T stop"
+    tiles, pixels = (alphas(plan, x, by_pixel)[2] for by_pixel in (False, True))
+    assert np.array_equal(tiles * (tiles >= ALPHA_MIN), pixels * (pixels >= ALPHA_MIN)), (
+        f"{plan.name}: a Gaussian is as wide as the panorama"
+    )
+    assert _unsolved(plan, x) < 1e-11, f"{plan.name}: Newton's method does not reach the rows of means"
     if plan.smooth:
         assert not any(base[name].any() for name in ("cut", "clamped", "floored")), (
             f"{plan.name}: is not smooth"
         )
     if plan.gradients:
         _check_gradients(plan, x, every)
+
+
+def _unsolved(plan: Plan, x: Arrays) -> float:
+    """Return how far places of means, px, are from where a camera at rest sees them at the time of the place."""
+    camera, worst = _camera(plan, x), 0.0
+    if camera.shutter is None:
+        return worst
+    seen, pace = camera.sight(x["means"]), readout_pace(camera.readout, camera.H, camera.W)
+    axis = camera.shutter.axis
+    for at in np.flatnonzero(seen.valid):
+        place = np.array([seen.u[at], seen.v[at]])
+        time = pace * (place[axis] - ((camera.W, camera.H)[axis] - 1) / 2)
+        R = camera.shutter.rotation(time) @ camera.R
+        rest = Camera.posed(R, camera.eye + time * camera.shutter.shift, camera.intrinsics)
+        u, v, _ = rest.project(rest.world_to_cam(x["means"][at]))
+        worst = max(worst, float(np.abs(place - (u, v)).max()))
+    return worst
 
 
 def _check_gradients(plan: Plan, x: Arrays, every: int) -> None:
@@ -344,19 +439,20 @@ def _check_gradients(plan: Plan, x: Arrays, every: int) -> None:
     for name, gradient in gradients(plan, x, upstream).items():
         bound = 1e-6 * max(float(np.abs(gradient).max()), 1.0)
         for at in range(0, gradient.size, every):
-            slope = _slope(loss, x, name, at)
-            assert abs(slope - gradient.flat[at]) <= bound, (
+            unit = COEFFICIENT_UNITS[at] if name == "distortion" else 1.0
+            slope = _slope(loss, x, name, at, 1e-5 * unit)
+            assert abs(slope - gradient.flat[at]) <= bound / unit, (
                 f"{plan.name}: d/d {name}[{at}] is {gradient.flat[at]}, but {slope}"
             )
 
 
-def _slope(loss: Callable[[Arrays], float], x: Arrays, name: str, at: int) -> float:
+def _slope(loss: Callable[[Arrays], float], x: Arrays, name: str, at: int, step: float) -> float:
     ends = []
     for sign in (1, -1):
         y = x | {name: x[name].copy()}
-        y[name].flat[at] += sign * 1e-5
+        y[name].flat[at] += sign * step
         ends.append(loss(y))
-    return (ends[0] - ends[1]) / 2e-5
+    return (ends[0] - ends[1]) / (2 * step)
 
 
 def write(plan: Plan, folder: Path) -> Path:

@@ -23,6 +23,7 @@ from gsplat_edu.render.camera_tensors import INTRINSICS, CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.projection import Distortion, Projection
 
 Arrays = dict[str, Any]
 
@@ -55,7 +56,8 @@ class Renderer:
         torch.stack(losses).sum().backward()
         found = {name: _array(leaf.grad) for name, leaf in leaves.items() if leaf.grad is not None}
         numbers = zip(INTRINSICS, found.pop("intrinsics"), strict=True)
-        return found | {name: np.asarray(number) for name, number in numbers}
+        motion = {"turn": found["motion"][:3], "shift": found.pop("motion")[3:]} if "motion" in found else {}
+        return found | motion | {name: np.asarray(number) for name, number in numbers}
 
     def _rendered(
         self, gaussians: Arrays, camera: Arrays, settings: Arrays, *, tracked: bool
@@ -67,6 +69,10 @@ class Renderer:
         }
         intrinsics = [camera[name] for name in INTRINSICS]
         pose = {"R": camera["R"], "eye": camera["eye"], "intrinsics": np.array(intrinsics)}
+        pose |= {"distortion": camera["distortion"]} if np.any(camera["distortion"]) else {}
+        lens = Distortion((), camera["radial_first"]) if "distortion" in pose else None
+        still = camera["readout"] == "none" and not camera["exposure"]
+        pose |= {} if still else {"motion": np.concatenate([camera["turn"], camera["shift"]])}
         leaves |= {name: torch.tensor(array, requires_grad=tracked) for name, array in pose.items()}
         out = render(
             Gaussians(
@@ -78,7 +84,16 @@ class Renderer:
                 logit_opacities=leaves["logit_opacities"],
             ),
             CameraTensors(
-                leaves["R"], leaves["eye"], leaves["intrinsics"], camera["height"], camera["width"]
+                leaves["R"],
+                leaves["eye"],
+                leaves["intrinsics"],
+                camera["height"],
+                camera["width"],
+                Projection(camera["projection"], lens),
+                leaves.get("distortion"),
+                leaves.get("motion"),
+                "down" if still else camera["readout"],
+                camera["exposure"],
             ),
             settings=RenderSettings(
                 sh_degree=settings["sh_degree"],

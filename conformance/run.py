@@ -15,7 +15,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +47,23 @@ OUTPUTS = ("image", "transmittance", "alpha", "depth", "median_depth", "features
 
 GRADIENTS = (
     *("means", "quats", "log_scales", "sh", "logit_opacities", "features", "background"),
-    *("R", "eye", "fx", "fy", "cx", "cy"),
+    *("R", "eye", "fx", "fy", "cx", "cy", "distortion", "turn", "shift"),
 )
-"""The gradients that are compared."""
+"""The gradients that are compared. Those of lens and shutter exist where a camera has them."""
+
+LENSES = ("distortion", "fisheye", "equirectangular", "orthographic", "rolling_shutter", "motion_blur")
+"""What a camera may have beyond a pinhole's; `without` names what a renderer does not know, as "lens.fisheye"."""
+
+PINHOLE: Arrays = {
+    "projection": "perspective",
+    "distortion": np.zeros(15),
+    "radial_first": False,
+    "readout": "none",
+    "turn": np.zeros(3),
+    "shift": np.zeros(3),
+    "exposure": 0.0,
+}
+"""Lens and shutter of a pinhole at rest, which the files of such cases leave out."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +75,7 @@ class Case:
         shows: What the case tests.
         hint: What a failure usually means.
         gaussians: means (N, 3), quats (N, 4), log_scales (N, 3), sh (N, K, 3), logit_opacities (N,), features (N, C).
-        camera: R (3, 3), eye (3,), fx, fy, cx, cy, width, height.
+        camera: R (3, 3), eye (3,), fx, fy, cx, cy, width, height; and lens and shutter, as `PINHOLE`.
         settings: background (3,), sh_degree, antialiased, jacobian_limit, alpha_max, z_near.
         truth: The true outputs by name.
         upstream: The gradients of a loss in the outputs; empty if the case has no gradients.
@@ -82,6 +96,15 @@ class Case:
     gradients: Arrays
     sensitivity: Arrays
     stopped: dict[str, float]
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Which of the `LENSES` the camera has."""
+        found = {self.camera["projection"]}
+        found |= {"distortion"} if np.any(self.camera["distortion"]) else set()
+        found |= {"rolling_shutter"} if self.camera["readout"] != "none" else set()
+        found |= {"motion_blur"} if self.camera["exposure"] else set()
+        return tuple(name for name in LENSES if name in found)
 
 
 @dataclass(frozen=True)
@@ -116,11 +139,13 @@ class Report:
         rows: One per compared array.
         hints: What a failure usually means, by case.
         left_out: What was not compared, at the caller's request.
+        skipped: The lenses that the renderer does not know, by the case that needs them and was not run.
     """
 
     rows: tuple[Row, ...]
     hints: dict[str, str]
     left_out: tuple[str, ...]
+    skipped: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def failures(self) -> tuple[Row, ...]:
@@ -147,6 +172,11 @@ class Report:
         cases, failed = len({row.case for row in self.rows}), len(self.failed_cases)
         lines.append(f"\n{cases - failed} of {cases} cases pass, {len(self.rows)} arrays compared.")
         lines += [f"Left out: {', '.join(self.left_out)}."] if self.left_out else []
+        if self.skipped:
+            lacks = [f"{name} ({', '.join(missing)})" for name, missing in self.skipped.items()]
+            lines.append(
+                f"{len(lacks)} cases not run, of lenses that the renderer lacks: {'; '.join(lacks)}."
+            )
         return "\n".join(lines)
 
 
@@ -162,7 +192,7 @@ def read_case(path: Path) -> Case:
     for key, array in flat.items():
         group, _, name = key.partition(".")
         groups[group][name] = array
-    groups["camera"] |= about["camera"]
+    groups["camera"] = PINHOLE | groups["camera"] | about["camera"]
     groups["settings"] |= about["settings"]
     groups["truth"]["alpha"] = 1.0 - groups["truth"]["transmittance"]
     groups["sensitivity"]["alpha"] = groups["sensitivity"]["transmittance"]
@@ -220,25 +250,35 @@ def check(
         gradients: Function (gaussians, camera, settings, upstream) -> gradients; None to compare outputs only.
         precision: "float64" or "float32", that of the renderer's arithmetic.
         cases: The cases; None for all.
-        without: Outputs ("median_depth") and gradients ("gradient.R") that the renderer does not have.
+        without: Outputs ("median_depth"), gradients ("gradient.R") and lenses ("lens.fisheye"; "lens" for all) that
+            the renderer does not have. The report names the cases of lenses that it does not know.
 
     Raises:
         ValueError: the precision or a name in `without` is unknown.
     """
-    known = {*OUTPUTS, *(f"gradient.{name}" for name in GRADIENTS)}
+    known = {
+        *OUTPUTS,
+        *(f"gradient.{name}" for name in GRADIENTS),
+        "lens",
+        *(f"lens.{name}" for name in LENSES),
+    }
     if unknown := sorted(set(without) - known):
         raise ValueError(f"without: does not know {unknown[0]!r}; use {', '.join(sorted(known))}")
     if precision not in EPSILON:
         raise ValueError(f"precision: is {precision!r}, but has to be float32 or float64")
     chosen = load_cases() if cases is None else tuple(cases)
     rows: list[Row] = []
+    skipped: dict[str, tuple[str, ...]] = {}
     for case in chosen:
+        if missing := tuple(lens for lens in case.needs if {"lens", f"lens.{lens}"} & set(without)):
+            skipped[case.name] = missing
+            continue
         rows += _compare(case, "", _outcome(render, case, with_upstream=False), precision, without)
         if case.gradients and gradients is not None:
             found = _outcome(gradients, case, with_upstream=True)
             rows += _compare(case, "gradient.", found, precision, without)
     left_out = (*sorted(without), *(("all gradients",) if gradients is None else ()))
-    return Report(tuple(rows), {case.name: case.hint for case in chosen}, left_out)
+    return Report(tuple(rows), {case.name: case.hint for case in chosen}, left_out, skipped)
 
 
 def _outcome(function: Callable[..., Arrays], case: Case, *, with_upstream: bool) -> Arrays | str:
@@ -302,7 +342,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--precision", choices=sorted(EPSILON), default="float64")
     parser.add_argument("--case", action="append", help="check only this case; may be repeated")
-    parser.add_argument("--without", default="", help="what the renderer lacks: median_depth,gradient.R,...")
+    parser.add_argument(
+        "--without", default="", help="what the renderer lacks: median_depth,lens.fisheye,..."
+    )
     options = parser.parse_args(argv)
     sys.path.insert(0, "")  # modules in the working directory
     try:

@@ -34,10 +34,17 @@ struct BoundFrame {
     bool direct, composited = false, with_depth = false;
     int64_t channels = 0;
     int32_t H, W;
+    int64_t camera_numbers;  // of its gradient
     Frame<T> frame;
 
-    BoundFrame(const SceneArrays &scene, const Camera &camera, const Settings &settings, int threads)
-        : n(scene.n), rest(scene.rest), direct(scene.direct), H(camera.H), W(camera.W), frame(scene.as<T>(), camera, settings, threads) {}
+    BoundFrame(const SceneArrays &scene, const Camera &camera, const Settings &settings, const uint8_t *needed, int threads)
+        : n(scene.n),
+          rest(scene.rest),
+          direct(scene.direct),
+          H(camera.H),
+          W(camera.W),
+          camera_numbers(gsplat::camera_numbers(camera)),
+          frame(scene.as<T>(), camera, settings, needed, threads) {}
 
     void check(const Arguments &a, const char *name, const PerGaussian &given) const {
         if (!given.means.is(KIND<T>)) a.fail(name, "is of another dtype than the frame");
@@ -71,13 +78,6 @@ struct BoundFrame {
     const StatisticArrays *collected_of(Arguments &a) const;
 };
 
-template <class S>
-const S &struct_of(Arguments &a, const char *name) {
-    const S *found = nullptr;
-    if (!nb::try_cast(a.take(name), found, false) || !found) a.fail(name, "has to be the structure of that name");
-    return *found;
-}
-
 // Statistics to collect, or null for None.
 template <class T>
 const StatisticArrays *BoundFrame<T>::collected_of(Arguments &a) const {
@@ -101,13 +101,14 @@ void make_frame(BoundFrame<T> *self, nb::args positional, nb::kwargs given) {
     const auto &scene = struct_of<SceneArrays>(a, "scene");
     const auto &camera = struct_of<Camera>(a, "camera");
     const auto &settings = struct_of<Settings>(a, "settings");
+    const Array needed = a.array_or_none("needed", Kind::U8, {camera.H, camera.W});
     const int threads = int(a.whole("threads", 1, MOST_THREADS));
     a.finish();
     if (!scene.means.is(KIND<T>)) a.fail("scene", "is of another dtype than the frame");
     if (!scene.direct && (settings.sh_degree + 1) * (settings.sh_degree + 1) - 1 > scene.rest)
         a.fail("settings", "sh_degree is above the degree of the scene's sh_rest");
     nb::gil_scoped_release release;
-    new (self) BoundFrame<T>(scene, camera, settings, threads);
+    new (self) BoundFrame<T>(scene, camera, settings, needed.as<uint8_t>(), threads);
 }
 
 template <class T>
@@ -136,6 +137,8 @@ void backward(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     self.check_images(a, images, incoming);
     if (incoming.features && (!gradients.features || gradients.features.shape[1] != self.channels))
         a.fail("gradients", "needs features, with as many channels as the images");
+    if (gradients.camera && gradients.camera.shape[0] != self.camera_numbers)
+        a.fail("gradients", "has a camera with another number of entries than the frame's camera has");
     nb::gil_scoped_release release;
     self.frame.backward(scene.as<T>(), {images.as_outputs<T>(), features.as<T>(), collected_as<T>(collected)}, incoming.as_gradients<T>(),
                         gradients.as<T>(), gradients.background.as<T>(), gradients.camera.as<double>());
@@ -215,6 +218,16 @@ void visible(const BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     self.frame.list_visible(ids.as<int64_t>(), radii.as<T>());
 }
 
+template <class T>
+void tile_lists(const BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
+    Arguments a("Frame.tile_lists", positional, given);
+    const Array begin = a.array("begin", {Kind::I64}, {self.frame.num_tiles() + 1}, true);
+    const Array ids = a.array("ids", {Kind::I64}, {self.frame.num_pairs()}, true);
+    a.finish();
+    nb::gil_scoped_release release;
+    self.frame.list_pairs(begin.as<int64_t>(), ids.as<int64_t>());
+}
+
 std::array<double, 6> of_stages(const std::array<StageTime, 6> &stages, double StageTime::*part) {
     std::array<double, 6> found;
     std::transform(stages.begin(), stages.end(), found.begin(), [part](const StageTime &stage) { return stage.*part; });
@@ -230,6 +243,7 @@ void bind_frame(nb::module_ &m, const char *name) {
         .def("backward", &backward<T>)
         .def("adam", &adam_backward<T>)
         .def("visible", &visible<T>)
+        .def("tile_lists", &tile_lists<T>)
         .def_prop_ro("seconds", [](const F &self) { return of_stages(self.frame.stages(), &StageTime::seconds); })
         .def_prop_ro("processor_seconds", [](const F &self) { return of_stages(self.frame.stages(), &StageTime::processor); })
         .def_prop_ro("parallel_seconds", [](const F &self) { return of_stages(self.frame.stages(), &StageTime::parallel); })

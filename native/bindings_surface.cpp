@@ -12,6 +12,22 @@ namespace gsplat {
 
 namespace {
 
+// The rays of a camera with a lens or a rolling shutter; those of a pinhole are not given.
+template <class T>
+RayImage<T> rays_of(Arguments &a, const Shape &plane) {
+    RayImage<T> found{};
+    if (!a.has("rays")) return found;
+    found.rays = a.array("rays", {KIND<T>}, {plane[0], plane[1], 3}).template as<T>();
+    const Array frames = a.array("frames", {Kind::F64}, {ANY, 12});
+    const int64_t axis = a.whole("axis", 0, 1), wanted = axis == 0 ? plane[1] : plane[0];
+    found.frames = frames.as<double>();
+    found.wraps = int32_t(a.whole("wraps", 0, 1));
+    if (frames.shape[0] == 1) return found;
+    if (frames.shape[0] != wanted) a.fail("frames", "have to be one, or one for each row or column");
+    found.by_row = axis == 1, found.by_column = axis == 0;
+    return found;
+}
+
 // Returns the loss of a camera's composited normals, and writes its gradients.
 template <class T>
 double surface_of(nb::args positional, nb::kwargs given) {
@@ -25,8 +41,11 @@ double surface_of(nb::args positional, nb::kwargs given) {
     args.grad_normals = a.array("grad_normals", {KIND<T>}, normals.shape, true).template as<T>();
     args.grad_depth = a.array("grad_depth", {KIND<T>}, plane, true).template as<T>();
     args.grad_alpha = a.array("grad_alpha", {KIND<T>}, plane, true).template as<T>();
-    a.numbers("R", args.R, 9);
-    args.fx = a.number("fx"), args.fy = a.number("fy"), args.cx = a.number("cx"), args.cy = a.number("cy");
+    args.lens = rays_of<T>(a, plane);
+    if (!args.lens.rays) {
+        a.numbers("R", args.R, 9);
+        args.fx = a.number("fx"), args.fy = a.number("fy"), args.cx = a.number("cx"), args.cy = a.number("cy");
+    }
     args.scale = a.number("scale"), args.jump = a.number("jump");
     const int threads = int(a.whole("threads", 1, MOST_THREADS));
     a.finish();
@@ -112,6 +131,8 @@ nb::tuple patches_of(nb::args positional, nb::kwargs given) {
     args.photo = grey_of(a, "photo", "photo_counts", "photo_intrinsics", plane);
     args.other = grey_of(a, "other", "other_counts", "other_intrinsics", {ANY, ANY});
     a.numbers("R", args.R, 9), a.numbers("turn", args.turn, 9), a.numbers("shift", args.shift, 3);
+    args.lens = rays_of<T>(a, plane);
+    if (args.lens.rays) args.other_camera = &struct_of<Camera>(a, "other_camera");
     args.radius = int32_t(a.whole("radius", 1, MOST_RADIUS)), args.stride = int32_t(a.whole("stride", 1, MOST));
     args.first_u = int32_t(a.whole("first_u", 0, MOST)), args.first_v = int32_t(a.whole("first_v", 0, MOST));
     args.scale = a.number("scale"), args.most = a.number("most");

@@ -26,6 +26,11 @@ struct TileState<T, WITH_ALL> : TileState<T, WITH_FEATURES> {
     Plane<T> median;
 };
 
+template <class T>
+struct TileState<T, WRAPPED> : TileState<T, WITH_ALL> {
+    WrappedSplats<T> wrapped;
+};
+
 // Draws one splat; `weights` gets T alpha by pixel if there are features.
 template <class T, int MODE, FalloffKind KIND>
 GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const AlphaClamp<T> &clamp, const Splat<T> &s, const TileBox &box,
@@ -49,7 +54,7 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const AlphaClamp<T> &clamp
         if (MODE != COLORS) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
         store(tile.transmittance.values + at, t - w);
         if constexpr (MODE >= WITH_FEATURES) store(weights + at, w);
-        if constexpr (MODE == WITH_ALL) {
+        if constexpr (MODE >= WITH_ALL) {
             const V half = splat(T(0.5)), median = load<V>(tile.median.values + at);
             store(tile.median.values + at, ((t >= half) & (t - w < half)) ? splat(s.depth) : median);
         }
@@ -99,7 +104,8 @@ GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box,
         store_colors<T>(out.image + 3 * pixel, count, rgb);
         memcpy(out.transmittance + pixel, &t, bytes);
         if (MODE != COLORS && out.depth) memcpy(out.depth + pixel, tile.depth.values + from, bytes);
-        if constexpr (MODE == WITH_ALL) memcpy(out.median + pixel, tile.median.values + from, bytes);
+        if constexpr (MODE >= WITH_ALL)
+            if (MODE == WITH_ALL || out.median) memcpy(out.median + pixel, tile.median.values + from, bytes);
         if constexpr (MODE >= WITH_FEATURES) tile.features.write(from, out.features + pixel * out.channels, count);
     });
 }
@@ -111,7 +117,7 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     TileState<T, MODE> tile;
     memset(&tile, 0, sizeof(TileState<T, COLORS>));
     if constexpr (MODE >= WITH_FEATURES) tile.features.clear(args.out.channels);
-    if constexpr (MODE == WITH_ALL) memset(&tile.median, 0, sizeof tile.median);
+    if constexpr (MODE >= WITH_ALL) memset(&tile.median, 0, sizeof tile.median);
     for (int y = 0; y < box.height; ++y)
         for (int x = 0; x < box.width; ++x) tile.transmittance.values[y * TILE + x] = 1;
 
@@ -123,15 +129,24 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     int bright = 0;
     for (; k < end; ++k) {
         const uint32_t i = (k - begin) % BATCH;
-        if (i == 0) batch.template begin<false>(args.splats, args.pairs + k, end - k, box, clamp, KEEPS_ROWS ? kept++ : nullptr);
+        if constexpr (MODE == WRAPPED) {
+            if (i == 0) {
+                const uint32_t count = tile.wrapped.take(args, args.pairs + k, end - k, box);
+                batch.template begin<false>(tile.wrapped.splats, tile.wrapped.pairs, count, box, clamp, KEEPS_ROWS ? kept++ : nullptr);
+            }
+        } else {
+            if (i == 0) batch.template begin<false>(args.splats, args.pairs + k, end - k, box, clamp, KEEPS_ROWS ? kept++ : nullptr);
+        }
         if (rows.top[i] > rows.bottom[i]) continue;
         const uint32_t id = args.pairs[k].gaussian;
+        const Splat<T> *s = args.splats + id;
+        if constexpr (MODE == WRAPPED) s = tile.wrapped.splats + i;
         T *weights = nullptr;
         if constexpr (MODE >= WITH_FEATURES)
             weights = tile.group.take(args.features + int64_t(args.out.channels) * id, rows.top[i], rows.bottom[i]);
         // An instance for INSIDE makes the forward pass no faster: its stores bound it.
-        rows.kind[i] == STEEP ? draw<T, MODE, STEEP>(args, clamp, args.splats[id], box, batch, i, tile, weights)
-                              : draw<T, MODE, GENTLE>(args, clamp, args.splats[id], box, batch, i, tile, weights);
+        rows.kind[i] == STEEP ? draw<T, MODE, STEEP>(args, clamp, *s, box, batch, i, tile, weights)
+                              : draw<T, MODE, GENTLE>(args, clamp, *s, box, batch, i, tile, weights);
         if constexpr (MODE >= WITH_FEATURES)
             if (tile.group.count == tile.group.SIZE) tile.group.add_to(tile.features);
         if (!lets_light_through(tile.transmittance, bright)) {
@@ -146,6 +161,7 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
 
 template <class T>
 void composite(const CompositeArgs<T> &args, int32_t tile) {
+    if (args.camera.wraps()) return composite_tile<T, WRAPPED>(args, tile);
     if (args.out.median) return composite_tile<T, WITH_ALL>(args, tile);
     if (args.out.features || args.settings.pixel_stop) return composite_tile<T, WITH_FEATURES>(args, tile);
     args.out.depth ? composite_tile<T, WITH_DEPTH>(args, tile) : composite_tile<T, COLORS>(args, tile);

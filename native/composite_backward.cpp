@@ -29,6 +29,11 @@ struct TileGradient<T, WITH_ALL> : TileGradient<T, WITH_FEATURES> {
     Plane<T> errors;
 };
 
+template <class T>
+struct TileGradient<T, WRAPPED> : TileGradient<T, WITH_ALL> {
+    WrappedSplats<T> wrapped;
+};
+
 // A pair, and where its sums go.
 template <class T>
 struct PairSlots {
@@ -100,7 +105,7 @@ GSPLAT_INLINE void splat_backward(const Settings &settings, const AlphaClamp<T> 
             store(tile.transmittance.values + at, t - w);
             wr += w * r, wg += w * g, wb += w * b;
             sum0 += h, sum1 += sum0, sum2 += sum1;
-            if constexpr (MODE == WITH_ALL) {
+            if constexpr (MODE >= WITH_ALL) {
                 const V across = falloff.across + splat(s.sy) * dy, along = splat(s.t0) + splat(s.ty) * dy;
                 statistics[ABS_U] += absolute(h * across), statistics[ABS_V] += absolute(h * (splat(s.sy) * across + splat(s.ty) * along));
                 statistics[WEIGHT] += w, statistics[PIXELS] += w > V{} ? splat(T(1)) : V{};
@@ -119,7 +124,8 @@ GSPLAT_INLINE void splat_backward(const Settings &settings, const AlphaClamp<T> 
     }
     sum8(sums, pair.slot);
     pair.slot[HYY] = sum(hyy), pair.slot[DEPTH] = MODE != COLORS ? sum(wz) : T(0);
-    if constexpr (MODE == WITH_ALL) write_statistics(s, statistics, pair.statistic_slot);
+    if constexpr (MODE >= WITH_ALL)
+        if (MODE == WITH_ALL || pair.statistic_slot) write_statistics(s, statistics, pair.statistic_slot);
 }
 
 // Loads the inputs of a tile's pixels; returns the sum of g T_final through `background`.
@@ -131,7 +137,7 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
     // A full tile of colours is written completely below.
     if (MODE != COLORS || box.width < TILE || box.height < TILE) memset(&tile, 0, sizeof(TileGradient<T, COLORS>));
     if constexpr (MODE >= WITH_FEATURES) tile.features.clear(in.features ? out.channels : 0);
-    if constexpr (MODE == WITH_ALL) memset(&tile.errors, 0, sizeof tile.errors);
+    if constexpr (MODE >= WITH_ALL) memset(&tile.errors, 0, sizeof tile.errors);
     Q sums[3] = {};
     for_each_four<T>(box, args.forward.camera.W, [&](int to, int64_t pixel, int count) {
         Q g[3], drawn[3];
@@ -145,7 +151,7 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
             store(tile.depth.values + to, gz);
             rest += gz * load_some(out.depth + pixel, count);
         }
-        if constexpr (MODE == WITH_ALL)
+        if constexpr (MODE >= WITH_ALL)
             if (args.errors) store(tile.errors.values + to, load_some(args.errors + pixel, count));
         if constexpr (MODE >= WITH_FEATURES)
             if (const int64_t channels = tile.features.channels)
@@ -159,12 +165,12 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
 }
 
 template <class T, int MODE>
-GSPLAT_INLINE PairSlots<T> slots_of(const CompositeBackwardArgs<T> &args, const Pair &pair) {
+GSPLAT_INLINE PairSlots<T> slots_of(const CompositeBackwardArgs<T> &args, const Pair &pair, const Splat<T> &s) {
     const int64_t slot = pair.slot, channels = args.forward.out.channels;
-    PairSlots<T> to{args.forward.splats[pair.gaussian], args.slots + SLOT * slot, nullptr, nullptr, 0};
+    PairSlots<T> to{s, args.slots + SLOT * slot, nullptr, nullptr, 0};
     if (MODE >= WITH_FEATURES && args.feature_slots)
         to.feature_slot = args.feature_slots + channels * slot, to.channels = int32_t(channels);
-    if (MODE == WITH_ALL) to.statistic_slot = args.statistic_slots + STATISTICS * slot;
+    if (MODE == WITH_ALL || (MODE == WRAPPED && args.statistic_slots)) to.statistic_slot = args.statistic_slots + STATISTICS * slot;
     return to;
 }
 
@@ -210,8 +216,10 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const Rows<T> &rows = batch.rows;
     KeptRows<T> *kept = kept_rows(forward, index);
     for (uint32_t k = begin; k < end; ++k) {
-        const PairSlots<T> pair = slots_of<T, MODE>(args, forward.pairs[k]);
         const uint32_t i = (k - begin) % BATCH;
+        const Splat<T> *s = forward.splats + forward.pairs[k].gaussian;
+        if constexpr (MODE == WRAPPED) s = tile.wrapped.splats + i;  // filled below
+        const PairSlots<T> pair = slots_of<T, MODE>(args, forward.pairs[k], *s);
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
         fetch_row(args.in.image, 3, next, forward.camera.W, k - begin);
         fetch_row(forward.out.image, 3, next, forward.camera.W, k - begin);
@@ -220,7 +228,12 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
             fetch_row(args.in.features, tile.features.channels, next, forward.camera.W, k - begin);
             fetch_row(forward.out.features, tile.features.channels, next, forward.camera.W, k - begin);
         }
-        if (i == 0 && k < stop)
+        if constexpr (MODE == WRAPPED) {
+            if (i == 0 && k < stop) {
+                const uint32_t count = tile.wrapped.take(forward, forward.pairs + k, stop - k, box);
+                batch.template begin<true>(tile.wrapped.splats, tile.wrapped.pairs, count, box, clamp, KEEPS_ROWS ? kept++ : nullptr);
+            }
+        } else if (i == 0 && k < stop)
             batch.template begin<true>(forward.splats, forward.pairs + k, stop - k, box, clamp, KEEPS_ROWS ? kept++ : nullptr);
         if constexpr (MODE >= WITH_FEATURES)
             if (k < stop && pair.channels && i % FeatureGroup<T>::SIZE == 0) begin_group(args, k, stop, rows, i, tile);
@@ -245,6 +258,7 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
 
 template <class T>
 void composite_backward(const CompositeBackwardArgs<T> &args, int32_t tile) {
+    if (args.forward.camera.wraps()) return tile_backward<T, WRAPPED>(args, tile);
     if (args.statistic_slots) return tile_backward<T, WITH_ALL>(args, tile);
     if (args.feature_slots || args.forward.settings.pixel_stop) return tile_backward<T, WITH_FEATURES>(args, tile);
     args.in.depth ? tile_backward<T, WITH_DEPTH>(args, tile) : tile_backward<T, COLORS>(args, tile);

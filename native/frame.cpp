@@ -33,13 +33,13 @@ class Timer {
 }  // namespace
 
 template <class T>
-Frame<T>::Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, int threads)
+Frame<T>::Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, const uint8_t *needed, int threads)
     : n_(scene.n), camera_(camera), settings_(settings), threads_(threads) {
     grid_.tiles_x = (camera.W + TILE - 1) / TILE, grid_.tiles_y = (camera.H + TILE - 1) / TILE;
     if (scene.n >= (int64_t(1) << 32)) throw std::length_error("more than 4,294,967,295 Gaussians");
     project(scene);
     sort();
-    intersect();
+    intersect(needed);
 }
 
 template <class T>
@@ -86,6 +86,12 @@ void Frame<T>::list_visible(int64_t *ids, T *radii) const {
     });
 }
 
+template <class T>
+void Frame<T>::list_pairs(int64_t *begin, int64_t *ids) const {
+    std::copy_n(tile_begin_.as<uint32_t>(), grid_.tiles() + 1, begin);
+    std::transform(pairs_.as<Pair>(), pairs_.as<Pair>() + pairs_count_, ids, [](const Pair &pair) { return int64_t(pair.gaussian); });
+}
+
 // Turns the counts of pairs, a row of tiles for each chunk, into the places where the chunks write theirs, and computes where
 // each tile's list begins.
 static void lay_out(int threads, int64_t tiles, int64_t chunks, uint32_t *table, uint32_t *tile_begin) {
@@ -111,21 +117,40 @@ static void lay_out(int threads, int64_t tiles, int64_t chunks, uint32_t *table,
     });
 }
 
+// Counts the tiles with a needed pixel before each tile, and in all; null if all pixels are needed.
+template <class T>
+const uint32_t *Frame<T>::find_drawn(const uint8_t *needed, Buffer &buffer) const {
+    if (!needed) return nullptr;
+    auto *before = static_cast<uint32_t *>(buffer.reserve(size_t(grid_.tiles() + 1) * 4));
+    std::fill(before, before + grid_.tiles(), 0);
+    parallel(threads_, grid_.tiles_y, [&](int64_t row, int) {
+        for (int64_t y = row * TILE; y < std::min((row + 1) * TILE, int64_t(camera_.H)); ++y)
+            for (int64_t tx = 0; tx < grid_.tiles_x; ++tx) {
+                const uint8_t *begin = needed + y * camera_.W + tx * TILE;
+                const int64_t width = std::min(int64_t(TILE), camera_.W - tx * TILE);
+                if (std::any_of(begin, begin + width, [](uint8_t pixel) { return pixel != 0; })) before[row * grid_.tiles_x + tx] = 1;
+            }
+    });
+    before[grid_.tiles()] = 0;
+    exclusive_sums(threads_, grid_.tiles() + 1, before);
+    return before;
+}
+
 // Counts pairs per chunk and tile, lays out the lists, and writes them. Every list is in depth order and is the same for any
 // number of chunks.
 template <class T>
-void Frame<T>::intersect() {
+void Frame<T>::intersect(const uint8_t *needed) {
     Timer timer(stages_[2]);
     const int64_t tiles = grid_.tiles();
     const int64_t chunks =
         std::clamp<int64_t>(visible_count_ / 512, 1, std::min<int64_t>(8 * int64_t(threads_), 1 + 8 * visible_count_ / tiles));
-    Buffer table_buffer, runs;
+    Buffer table_buffer, runs, drawn;
     auto *table = static_cast<uint32_t *>(table_buffer.reserve(size_t(chunks * tiles) * 4));
     const size_t n = size_t(std::max<int64_t>(n_, 1));
     auto *pairs_of = static_cast<uint32_t *>(pairs_of_.reserve(n * 4));
     auto *slot_begin = static_cast<uint32_t *>(slot_begin_.reserve(n * 4));
     auto *kept = static_cast<TileRuns *>(runs.reserve(size_t(visible_count_ + 1) * sizeof(TileRuns)));
-    IntersectArgs<T> args{splats(), sorted_.as<uint32_t>(), grid_, camera_, kept, pairs_of, slot_begin, nullptr};
+    IntersectArgs<T> args{splats(), sorted_.as<uint32_t>(), grid_, camera_, kept, pairs_of, slot_begin, nullptr, find_drawn(needed, drawn)};
     auto begin = [&](int64_t chunk) { return visible_count_ * chunk / chunks; };
     parallel(threads_, blocks(),
              [&](int64_t block, int) { std::fill(pairs_of + block * BLOCK, pairs_of + std::min((block + 1) * BLOCK, n_), 0); });
@@ -222,12 +247,13 @@ void Frame<T>::backward(const Scene<T> &scene, const Drawn<T> &drawn, const Imag
         for (int k = 0; k < 3; ++k) background[k] += done.tile_background[3 * tile + k];
     ProjectBackwardArgs<T> args = last_stage(scene, done.slots);
     args.grads = out;
-    if (camera) args.camera_sums = static_cast<double *>(camera_sums.reserve(size_t(blocks() + 1) * CAMERA * sizeof(double)));
+    const int numbers = camera_numbers(camera_);
+    if (camera) args.camera_sums = static_cast<double *>(camera_sums.reserve(size_t(blocks() + 1) * size_t(numbers) * sizeof(double)));
     parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project_backward(args, block); });
     if (!camera) return;
-    std::fill_n(camera, int(CAMERA), 0.0);
+    std::fill_n(camera, numbers, 0.0);
     for (int64_t block = 0; block < blocks(); ++block)  // in this order for any number of threads
-        for (int k = 0; k < CAMERA; ++k) camera[k] += args.camera_sums[block * CAMERA + k];
+        for (int k = 0; k < numbers; ++k) camera[k] += args.camera_sums[block * numbers + k];
 }
 
 template <class T>

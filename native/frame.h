@@ -35,10 +35,11 @@ struct SlotBuffers {
 template <class T>
 class Frame {
   public:
-    Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, int threads);
+    // Draws only tiles in which a pixel is needed; `needed` has a byte for each pixel, or is null if all are.
+    Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, const uint8_t *needed, int threads);
     void composite(const Images<T> &out, const T *features);
     // The scene, the images and the features are passed again: they may have moved between the passes.
-    // `camera` gets CAMERA numbers, unless it is null.
+    // `camera` gets `camera_numbers`, unless it is null.
     void backward(const Scene<T> &scene, const Drawn<T> &drawn, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background,
                   double *camera);
     // The same, but every Gaussian's gradient goes into a step of Adam; `groups` has no gradients.
@@ -46,16 +47,21 @@ class Frame {
 
     int64_t num_visible() const { return visible_count_; }
     int64_t num_pairs() const { return pairs_count_; }
+    int64_t num_tiles() const { return grid_.tiles(); }
     // Of project, sort, intersect, composite, composite_backward and project_backward.
     const std::array<StageTime, 6> &stages() const { return stages_; }
     // Writes the ids of the visible Gaussians, ascending, and the half extents of their ellipses, px.
     void list_visible(int64_t *ids, T *radii) const;
 
+    // Writes where each tile's list begins, one number more than tiles, and the ids of the Gaussians in all lists, near to far.
+    void list_pairs(int64_t *begin, int64_t *ids) const;
+
   private:
     const Splat<T> *splats() const { return splats_.as<Splat<T>>(); }
     void project(const Scene<T> &scene);
     void sort();
-    void intersect();
+    void intersect(const uint8_t *needed);
+    const uint32_t *find_drawn(const uint8_t *needed, Buffer &buffer) const;
     CompositeArgs<T> composite_args(const Images<T> &out, const T *features) const;
     CompositeBackwardArgs<T> composite_backward(const Drawn<T> &drawn, const ImageGrads<T> &in, SlotBuffers &to);
     // Sums the slots of each Gaussian, first to last.

@@ -4,6 +4,7 @@
 
 #include "kernels.h"
 #include "lanes.h"
+#include "sight.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -114,6 +115,7 @@ struct Chunk {
     T quat[4][CHUNK], scale[3][CHUNK];  // raw parameters; scales after exp
     double cov3d[9][CHUNK];             // covariances given directly
     T opacity[CHUNK];                   // after the sigmoid
+    double time[CHUNK];                 // at which a rolling shutter sees them, see sight.h
 };
 
 template <class T>
@@ -141,6 +143,20 @@ GSPLAT_INLINE void gather(const Scene<T> &scene, const uint32_t *ids, int count,
     }
 }
 
+// The times at which a rolling shutter sees a chunk; nothing for other cameras.
+template <class T>
+GSPLAT_INLINE void read_times(const Camera &cam, Chunk<T> &in) {
+    if (!cam.moving) return;
+    for (int l = 0; l < in.padded; l += WIDE) {
+        VD offset[3], at_rest[3];
+        for (int k = 0; k < 3; ++k) offset[k] = widened(in.mean[k] + l) - splat(cam.eye[k]);
+        VD time;
+        rotated(cam.R, offset, at_rest);
+        time_of(cam, at_rest, time);
+        store(in.time + l, time);
+    }
+}
+
 // Fetches `count` numbers into the first cache while others are computed; `WRITE`: in order to write them.
 template <int WRITE, class T>
 GSPLAT_INLINE void fetch(const T *from, int count) {
@@ -154,6 +170,7 @@ GSPLAT_INLINE void fetch(const T *from, int count) {
 // ellipses lose digits here that float cannot spare, and the cost is once per Gaussian (docs/PRECISION.md).
 struct Projected {
     VD offset[3], p[3];                   // mean - eye in world axes; mean in camera axes
+    VD u, v, depth;                       // where it is seen, and its depth; of a pinhole, only the depth
     VD iz, ratio[2];                      // 1/z; x/z and y/z, clamped for the Jacobian
     MD clamped[2];                        // whether each was clamped
     VD t0[3], t1[3];                      // rows of J W
@@ -161,8 +178,10 @@ struct Projected {
     VD R[9], s[3];                        // rotation, scales
     VD r0[3], r1[3], n[3];                // rows of J W M, M = R S, and their cross product
     VD a0, b0, c0, det0;                  // screen covariance before the dilation
-    VD a, b, c, inverse_c, inverse_det;   // and after it
-    VD opacity, compensation;             // opacity before antialiasing's compensation, and that factor
+    VD blur[2], along[3];                 // motion blur g, px, and g0 r1 - g1 r0; set if the camera has an exposure
+    VD inverse_still;                     // 1 / determinant after the dilation, before the blur; the same
+    VD a, b, c, inverse_c, inverse_det;   // and after both
+    VD opacity, compensation;             // opacity before the factor of antialiasing and blur, and that factor
     MD valid;                             // before the camera, bright enough and finite
 };
 
@@ -187,8 +206,17 @@ template <class T>
 GSPLAT_INLINE void project_mean(const Chunk<T> &in, int l, const Camera &cam, const Settings &set, Projected &g) {
     const double *R = cam.R;
     for (int k = 0; k < 3; ++k) g.offset[k] = widened(in.mean[k] + l) - splat(cam.eye[k]);
+    if (cam.lens != PINHOLE) {
+        Sight seen;
+        sight(cam, g.offset, cam.moving ? load<VD>(in.time + l) : VD{}, set.z_near, seen);
+        for (int k = 0; k < 3; ++k) g.p[k] = seen.p[k], g.t0[k] = seen.t0[k], g.t1[k] = seen.t1[k];
+        g.u = seen.u, g.v = seen.v, g.depth = seen.depth, g.valid = seen.valid;
+        g.blur[0] = seen.blur[0], g.blur[1] = seen.blur[1];
+        return;
+    }
     for (int k = 0; k < 3; ++k)
         g.p[k] = splat(R[3 * k]) * g.offset[0] + splat(R[3 * k + 1]) * g.offset[1] + splat(R[3 * k + 2]) * g.offset[2];
+    g.depth = g.p[2];
     g.valid = g.p[2] > splat(set.z_near);
     g.iz = splat(1.0) / g.p[2];
     const double low[2] = {cam.x_low, cam.y_low}, high[2] = {cam.x_high, cam.y_high};
@@ -234,7 +262,23 @@ GSPLAT_INLINE void project_covariance(const Chunk<T> &in, int l, bool raw, Proje
     }
 }
 
-// Sigma2d = (J W M)(J W M)' + d I with the dilation d, and opacity, of the Gaussians in lanes l and up.
+// Adds motion blur, g g', to the dilated covariance; returns its determinant from that before. No term of the difference,
+// g' adj(Sigma2d + d I) g, is negative.
+GSPLAT_INLINE VD blurred(bool raw, VD dilation, VD det, Projected &g) {
+    const VD x = g.blur[0], y = g.blur[1];
+    VD more = dilation * (x * x + y * y);
+    if (raw) {
+        for (int k = 0; k < 3; ++k) g.along[k] = x * g.r1[k] - y * g.r0[k];
+        more += dot3(g.along, g.along);
+    } else {
+        more += vmax(x * x * g.c0 - (x + x) * y * g.b0 + y * y * g.a0, VD{});
+    }
+    g.a += x * x, g.b += x * y, g.c += y * y;
+    g.inverse_still = splat(1.0) / det;
+    return det + more;
+}
+
+// Sigma2d = (J W M)(J W M)' + d I + g g' with the dilation d and the blur g, and opacity, of the Gaussians in lanes l and up.
 template <class T>
 GSPLAT_INLINE void project_shape(const Chunk<T> &in, int l, bool raw, const Camera &cam, const Settings &set, Projected &g) {
     project_mean(in, l, cam, set, g);
@@ -242,13 +286,18 @@ GSPLAT_INLINE void project_shape(const Chunk<T> &in, int l, bool raw, const Came
     g.opacity = widened(in.opacity + l);
     const VD d = splat(set.dilation);
     g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
-    const VD det = g.det0 + d * (g.a0 + g.c0) + splat(set.dilation2);
+    VD det = g.det0 + d * (g.a0 + g.c0) + splat(set.dilation2);
+    const VD still = det;
+    if (cam.spread != 0) det = blurred(raw, d, det, g);
     const VD inverse = splat(1.0) / (g.c * det);  // one division for two
     g.inverse_c = inverse * det, g.inverse_det = inverse * g.c;
     g.compensation = splat(1.0);
-    if (set.antialiased) g.compensation = sqrt_(vmax(g.det0, splat(DET_FLOOR)) * g.inverse_det);
+    if (set.antialiased)
+        g.compensation = sqrt_(vmax(g.det0, splat(DET_FLOOR)) * g.inverse_det);
+    else if (cam.spread != 0)
+        g.compensation = sqrt_(still * g.inverse_det);
     // The mean must be finite in the scene's type, the type of its gradients; so must z², so that weighted depths can be added.
-    g.valid &= finite(rounded<T>(g.p[0] + g.p[1] + g.p[2] * g.p[2])) & (g.a + g.c <= splat(SPLAT_LIMIT * SPLAT_LIMIT)) & finite(det) &
+    g.valid &= finite(rounded<T>(g.p[0] + g.p[1] + g.depth * g.depth)) & (g.a + g.c <= splat(SPLAT_LIMIT * SPLAT_LIMIT)) & finite(det) &
                (det > splat(THINNEST) * (g.a + g.c)) & (g.opacity * g.compensation >= splat(ALPHA_MIN));
 }
 
@@ -260,7 +309,10 @@ struct Position {
 template <class T>
 GSPLAT_INLINE Position position(const Projected &g, const Camera &cam) {
     Position at;
-    at.u = splat(cam.fx) * g.p[0] * g.iz + splat(cam.cx), at.v = splat(cam.fy) * g.p[1] * g.iz + splat(cam.cy);
+    if (cam.lens == PINHOLE)
+        at.u = splat(cam.fx) * g.p[0] * g.iz + splat(cam.cx), at.v = splat(cam.fy) * g.p[1] * g.iz + splat(cam.cy);
+    else
+        at.u = g.u, at.v = g.v;
     at.x = rounded<T>(vmin(vmax(at.u, VD{}), splat(double(cam.W - 1))));
     at.y = rounded<T>(vmin(vmax(at.v, VD{}), splat(double(cam.H - 1))));
     return at;
@@ -277,7 +329,12 @@ template <class T>
 GSPLAT_INLINE void shade(const Chunk<T> &in, const Camera &cam, int degree, Shade<T> &out) {
     using V = typename Vector<T>::V;
     for (int l = 0; l < in.padded; l += WIDE)
-        for (int k = 0; k < 3; ++k) narrowed(out.dir[k] + l, widened(in.mean[k] + l) - splat(cam.eye[k]));
+        for (int k = 0; k < 3; ++k) {
+            VD offset = widened(in.mean[k] + l) - splat(cam.eye[k]);
+            if (cam.moving) offset -= load<VD>(in.time + l) * splat(cam.shift[k]);
+            if (cam.lens == ORTHOGRAPHIC) offset = splat(cam.R[6 + k]);
+            narrowed(out.dir[k] + l, offset);
+        }
     for (int l = 0; l < in.padded; l += Vector<T>::LANES) {
         V d[3], b[16];
         for (int k = 0; k < 3; ++k) d[k] = load<V>(out.dir[k] + l);

@@ -12,56 +12,94 @@ constexpr int64_t AHEAD = 16;  // Gaussians whose numbers are fetched before the
 
 // An ellipse in the form that the tile search needs.
 template <class T>
-struct Ellipse {
+struct Search {
     T u, v, ex, ey;
     T inverse_ey;
-    T slant;          // sx sy / (sy² + ty²): the rightmost point is at dy = -slant ex
-    T half, tangent;  // at height dy the ellipse spans dx = tangent dy +- half sqrt(1 - (dy / ey)²)
+    T rightmost;            // dy of the rightmost point
+    T half, tangent;        // at height dy the ellipse spans dx = tangent dy +- half sqrt(1 - (dy / ey)²)
+    T slack;
+    int32_t first, last;    // rows of pixels that the ellipse meets, first > last if none
 };
 
+// Counting and writing search for large ellipses twice, and have to find the same tiles: otherwise a list has a place that nothing
+// is written to.
 template <class T>
-GSPLAT_INLINE Ellipse<T> ellipse(const Splat<T> &s) {
-    Ellipse<T> e;
-    e.u = s.u, e.v = s.v, e.ex = s.extent[0], e.ey = s.extent[1];
+GSPLAT_ONE_COPY void begin_search(const Splat<T> &s, T shift, const Camera &cam, Search<T> &e) {
+    e.u = s.u + shift, e.v = s.v, e.ex = s.extent[0], e.ey = s.extent[1];
     e.inverse_ey = 1 / e.ey;
-    e.slant = s.sx * s.sy / (s.sy * s.sy + s.ty * s.ty);
+    e.rightmost = -(s.sx * s.sy / (s.sy * s.sy + s.ty * s.ty)) * e.ex;
     e.tangent = -s.sy / s.sx;
     // L = log2(255 o) is the drop of the exponent from the centre to the rim.
     const T drop = s.log2_o - T(LOG2_ALPHA_MIN);
     e.half = sqrt_(vmax(drop, T(0))) / s.sx;
-    return e;
+    const T above = rim_slack(abs_(e.v) + e.ey);
+    e.first = int32_t(vmin(vmax(ceil_(e.v - e.ey - above), T(0)), T(cam.H)));
+    e.last = int32_t(vmax(vmin(floor_(e.v + e.ey + above), T(cam.H - 1)), T(-1)));
+    e.slack = rim_slack(abs_(e.u) + abs_(e.tangent) * vmin(e.ey, abs_(e.v) + T(cam.H)) + e.half);
 }
 
-// Calls visit(first tile, number of tiles) for every row of tiles that the ellipse meets, top to bottom. Rows are worked out
-// four at a time, in plain loops that the compiler vectorises.
+// The columns of pixels that the ellipse meets in four rows of tiles from ty on, c0 > c1 if none; in plain loops that the compiler
+// vectorises.
+template <class T>
+GSPLAT_ONE_COPY void columns_of(const Search<T> &e, const Camera &cam, int32_t ty, int32_t *c0, int32_t *c1) {
+    const T end = T(cam.W - 1);
+    for (int32_t r = 0; r < 4; ++r) {
+        T low = T((ty + r) * TILE) - e.v, high = T((ty + r) * TILE + TILE - 1) - e.v;
+        low = vmax(low, -e.ey), high = vmin(high, e.ey);
+        const T middle = (low + high) / 2;  // of a row that only the slack meets
+        const bool crossed = low > high;
+        low = crossed ? middle : low, high = crossed ? middle : high;
+        const T right = vmin(vmax(e.rightmost, low), high), left = vmin(vmax(-e.rightmost, low), high);
+        const T yr = right * e.inverse_ey, yl = left * e.inverse_ey;
+        const T x1 = e.u + e.tangent * right + e.half * sqrt_(vmax(1 - yr * yr, T(0))) + e.slack;
+        const T x0 = e.u + e.tangent * left - e.half * sqrt_(vmax(1 - yl * yl, T(0))) - e.slack;
+        c0[r] = int32_t(vmin(vmax(ceil_(x0), T(0)), T(cam.W))), c1[r] = int32_t(vmax(vmin(floor_(x1), end), T(-1)));
+    }
+}
+
+// Calls visit(first tile, number of tiles) for every row of tiles that the ellipse meets, top to bottom.
 template <class T, class F>
-GSPLAT_INLINE void for_each_run(const Ellipse<T> &e, const Camera &cam, const Grid &grid, F visit) {
-    const T above = rim_slack(abs_(e.v) + e.ey);
-    const int32_t first = int32_t(vmin(vmax(ceil_(e.v - e.ey - above), T(0)), T(cam.H)));
-    const int32_t last = int32_t(vmax(vmin(floor_(e.v + e.ey + above), T(cam.H - 1)), T(-1)));
-    if (first > last) return;
-    const T slack = rim_slack(abs_(e.u) + abs_(e.tangent) * vmin(e.ey, abs_(e.v) + T(cam.H)) + e.half);
-    const T end = T(cam.W - 1), rightmost = -e.slant * e.ex;
-    for (int32_t ty = first / TILE; ty <= last / TILE; ty += 4) {
+GSPLAT_INLINE void for_each_run(const Splat<T> &s, T shift, const Camera &cam, const Grid &grid, F visit) {
+    Search<T> e;
+    begin_search(s, shift, cam, e);
+    if (e.first > e.last) return;
+    for (int32_t ty = e.first / TILE; ty <= e.last / TILE; ty += 4) {
         int32_t c0[4], c1[4];
-        for (int32_t r = 0; r < 4; ++r) {
-            T low = T((ty + r) * TILE) - e.v, high = T((ty + r) * TILE + TILE - 1) - e.v;
-            low = vmax(low, -e.ey), high = vmin(high, e.ey);
-            const T middle = (low + high) / 2;  // of a row that only the slack meets
-            const bool crossed = low > high;
-            low = crossed ? middle : low, high = crossed ? middle : high;
-            const T right = vmin(vmax(rightmost, low), high), left = vmin(vmax(-rightmost, low), high);
-            const T yr = right * e.inverse_ey, yl = left * e.inverse_ey;
-            const T x1 = e.u + e.tangent * right + e.half * sqrt_(vmax(1 - yr * yr, T(0))) + slack;
-            const T x0 = e.u + e.tangent * left - e.half * sqrt_(vmax(1 - yl * yl, T(0))) - slack;
-            c0[r] = int32_t(vmin(vmax(ceil_(x0), T(0)), T(cam.W))), c1[r] = int32_t(vmax(vmin(floor_(x1), end), T(-1)));
-        }
-        for (int32_t r = 0; r < 4 && ty + r <= last / TILE; ++r)
+        columns_of(e, cam, ty, c0, c1);
+        for (int32_t r = 0; r < 4 && ty + r <= e.last / TILE; ++r)
             if (c0[r] <= c1[r]) {
                 const int32_t tx = c0[r] / TILE;
                 visit(uint32_t((ty + r) * grid.tiles_x + tx), uint32_t(c1[r] / TILE - tx + 1));
             }
     }
+}
+
+// The columns of tiles to which one copy of a mean is the nearest, low > high if none.
+template <class T>
+GSPLAT_ONE_COPY void columns_of_copy(const Camera &cam, const Grid &grid, T u, int copy, int32_t *low, int32_t *high) {
+    *low = grid.tiles_x, *high = -1;
+    for (int32_t tx = 0; tx < grid.tiles_x; ++tx)
+        if (seam_shift(cam, tx * TILE, u) == T(copy) * T(cam.W)) *low = vmin(*low, tx), *high = tx;
+}
+
+// The same in an image that wraps: for each copy of the ellipse, 360 degrees apart, the tiles to which it is the nearest.
+template <class T, class F>
+GSPLAT_INLINE void for_each_wrapped_run(const Splat<T> &s, const Camera &cam, const Grid &grid, F visit) {
+    for (int copy = -1; copy <= 1; ++copy) {
+        int32_t low, high;
+        columns_of_copy(cam, grid, s.u, copy, &low, &high);
+        if (high < 0) continue;
+        for_each_run(s, T(copy) * T(cam.W), cam, grid, [&](uint32_t first, uint32_t n) {
+            const int32_t row = int32_t(first) / grid.tiles_x * grid.tiles_x, begin = vmax(int32_t(first) - row, low);
+            const int32_t end = vmin(int32_t(first + n) - row, high + 1);
+            if (begin < end) visit(uint32_t(row + begin), uint32_t(end - begin));
+        });
+    }
+}
+
+template <class T, class F>
+GSPLAT_INLINE void for_each_run_of(const Splat<T> &s, const Camera &cam, const Grid &grid, F visit) {
+    cam.wraps() ? for_each_wrapped_run(s, cam, grid, visit) : for_each_run(s, T(0), cam, grid, visit);
 }
 
 template <class T>
@@ -119,6 +157,12 @@ GSPLAT_INLINE void runs_of(const Splat<T> *splats, const uint32_t *ids, uint32_t
         }
 }
 
+// How many tiles of a run are drawn.
+template <class T>
+GSPLAT_INLINE uint32_t drawn_tiles(const IntersectArgs<T> &args, uint32_t first, uint32_t n) {
+    return args.drawn_before ? args.drawn_before[first + n] - args.drawn_before[first] : n;
+}
+
 // Counts differences from tile to tile, two numbers per run, and adds them up at the end. No branch depends on a small ellipse.
 template <class T>
 void count(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t *per_tile) {
@@ -136,18 +180,18 @@ void count(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t *p
             const uint32_t id = args.sorted[k + i];
             uint32_t total = 0, rows = 0;
             TileRuns &kept = args.runs[k + i];
-            if (runs.rows[i] > int32_t(TileRuns::KEPT)) {
-                for_each_run(ellipse(args.splats[id]), args.camera, args.grid, [&](uint32_t first, uint32_t n) {
+            if (runs.rows[i] > int32_t(TileRuns::KEPT) || args.camera.wraps()) {
+                for_each_run_of(args.splats[id], args.camera, args.grid, [&](uint32_t first, uint32_t n) {
                     add(first, n);
                     if (rows < TileRuns::KEPT) kept.runs[rows] = {first, n};
-                    total += n, ++rows;
+                    total += drawn_tiles(args, first, n), ++rows;
                 });
             } else {
                 for (uint32_t r = 0; r < TileRuns::KEPT; ++r) {
                     const uint32_t first = uint32_t(runs.first[r][i]), n = uint32_t(runs.count[r][i]);
                     add(first, n);
                     kept.runs[rows] = {first, n};
-                    total += n, rows += n > 0;
+                    total += drawn_tiles(args, first, n), rows += n > 0;
                 }
             }
             kept.rows = rows;
@@ -155,7 +199,10 @@ void count(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t *p
         }
     }
     uint32_t sum = 0;
-    for (uint32_t tile = 0; tile < tiles; ++tile) per_tile[tile] = sum += per_tile[tile];
+    for (uint32_t tile = 0; tile < tiles; ++tile) {
+        sum += per_tile[tile];
+        per_tile[tile] = drawn_tiles(args, tile, 1) ? sum : 0;
+    }
 }
 
 template <class T>
@@ -166,10 +213,11 @@ void scatter(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t 
         if (k + AHEAD < end) __builtin_prefetch(args.slot_begin + args.sorted[k + AHEAD]);
         uint32_t slot = args.slot_begin[id];
         auto write = [&](uint32_t first, uint32_t tiles) {
-            for (uint32_t tile = first; tile < first + tiles; ++tile) args.pairs[next[tile]++] = Pair{id, slot++};
+            for (uint32_t tile = first; tile < first + tiles; ++tile)
+                if (drawn_tiles(args, tile, 1)) args.pairs[next[tile]++] = Pair{id, slot++};
         };
         if (kept.rows > TileRuns::KEPT)
-            for_each_run(ellipse(args.splats[id]), args.camera, args.grid, write);
+            for_each_run_of(args.splats[id], args.camera, args.grid, write);
         else
             for (uint32_t row = 0; row < kept.rows; ++row) write(kept.runs[row].first, kept.runs[row].count);
     }

@@ -10,13 +10,29 @@
 
 namespace gsplat {
 
-// Pinhole camera in OpenCV axes: x_cam = R (x - eye), u = fx x/z + cx.
+// The projections, in the order of `PROJECTIONS` in src/gsplat_edu/scene/projection.py; a pinhole at rest has kernels of its own.
+enum Lens : int32_t { PERSPECTIVE, FISHEYE, EQUIRECTANGULAR, ORTHOGRAPHIC, PINHOLE };
+
+constexpr int COEFFICIENTS = 15;                       // of a distortion
+
+// A camera in OpenCV axes: x_cam = R (x - eye); of a pinhole, u = fx x/z + cx. What follows H and W is of other cameras only.
 struct Camera {
     double R[9];
     double eye[3];
     double fx, fy, cx, cy;
     double x_low, x_high, y_low, y_high;               // bounds of x/z and y/z inside the Jacobian; may be infinite
     int32_t H, W;
+    Lens lens;
+    bool bounded;                                      // whether a perspective lens or shutter has such bounds; see lens.h
+    bool distorted, radial_first;                      // whether there are coefficients; see lens.h
+    bool along_ray;                                    // whether depth is the distance, not z
+    bool moving;                                       // whether there is a rolling shutter
+    int32_t axis;                                      // 0 if columns are read in turn, 1 if rows are
+    double coefficients[COEFFICIENTS];
+    double widest;                                     // of a fisheye cos, of a perspective lens tan² of the widest angle
+    double turn[3], shift[3], pace, middle;            // see sight.h; pace is 0 for a global shutter with motion blur
+    double spread;                                     // exposure / sqrt(12); 0 for no motion blur
+    bool wraps() const { return lens == EQUIRECTANGULAR; }
 };
 
 // Settings of one render.
@@ -133,6 +149,7 @@ struct IntersectArgs {
     uint32_t *pairs_of;                                // N, number of tiles that each Gaussian touches
     const uint32_t *slot_begin;                        // N, first slot of each Gaussian
     Pair *pairs;
+    const uint32_t *drawn_before;                      // tiles + 1, how many of the tiles before each are drawn; null if all are
 };
 
 template <class T>
@@ -168,8 +185,10 @@ struct CompositeBackwardArgs {
     const T *errors;                                   // H W; null for zero
 };
 
-// Numbers of a camera's gradient: R row by row, the eye, fx, fy, cx, cy.
+// Numbers of a pinhole's gradient: R row by row, the eye, fx, fy, cx, cy; of other cameras also the coefficients, turn and shift.
 constexpr int CAMERA = 16;
+constexpr int LENS_CAMERA = CAMERA + COEFFICIENTS + 6;
+inline int camera_numbers(const Camera &camera) { return camera.lens == PINHOLE ? CAMERA : LENS_CAMERA; }
 
 template <class T>
 struct ProjectBackwardArgs {
@@ -179,7 +198,7 @@ struct ProjectBackwardArgs {
     const uint32_t *pairs_of, *slot_begin;
     const T *slots;
     SceneGrads<T> grads;
-    double *camera_sums;                               // blocks x CAMERA, gradients of the camera; null if not wanted
+    double *camera_sums;                               // blocks x camera_numbers, gradients of the camera; null if not wanted
 };
 
 struct AdamNumbers {
@@ -272,19 +291,32 @@ struct NormalArgs {
     T *grad_quats;                                     // n 4, only in the backward pass
 };
 
+// The rays of a camera's pixels. A frame is the camera when a pixel is read: 9 numbers from its axes to the world's, row by row,
+// and the centre less that at half time.
+template <class T>
+struct RayImage {
+    const T *rays;  // H W 3, of depth 1, in the frame's axes; 0 where there is none; null for a pinhole
+    const double *frames;  // 12 numbers each
+    int32_t by_row, by_column;  // 1 if rows, or columns, have a frame each; one frame otherwise
+    int32_t wraps;  // 1 if the first and the last column are neighbours, as in a panorama
+
+    const double *frame(int64_t row, int64_t column) const { return frames + 12 * (row * by_row + column * by_column); }
+};
+
 // How far composited normals are from those of the depth; surface.cpp has the formulas.
 template <class T>
 struct SurfaceArgs {
-    const T *normals, *depth, *alpha;                  // H W 3 in world axes; H W: sum w z; H W
+    const T *normals, *depth, *alpha;  // H W 3 in world axes; H W: sum w z; H W
     int32_t H, W;
-    double R[9], fx, fy, cx, cy;                       // world to camera, row by row
-    double scale, jump;                                // factor of the loss, largest jump of the depth
-    T *depths, *tangents;                              // scratch: H W, H W 6
-    T *grad_normals, *grad_depth, *grad_alpha;         // as their primals
-    double *sums;                                      // H: the loss of each row
+    RayImage<T> lens;  // of another camera than a pinhole
+    double R[9], fx, fy, cx, cy;  // world to camera, row by row; of a pinhole
+    double scale, jump;  // factor of the loss, largest jump of the depth
+    T *depths, *tangents;  // scratch: H W, H W 6
+    T *grad_normals, *grad_depth, *grad_alpha;  // as their primals
+    double *sums;  // H: the loss of each row
 };
 
-constexpr int64_t BLOCK = 256;                         // Gaussians per task
+constexpr int64_t BLOCK = 256;  // Gaussians per task
 
 // The kernels of one instruction set and scalar type.
 template <class T>
@@ -306,14 +338,14 @@ struct Kernels {
     void (*surface_gradient)(const SurfaceArgs<T> &, int64_t row);
     void (*normals)(const NormalArgs<T> &, int64_t block);
     void (*normals_backward)(const NormalArgs<T> &, int64_t block);
-    int64_t rows_bytes;                                // of a batch, in CompositeArgs::rows; 0 if none are kept
+    int64_t rows_bytes;  // of a batch, in CompositeArgs::rows; 0 if none are kept
 };
 
 struct Isa {
     const char *name;
     Kernels<float> f32;
     Kernels<double> f64;
-    int (*fma_benchmark)(int64_t rounds, float *sink); // independent vector FMAs, returns FMAs per round
+    int (*fma_benchmark)(int64_t rounds, float *sink);  // independent vector FMAs, returns FMAs per round
 };
 
 }  // namespace gsplat

@@ -28,6 +28,10 @@ GSPLAT_INLINE int list_before(const ProjectArgs<T> &args, int64_t begin, int64_t
     const Camera &cam = args.camera;
     const double *R = cam.R + 6;
     int count = 0;
+    if (cam.along_ray || cam.moving) {  // decided where they are seen
+        for (int64_t i = begin; i < end; ++i) ids[count++] = uint32_t(i);
+        return count;
+    }
     for (int64_t i = begin; i < end; ++i) {
         const T *mean = args.scene.means + 3 * i;
         const double z =
@@ -50,7 +54,7 @@ GSPLAT_INLINE void ellipses(const ProjectArgs<T> &args, const Chunk<T> &in, int 
     narrowed(out.u + l, at.u), narrowed(out.v + l, at.v), narrowed(out.x + l, at.x), narrowed(out.y + l, at.y);
     narrowed(out.sx + l, sx), narrowed(out.sy + l, sy), narrowed(out.ty + l, ty);
     narrowed(out.s0 + l, sx * dx + sy * dy), narrowed(out.t0 + l, ty * dy);
-    narrowed(out.depth + l, g.p[2]), narrowed(out.a + l, g.a), narrowed(out.c + l, g.c);
+    narrowed(out.depth + l, g.depth), narrowed(out.a + l, g.a), narrowed(out.c + l, g.c);
     narrowed(out.opacity + l, g.valid ? g.opacity * g.compensation : VD{});
 }
 
@@ -104,6 +108,7 @@ uint32_t project_chunk(const ProjectArgs<T> &args, const uint32_t *ids, int coun
     Chunk<T> in;
     Records<T> records;
     gather(scene, ids, count, in);
+    read_times(args.camera, in);
     for (int l = 0; l < in.padded; l += WIDE) {
         for (int k = l; k < vmin(l + WIDE, count); ++k) {
             fetch<0>(scene.sh_rest + 3 * int64_t(scene.rest) * ids[k], 3 * scene.rest);

@@ -27,8 +27,20 @@ struct Gradients {
 struct Whitened {
     VD sx, sy, ty;
     VD m0, m1;         // sum h y0, sum h y1
-    VD m00, m01, m11;  // sum h y0², sum h y0 y1, sum h y1²; minus sum h on the diagonal with antialiasing
+    VD m00, m01, m11;  // sum h y0², sum h y0 y1, sum h y1²; minus sum h on the diagonal with antialiasing or motion blur
 };
+
+// What the opacity's factor passes on besides det^(-1/2) of the drawn ellipse: sum h by the determinant whose root it has, and what
+// that determinant's matrix has on the diagonal beside Sigma2d. Antialiasing has det0; motion blur without it, the dilated one.
+struct Lit {
+    VD h, dilation;
+};
+
+GSPLAT_INLINE Lit lit_by(const Camera &cam, const Settings &set, const Projected &g, VD h) {
+    if (set.antialiased) return {g.det0 > splat(DET_FLOOR) ? h / g.det0 : VD{}, VD{}};
+    if (cam.spread != 0) return {h * g.inverse_still, splat(set.dilation)};
+    return {VD{}, VD{}};
+}
 
 // Computed from the moments of h about the splat's reference point.
 template <class T>
@@ -43,7 +55,7 @@ GSPLAT_INLINE Whitened whiten(const Camera &cam, const Settings &set, const Proj
     w.m00 = s * (s * slot[H] + along + along) + w.sx * (w.sx * slot[HXX] + (w.sy + w.sy) * slot[HXY]) + w.sy * w.sy * slot[HYY];
     w.m01 = s * (t * slot[H] + down) + t * along + w.ty * (w.sx * slot[HXY] + w.sy * slot[HYY]);
     w.m11 = t * (t * slot[H] + down + down) + w.ty * w.ty * slot[HYY];
-    if (set.antialiased) w.m00 -= slot[H], w.m11 -= slot[H];  // the opacity's factor contains det^(-1/2)
+    if (set.antialiased || cam.spread != 0) w.m00 -= slot[H], w.m11 -= slot[H];  // the opacity's factor contains det^(-1/2)
     return w;
 }
 
@@ -64,22 +76,32 @@ GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const VD
 
 // Propagates the moments to M = R S and J W, for raw parameters; returns d0 . t0 + d1 . t1. With r = (J W) M (two rows), w = L r and
 // N the matrix of moments: dL/dSigma2d = L' N L / 2, dL/dr = L' N w; w is of order 1, however long the ellipse. `lit` is
-// antialiasing's part: the opacity's factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r, Sigma before the dilation.
+// the opacity's part: its factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r, Sigma before the dilation or, with motion blur, after.
+// `db` gets the gradient of the blur, a fourth column of r, if there is one.
 template <class T>
-GSPLAT_INLINE VD raw_gradient(const Projected &g, const Whitened &m, VD dilation, VD lit, int l, Gradients<T> &out, VD *d0, VD *d1) {
+GSPLAT_INLINE VD raw_gradient(const Projected &g, const Whitened &m, VD dilation, const Lit &lit, bool blurs, int l, Gradients<T> &out,
+                              VD *d0, VD *d1, VD *db) {
     VD across0[3], across1[3], dR[9], dr0[3], dr1[3], dq[4], total = VD{};
     cross3(g.r1, g.n, across0), cross3(g.n, g.r0, across1);  // c0 r0 - b0 r1 and a0 r1 - b0 r0
     const VD sx_c = m.sx * g.inverse_c;
     for (int k = 0; k < 3; ++k) {
         // sx r0 + sy r1 = sx (r0 - b/c r1)
-        const VD w0 = sx_c * (dilation * g.r0[k] + across0[k]), w1 = m.ty * g.r1[k];
+        VD w0 = sx_c * (dilation * g.r0[k] + across0[k]);
+        const VD w1 = m.ty * g.r1[k];
+        if (blurs) w0 -= sx_c * g.blur[1] * g.along[k];
         const VD dw0 = m.m00 * w0 + m.m01 * w1, dw1 = m.m01 * w0 + m.m11 * w1;
-        const VD extra0 = lit * across0[k], extra1 = lit * across1[k];
+        VD extra0 = lit.h * across0[k], extra1 = lit.h * across1[k];
+        if (blurs) extra0 += lit.h * lit.dilation * g.r0[k], extra1 += lit.h * lit.dilation * g.r1[k];
         dr0[k] = m.sx * dw0 + extra0, dr1[k] = m.sy * dw0 + m.ty * dw1 + extra1;
         const VD scale = w0 * dw0 + w1 * dw1 + g.r0[k] * extra0 + g.r1[k] * extra1;  // r0 . dr0 + r1 . dr1
         narrowed(out.log_scale[k] + l, scale);
         total += scale;
         dr0[k] *= g.s[k], dr1[k] *= g.s[k];
+    }
+    if (blurs) {  // w of the fourth column: sx (g0 - b/c g1) and ty g1
+        const VD w0 = sx_c * (dilation * g.blur[0] + dot3(g.r1, g.along)), w1 = m.ty * g.blur[1];
+        const VD dw0 = m.m00 * w0 + m.m01 * w1, dw1 = m.m01 * w0 + m.m11 * w1;
+        db[0] = m.sx * dw0, db[1] = m.sy * dw0 + m.ty * dw1;
     }
     for (int k = 0; k < 3; ++k) {
         d0[k] = dot3(g.R + 3 * k, dr0), d1[k] = dot3(g.R + 3 * k, dr1);
@@ -92,12 +114,18 @@ GSPLAT_INLINE VD raw_gradient(const Projected &g, const Whitened &m, VD dilation
 
 // The same for covariances given directly: a = t0' S t0, b = t0' S t1, c = t1' S t1.
 template <class T>
-GSPLAT_INLINE VD direct_gradient(const Projected &g, const Whitened &m, VD lit, int l, Gradients<T> &out, VD *d0, VD *d1) {
+GSPLAT_INLINE VD direct_gradient(const Projected &g, const Whitened &m, const Lit &lit, bool blurs, int l, Gradients<T> &out, VD *d0,
+                                 VD *d1, VD *db) {
     const VD half = splat(0.5);
     // Gradients of a, b (once for both entries) and c: L' N L / 2.
     VD a = half * m.sx * m.sx * m.m00, b = m.sx * (m.sy * m.m00 + m.ty * m.m01);
     VD c = half * (m.sy * (m.sy * m.m00 + (m.ty + m.ty) * m.m01) + m.ty * m.ty * m.m11);
-    a += half * lit * g.c0, b -= lit * g.b0, c += half * lit * g.a0;
+    if (blurs) {
+        db[0] = (a + a) * g.blur[0] + b * g.blur[1];
+        db[1] = (c + c) * g.blur[1] + b * g.blur[0];
+        a += half * lit.h * lit.dilation, c += half * lit.h * lit.dilation;
+    }
+    a += half * lit.h * g.c0, b -= lit.h * g.b0, c += half * lit.h * g.a0;
     VD total = VD{};
     for (int k = 0; k < 3; ++k) {
         d0[k] = (a + a) * g.r0[k] + b * g.r1[k];
@@ -185,6 +213,29 @@ GSPLAT_INLINE void camera_gradient(const Projected &g, const Camera &cam, const 
     for (int k = 0; k < CAMERA; ++k) sums[k] += counts ? d[k] : VD{};
 }
 
+// Gradients of the rows of J W, of the image position, and of the motion blur.
+struct ThroughImage {
+    const VD *d0, *d1, *uv, *blur;
+};
+
+// Propagates the gradients of J W, image position, depth and direction through a lens to the means and, if `WITH_CAMERA`, adds those of
+// the camera for the lanes that are drawn.
+template <bool WITH_CAMERA, class T>
+GSPLAT_INLINE void lens_gradient(const Camera &cam, const Chunk<T> &in, int l, const Projected &g, const ThroughImage &through, VD depth,
+                                 const T (*direction)[CHUNK], Gradients<T> &out, VD *camera) {
+    SightGradient gradient;
+    for (int k = 0; k < 3; ++k)
+        gradient.d0[k] = through.d0[k], gradient.d1[k] = through.d1[k], gradient.direction[k] = widened(direction[k] + l);
+    gradient.at[0] = through.uv[0], gradient.at[1] = through.uv[1], gradient.depth = depth;
+    gradient.blur[0] = through.blur[0], gradient.blur[1] = through.blur[1];
+    VD dmean[3], numbers[LENS_CAMERA];
+    sight_adjoint(cam, g.offset, cam.moving ? load<VD>(in.time + l) : VD{}, gradient, dmean, WITH_CAMERA ? numbers : nullptr);
+    for (int k = 0; k < 3; ++k) narrowed(out.mean[k] + l, dmean[k]);
+    if (!WITH_CAMERA) return;
+    const MD drawn = widened(out.drawn + l) != VD{};
+    for (int k = 0; k < LENS_CAMERA; ++k) camera[k] += drawn ? numbers[k] : VD{};
+}
+
 // Propagates the sums of WIDE Gaussians to shape, mean and opacity, and to the camera if `WITH_CAMERA`.
 template <bool WITH_CAMERA, class T>
 GSPLAT_INLINE void shape_gradient(const ProjectBackwardArgs<T> &args, const Chunk<T> &in, int l, const T (*sums)[CHUNK],
@@ -193,26 +244,30 @@ GSPLAT_INLINE void shape_gradient(const ProjectBackwardArgs<T> &args, const Chun
     const bool raw = args.scene.quats != nullptr;
     Projected g;
     project_shape(in, l, raw, cam, args.settings, g);
-    VD slot[SLOT], d0[3], d1[3], dp[3];
+    VD slot[SLOT], d0[3], d1[3], dp[3], db[2] = {};
+    const bool blurs = cam.spread != 0;
     for (int j = 0; j < SLOT; ++j) slot[j] = widened(sums[j] + l);
     const Whitened m = whiten<T>(cam, args.settings, g, slot);
     const VD uv[2] = {m.sx * m.m0, m.sy * m.m0 + m.ty * m.m1};
     const VD nx = uv[0] * splat(0.5 * cam.W), ny = uv[1] * splat(0.5 * cam.H);
     narrowed(out.means2d_norm + l, sqrt_(nx * nx + ny * ny));
-    VD lit = VD{};
-    if (args.settings.antialiased) lit = g.det0 > splat(DET_FLOOR) ? slot[H] / g.det0 : VD{};
-    const VD total =
-        raw ? raw_gradient(g, m, splat(args.settings.dilation), lit, l, out, d0, d1) : direct_gradient(g, m, lit, l, out, d0, d1);
+    const Lit lit = lit_by(cam, args.settings, g, slot[H]);
+    const VD total = raw ? raw_gradient(g, m, splat(args.settings.dilation), lit, blurs, l, out, d0, d1, db)
+                         : direct_gradient(g, m, lit, blurs, l, out, d0, d1, db);
+    narrowed(out.opacity + l, raw ? (splat(1.0) - g.opacity) * slot[H] : slot[H] / g.opacity);
+    narrowed(out.drawn + l, g.valid ? widened(out.drawn + l) : VD{});
+    VD dmean[3];
+    if (cam.lens != PINHOLE) {
+        lens_gradient<WITH_CAMERA>(cam, in, l, g, {d0, d1, uv, db}, slot[DEPTH], through_color, out, camera);
+        return;
+    }
     mean_gradient(g, cam, d0, d1, total, uv, dp);
     dp[2] += slot[DEPTH];
-    VD dmean[3];
     for (int k = 0; k < 3; ++k) {
         dmean[k] = splat(cam.R[k]) * dp[0] + splat(cam.R[3 + k]) * dp[1] + splat(cam.R[6 + k]) * dp[2];
         dmean[k] += widened(through_color[k] + l);
         narrowed(out.mean[k] + l, dmean[k]);
     }
-    narrowed(out.opacity + l, raw ? (splat(1.0) - g.opacity) * slot[H] : slot[H] / g.opacity);
-    narrowed(out.drawn + l, g.valid ? widened(out.drawn + l) : VD{});
     if (WITH_CAMERA) camera_gradient(g, cam, d0, d1, uv, dp, dmean, widened(out.drawn + l) != VD{}, camera);
 }
 
@@ -223,6 +278,7 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
     Chunk<T> in;
     alignas(64) T sums[SLOT][CHUNK], through_color[3][CHUNK] = {};
     gather(args.scene, ids, count, in);
+    read_times(args.camera, in);
     sum_slots(args, ids, count, in.padded, sums);
     if (args.scene.quats) {
         color_gradient(args, ids, in, sums, out, through_color);
@@ -313,7 +369,8 @@ GSPLAT_INLINE void propagate(const ProjectBackwardArgs<T> &args, int64_t block) 
         else
             zero(args, i);
     }
-    VD camera[CAMERA] = {};
+    VD camera[LENS_CAMERA] = {};
+    const int numbers = camera_numbers(args.camera);
     for (int first = 0; first < drawn; first += CHUNK) {
         const int count = vmin(CHUNK, drawn - first);
         Gradients<T> gradients;
@@ -321,10 +378,10 @@ GSPLAT_INLINE void propagate(const ProjectBackwardArgs<T> &args, int64_t block) 
         for (int l = 0; l < count; ++l) write(args, gradients, l, ids[first + l]);
     }
     if (!WITH_CAMERA) return;
-    for (int k = 0; k < CAMERA; ++k) {
+    for (int k = 0; k < numbers; ++k) {
         double sum = 0;
         for (int l = 0; l < WIDE; ++l) sum += camera[k][l];
-        args.camera_sums[block * CAMERA + k] = sum;
+        args.camera_sums[block * numbers + k] = sum;
     }
 }
 

@@ -25,6 +25,13 @@
 #define GSPLAT_INLINE static inline __attribute__((always_inline))
 #define GSPLAT_METHOD inline __attribute__((always_inline))
 #define GSPLAT_CALLED static __attribute__((noinline))  // the compiler finds better registers for a large function on its own
+// Of two copies of a function, the compiler may contract other products into sums. Results that have to be equal to the last bit
+// come from one copy.
+#if defined(__GNUC__) && !defined(__clang__)
+#define GSPLAT_ONE_COPY static __attribute__((noinline, noclone))
+#else
+#define GSPLAT_ONE_COPY static __attribute__((noinline))
+#endif
 
 namespace gsplat {
 namespace GSPLAT_ISA {

@@ -14,6 +14,36 @@ namespace gsplat {
 constexpr int64_t MOST = std::numeric_limits<int32_t>::max();  // of a size
 constexpr int64_t MOST_THREADS = 65536;
 
+// A structure that Python has made.
+template <class S>
+const S &struct_of(Arguments &a, const char *name) {
+    const S *found = nullptr;
+    if (!nb::try_cast(a.take(name), found, false) || !found) a.fail(name, "has to be the structure of that name");
+    return *found;
+}
+
+// What follows a pinhole's numbers; of a pinhole at rest, nothing does.
+inline void read_lens(Arguments &a, Camera &cam) {
+    cam.lens = PINHOLE;
+    if (!a.has("lens")) return;
+    std::array<double, 6> motion;
+    cam.lens = Lens(a.whole("lens", PERSPECTIVE, ORTHOGRAPHIC));
+    a.numbers("coefficients", cam.coefficients, COEFFICIENTS), a.numbers("motion", motion.data(), 6);
+    cam.distorted = a.flag("distorted"), cam.radial_first = a.flag("radial_first"), cam.moving = a.flag("moving");
+    cam.axis = int32_t(a.whole("axis", 0, 1)), cam.pace = a.number("pace"), cam.widest = a.number("widest");
+    const double exposure = a.number("exposure");
+    if (!(exposure >= 0 && std::isfinite(exposure))) a.fail("exposure", "has to be finite and at least 0");
+    cam.spread = cam.moving ? exposure / std::sqrt(12.0) : 0.0;
+    if (cam.distorted && cam.lens > FISHEYE) a.fail("distorted", "has to be false for this lens");
+    cam.along_ray = cam.lens == FISHEYE || cam.lens == EQUIRECTANGULAR;
+    cam.middle = 0.5 * ((cam.axis == 0 ? cam.W : cam.H) - 1);
+    std::copy_n(motion.data(), 3, cam.turn), std::copy_n(motion.data() + 3, 3, cam.shift);
+    for (const double c : cam.coefficients)
+        if (!std::isfinite(c)) a.fail("coefficients", "have to be finite");
+    for (const double c : motion)
+        if (!std::isfinite(c)) a.fail("motion", "has to be finite");
+}
+
 inline Camera camera_of(Arguments a) {
     Camera cam{};
     const Array R = a.array("R", {Kind::F64}, {3, 3}), eye = a.array("eye", {Kind::F64}, {3});
@@ -22,10 +52,15 @@ inline Camera camera_of(Arguments a) {
     cam.fx = a.number("fx"), cam.fy = a.number("fy"), cam.cx = a.number("cx"), cam.cy = a.number("cy");
     std::array<double, 2> x, y;
     a.numbers("x_bounds", x.data(), 2), a.numbers("y_bounds", y.data(), 2);
+    if (x[0] > x[1]) a.fail("x_bounds", "have to ascend");
+    if (y[0] > y[1]) a.fail("y_bounds", "have to ascend");
     cam.x_low = x[0], cam.x_high = x[1], cam.y_low = y[0], cam.y_high = y[1];
     cam.H = int32_t(a.whole("H", 1, MOST)), cam.W = int32_t(a.whole("W", 1, MOST));
     const int64_t tiles = ((int64_t(cam.H) + TILE - 1) / TILE) * ((int64_t(cam.W) + TILE - 1) / TILE);
     if (tiles > MOST) a.fail("H", "times W is more pixels than can be rendered");
+    read_lens(a, cam);
+    const double bounds[4] = {cam.x_low, cam.x_high, cam.y_low, cam.y_high};
+    cam.bounded = cam.lens == PERSPECTIVE && std::any_of(bounds, bounds + 4, [](double b) { return std::isfinite(b); });
     a.finish();
     return cam;
 }
@@ -99,7 +134,9 @@ struct GradientArrays : PerGaussian {
         const Kind kind = means.is(Kind::F32) ? Kind::F32 : Kind::F64;
         means2d_norm = a.array("means2d_norm", {kind}, {n}, true);
         background = a.array("background", {kind}, {3}, true);
-        camera = a.array_or_none("camera", Kind::F64, {CAMERA}, true);
+        camera = a.array_or_none("camera", Kind::F64, {ANY}, true);
+        if (camera && camera.shape[0] != CAMERA && camera.shape[0] != LENS_CAMERA)
+            a.fail("camera", "has to be of 16 numbers, or of 37 for a lens");
         features = a.array_or_none("features", kind, {n, ANY}, true);
         a.finish();
     }

@@ -10,7 +10,9 @@
 //     dN = -a e,   dm = (g - e (e . g)) / |m|,   dtx = dm x ty,   dty = tx x dm
 //     dz = r . (dtx(u - 1) - dtx(u + 1) + dty(v - 1) - dty(v + 1)),   dD = dz / a,   da = -dz z / a
 //
-// A pixel takes part if its four neighbours have a depth, and these differ by less than `jump` of the nearest.
+// A pixel takes part if its four neighbours have a depth, and these differ by less than `jump` of the nearest. Through a lens, P = o + z r
+// with the centre o when the pixel is read, and a pixel without a ray has no depth. The first and
+// the last column of a panorama are neighbours.
 // Three passes over rows, each into planes of its own: depths, tangents' gradients, sums at each pixel.
 #include "isa.h"
 #include "simd.h"
@@ -26,7 +28,29 @@ struct RowRay {
         const double y = (double(row) - args.cy) / args.fy;
         for (int k = 0; k < 3; ++k) base[k] = T(y * args.R[3 + k] + args.R[6 + k]), right[k] = T(args.R[k]);
     }
-    GSPLAT_METHOD T x(int64_t u) const { return (T(u) - cx) * inverse; }
+    GSPLAT_METHOD void at(int64_t u, T *r) const {
+        const T x = (T(u) - cx) * inverse;
+        for (int k = 0; k < 3; ++k) r[k] = base[k] + x * right[k];
+    }
+    // Adds the way from the centre of one pixel to that of another; a pinhole has one centre.
+    GSPLAT_METHOD static void between(const RowRay &, int64_t, const RowRay &, int64_t, T *) {}
+};
+
+// The same through a lens or a rolling shutter.
+template <class T>
+struct RowLensRay {
+    const SurfaceArgs<T> &args;
+    int64_t row;
+    GSPLAT_METHOD RowLensRay(const SurfaceArgs<T> &given, int64_t which) : args(given), row(which) {}
+    GSPLAT_METHOD void at(int64_t u, T *r) const {
+        const T *own = args.lens.rays + 3 * (row * args.W + u);
+        const double *frame = args.lens.frame(row, u);
+        for (int k = 0; k < 3; ++k) r[k] = T(frame[3 * k]) * own[0] + T(frame[3 * k + 1]) * own[1] + T(frame[3 * k + 2]) * own[2];
+    }
+    GSPLAT_METHOD static void between(const RowLensRay &from, int64_t u, const RowLensRay &to, int64_t v, T *tangent) {
+        const double *first = from.args.lens.frame(from.row, u) + 9, *last = to.args.lens.frame(to.row, v) + 9;
+        for (int k = 0; k < 3; ++k) tangent[k] += T(last[k] - first[k]);
+    }
 };
 
 template <class T>
@@ -34,32 +58,39 @@ void surface_depths(const SurfaceArgs<T> &args, int64_t row) {
     const T *alphas = args.alpha + row * args.W, *sums = args.depth + row * args.W;
     T *depths = args.depths + row * args.W;
     for (int64_t u = 0; u < args.W; ++u) depths[u] = alphas[u] > 0 ? sums[u] / alphas[u] : T(0);
+    if (!args.lens.rays) return;
+    const T *rays = args.lens.rays + 3 * row * args.W;
+    for (int64_t u = 0; u < args.W; ++u, rays += 3)
+        if (rays[0] == 0 && rays[1] == 0 && rays[2] == 0) depths[u] = 0;
 }
 
-template <class T>
-void surface_tangents(const SurfaceArgs<T> &args, int64_t row) {
+template <class T, class Ray>
+GSPLAT_INLINE void tangents_of(const SurfaceArgs<T> &args, int64_t row) {
     const int64_t W = args.W;
     T *out = args.tangents + 6 * row * W;
     memset(out, 0, size_t(6 * W) * sizeof(T));
     memset(args.grad_normals + 3 * row * W, 0, size_t(3 * W) * sizeof(T));
     args.sums[row] = 0;
     if (row == 0 || row + 1 == args.H) return;
-    const RowRay<T> ray(args, row), above(args, row - 1), below(args, row + 1);
+    const Ray ray(args, row), above(args, row - 1), below(args, row + 1);
     const T *z = args.depths + row * W, *up = z - W, *down = z + W;
     const T *normals = args.normals + 3 * row * W, *alphas = args.alpha + row * W;
     T *grads = args.grad_normals + 3 * row * W;
     const T jump = T(1 + args.jump), scale = T(args.scale);
     double total = 0;
-    for (int64_t u = 1; u + 1 < W; ++u) {
-        const T left = z[u - 1], right = z[u + 1], high = up[u], low = down[u];
+    const bool wraps = args.lens.wraps;
+    for (int64_t u = wraps ? 0 : 1; u + (wraps ? 0 : 1) < W; ++u) {
+        const int64_t prior = wraps && u == 0 ? W - 1 : u - 1, next = wraps && u + 1 == W ? 0 : u + 1;
+        const T left = z[prior], right = z[next], high = up[u], low = down[u];
         const T least = vmin(vmin(left, right), vmin(high, low)), most = vmax(vmax(left, right), vmax(high, low));
         if (!(least > 0 && most < jump * least)) continue;
-        const T x = ray.x(u), before = ray.x(u - 1), after = ray.x(u + 1);
-        T tx[3], ty[3], m[3];
+        T tx[3], ty[3], m[3], before[3], after[3], over[3], under[3];
+        ray.at(prior, before), ray.at(next, after), above.at(u, over), below.at(u, under);
         for (int k = 0; k < 3; ++k) {
-            tx[k] = right * (ray.base[k] + after * ray.right[k]) - left * (ray.base[k] + before * ray.right[k]);
-            ty[k] = low * (below.base[k] + x * ray.right[k]) - high * (above.base[k] + x * ray.right[k]);
+            tx[k] = right * after[k] - left * before[k];
+            ty[k] = low * under[k] - high * over[k];
         }
+        Ray::between(ray, prior, ray, next, tx), Ray::between(above, u, below, u, ty);
         m[0] = ty[1] * tx[2] - ty[2] * tx[1], m[1] = ty[2] * tx[0] - ty[0] * tx[2], m[2] = ty[0] * tx[1] - ty[1] * tx[0];
         const T squared = m[0] * m[0] + m[1] * m[1] + m[2] * m[2];
         if (!(squared > 0)) continue;
@@ -79,25 +110,37 @@ void surface_tangents(const SurfaceArgs<T> &args, int64_t row) {
 }
 
 template <class T>
-void surface_gradient(const SurfaceArgs<T> &args, int64_t row) {
-    const RowRay<T> ray(args, row);
+void surface_tangents(const SurfaceArgs<T> &args, int64_t row) {
+    args.lens.rays ? tangents_of<T, RowLensRay<T>>(args, row) : tangents_of<T, RowRay<T>>(args, row);
+}
+
+template <class T, class Ray>
+GSPLAT_INLINE void gradient_of(const SurfaceArgs<T> &args, int64_t row) {
+    const Ray ray(args, row);
     const int64_t W = args.W, H = args.H;
     const T *z = args.depths + row * W, *tangents = args.tangents + 6 * row * W, *alphas = args.alpha + row * W;
     T *of_depth = args.grad_depth + row * W, *of_alpha = args.grad_alpha + row * W;
+    const bool wraps = args.lens.wraps;
     for (int64_t u = 0; u < W; ++u) {
-        const T x = ray.x(u);
-        T dz = 0;
+        const int64_t prior = wraps && u == 0 ? W - 1 : u - 1, next = wraps && u + 1 == W ? 0 : u + 1;
+        T dz = 0, r[3];
+        ray.at(u, r);
         for (int k = 0; k < 3; ++k) {
             T of_point = 0;
-            if (u > 0) of_point += tangents[6 * (u - 1) + k];
-            if (u + 1 < W) of_point -= tangents[6 * (u + 1) + k];
+            if (prior >= 0) of_point += tangents[6 * prior + k];
+            if (next < W) of_point -= tangents[6 * next + k];
             if (row > 0) of_point += tangents[6 * (u - W) + 3 + k];
             if (row + 1 < H) of_point -= tangents[6 * (u + W) + 3 + k];
-            dz += of_point * (ray.base[k] + x * ray.right[k]);
+            dz += of_point * r[k];
         }
         of_depth[u] = alphas[u] > 0 ? dz / alphas[u] : T(0);
         of_alpha[u] = -of_depth[u] * z[u];
     }
+}
+
+template <class T>
+void surface_gradient(const SurfaceArgs<T> &args, int64_t row) {
+    args.lens.rays ? gradient_of<T, RowLensRay<T>>(args, row) : gradient_of<T, RowRay<T>>(args, row);
 }
 
 // The axis k of a rotation by the unit quaternion (w, x, y, z): the column k of its matrix.

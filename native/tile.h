@@ -9,7 +9,8 @@ namespace gsplat {
 namespace GSPLAT_ISA {
 
 // What is composited: colours; depth as well; features as well; or also median depth or statistics. The last three do what is asked for.
-enum Mode { COLORS, WITH_DEPTH, WITH_FEATURES, WITH_ALL };
+// WRAPPED does so, too, in an image whose left and right edges meet.
+enum Mode { COLORS, WITH_DEPTH, WITH_FEATURES, WITH_ALL, WRAPPED };
 
 // With Settings::pixel_stop a pixel ends before the first splat that would take its transmittance to T_STOP or below, and keeps the
 // transmittance that it has. The planes mark a pixel that has ended by a negative transmittance. Sets alpha to 0 where the pixel has
@@ -297,6 +298,29 @@ struct Batch {
             rows_of(splats, pairs, count, box, clamp, rows);
         if constexpr (!AGAIN && KEEPS_ROWS) keep(rows, *kept);
         steps_of(splats, pairs, count, box, rows, steps);
+    }
+};
+
+// The whole turns, px, by which a mean at column u of an image that wraps is nearest to a tile.
+template <class T>
+GSPLAT_INLINE T seam_shift(const gsplat::Camera &cam, int32_t tile_left, T u) {
+    return T(cam.W) * floor_((T(tile_left) + T(0.5 * (TILE - 1)) - u) / T(cam.W) + T(0.5));
+}
+
+// The splats of a batch in an image that wraps, each moved by whole turns to be nearest to the tile; and the pairs that name them.
+template <class T>
+struct WrappedSplats {
+    Splat<T> splats[BATCH];
+    Pair pairs[BATCH];
+
+    GSPLAT_METHOD uint32_t take(const CompositeArgs<T> &args, const Pair *from, uint32_t left, const TileBox &box) {
+        const uint32_t count = vmin(BATCH, left);
+        for (uint32_t i = 0; i < count; ++i) {
+            splats[i] = args.splats[from[i].gaussian], pairs[i] = {i, from[i].slot};
+            const T shift = seam_shift(args.camera, box.x0, splats[i].u);
+            splats[i].u += shift, splats[i].x += shift;
+        }
+        return count;
     }
 };
 

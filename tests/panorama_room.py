@@ -53,6 +53,15 @@ def colours_of(eye, rays):
         eye: (3,) the point.
         rays: (..., 3) directions, of any length.
     """
+    return _traced(eye, rays)[0]
+
+
+def depths_of(eye, rays):
+    """Return where rays from a point end, (...): in lengths of the ray, infinity where it hits nothing."""
+    return _traced(eye, rays)[1]
+
+
+def _traced(eye, rays):
     flat = rays.reshape(-1, 3)
     nearest = np.full(len(flat), np.inf)
     found = np.zeros((len(flat), 3), np.float32)
@@ -74,7 +83,7 @@ def colours_of(eye, rays):
         lower = texture[j + 1, i] * (1 - p) + texture[j + 1, i + 1] * p
         found[hit] = upper * (1 - r) + lower * r
         nearest[hit] = t[hit]
-    return found.reshape(rays.shape)
+    return found.reshape(rays.shape), nearest.reshape(rays.shape[:-1])
 
 
 def averaged(dense):

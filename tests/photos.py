@@ -6,6 +6,7 @@ starts, share them in a folder.
 import hashlib
 import os
 import struct
+import threading
 import zlib
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def keep() -> None:
         path = folder / f"{hashlib.sha256(pose + b''.join(a.tobytes() for a in splats)).hexdigest()}.npz"
         if not path.exists():
             image, transmittance = original(camera, *splats)
-            part = path.with_suffix(f".{os.getpid()}.npz")
+            part = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}.npz")
             np.savez(part, image=image, transmittance=transmittance)
             part.replace(path)
         with np.load(path) as kept:

@@ -16,7 +16,7 @@ from gsplat_edu.runs.processes import Processes
 MEETING = timedelta(seconds=60)
 
 
-def together(size: int, work: Callable, patience: float = 30.0) -> list:
+def together(size: int, work: Callable, patience: float = 120.0) -> list:
     """Call `work(team)` for all ranks at the same time; return the results by rank. If ranks fail, raise the error of
     the first one that did not fail because another rank was missing.
 

@@ -1,4 +1,4 @@
-"""A renderer written from conformance/SPECIFICATION.md alone, each convention of which can be broken on purpose.
+"""A renderer written from the two specifications in conformance/; each convention can be broken on purpose.
 
 It imports nothing from the package. Unbroken, it is a third implementation that passes the conformance kit; broken,
 it shows that the kit can fail.
@@ -6,12 +6,14 @@ it shows that the kit can fail.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from simple_lens import LensConventions, View, is_pinhole, nearest_copy, see
 
 Arrays = dict[str, Any]
 
@@ -60,6 +62,7 @@ class Conventions:
     stop: str = "never"  # or "before" the Gaussian that takes T of a pixel below stop_at
     stop_at: float = 1e-4
     refuses_empty: bool = False
+    lens: LensConventions = field(default_factory=LensConventions)
     # these change gradients, but no outputs
     clamp_passes: bool = False
     floor_passes: bool = False
@@ -67,6 +70,7 @@ class Conventions:
     jacobian_passes: bool = False
     direction_detached: bool = False
     jacobian_detached: bool = False
+    lens_jacobian_detached: bool = False
     compensation_detached: bool = False
     length_detached: bool = False
     transmittance_detached: bool = False
@@ -80,7 +84,8 @@ class SimpleRenderer:
 
     def render(self, gaussians: Arrays, camera: Arrays, settings: Arrays) -> Arrays:
         leaves = _leaves(gaussians, camera, settings, tracked=False)
-        return {name: value.numpy() for name, value in self._outputs(leaves, camera, settings).items()}
+        found = self._outputs(leaves, camera, settings)
+        return {name: value.numpy(force=True) for name, value in found.items()}
 
     def gradients(self, gaussians: Arrays, camera: Arrays, settings: Arrays, upstream: Arrays) -> Arrays:
         leaves = _leaves(gaussians, camera, settings, tracked=True)
@@ -92,16 +97,22 @@ class SimpleRenderer:
         c, shape = self.c, (camera["height"], camera["width"])
         if c.refuses_empty and len(x["means"]) == 0:
             raise ValueError("no Gaussians")
-        mean_cam = (x["means"] - x["eye"]) @ x["R"].T
-        drawn = self._order(x, mean_cam, settings)
-        colours = self._colours(x, settings)[drawn]
-        means2d, cov = self._project(x, mean_cam, drawn, camera, settings)
-        alpha = self._alpha(x, drawn, means2d, cov, settings, shape)
+        pinhole = is_pinhole(camera)
+        view = (
+            self._through_pinhole(x, camera, settings)
+            if pinhole
+            else see(x, camera, settings["jacobian_limit"], c.lens)
+        )
+        drawn = self._order(x, view, settings)
+        colours = self._colours(x, view.direction, settings)[drawn]
+        means2d, cov = view.places[drawn], self._ellipses(x, view, drawn)
+        alpha = self._alpha(x, drawn, means2d, cov, settings, camera, view.blur)
         before, after = self._transmittance(alpha)
         w = (before.detach() if c.transmittance_detached else before) * alpha
         T = after[-1] if len(drawn) else x["means"].new_ones(shape)
-        z = mean_cam[drawn, 2]
-        depth = torch.einsum("nyx,n->yx", w, z if c.depth != "distance" else mean_cam[drawn].norm(dim=-1))
+        z = view.depth[drawn]
+        distance = (x["means"] - x["eye"])[drawn].norm(dim=-1)
+        depth = torch.einsum("nyx,n->yx", w, z if c.depth != "distance" else distance)
         if c.depth == "divided by alpha":
             depth = depth / (1 - T).clamp(min=1e-12)
         crosses = ((before >= c.median_below) & (after < c.median_below)).to(w)
@@ -114,18 +125,18 @@ class SimpleRenderer:
             "features": torch.einsum("nyx,nc->yxc", w, x["features"][drawn]) + c.features_over * T[..., None],
         }
 
-    def _order(self, x: dict[str, Tensor], mean_cam: Tensor, settings: Arrays) -> Tensor:
-        c, z = self.c, mean_cam[:, 2].detach()
+    def _order(self, x: dict[str, Tensor], view: View, settings: Arrays) -> Tensor:
+        c, z = self.c, view.depth.detach()
         near = settings["z_near"] if c.z_near is None else c.z_near
-        drawn = torch.nonzero(z >= near if c.near_included else z > near)[:, 0]
-        key = {"z": z, "distance": mean_cam.detach().norm(dim=-1), "input": torch.zeros_like(z)}[c.order]
+        drawn = torch.nonzero(view.seen & (z >= near if c.near_included else z > near))[:, 0]
+        distance = (x["means"] - x["eye"]).detach().norm(dim=-1)
+        key = {"z": z, "distance": distance, "input": torch.zeros_like(z)}[c.order]
         if c.ties == "last":
             drawn = drawn.flip(0)
         return drawn[torch.argsort(key[drawn], stable=True)]
 
-    def _colours(self, x: dict[str, Tensor], settings: Arrays) -> Tensor:
+    def _colours(self, x: dict[str, Tensor], offset: Tensor, settings: Arrays) -> Tensor:
         c = self.c
-        offset = x["means"] - x["eye"]
         d = offset / offset.norm(dim=-1, keepdim=True)
         d = (d.detach() if c.direction_detached else d) * (-1 if c.toward_camera else 1)
         degree = settings["sh_degree"] if c.sh_degree is None else c.sh_degree
@@ -136,12 +147,11 @@ class SimpleRenderer:
         floored = raw.clamp(min=0.0 if c.sh_floor else -np.inf, max=c.sh_ceiling)
         return raw + (floored - raw).detach() if c.floor_passes else floored
 
-    def _project(
-        self, x: dict[str, Tensor], mean_cam: Tensor, drawn: Tensor, camera: Arrays, settings: Arrays
-    ) -> tuple[Tensor, Tensor]:
-        """Return means in the image (M, 2) and covariances before the dilation (M, 2, 2)."""
-        c = self.c
-        px, py, z = mean_cam[drawn].unbind(-1)
+    def _through_pinhole(self, x: dict[str, Tensor], camera: Arrays, settings: Arrays) -> View:
+        offset = x["means"] - x["eye"]
+        px, py, depth = (offset @ x["R"].T).unbind(-1)
+        near = self.c.z_near if self.c.z_near is not None else settings["z_near"]
+        z = torch.where(depth.detach() < near, torch.ones_like(depth), depth)  # those are not drawn
         fx, fy = x["fx"], x["fy"]
         means2d = torch.stack([fx * px / z + x["cx"], fy * py / z + x["cy"]], dim=-1)
         sides = (("fx", "cx", "width"), ("fy", "cy", "height"))
@@ -152,13 +162,21 @@ class SimpleRenderer:
         zero = torch.zeros_like(z)
         rows = [[fx / z, zero, -fx * ratios[0] / z], [zero, fy / z, -fy * ratios[1] / z]]
         J = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-        J = J.detach() if c.jacobian_detached else J
+        everywhere = torch.ones(len(z), dtype=torch.bool)
+        # detached before the rotation, which is no part of the Jacobian
+        JW = (J.detach() if self.c.jacobian_detached else J) @ x["R"]
+        return View(means2d, JW, depth, offset, everywhere)
+
+    def _ellipses(self, x: dict[str, Tensor], view: View, drawn: Tensor) -> Tensor:
+        """Return covariances in the image before the dilation, (M, 2, 2)."""
+        c = self.c
         q = x["quats"][drawn][:, list(c.quaternion)]
         length = q.norm(dim=-1, keepdim=True)
         q = q / (length.detach() if c.length_detached else length) if c.normalised else q
         Q = _rotation(q)
-        M = J @ x["R"] @ ((Q.mT if c.transposed else Q) * torch.exp(x["log_scales"][drawn])[:, None])
-        return means2d, M @ M.mT
+        JW = view.JW[drawn].detach() if c.lens_jacobian_detached else view.JW[drawn]
+        M = JW @ ((Q.mT if c.transposed else Q) * torch.exp(x["log_scales"][drawn])[:, None])
+        return M @ M.mT
 
     def _clamped(
         self,
@@ -184,11 +202,17 @@ class SimpleRenderer:
         means2d: Tensor,
         cov: Tensor,
         settings: Arrays,
-        shape: tuple[int, int],
+        camera: Arrays,
+        blur: Tensor | None,
     ) -> Tensor:
-        c = self.c
+        c, shape = self.c, (camera["height"], camera["width"])
         dilated = cov + c.dilation * torch.eye(2, dtype=cov.dtype)
         opacity = torch.sigmoid(x["logit_opacities"][drawn])
+        if blur is not None:
+            b = blur[drawn]
+            blurred = dilated + b[:, :, None] * b[:, None, :] / 12
+            opacity = opacity * (torch.linalg.det(dilated) / torch.linalg.det(blurred)) ** c.lens.blur_factor
+            dilated = blurred
         if settings["antialiased"] and c.compensates:
             factor = (
                 torch.linalg.det(cov).clamp(min=1e-12) / torch.linalg.det(dilated)
@@ -197,6 +221,7 @@ class SimpleRenderer:
         rows, columns = np.mgrid[: shape[0], : shape[1]] + c.pixel_offset
         grid = (rows, columns) if c.axes_swapped else (columns, rows)
         d = torch.tensor(np.stack(grid, axis=-1)) - means2d[:, None, None]
+        d = torch.stack([nearest_copy(d[..., 0], camera, c.lens), d[..., 1]], dim=-1)
         square = torch.einsum("nyxi,nij,nyxj->nyx", d, torch.linalg.inv(dilated), d)
         raw = opacity[:, None, None] * torch.exp(-0.5 * square)
         clamped = raw.clamp(max=settings["alpha_max"] if c.alpha_max is None else c.alpha_max)
@@ -224,7 +249,9 @@ class SimpleRenderer:
 
 
 def _leaves(gaussians: Arrays, camera: Arrays, settings: Arrays, *, tracked: bool) -> dict[str, Tensor]:
-    names = ("R", "eye", "fx", "fy", "cx", "cy")
+    names = ["R", "eye", "fx", "fy", "cx", "cy"]
+    names += ["distortion"] if camera["distortion"].any() else []
+    names += ["turn", "shift"] if camera["readout"] != "none" or camera["exposure"] else []
     given = gaussians | {"background": settings["background"]} | {name: camera[name] for name in names}
     return {n: torch.tensor(v, dtype=torch.float64, requires_grad=tracked) for n, v in given.items()}
 

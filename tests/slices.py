@@ -75,6 +75,8 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/repo/test_notebooks.py::test_chapters_execute_on_a_reduced_budget": (14, 14),
     "tests/train/test_transients.py::test_found_masks_recover_most_of_the_quality_of_true_masks": (13, 1),
     "tests/train/test_poses.py::test_wrong_poses_are_corrected_and_held_out_quality_with_them": (12, 1),
+    "tests/runs/test_pilot.py::test_a_lens_is_learned_if_it_is_wrong": (46, 2),
+    "tests/runs/test_pilot.py::test_a_shutter_is_learned_if_photos_have_one": (24, 2),
     "tests/runs/test_pilot.py::test_poses_are_refined_if_they_are_wrong": (11, 2),
     "tests/sfm/test_training.py::test_one_command": (10, 2),
     "tests/studio/test_page_pictures.py::test_a_training_is_drawn_while_it_runs": (9, 1),

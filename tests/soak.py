@@ -15,7 +15,7 @@ import numpy as np
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.scene.camera import orbit_camera
+from gsplat_edu.scene.rig import orbit_camera
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.config import TrainConfig

@@ -1,12 +1,21 @@
 import errno
 import os
+import shutil
 import stat
 from pathlib import Path
 
 import pytest
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.base.files import check_writable, described, unreadable, written_aside
+from gsplat_edu.base import files
+from gsplat_edu.base.files import (
+    check_writable,
+    described,
+    newest_first,
+    remove_leftovers,
+    unreadable,
+    written_aside,
+)
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.cli.arguments import run_command
 from systems import needs_posix
@@ -30,6 +39,49 @@ def test_permissions_are_those_of_any_new_file(tmp_path):
     finally:
         os.umask(old)
     assert stat.S_IMODE((tmp_path / "x").stat().st_mode) == 0o644
+
+
+@needs_posix
+def test_writers_do_not_change_the_permissions_of_files_that_other_threads_make(tmp_path, monkeypatch):
+    """The umask belongs to the whole process: a thread that sets it for a moment opens other threads' files to all."""
+    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail("the umask was changed"))
+    with written_aside(tmp_path / "x") as aside:
+        aside.unlink()
+        aside.write_text("")  # some writers make the file anew
+        aside.chmod(0o600)
+    assert (tmp_path / "x").stat().st_mode == aside_like(tmp_path).stat().st_mode
+
+
+def aside_like(folder):
+    (folder / "plain").touch()
+    return folder / "plain"
+
+
+def test_a_folder_that_vanishes_meanwhile_is_passed_over(tmp_path, monkeypatch):
+    left = tmp_path / "z" / f".x.{files._this_machine()}-{2**22 + 1}-0123abcd.ply"
+    for folder in ("a/b", "z"):
+        (tmp_path / folder).mkdir(parents=True)
+    left.touch()
+    (tmp_path / "z" / "kept").touch()
+    scan = os.scandir
+
+    def vanishing(place):
+        if place in (tmp_path / "a" / "b", str(tmp_path / "a" / "b")):
+            monkeypatch.undo()
+            shutil.rmtree(tmp_path / "a")  # another program removes it once it is listed
+        return scan(place)
+
+    monkeypatch.setattr(os, "scandir", vanishing)
+    remove_leftovers(tmp_path)
+    assert not (tmp_path / "a").exists() and [path.name for path in left.parent.iterdir()] == ["kept"]
+
+
+def test_files_are_sorted_by_time_and_vanished_ones_left_out(tmp_path):
+    paths = [tmp_path / name for name in "abc"]
+    for time, path in zip((1, 3, 2), paths, strict=True):
+        path.touch()
+        os.utime(path, (time, time))
+    assert newest_first([*paths, tmp_path / "gone"]) == [paths[1], paths[2], paths[0]]
 
 
 def test_a_failure_leaves_the_old_file(tmp_path):

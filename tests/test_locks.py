@@ -2,9 +2,11 @@
 
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -133,3 +135,47 @@ def test_a_lock_that_is_a_link_is_refused_and_its_target_is_unchanged(tmp_path):
     ):
         pass
     assert target.read_text() == "kept"
+
+
+@pytest.mark.parametrize("looks", [1, 2])
+def test_a_lock_file_that_vanishes_between_two_looks_at_it_is_no_error(tmp_path, monkeypatch, looks):
+    """Its holder removes it at the end; it must not be taken for a link or a folder then."""
+    (tmp_path / LOCK).touch()
+    look, seen = Path.stat, []
+
+    def vanishing(path, **options):
+        found = look(path, **options)
+        if path.name == LOCK:
+            seen.append(path)
+            if len(seen) == looks:
+                monkeypatch.undo()
+                path.unlink(missing_ok=True)
+        return found
+
+    begin = os.open
+
+    def opening(path, *words, **options):
+        if Path(path).name == LOCK:
+            monkeypatch.undo()  # from here on it is our own file
+        return begin(path, *words, **options)
+
+    monkeypatch.setattr(Path, "stat", vanishing)
+    monkeypatch.setattr(os, "open", opening)
+    assert lock(tmp_path) and seen
+
+
+@pytest.mark.parametrize("at", [LOCK, "run"])
+def test_a_folder_that_its_holder_removes_at_the_end_is_made_again(tmp_path, monkeypatch, at):
+    """It vanishes when the lock file is about to be opened, or when the folder is tried out."""
+    folder, begin = tmp_path / "run", os.open
+
+    def opening(path, *words, **options):
+        if Path(path).name == at:
+            monkeypatch.undo()
+            shutil.rmtree(folder)
+        return begin(path, *words, **options)
+
+    folder.mkdir()
+    monkeypatch.setattr(os, "open", opening)
+    with locked("--out", folder, "gsplat-edu train", pytest.fail):
+        assert (folder / LOCK).is_file()

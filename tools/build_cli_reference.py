@@ -99,7 +99,10 @@ def _invocation(action: argparse.Action) -> str:
     names = ", ".join(action.option_strings)
     if action.nargs == 0:
         return names
-    values = action.metavar if isinstance(action.metavar, tuple) else (str(action.metavar),)
+    shown = (
+        "|".join(map(str, action.choices)) if action.metavar is None and action.choices else action.metavar
+    )
+    values = shown if isinstance(shown, tuple) else (str(shown),)
     text = " ".join(values)
     text = {"?": f"[{text}]", "+": f"{text} [{text} ...]"}.get(str(action.nargs), text)
     return _cell(f"{names} {text}")

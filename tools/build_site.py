@@ -59,6 +59,7 @@ BUILD_ON = {
     "benchmarks/archive/RESULTS-2026-11.md": "Earlier measurements",
     "conformance/README.md": "Conformance kit",
     "conformance/SPECIFICATION.md": "Specification of a renderer",
+    "conformance/LENSES.md": "Specification of lenses",
     "CONTRIBUTING.md": "Contributing",
     "SECURITY.md": "Security",
     "docs/LICENCES.md": "Licences",

@@ -37,6 +37,7 @@ FIGURES = (
     Figure("02_gaussians_in_2d", "pushed = [leaning", "ellipse", "Drag a splat", data=False),
     Figure("03_gaussians_in_3d", '"then turned: R S"', "ellipsoid", "Turn a Gaussian", data=False),
     Figure("04_splatting", "the axes zoom in", "tangent", "Drag a Gaussian", data=False),
+    Figure("04_splatting", "def by_fisheye", "lens", "Drag a ball across a lens", data=False),
     Figure("05_sort_and_composite", '"the same splats in three orders"', "sphere", "Turn the sphere"),
     Figure("06_spherical_harmonics", "gloss of one splat", "harmonics", "Drag a coefficient", data=False),
     Figure("07_a_trained_scene", '"nothing forgotten": complete', "scene", "Forget a function"),

@@ -41,7 +41,7 @@ from ladder.splats import Splats
 
 OWN = {
     "naive": ("job", "view", "constants", "naive"),
-    "count": ("job", "view", "constants", "ellipse", "count"),
+    "count": ("job", "view", "constants", "flat", "ellipse", "count"),
     "add_slots": ("job", "add_slots"),
 }
 """The modules of this folder, and the WGSL files that are joined to each; those of the engine stand before ours."""

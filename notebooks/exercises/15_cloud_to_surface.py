@@ -39,9 +39,9 @@ front = Camera.looking_at([0, 0, 0], [0, 0, 1], fx=1200, fy=1200, H=65, W=97)
 facing = np.array([np.sin(tilt), 0, -np.cos(tilt)])
 meets = DISTANCE * facing[2] / (front.rays() @ facing)
 for splats_laid in (3_000, 20_000):
-    maps, _ = render_maps(wall_in_space(splats_laid, tilt, 0.2), front, KINDS, backend="cpu")
+    maps, _ = render_maps(wall_in_space(splats_laid, tilt, 0.2), front, DEPTHS, backend="cpu")
     kappa = 2 * np.pi * SIZE**2 * 0.2 * splats_laid / 1.6
-    biases = [np.median(maps[kind].numpy() - meets) / (SIZE * np.sin(tilt)) for kind in KINDS]
+    biases = [np.median(maps[kind].numpy() - meets) / (SIZE * np.sin(tilt)) for kind in DEPTHS]
     print(f"alphas {kappa:.1f}: depth {biases[0]:.2f}, median {biases[1]:.2f}, law {bias_law(kappa)}")
     assert np.allclose(biases[:2], bias_law(kappa), rtol=0.15, atol=0)
     assert abs(biases[2]) < 1e-6  # exact up to the pixel's rounding

@@ -74,7 +74,7 @@ print(f"budget: {COUNT} photos, {WIDTH} px, {ITERATIONS} iterations{' (reduced)'
 # and $z$ away from the camera.
 
 # %%
-KINDS = "depth", "median-depth", "planar-depth"  # what the package calls the three
+DEPTHS = "depth", "median-depth", "planar-depth"  # what the package calls the three
 DISTANCE, SIZE = 4.0, 0.05  # of the wall, and the standard deviation of its splats along it; world units
 
 
@@ -240,11 +240,11 @@ def trained(finish, surface):
     trainer = training(config, data, load_backend("cpu"))
     trainer.run()
     settings = RenderSettings(config.background, jacobian_limit=config.jacobian_limit)
-    errors, angles = {kind: [] for kind in KINDS}, []
+    errors, angles = {kind: [] for kind in DEPTHS}, []
     for view, photo in zip(capture.views, capture.photos, strict=True):
         with torch.no_grad():
-            maps, _ = render_maps(trainer.gaussians, view.camera, (*KINDS, "normal"), settings, "cpu")
-        for kind in KINDS:
+            maps, _ = render_maps(trainer.gaussians, view.camera, (*DEPTHS, "normal"), settings, "cpu")
+        for kind in DEPTHS:
             both = (photo.depth > 0) & (maps[kind].numpy() > 0)
             errors[kind].append(np.where(both, maps[kind].numpy() - photo.depth, np.nan))
         cosine = np.clip((maps["normal"].numpy() * photo.normals).sum(axis=-1)[photo.depth > 0], -1, 1)
@@ -252,7 +252,7 @@ def trained(finish, surface):
     cameras = [(view.name, view.camera) for view in capture.views]
     meshed = extract_mesh(trainer.gaussians, cameras, settings, load_backend("cpu"))
     return SimpleNamespace(
-        meshed=meshed, angle=np.mean(angles), errors={k: np.stack(errors[k]) for k in KINDS}
+        meshed=meshed, angle=np.mean(angles), errors={k: np.stack(errors[k]) for k in DEPTHS}
     )
 
 
@@ -268,7 +268,7 @@ for row, (name, run) in zip(axes, runs.items(), strict=True):
 fig.colorbar(shown, ax=axes, label="depth error, world units")
 plt.show()
 before, after = runs.values()
-far = [[np.nanmean(np.abs(run.errors[kind])) for kind in KINDS] for run in (before, after)]
+far = [[np.nanmean(np.abs(run.errors[kind])) for kind in DEPTHS] for run in (before, after)]
 assert after.angle < before.angle and (SHORT or np.all(np.array(far[1]) < far[0]))
 
 # %% [markdown]

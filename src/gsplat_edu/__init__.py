@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, C0, C1, C2, C3, DILATION, T_STOP, TILE, Z_NEAR
 from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, ShapeError, SplatError
 from gsplat_edu.render.numpy_reference import render_gaussians
-from gsplat_edu.scene.camera import Camera, CameraLike, look_at, orbit_camera
+from gsplat_edu.scene.camera import Camera, CameraLike, look_at
 from gsplat_edu.scene.gaussian_math import (
     build_cov3d,
     build_cov3d_batch,
@@ -20,6 +20,7 @@ from gsplat_edu.scene.gaussian_math import (
     quat_to_R,
     quat_to_R_batch,
 )
+from gsplat_edu.scene.rig import orbit_camera
 from gsplat_edu.scene.sh import eval_sh, sh_basis
 from gsplat_edu.scene.sphere_shell import sphere_shell
 

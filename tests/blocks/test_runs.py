@@ -127,8 +127,12 @@ def test_a_photo_or_a_camera_changed_after_the_split_is_named_before_anything_is
     capture = tmp_path / "capture"
     shutil.copytree(city, capture)
     plan = BlockPlan.read(run)
-    name = plan.blocks[0].train[-1]
-    other = next(i for i, block in enumerate(plan.blocks) if name not in (*block.train, *block.test))
+    name, other = next(
+        (name, i)
+        for name in plan.blocks[0].train
+        for i, block in enumerate(plan.blocks)
+        if name not in (*block.train, *block.test)
+    )
     photo, original = capture / "images" / name, (city / "images" / name).read_bytes()
     with Image.open(photo) as image:
         image.rotate(180).save(photo)

@@ -1,5 +1,6 @@
 """The share of an image that a cell covers, by its airspace and by a coarse model, and the Gaussians in any view."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -7,13 +8,20 @@ import pytest
 import torch
 
 from gsplat_edu.blocks.plan import Area, Cell, Ground
-from gsplat_edu.blocks.views import airspace_shares, in_any_view, seen_shares
+from gsplat_edu.blocks.seams import strip_mask, strip_width
+from gsplat_edu.blocks.views import ENOUGH, airspace_shares, assigned, in_any_view, seen_shares
+from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.projection import Projection
+from gsplat_edu.scene.views import View
+from lens_scenes import LENSES, around, lens_camera
 
 GROUND = Ground((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)))
 AREA = Area(GROUND, (-10.0, -10.0), (10.0, 10.0), (0.0, 0.01))
+DEPTH = RenderSettings(depth=True)
 HALVES = [Cell((-math.inf, -math.inf), (0.0, math.inf)), Cell((0.0, -math.inf), (math.inf, math.inf))]
 
 
@@ -73,6 +81,18 @@ def test_hidden_ground_does_not_count():
     np.testing.assert_allclose(hidden, [4.4 / 4.8, 0.4 / 4.8, 0.0], atol=0.04)
 
 
+def test_a_view_belongs_to_all_blocks_that_it_shows_enough_of_and_to_one_at_least(city):
+    """One view shows both halves, one mostly the right half, and two beside the carpet show nothing."""
+    places = {"both": 0.0, "mostly right": 4.25 - 8 * ENOUGH / 2, "blind left": -30.0, "blind right": 30.0}
+    views = [View(downwards(x), np.zeros((48, 64, 3)), name=name) for name, x in places.items()]
+    points = carpet().means.double().numpy()
+    capture = dataclasses.replace(load_dataset(city), train=tuple(views), test=())
+    found = assigned(capture, AREA, points, 2, lambda cameras, cells: shows(carpet(), cameras, cells), 1)
+    names = {side: set(block.train) for side, block in zip(("left", "right"), found, strict=True)}
+    assert found[0].core.high[0] == pytest.approx(0.0, abs=0.5)
+    assert names == {"left": {"both", "blind left"}, "right": {"both", "mostly right", "blind right"}}
+
+
 def test_more_cells_than_channels_take_several_renders():
     strips = [Cell((a, -math.inf), (a + 0.5, math.inf)) for a in np.arange(-10, 10, 0.5)]
     (shares,) = shows(carpet(), [downwards(0.0)], strips)
@@ -95,3 +115,53 @@ def test_only_gaussians_beside_the_view_are_left_out():
         drawn[render(scene, camera, backend="cpu").visible.numpy()] = True
     lost = drawn & ~shown
     assert lost.mean() < 0.02
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_lens_loses_no_gaussian_that_it_draws(name):
+    """With the Gaussians in the cone of the lens only, its image is the same, behind a rolling shutter too."""
+    camera, scene = lens_camera(name, 60, 48), around(400, seed=5).gaussians(torch.float32)
+    scene = dataclasses.replace(scene, log_scales=scene.log_scales - 1.0)
+    if camera.projection.kind == "fisheye":  # up to 80 degrees from the axis instead of 160
+        narrow = dataclasses.replace(camera.intrinsics, fx=2 * camera.fx, fy=2 * camera.fy)
+        camera = Camera.posed(camera.R, camera.eye, narrow, camera.shutter)
+    settings = RenderSettings(jacobian_limit=1.3)
+    shown = in_any_view(scene, [camera])
+    whole, part = (
+        render(g, camera, settings=settings, backend="cpu").image
+        for g in (scene, scene.map(lambda t: t[torch.from_numpy(shown)]))
+    )
+    assert float((whole - part).abs().max()) < 0.02 and float(whole.max()) > 0.1
+    whole_sphere = camera.projection.kind in ("equirectangular", "orthographic")
+    assert shown.all() if whole_sphere else 0.1 < shown.mean() < 0.95
+
+
+@pytest.mark.parametrize("projection", [Projection("fisheye"), Projection("equirectangular")])
+def test_places_near_a_cut_are_found_through_a_lens(projection):
+    """The pixels of the mask are those whose rays meet the ground near the cut."""
+    pinhole = downwards(0.0)
+    if projection.kind == "equirectangular":
+        camera = Camera.panorama(pinhole.R, pinhole.eye, 48, 96)
+    else:
+        camera = Camera(pinhole.R, pinhole.eye, 20.0, 20.0, 31.5, 31.5, 64, 64).through(projection)
+    mask = strip_mask(
+        AREA, HALVES, carpet(), camera, lambda g, c: render(g, c, settings=DEPTH, backend="cpu")
+    )
+    rays = camera.rays()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        there = camera.eye + (5.0 / rays[..., 1:2]) * rays
+    ground = (rays[..., 1] > 0.5) & (np.abs(there[..., ::2]) < 7).all(axis=-1)
+    true = np.abs(there[..., 0]) < strip_width(AREA, HALVES)
+    assert ground.sum() > 200 and (mask == true)[ground].mean() > 0.95 and mask[ground].any()
+    assert not mask[rays[..., 1] < 0].any()
+
+
+def test_the_airspace_of_a_panorama_is_measured_by_its_rays():
+    """Half of the directions of a panorama over the cut look down, a quarter on each side."""
+    pinhole = downwards(0.0)
+    (air,) = airspace_shares(
+        Area(GROUND, (-500.0, -500.0), (500.0, 500.0), (0.0, 0.01)),
+        [Camera.panorama(look_at(pinhole.eye, pinhole.eye + np.array([0, 0, 1])), pinhole.eye, 48, 96)],
+        HALVES,
+    )
+    np.testing.assert_allclose(air, 0.25, atol=0.01)

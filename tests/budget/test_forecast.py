@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,10 @@ import torch
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import spelled_seconds
+from gsplat_edu.budget.choice import Prospect
 from gsplat_edu.budget.costs import (
+    DEPTH_TIME,
+    SURFACE_TIME,
     Facts,
     Footprint,
     Measurements,
@@ -17,20 +21,25 @@ from gsplat_edu.budget.costs import (
     expected_counts,
     photo_copies,
     pixel_share,
+    term_factors,
     wanted_gaussians,
 )
 from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import _pairs_at_first, probe, resident_bytes
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.depths import CAPTURE, POINTS
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.ops.lenses import RAY_ROOM
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.given_depth import GivenDepth
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.optimizer import Adam
+from lens_captures import FISHEYE, write_room
 
 FACTS = Facts(
     train=80, test=20, points=1_000, pixels=1e4, largest=1e4, full=4e4, photo_bytes=3_000_000, workers=2
@@ -157,6 +166,48 @@ def test_patches_need_photos_without_colours():
     assert photo_copies(surface, facts) == 2 * 640_000 * 100
     assert photo_copies(surface, dataclasses.replace(facts, train=1_000)) == 1 << 28
     assert photo_copies(surface.changed(patch_weight=0.0), facts) == 0
+
+
+def test_a_surface_needs_the_rays_of_each_lens(tmp_path):
+    facts = dataclasses.replace(FACTS, lens_pixels=1_000_000.0)
+    config = PLAIN.changed(surface=True, patch_weight=0.0)
+    assert photo_copies(config, facts) == 12_000_000
+    assert photo_copies(config, facts.smaller(2.0)) == 3_000_000
+    assert photo_copies(PLAIN, facts) == 0
+    assert photo_copies(config, dataclasses.replace(facts, lens_pixels=1e9)) == RAY_ROOM
+    write_room(tmp_path, FISHEYE, 8, 32)
+    assert Facts.of(load_dataset(tmp_path, DataSettings(lens="native"))).lens_pixels == 32 * 32
+    assert Facts.of(load_dataset(tmp_path, DataSettings(lens="undistort"))).lens_pixels == 0
+
+
+def test_a_forecast_counts_the_term_of_depth():
+    """Every `depth_every`-th step compares depth, from the first one on; time for normals comes on top of it."""
+    plain, depth = (
+        predict(dataclasses.replace(FACTS, depth=given), MEASURED, PLAIN) for given in ("", "maps")
+    )
+    more = 1.0 + DEPTH_TIME["maps"] / PLAIN.depth_every
+    assert DEPTH_TIME["maps"] > DEPTH_TIME["points"] > 0.0 and PLAIN.depth_every > 1
+    assert depth.seconds["training"] == pytest.approx(more * plain.seconds["training"], rel=1e-12)
+    assert depth.steps == pytest.approx([more * step for step in plain.steps], rel=1e-12)
+    others = [{**one.seconds, "training": 0.0} for one in (plain, depth)]
+    assert others[0] == others[1] and plain.memory == depth.memory
+    each = PLAIN.changed(depth_every=1, surface=True, surface_start=10)
+    factors, points = term_factors(each, "points"), DEPTH_TIME["points"]
+    assert factors[9] == 1.0 + points
+    assert factors[10] == 1.0 + points + SURFACE_TIME / each.surface_every
+    assert factors - points == pytest.approx(term_factors(each))
+
+
+def test_depth_is_a_fact_of_views_that_carry_it(capture):
+    dataset = load_dataset(capture)
+    assert Facts.of(dataset).depth == ""
+    for sparse, kind in ((True, "points"), (False, "maps")):
+        depth = GivenDepth(np.zeros((1, 2)), np.ones(1), sparse=sparse)
+        carried = tuple(view.with_depth(lambda depth=depth: depth) for view in dataset.train)
+        assert Facts.of(dataclasses.replace(dataset, train=carried)).depth == kind
+    for path, kind in ((POINTS, "points"), (CAPTURE, "maps"), (Path("depth"), "maps")):
+        assert Facts.of(dataset, depth=path).depth == kind
+        assert Prospect(dataset, dataset, PLAIN, depth=path).facts.depth == kind
 
 
 def test_pairs_are_forecast_at_the_photo_size_with_which_the_run_starts():

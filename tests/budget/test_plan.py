@@ -266,7 +266,7 @@ def test_the_fast_recipe_plans_its_number_without_limits_and_a_resumed_run_keeps
     run = dataclasses.replace(options(capture, tmp_path / "run", 20), config=recipe(20, strategy="fast"))
     found = plan(run, Limits())
     facts = Facts.of(load_dataset(capture))
-    assert found.max_gaussians == wanted_gaussians(run.config, facts.points, facts.pixels, facts.train)
+    assert found.max_gaussians == facts.wanted(run.config)
     assert found.max_gaussians == 64 * 48 and found.iterations == 20, "at most one Gaussian per pixel"
     assert found.sentences == (
         f"the recipe plans {found.max_gaussians:,} Gaussians; --max-gaussians changes that",

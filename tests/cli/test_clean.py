@@ -10,14 +10,19 @@ import torch
 import gsplat_edu.cli.main as command_line
 from fixtures.plant import floaters
 from gsplat_edu.base.constants import C0
+from gsplat_edu.clean.judge import SENTENCES
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.edits.runs import mask_of
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.cleaning import default_target
+from gsplat_edu.runs.floaters import propose
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from splats import splats_on
@@ -73,6 +78,19 @@ def test_a_run_is_cleaned_into_a_new_file(made, cli, capsys):
     counts = [int(line.split()[0]) for line in printed.splitlines() if line.startswith("   ")]
     assert sum(counts) == removed
     written.unlink()
+
+
+def test_the_editor_proposes_what_is_cleaned(made, cli, tmp_path):
+    folder, _, own = made
+    assert cli(["clean", str(folder.path), "--out", str(tmp_path / "clean.ply")]) == 0
+    steps = []
+    found = propose(folder.path, lambda done, total: steps.append((done, total)))
+    assert found["basis"] == "Judged by 12 photos, as by gsplat-edu clean."
+    removed = np.any([mask_of(tuple(group["runs"]), own + 8) for group in found["groups"]], axis=0)
+    kept = open_source(folder.path).scene.gaussians.means[torch.from_numpy(~removed)]
+    assert torch.equal(kept, open_source(tmp_path / "clean.ply").scene.gaussians.means)
+    assert {group["reason"] for group in found["groups"]} <= set(SENTENCES.values())
+    assert 0 < removed.sum() < own and len(steps) > 12 and steps[-1][0] == steps[-1][1]
 
 
 def test_a_scene_file_is_judged_by_a_capture(made, cli, tmp_path):
@@ -171,3 +189,55 @@ def test_a_training_cleans_its_scene_on_request(made, cli, capsys, tmp_path):
     assert set(record["cleaning"]["removed"]) == {"unseen", "in_front", "refuted"}
     assert record["num_gaussians"] == len(read_scene(RunFolder(run).scene(5)).gaussians)
     assert record["test"]["psnr"] == pytest.approx(record["cleaning"]["psnr_after"], abs=1e-9)
+
+
+def test_the_edits_of_a_scene_are_carried_over(made, cli, capsys, tmp_path):
+    """The cleaned scene has the same operations, which remove what they removed of the run, and can be applied."""
+    folder, _, _ = made
+    source = open_source(folder.path)
+    x = source.scene.gaussians.means[:, 0]
+    half = {
+        "op": "select",
+        "how": "replace",
+        "by": "sphere",
+        "center": [float(x.max()), 0.0, 0.0],
+        "radius": float(x.max()),
+    }
+    identity = identity_of(source.scene.gaussians, source.origin).document()
+    document = {
+        "format": "gsplat_edu edits",
+        "version": 1,
+        "scene": identity,
+        "operations": [
+            half,
+            {"op": "shrink", "radius": 0.05},
+            {"op": "select", "how": "add", "by": "list", "reason": "by hand", "runs": [0, 3, 40, 20]},
+            {"op": "delete"},
+        ],
+    }
+    edits = tmp_path / "edits.json"
+    edits.write_text(json.dumps(document))
+    out = tmp_path / "clean" / "clean.ply"
+    assert cli(["clean", str(folder.path), "--out", str(out), "--edits", str(edits)]) == 0
+    carried = json.loads((out.parent / "edits.json").read_text())
+    assert [entry["op"] for entry in carried["operations"]] == ["select", "select", "select", "delete"]
+    assert carried["operations"][0] == half
+    assert carried["operations"][2]["reason"] == "by hand" and len(carried["operations"][2]["runs"]) > 2
+    assert cli(["convert", str(out), str(tmp_path / "a.ply"), "--edits", str(out.parent / "edits.json")]) == 0
+    assert cli(["convert", str(folder.path), str(tmp_path / "b.ply"), "--edits", str(edits)]) == 0
+    of_run, of_clean, both = (
+        read_scene(path).gaussians for path in (tmp_path / "b.ply", out, tmp_path / "a.ply")
+    )
+    rows = [{tuple(row) for row in some.means.tolist()} for some in (of_run, of_clean, both)]
+    assert rows[2] == rows[0] & rows[1] and 0 < len(rows[2]) < min(len(rows[0]), len(rows[1]))
+    capsys.readouterr()
+    for words, said in (
+        (["--out", str(out), "--edits", str(edits)], "there is an edits.json beside"),
+        (["--edits", str(edits)], "--edits: fit only a PLY"),
+        (
+            ["--out", str(tmp_path / "x" / "x.ply"), "--edits", str(out.parent / "edits.json")],
+            "another scene",
+        ),
+    ):
+        assert cli(["clean", str(folder.path), *words]) == 2
+        assert said in capsys.readouterr().err

@@ -1,11 +1,12 @@
 import dataclasses
 import shutil
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
-from gsplat_edu.base.locks import LOCK
+from gsplat_edu.base.locks import LOCK, locked
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
@@ -102,7 +103,7 @@ def other(tmp_path_factory):
 
 def moved_away(view):
     camera = view.camera
-    values = {field.name: getattr(camera, field.name) for field in dataclasses.fields(camera)}
+    values = {field.name: getattr(camera, field.name) for field in dataclasses.fields(camera) if field.init}
     return type(view)(type(camera)(**(values | {"eye": camera.eye * 1.1})), view.image, name=view.name)
 
 
@@ -143,6 +144,26 @@ def test_an_evaluation_overwrites_neither_runs_nor_other_files(run, cli, capsys,
         assert cli(["eval", str(run.path), "--out", str(place)]) == 2
         error = capsys.readouterr().err
         assert says in error and error.count("\n") == 1 and contents(place) == before
+
+
+def test_an_evaluation_does_not_overwrite_a_run_that_ended_while_it_took_the_lock(
+    run, cli, capsys, tmp_path, monkeypatch
+):
+    """The other run ends between the start of the evaluation and its lock."""
+    out, written = tmp_path / "out", []
+
+    @contextmanager
+    def late(name, folder, *words):
+        shutil.copytree(run.path, folder)
+        written.append(contents(folder))
+        with locked(name, folder, *words):
+            yield
+
+    monkeypatch.setattr("gsplat_edu.cli.eval.locked", late)
+    assert cli(["eval", str(run.path), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert f"--out: {out} holds a run" in error and error.count("\n") == 1
+    assert [contents(out)] == written
 
 
 def test_a_copy_of_the_capture_is_accepted_and_a_changed_photo_is_named(made, run, cli, capsys, tmp_path):

@@ -35,6 +35,8 @@ NEEDED = {
     "view": "a",
     "studio": "",
     "doctor": "a",
+    "leave-out": "a",
+    "mask": "a b",
     "info": "a",
     "demo": "",
 }

@@ -8,7 +8,7 @@ import torch
 
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.engine import adapters
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.backends import BACKENDS, gpu_of, unavailable
@@ -110,6 +110,23 @@ def test_a_dataset_is_described_and_no_photo_is_decoded(info, tmp_path, monkeypa
     monkeypatch.setattr("gsplat_edu.data.images.ImageStore.read", decode)
     said = info(tmp_path / "capture")
     for words in ("COLMAP", "9: 32x24", "7 for training, 2 held out", f"{len(points):,}", "extent", "fx "):
+        assert words in said, words
+
+
+def test_lens_and_shutter_of_a_capture_are_named(info, tmp_path):
+    """Of a file with a distortion and a shutter; a capture of resting pinholes has no line of a shutter."""
+    write_transforms(tmp_path, *procedural_capture(size=32, count=9))
+    assert "pinhole" in (said := info(tmp_path)) and "rolling" not in said
+    path = tmp_path / "transforms.json"
+    motion = {"rolling_shutter_time": 0.02, "camera_angular_velocity": [0, 1, 0]}
+    contents = json.loads(path.read_text()) | {"camera_model": "OPENCV", "k1": 0.02, "p2": -0.003} | motion
+    path.write_text(json.dumps(contents))
+    said = info(tmp_path)
+    for words in (
+        "perspective, k1 0.02, p2 -0.003",
+        "rolling in 9 of 9 photos: turn 1.1 degrees, shift 0 world units (medians)",
+        "9 of 9 photos have a rolling shutter or motion blur, which is ignored",
+    ):
         assert words in said, words
 
 

@@ -127,7 +127,6 @@ def test_the_time_left_is_visible_in_80_columns():
 
 def test_progress_is_repeated_while_the_mapper_reports_nothing(monkeypatch):
     """COLMAP's mapper may adjust all poses for minutes between two photos, and after the last photo."""
-    monkeypatch.setattr("gsplat_edu.sfm.colmap.PROGRESS_EVERY", 0.001)
     monkeypatch.setattr("gsplat_edu.sfm.colmap.BEAT", 0.0)
     answers, seen = SimpleQueue(), []
 
@@ -137,10 +136,10 @@ def test_progress_is_repeated_while_the_mapper_reports_nothing(monkeypatch):
             answers.put({"result": {"models": []}})
 
     answers.put({"done": 7})
-    assert _await_result(answers, progress, None) == {"models": []}
+    assert _await_result(answers, progress) == {"models": []}
     assert seen == [7, 7, 7, 7, 7]
     answers.put({"ended": True})
-    assert _await_result(answers, progress, None) is None
+    assert _await_result(answers, progress) is None
 
 
 def test_a_training_without_a_terminal_prints_the_time_left(tmp_path, capsys):

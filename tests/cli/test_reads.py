@@ -47,7 +47,7 @@ def test_train_with_everything_left_open(capture, tmp_path, reads, monkeypatch, 
     monkeypatch.setattr(pilot, "PILOT_STEPS", 5)
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--iterations", "12"]
     words += ["--resolution", "auto", "--refine", "auto", "--transients", "auto", "--appearance", "auto"]
-    assert main([*words, "--max-memory", "4GiB", "--time-limit", "20m"]) == 0
+    assert main([*words, "--max-memory", "4GiB", "--time-limit", "9h"]) == 0
     assert reads == {("read_capture", capture): 1} | photo_headers(capture)
     said = capsys.readouterr().out
     for chosen in ("--resolution auto: ", "--refine none: short", "forecast: time", "--transients none: "):

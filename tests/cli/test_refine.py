@@ -3,12 +3,18 @@
 import json
 
 import pytest
+import torch
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs import pilot
+from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.runs.trials import RefineTrials
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.poses import DISTORTIONS, MOTIONS
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +70,50 @@ def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(capture, tmp_path, c
     said = " ".join(capsys.readouterr().out.split())
     chosen = json.loads((run / "config.json").read_text())["train"]["refine"]
     assert f"--refine {chosen}: short trainings score the held-out photos" in said
+    trials = json.loads((run / "config.json").read_text())["refine_trials"]
+    assert f"{trials['posed']['none']:.2f} dB with none" in said and trials["asked"] == ""
     assert main([*words, "--iterations", "9", "--resume"]) == 0
     assert "short trainings" not in capsys.readouterr().out
-    assert json.loads((run / "config.json").read_text())["train"]["refine"] == chosen
+    config = json.loads((run / "config.json").read_text())
+    assert (config["train"]["refine"], config["refine_trials"]) == (chosen, trials)
+
+
+def test_the_report_says_whether_a_given_shutter_helped(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
+    run = tmp_path / "run"
+    words = ["train", str(capture), "--out", str(run), "--refine", "shutter"]
+    assert main([*words, "--iterations", "6"]) == 0
+    trials = RefineTrials.of(json.loads((run / "config.json").read_text()))
+    assert trials is not None and set(trials.moving) == {"none (control)", "shutter"}
+    verdict = "improves" if trials.gain > 0 else "does not improve"
+    note = f"refine shutter: {trials}"
+    assert f": shutter {verdict} them ({trials.gain:+.2f} dB)" in note
+    assert note in (run / "report.html").read_text()
+    assert main([*words, "--iterations", "9", "--resume"]) == 0
+    assert "short trainings" not in capsys.readouterr().out.rpartition("extended from")[2]
+    assert RefineTrials.of(json.loads((run / "config.json").read_text())) == trials
+    assert note in (run / "report.html").read_text()
+
+
+@pytest.mark.parametrize("refine", ["poses+lens", "all"])
+def test_a_resumed_run_with_lens_or_shutter_has_the_same_bytes(capture, tmp_path, refine):
+    def opened(name, *, resume=False):
+        config = recipe(30, strategy="fast", max_gaussians=300, refine=refine)
+        return CaptureRun(
+            RunOptions(capture, tmp_path / name, config, DataSettings(lens="native"), resume=resume)
+        )
+
+    whole, first = opened("whole"), opened("parts")
+    whole.train()
+    assert first.train(lambda: first.trainer.iteration >= 17)
+    second = opened("parts", resume=True)
+    assert second.trainer.iteration == 17
+    second.train()
+    (tensors, _), (resumed, _) = whole.trainer.state(), second.trainer.state()
+    learned = {"poses+lens": (DISTORTIONS,), "all": (DISTORTIONS, MOTIONS)}[refine]
+    assert all(tensors[f"view_model.{name}"].abs().max() > 0 for name in learned)
+    assert tensors.keys() == resumed.keys()
+    assert all(torch.equal(tensor, resumed[name]) for name, tensor in tensors.items())
 
 
 def test_unknown_names_are_refused(capture, tmp_path, capsys):

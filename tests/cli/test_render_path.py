@@ -66,6 +66,24 @@ def test_a_run_is_rendered_along_a_path_in_the_captures_coordinates(made, path, 
     np.testing.assert_allclose(curve.cameras(5, 8, 8)[2].eye, views[1].camera.eye, atol=1e-9)
 
 
+def test_a_video_eases_and_rests_as_the_path_says(made, path, cli, tmp_path, capsys):
+    _, _, bare, _ = made
+    held = dataclasses.replace(path.keyframes[2], hold=1.0)
+    eased = KeyframePath((*path.keyframes[:2], held), False, None, "views")
+    write_path(tmp_path / "path.json", eased)
+    assert (
+        cli(["render", str(bare), "--path", "path.json", "--out", "frames", "--fps", "4", "--size", "40"])
+        == 0
+    )
+    assert "wrote frames/: 13 images of " in capsys.readouterr().out, "two seconds and a rest of one"
+    cameras = PathCurve(eased).cameras(13, 40, 40)
+    assert all(np.array_equal(camera.eye, cameras[8].eye) for camera in cameras[8:])
+    assert not np.allclose(cameras[1].eye, PathCurve(path).cameras(9, 40, 40)[1].eye)
+    for i in (1, 6, 8, 12):
+        found = pixels(tmp_path / "frames" / f"frame_{i:04d}.png")
+        assert np.abs(found - picture(bare, cameras[i], file_settings(read_scene(bare)))).max() <= 0.51
+
+
 def test_a_scene_file_becomes_a_square_video_and_maps_a_folder(made, path, cli, tmp_path, capsys):
     folder, _, bare, _ = made
     write_path(tmp_path / "path.json", path)

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from gsplat_edu.base.locks import locked
 from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from as train_options_from
 from gsplat_edu.cli.sfm import options_from, stage_bars
@@ -245,6 +246,17 @@ def test_an_existing_run_needs_resume_before_its_capture_is_replaced(tmp_path, c
     assert main(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run")]) != 0
     said = capsys.readouterr().err
     assert "already holds a run; add --resume" in said and said.count("\n") == 1
+
+
+@pytest.mark.usefixtures("as_shipped", "never")
+def test_a_training_does_not_search_for_poses_where_another_command_does(tmp_path, capsys):
+    save(tmp_path / "photos", box_orbit(3))
+    found = tmp_path / "run" / "capture"
+    with locked("OUT", found, "gsplat-edu sfm", pytest.fail):
+        assert main(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert f"--out: {found} is in use by `gsplat-edu sfm`" in said and said.count("\n") == 1
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.usefixtures("never")

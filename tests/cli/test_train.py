@@ -131,6 +131,7 @@ def test_config_json_has_flat_names(tmp_path):
         "lens_rate",
         "transients",
         "outside_masks",
+        "region",
         "surface",
         *FOR_SURFACE,
         *FOR_DEPTH,

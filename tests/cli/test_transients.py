@@ -125,7 +125,7 @@ def test_few_photos_and_unknown_names_are_refused(tmp_path, capsys):
 def test_doctor_names_the_photos_and_the_option(struck, run, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "plain")
     ended = " ".join(capsys.readouterr().out.split())
-    assert "show things or shadows that the others do not, most of all" in ended
+    assert "things or shadows that the other photos do not show in" in ended
     assert f"gsplat-edu doctor {folder}; --transients mask leaves them out" in ended
     assert main(["doctor", str(folder)]) == 0
     said = " ".join(capsys.readouterr().out.split())

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
+from gsplat_edu.cli import view
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, write_path
 from gsplat_edu.io.formats import write_scene
@@ -145,6 +146,19 @@ def test_levels_of_detail_are_served_with_their_files(tmp_path):
         assert fetched(f"{url}lod-meta.json") == path.read_bytes()
         assert fetched(f"{url}0_1/quats.webp") == (path.parent / "0_1" / "quats.webp").read_bytes()
     assert printed.splitlines()[0] == f"{path}: levels of 40, 20 splats, 25 files"
+
+
+def test_ctrl_c_right_after_the_address_was_printed_ends_the_command_cleanly(made, monkeypatch, capsys):
+    """The line says that Ctrl-C stops it; the server may not have begun to answer yet."""
+
+    def pressed():
+        signal.raise_signal(signal.SIGINT)
+        return False
+
+    monkeypatch.setattr(view, "has_screen", pressed)
+    assert command_line.main(["view", str(made[1]), "--port", "0"]) == 0
+    said = capsys.readouterr()
+    assert said.out.endswith("   (press Ctrl-C to stop)\nended\n") and said.err == ""
 
 
 @pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")

@@ -15,15 +15,8 @@ pytestmark = pytest.mark.usefixtures("as_shipped")
 UNSUPPORTED = {
     "sparse_grad": True,
     "distributed": True,
-    "camera_model": "fisheye",
-    "with_ut": True,
     "with_eval3d": True,
-    "radial_coeffs": torch.zeros(C, 6),
-    "tangential_coeffs": torch.zeros(C, 2),
-    "thin_prism_coeffs": torch.zeros(C, 4),
     "ftheta_coeffs": object(),
-    "rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM,
-    "viewmats_rs": torch.eye(4).repeat(C, 1, 1),
     "return_normals": True,
     "global_z_order": False,
     "rays": torch.zeros(C, 12, 16, 6),
@@ -72,10 +65,90 @@ def test_the_name_of_gsplats_default_renderer_is_accepted():
         rasterization(**arguments(), renderer_config=other)
 
 
-@pytest.mark.parametrize("value", ["ortho", "ftheta", "panorama"])
-def test_every_other_camera_model_is_refused(value):
-    with pytest.raises(ArgumentError, match=f"^camera_model: is '{value}'"):
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (
+            "ftheta",
+            "camera_model: is 'ftheta', which is not supported; fit radial_coeffs of camera_model='fisheye'",
+        ),
+        (
+            "lidar",
+            "camera_model: is 'lidar', which is not supported; give cameras by viewmats, Ks and camera_model",
+        ),
+        ("panorama", "camera_model: "),
+        (None, "camera_model: "),
+    ],
+)
+def test_every_other_camera_model_is_refused(value, says):
+    with pytest.raises(ArgumentError, match=f"^{re.escape(says)}"):
         rasterization(**arguments(), camera_model=value)
+
+
+SHUTTER = {"rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM}
+END = torch.eye(4).repeat(C, 1, 1)
+TURNED = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0])).repeat(C, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "says"),
+    [
+        (
+            {"radial_coeffs": torch.zeros(C, 4)},
+            ShapeError,
+            "radial_coeffs: has shape (2, 4), but has to be (2, 6)",
+        ),
+        (
+            {"radial_coeffs": torch.zeros(C, 6).double()},
+            ArgumentError,
+            "radial_coeffs: is torch.float64 on cpu",
+        ),
+        ({"radial_coeffs": torch.full((C, 6), float("nan"))}, ArgumentError, "radial_coeffs[0, 0]: "),
+        ({"tangential_coeffs": torch.zeros(2)}, ShapeError, "tangential_coeffs: has shape (2,)"),
+        ({"thin_prism_coeffs": [0.0] * 4}, ArgumentError, "thin_prism_coeffs: is list"),
+        (
+            {"radial_coeffs": torch.zeros(C, 6), "camera_model": "fisheye"},
+            ShapeError,
+            "radial_coeffs: has shape (2, 6), but has to be (2, 4)",
+        ),
+        (
+            {"thin_prism_coeffs": torch.zeros(C, 4), "camera_model": "fisheye"},
+            ArgumentError,
+            "thin_prism_coeffs: a camera with camera_model='fisheye' has none; leave it out",
+        ),
+        (
+            {"radial_coeffs": torch.zeros(C, 6), "camera_model": "ortho"},
+            ArgumentError,
+            "radial_coeffs: a camera with camera_model='ortho' has none; leave it out",
+        ),
+        ({"rolling_shutter": "down"}, ArgumentError, "rolling_shutter: is 'down', but has to be a member of"),
+        (
+            SHUTTER,
+            ArgumentError,
+            "viewmats_rs: is None; a rolling shutter needs the poses of what is read last",
+        ),
+        (
+            {"viewmats_rs": END},
+            ArgumentError,
+            "viewmats_rs: is given, but rolling_shutter is GLOBAL; name the",
+        ),
+        (SHUTTER | {"viewmats_rs": END[0]}, ShapeError, "viewmats_rs: has shape (4, 4)"),
+        (
+            SHUTTER | {"viewmats_rs": 2 * END},
+            ArgumentError,
+            "viewmats_rs: a rolling shutter needs matrices with",
+        ),
+        (
+            SHUTTER | {"viewmats_rs": TURNED},
+            ArgumentError,
+            "viewmats_rs: the camera turns by more than a radian",
+        ),
+        ({"with_ut": "yes"}, ArgumentError, "with_ut: "),
+    ],
+)
+def test_lenses_and_shutters_are_refused_by_name(given, error, says):
+    with pytest.raises(error, match=f"^{re.escape(says)}"):
+        rasterization(**arguments(), **given)
 
 
 WRONG = {
@@ -192,7 +265,7 @@ def test_the_projection_refuses_by_name():
     given = arguments()
     names = ("means", "covars", "quats", "scales", "viewmats", "Ks", "width", "height")
     args = [given.get(name) for name in names]
-    for name, value in (("sparse_grad", True), ("camera_model", "ortho")):
+    for name, value in (("sparse_grad", True), ("camera_model", "ftheta")):
         with pytest.raises(ArgumentError, match=f"^{name}: "):
             fully_fused_projection(*args, **{name: value})
     with pytest.raises(ShapeError, match="^covars: "):

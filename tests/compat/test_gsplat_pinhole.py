@@ -83,8 +83,8 @@ def test_proj():
     # gsplat's torch functions skew the means, but its kernels and ours do not read those entries
     skew = torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=torch.float64)
     assert_same_gradients(inputs, found, wanted, {2: skew})
-    with pytest.raises(ArgumentError, match="^camera_model: is 'ortho'"):
-        compat.proj(*inputs, W, H, camera_model="ortho")
+    with pytest.raises(ArgumentError, match="^camera_model: is 'ftheta'"):
+        compat.proj(*inputs, W, H, camera_model="ftheta")
 
 
 @pytest.mark.parametrize("fused", [False, True])

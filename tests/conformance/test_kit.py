@@ -11,6 +11,7 @@ import pytest
 from safetensors.numpy import save_file
 
 import run
+from simple_lens import LensConventions
 from simple_renderer import Conventions, SimpleRenderer
 
 OUTPUT_BREAKS = {
@@ -59,8 +60,39 @@ OUTPUT_BREAKS = {
     "rows and columns exchanged, tall image": ("odd_size", {"axes_swapped": True}),
     "pixel centre of the only pixel at a half": ("one_pixel", {"pixel_offset": 0.5}),
     "empty scenes refused": ("no_gaussians", {"refuses_empty": True}),
+    "antialiasing ignored behind a lens": ("lens_antialiased", {"compensates": False}),
 }
 """Broken conventions by name: the case that has to catch it, and the change of the renderer."""
+
+LENS_BREAKS = {
+    "distortion ignored": ("lens_opencv", {"distorts": False}),
+    "prism terms of u and v exchanged": ("lens_prism", {"prism": (13, 14, 11, 12)}),
+    "prism terms of the two powers exchanged": ("lens_prism", {"prism": (12, 11, 14, 13)}),
+    "means beyond the end of a lens drawn": ("lens_ends", {"lens_ends": False}),
+    "a fisheye blind past 90 degrees": ("lens_fisheye", {"behind": False}),
+    "order and depth of a fisheye by z": ("lens_fisheye", {"depth": "z"}),
+    "radial_first ignored": ("lens_radial_first", {"radial_first": False}),
+    "order and depth of a panorama by z": ("lens_panorama", {"depth": "z"}),
+    "no seam": ("lens_seam", {"periodic": False}),
+    "directions of an orthographic camera from its centre": ("lens_orthographic", {"parallel": False}),
+    "first row at time 0": ("shutter_down", {"first_time": 0.0}),
+    "last row at time 1": ("shutter_down", {"first_time": 0.0, "rows": -1}),
+    "rows read from the top": ("shutter_up", {"reverses": False}),
+    "rows read instead of columns": ("shutter_left", {"columns": False}),
+    "no shear": ("shutter_right", {"shears": False}),
+    "turn without shift": ("shutter_panorama", {"shifts": False}),
+    "no motion blur": ("blur_global", {"blurs": False}),
+    "blur of a fixed row": ("blur_down", {"follows": False}),
+    "opacities of blurred splats kept": ("blur_global", {"blur_factor": 0.0}),
+    "bounds of an undistorted image": ("lens_clamp", {"edges_distorted": False}),
+    "no clamp behind a lens": ("lens_clamp", {"clamps": False}),
+    "no clamp behind a shutter": ("shutter_clamp", {"clamps": False}),
+}
+"""The same of lenses and shutters."""
+
+OUTPUT_BREAKS |= {
+    name: (case, {"lens": LensConventions(**changes)}) for name, (case, changes) in LENS_BREAKS.items()
+}
 
 GRADIENT_BREAKS = {
     "direction detached": ("gradient_smooth", {"direction_detached": True}),
@@ -72,6 +104,15 @@ GRADIENT_BREAKS = {
     "gradient passes the clamp of alpha": ("gradient_alpha_clamp", {"clamp_passes": True}),
     "gradient passes the floor of colours": ("gradient_colour_floor", {"floor_passes": True}),
     "gradient passes the cut-off": ("gradient_random", {"cut_passes": True}),
+    "Jacobian of a lens detached": ("gradient_lens_opencv", {"lens_jacobian_detached": True}),
+    "Jacobian of a fisheye detached": ("gradient_lens_fisheye", {"lens_jacobian_detached": True}),
+    "direction in a panorama detached": ("gradient_lens_panorama", {"direction_detached": True}),
+    "direction of an orthographic camera detached": (
+        "gradient_lens_orthographic",
+        {"direction_detached": True},
+    ),
+    "time of a mean detached": ("gradient_shutter", {"lens": LensConventions(time_detached=True)}),
+    "motion blur detached": ("gradient_blur", {"lens": LensConventions(blur_detached=True)}),
 }
 """Broken gradients by name, which leave every output unchanged."""
 
@@ -131,7 +172,8 @@ def test_every_case_catches_something():
 @pytest.mark.parametrize("name", [*run.OUTPUTS, *(f"gradient.{name}" for name in run.GRADIENTS)])
 def test_every_compared_array_can_fail(name):
     """An array that is off by twice its tolerance fails, and no other array does."""
-    (case,) = run.load_cases(["gradient_smooth"])
+    of_lens = name.rpartition(".")[2] in ("distortion", "turn", "shift")
+    (case,) = run.load_cases(["gradient_shutter" if of_lens else "gradient_smooth"])
     renderer = SimpleRenderer()
     prefix, _, array = name.rpartition(".")
 
@@ -184,6 +226,35 @@ def test_a_renderer_that_writes_into_its_inputs_cannot_change_the_case():
 
     assert run.check(render, cases=cases).passed
     np.testing.assert_array_equal(cases[0].gaussians["means"], before)
+
+
+def test_a_lens_that_the_renderer_lacks_is_named():
+    """Its cases do not count as passed: they are listed by name, with what they need."""
+    cases = run.load_cases(["random", "lens_fisheye", "shutter_down"])
+    report = run.check(SimpleRenderer().render, cases=cases, without=["lens.fisheye", "lens.distortion"])
+    assert report.passed and report.skipped == {"lens_fisheye": ("distortion", "fisheye")}
+    assert {row.case for row in report.rows} == {"random", "shutter_down"}
+    assert "2 of 2 cases pass" in str(report)
+    assert "1 cases not run, of lenses that the renderer lacks: lens_fisheye (distortion, fisheye)." in str(
+        report
+    )
+    everything = run.check(SimpleRenderer().render, without=["lens"])
+    assert set(everything.skipped) == {case.name for case in run.load_cases() if case.needs}
+    assert not run.check(SimpleRenderer().render, cases=cases[1:2], without=["lens"]).passed
+
+
+def test_a_renderer_that_ignores_lens_and_shutter_fails_every_case_of_them():
+    def render(gaussians, camera, settings):
+        return SimpleRenderer().render(gaussians, camera | run.PINHOLE, settings)
+
+    report = run.check(render, precision="float32")
+    assert set(report.failed_cases) == {case.name for case in run.load_cases() if case.needs}
+
+
+def test_every_lens_and_readout_has_a_case():
+    cases = run.load_cases()
+    assert {lens for case in cases for lens in case.needs} == set(run.LENSES)
+    assert {case.camera["readout"] for case in cases} == {"none", "down", "up", "left", "right"}
 
 
 def test_a_check_without_cases_does_not_pass():

@@ -10,7 +10,8 @@ from gsplat_edu.data.points import RANDOM_POINTS
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.visible_cloud import FARTHEST, NEAREST, cloud_in_cube, cloud_in_view, seen_by
 from gsplat_edu.data.writers import write_blender, write_transforms
-from gsplat_edu.scene.camera import Camera, look_at, orbit_camera, scene_extent
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.rig import orbit_camera, scene_extent
 from gsplat_edu.scene.views import View
 
 

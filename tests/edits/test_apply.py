@@ -182,3 +182,17 @@ def test_the_last_operation_of_a_kind_counts():
         == ()
     )
     assert views_after([ops.CameraPath(path), ops.CameraPath(None)]).path is None
+
+
+def test_named_views_take_the_order_of_the_last_list():
+    named = [ops.NamedView(name, view(i)) for i, name in enumerate("abcd")]
+    order = ops.OrderViews(("d", "none", "b"))
+
+    def names(*operations):
+        return "".join(one.name for one in views_after(operations).named)
+
+    assert names(*named, order) == "dbac", "those without a place follow in their order"
+    assert names(*named, order, ops.NamedView("b", view(9)), ops.NamedView("e", view(5))) == "dbace"
+    assert names(*named, order, ops.RemoveView("d"), ops.NamedView("d", view(5))) == "bacd"
+    assert names(order, *named) == "abcd", "a view has to exist before it gets a place"
+    assert names(*named, order, ops.OrderViews(("c",))) == "cdba"

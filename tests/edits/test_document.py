@@ -20,6 +20,7 @@ CAMERA = {
 BOX = {"center": [0, 0, 0], "rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "half": [1, 2, 3]}
 VIEW = {"position": [0, 0, -2], "rotation": EYE, "fov": 50.0}
 PATH = {"format": "gsplat_edu path", "version": 1, "loop": False, "keyframes": [VIEW, VIEW]}
+FRONT = {"bounds": [1, 2, 3.5, 4], "columns": 2, "rows": 1, "deepest": [0.5, 3]}
 
 
 def select(by, **fields):
@@ -38,14 +39,22 @@ EVERY = [
     select("all"),
     *({"op": op} for op in ("deselect", "invert", "delete", "hide", "show")),
     {"op": "crop", **BOX},
+    {"op": "move", "rotation": BOX["rotation"], "translation": [1, 2, 3], "center": [4, 5, 6]},
     {"op": "upright", "points": [[0, 0, 0], [1, 0, 0], [0, 0, 1]]},
     {"op": "scale", "points": [[0, 0, 0], [2, 0, 0]], "length": 1, "unit": "m"},
     {"op": "start", **VIEW, "pivot": [0, 0, 0]},
     {"op": "view", "name": "Tür <b>", **VIEW},
+    {"op": "view", "name": "step", **VIEW, "text": "One <b>line</b>.\nAnother one."},
+    {"op": "order_views", "names": ["step", "Tür <b>", "none"]},
     {"op": "remove_view", "name": "Tür <b>"},
     {"op": "path", "path": PATH},
     {"op": "path", "path": None},
     {"op": "measure", "points": [[0, 0, 0], [2, 0, 0]], "note": ""},
+    select("rectangle", camera=CAMERA, corners=[1, 2, 3.5, 4], front=FRONT),
+    select("distance", center=[1, 2, 3], low=0.5, high=2),
+    select("list", reason="seen by nobody", runs=[0, 2, 5, 1]),
+    {"op": "grow", "radius": 0.25},
+    {"op": "shrink", "radius": 0.5},
 ]
 
 
@@ -77,8 +86,15 @@ def test_every_operation_is_read():
         (0.0,) * 3, ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), (1.0, 2.0, 3.0)
     )
     assert regions[6:] == [ops.Opacity(-2.0, None), ops.Size(-5.0, -1.0), ops.Everything()]
-    assert edits.operations[16] == ops.Scale(((0.0,) * 3, (2.0, 0.0, 0.0)), 1.0, "m")
-    assert edits.operations[18].name == "Tür <b>"
+    rows = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    assert edits.operations[15] == ops.Move(rows, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    assert edits.operations[17] == ops.Scale(((0.0,) * 3, (2.0, 0.0, 0.0)), 1.0, "m")
+    assert edits.operations[19].name == "Tür <b>"
+    assert edits.operations[-4:-2] == (
+        ops.Select("replace", ops.Distance((1.0, 2.0, 3.0), 0.5, 2.0)),
+        ops.Select("replace", ops.List("seen by nobody", (0, 2, 5, 1))),
+    )
+    assert edits.operations[-2:] == (ops.Grow(0.25), ops.Shrink(0.5))
 
 
 def test_an_empty_document_is_read_back():
@@ -90,8 +106,9 @@ def test_every_missing_and_every_unknown_field_is_named():
     for index, operation in enumerate(EVERY):
         for key in operation:
             less = {name: value for name, value in operation.items() if name != key}
-            if operation.get("by") == "size":
-                continue  # an interval may be open at one end
+            ranged = operation.get("by") in ("size", "distance") and key in ("low", "high")
+            if ranged or key in ("text", "front"):
+                continue  # optional: an end of an interval, a step of a tour, a selection of what is in front
             assert f"operations[{index}]: lacks '{key}'" in refused(document(*EVERY[:index], less))
         more = {**operation, "extra": 1}
         assert f'operations[{index}]: has an unknown key "extra"' in refused(document(*EVERY[:index], more))
@@ -124,6 +141,8 @@ def test_anything_but_a_finite_number_in_place_of_a_number_is_refused(wrong):
     places = numbers_in(whole)
     assert len(places) > 150
     for place in places:
+        if wrong is None and "deepest" in place:
+            continue  # no limit
         message = refused(replaced(whole, place, wrong))
         names = [str(key) for key in place if not isinstance(key, int)]
         assert names[-1] in message or "is not JSON" in message, (place, message)
@@ -159,6 +178,25 @@ def test_anything_but_a_finite_number_in_place_of_a_number_is_refused(wrong):
         ({"op": "view", "name": "", **VIEW}, "operations[0].name: is"),
         ({"op": "view", "name": "a\nb", **VIEW}, "must not hold control characters"),
         ({"op": "view", "name": "a", **VIEW, "fov": 0}, "operations[0].fov: is 0"),
+        ({"op": "view", "name": "a", **VIEW, "text": 3}, "operations[0].text: is 3"),
+        ({"op": "view", "name": "a", **VIEW, "text": "a" * 2001}, "operations[0].text: is"),
+        ({"op": "view", "name": "a", **VIEW, "text": "a\tb"}, "must not hold control characters"),
+        ({"op": "remove_view", "name": "a", "text": ""}, "unknown"),
+        ({"op": "order_views", "names": "a"}, "operations[0].names: is"),
+        ({"op": "order_views", "names": ["a", 3]}, "operations[0].names[1]: is 3"),
+        ({"op": "order_views", "names": ["a", "b", "a"]}, 'operations[0].names[2]: is "a" again'),
+        ({"op": "path", "path": {**PATH, "ease": "slow"}}, 'operations[0].path: ease: is "slow"'),
+        ({"op": "grow", "radius": 0}, "operations[0].radius: is 0, but has to be from"),
+        (select("distance", center=[0, 0, 0]), "operations[0]: lacks 'low' and 'high'"),
+        (select("distance", center=[0, 0, 0], low=-1), "operations[0].low: is -1, but has to be from 0"),
+        (select("list", reason="a\nb", runs=[]), "operations[0].reason: "),
+        (select("list", reason="", runs=[0]), "operations[0].runs: has 1 numbers, but has to have a start and a"),
+        (select("list", reason="", runs=[0, 0]), "operations[0].runs[1]: is 0, but has to be a whole number from 1"),
+        (select("list", reason="", runs=[-1, 1]), "operations[0].runs[0]: is -1, but has to be a whole number from 0"),
+        (select("list", reason="", runs=[0, 1.0]), "operations[0].runs[1]: is 1.0, but has to be a whole number"),
+        (select("list", reason="", runs=[2, 1, 0, 1]), "operations[0].runs[2]: is 0, but the run before ends at 3"),
+        (select("list", reason="", runs=[0, 1, 1, 1]), "operations[0].runs[2]: is 1, but the run before ends at 1"),
+        (select("list", reason="", runs=[5, 3]), "operations[0].runs: end at 8, but the scene has 7 splats"),
         ({"op": "path", "path": {**PATH, "keyframes": [VIEW]}}, "operations[0].path: keyframes: has 1"),
     ],
 )  # fmt: skip
@@ -199,6 +237,7 @@ def test_cutting_a_file_anywhere_is_one_line(tmp_path):
 def test_another_scene_is_refused_in_one_line_unless_positions_suffice():
     places = parsed(document(select("sphere", center=[0, 0, 0], radius=1), {"op": "delete"}))
     values = parsed(document({"op": "invert"}, select("opacity", low=0)))
+    listed = parsed(document(select("list", reason="", runs=[0, 1])))
     other = Identity(8, "cd" * 32, SCENE.origin)
     places.check_scene(SCENE, "e.json")
     for scene, says in (
@@ -211,3 +250,5 @@ def test_another_scene_is_refused_in_one_line_unless_positions_suffice():
     places.check_scene(other, "e.json", anyway=True)
     with pytest.raises(ArgumentError, match=r"operations\[1\] selects by opacity, which does not carry over"):
         values.check_scene(other, "e.json", anyway=True)
+    with pytest.raises(ArgumentError, match=r"operations\[0\] selects by list, which does not carry over"):
+        listed.check_scene(other, "e.json", anyway=True)

@@ -8,7 +8,7 @@ import torch
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.edits import operations as ops
-from gsplat_edu.edits.cells import MOST_TESTS, Work
+from gsplat_edu.edits.cells import MOST_TESTS, EditWork
 from gsplat_edu.edits.document import NEAR
 from gsplat_edu.edits.membership import Values, members
 from gsplat_edu.scene.gaussians import Gaussians
@@ -185,7 +185,7 @@ def test_a_long_stroke_compares_each_part_with_the_splats_near_it(kind):
     values = picture_points(rng, 20_000)
     turn = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
     points = tuple(map(tuple, np.stack([150 + 140 * np.cos(turn), 100 + 90 * np.sin(turn)], axis=1).tolist()))
-    work = Work()
+    work = EditWork()
     region = ops.Lasso(FRONT, points) if kind == "lasso" else ops.Brush(FRONT, 1.0, points)
     inside = members(region, values, work)
     assert 0 < inside.sum() < len(inside)
@@ -198,6 +198,6 @@ def test_operations_that_take_too_many_tests_are_refused_before_they_are_made():
     zigzag = tuple((0.0, 0.0) if i % 2 else (300.0, 200.0) for i in range(20_000))
     for region in (ops.Lasso(FRONT, zigzag), ops.Brush(FRONT, 1e-9, zigzag)):
         with pytest.raises(ArgumentError, match=r"edits: the operations take more than 10,000,000,000 tests"):
-            members(region, values, Work(most=1_000_000))
+            members(region, values, EditWork(most=1_000_000))
     with pytest.raises(ArgumentError, match="tests of a splat"):
-        members(ops.Sphere((0.0, 0.0, 0.0), 1.0), values, Work(most=999))
+        members(ops.Sphere((0.0, 0.0, 0.0), 1.0), values, EditWork(most=999))

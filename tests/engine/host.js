@@ -1,6 +1,6 @@
 // A host of the engine's programs in a browser: it plays what `passes.manifest` describes, as host.py does from Python.
 
-const WORD = 4, JOB_BYTES = 32, SLICE = 256, VIEW_BYTES = 512, LEAST = 4;
+const WORD = 4, JOB_BYTES = 32, SLICE = 256, VIEW_BYTES = 640, LEAST = 4;
 
 const sizeOf = (size, counts) => size.words * Math.ceil(counts[size.count] / size.per);
 

@@ -13,8 +13,11 @@ from gsplat_edu.engine.passes import FOLDER, LIMITS, MODULES, Buffer, Pass, Prog
 from gsplat_edu.engine.statistics import statistics_program
 from gsplat_edu.engine.step import step_program
 
-PROGRAM = program(16, True)
-PROGRAMS = (PROGRAM, step_program(16), statistics_program(PROGRAM, False))
+PROGRAM, PANORAMA = program(16, True), program(16, True, "panorama")
+PROGRAMS = (
+    *(PROGRAM, step_program(16), statistics_program(PROGRAM, False)),
+    *(program(16, True, "lens"), PANORAMA, statistics_program(PANORAMA, False)),
+)
 PASSES = {(one.module, one.entry): one for each in PROGRAMS for one in each.passes()}
 BYTES = {"u32": 4, "f32": 4, "vec2<f32>": 8, "vec4<f32>": 16, "Splat": 48}
 

@@ -51,6 +51,19 @@ def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkey
 @pytest.mark.parametrize(
     ("file", "right", "wrong", "message"),
     [
+        (
+            "lens",
+            "arc.s1 = (z * inverse",
+            "arc.s1 = 1.01 * (z * inverse",
+            "the image of a test scene is wrong by",
+        ),
+        (
+            "sight_backward",
+            "let more = s.k * (s.speed.x",
+            "let more = 0.9 * s.k * (s.speed.x",
+            "the gradient of means is wrong by",
+        ),
+        ("seam", "return turn *", "return 0.0 *", "the image of a test scene is wrong by"),
         ("loss", "2.0 * pair.x * blurred", "1.9 * pair.x * blurred", "a training's gradient of "),
         ("loss", "sums.x += abs(", "sums.x += 1.01 * abs(", "the loss of a test scene is wrong by 0.0"),
         ("adam", "by.new2 * g * g", "by.new2 * g", "a step of Adam for means is wrong"),
@@ -62,7 +75,7 @@ def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkey
         ),
         ("noise", "0x9E3779B9u", "0x9E3779B8u", "a training's noise is wrong by "),
     ],
-    ids=["gradient", "value", "adam", "statistics", "noise"],
+    ids=["lens", "shutter", "seam", "gradient", "value", "adam", "statistics", "noise"],
 )
 def test_a_wrong_step_is_refused(monkeypatch, file, right, wrong, message):
     """As if a driver had compiled a pass of a step wrongly."""

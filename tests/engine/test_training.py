@@ -1,16 +1,22 @@
 """Training on the backend webgpu: the same bits again and after a resume, and near the native backend's."""
 
+import warnings
+
 import pytest
 import torch
 
+from gsplat_edu import Camera
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.initialize import random_ball
+from gsplat_edu.train.resident import ResidentStepper
+from lens_scenes import LENSES
 
 ITERATIONS = 50
 
@@ -38,6 +44,29 @@ def test_fifty_steps_follow_the_native_backend(views):
     losses, expected = ours.run().losses, native.run().losses
     assert losses == pytest.approx(expected, rel=ITERATIONS * 3e-4)
     assert losses[-1] < 0.9 * losses[0]
+
+
+def test_lenses_and_pinholes_are_trained_on_the_device(views):
+    """Views of every lens in one training; the warning that steps pass through the host would be an error."""
+    mixed = [
+        View.stored(lens_view(view.camera, LENSES[name]), view.read, view.name)
+        for view, name in zip(views, LENSES, strict=False)
+    ]
+    config = course_config(iterations=26, max_gaussians=40).changed(densify_stop=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ours = trainer([*mixed, views[-1]], "webgpu", config)
+    assert isinstance(ours.stepper, ResidentStepper)
+    native = trainer([*mixed, views[-1]], "cpu", config)
+    assert ours.run().losses == pytest.approx(native.run().losses, rel=26 * 3e-4)
+
+
+def lens_view(camera, lens):
+    projection, shutter = lens
+    if projection.kind == "equirectangular":
+        panorama = Camera.panorama(camera.R, camera.eye, camera.H, camera.W)
+        return Camera.posed(panorama.R, panorama.eye, panorama.intrinsics, shutter)
+    return camera.through(projection, shutter)
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc", "fast"])

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 import gsplat_edu.evaluate.report as report_module
+from browsers import chromium
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, summarize
 from gsplat_edu.evaluate.report import SCRIPT, Picture, Report, machine_facts, verdict, write_report
@@ -255,6 +256,21 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
         assert abs(row[int(0.1 * len(row))] - 200) < 4 and abs(row[int(0.6 * len(row))] - 150) < 4
         assert complaints == []
         browser.close()
+
+
+@pytest.mark.sliced(1)
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_a_report_has_the_colours_of_its_reader(tmp_path, scheme):
+    log = [{"iteration": i, "loss": 1 / i, "num_gaussians": i} for i in range(1, 20)]
+    write_report(tmp_path / "r.html", Report("t", {}, config={"a": 1}, log=log))
+    with chromium() as browser:
+        tab = browser.new_context(color_scheme=scheme, viewport={"width": 800, "height": 900}).new_page()
+        tab.goto((tmp_path / "r.html").as_uri())
+        curve = np.array(Image.open(io.BytesIO(tab.locator(".curves svg").first.screenshot())).convert("L"))
+        whole = np.array(Image.open(io.BytesIO(tab.screenshot())).convert("L"))
+    for shot in (curve, whole):  # most of it is ground, and something is written on it
+        assert (np.median(shot) < 60) == (scheme == "dark"), np.median(shot)
+        assert (shot > 150).any() and (shot < 100).any()
 
 
 def test_a_report_without_content_is_a_valid_page(tmp_path):

@@ -128,15 +128,17 @@ def test_data_that_is_not_a_video_is_refused():
 
 
 @pytest.mark.sliced(1)
-@pytest.mark.parametrize(("height", "width"), [(63, 95), (720, 1280)])
-def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
+@pytest.mark.parametrize(
+    ("height", "width", "sphere"), [(63, 95, False), (720, 1280, False), (64, 128, True)]
+)
+def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width, sphere):
     """Chromium does not play MPEG-4 Part 2, and assumes BT.709 for untagged videos of any size."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("chromium is not installed")
     frames = [quarters(height, width, i) for i in range(4)]
-    (path,) = write_frames(tmp_path / "v.mp4", frames, fps=10)
+    (path,) = write_frames(tmp_path / "v.mp4", frames, fps=10, sphere=sphere)
     flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=flags)

@@ -162,6 +162,9 @@ def test_damaged_edits():
             "points": [[1, 2], [3, 4]],
         },
         {"op": "select", "how": "replace", "by": "sphere", "center": [0, 0, 0], "radius": 1},
+        {"op": "select", "how": "add", "by": "list", "reason": "alone", "runs": [0, 1, 2, 1]},
+        {"op": "select", "how": "add", "by": "distance", "center": [0, 0, 0], "low": 1, "high": 2},
+        {"op": "grow", "radius": 0.5},
         {"op": "delete"},
         {"op": "upright", "points": [[0, 0, 0], [1, 0, 0], [0, 0, 1]]},
     ]

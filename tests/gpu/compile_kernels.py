@@ -1,7 +1,8 @@
 """Compile kernels for a GPU, which this machine may lack: compile_kernels.py CAPABILITY least|most
-gaussians|pixels|loss
+gaussians|lenses|pixels|loss
 
-Kernels that have variants are compiled without their options (least) or with all of them (most).
+Kernels that have variants are compiled without their options (least) or with all of them (most), for the pinhole and
+for lenses.
 
 Prints the name of each kernel and the bytes per thread that it spills from registers, as the assembler reports.
 test_compile.py runs this in a new process, because importing a kernel fixes the choice of the interpreter.
@@ -18,7 +19,7 @@ from triton.backends import nvidia
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, compile as compiled
 
-from gsplat_edu.render.triton import adam, composite, intersect, loss, project
+from gsplat_edu.render.triton import adam, composite, intersect, loss, project, sight
 
 INTEGERS = {"n", "width", "height", "tiles_x", "W", "H"}
 KINDS = {
@@ -61,22 +62,35 @@ def stage(kernel, warps=4, **constants) -> None:
 
 def main() -> None:
     warnings.simplefilter("ignore")
-    {"gaussians": of_gaussians, "pixels": of_pixels, "loss": of_loss}[sys.argv[3]]()
+    {"gaussians": of_gaussians, "lenses": of_lenses, "pixels": of_pixels, "loss": of_loss}[sys.argv[3]]()
 
 
 def of_gaussians() -> None:
     shape = {"DEGREE": 3 * MOST, "REST": 15 * MOST, "ANTIALIASED": MOST, "DILATION": 0.3}
-    stage(project.project_kernel, **shape, BLOCK=128)
-    stage(project.project_backward_kernel, 2, **shape, WITH_CAMERA=MOST, BLOCK=64)
-    stage(intersect.count_kernel, BLOCK=128)
-    stage(intersect.emit_kernel, BLOCK=128)
+    for lens in (0, 1 + MOST):  # with motion blur
+        stage(project.project_kernel, **shape, LENS=lens, WRAPS=lens > 0 and MOST, BLOCK=128)
+        stage(
+            project.project_backward_kernel, 2, **shape, LENS=lens, WITH_CAMERA=MOST and lens == 0, BLOCK=64
+        )
+        stage(intersect.count_kernel, WRAPS=lens > 0, BLOCK=128)
+        stage(intersect.emit_kernel, WRAPS=lens > 0, BLOCK=128)
     arrays = dict.fromkeys(("parameter", "m", "v", "gradient"), FLOATS)
     build(adam._adam, {**arrays, "count": "i32", "numbers": ("fp32",) * 8})
 
 
+def of_lenses() -> None:
+    """Every projection: plain and at rest, or with a rolling shutter, blur and, if it can, all terms and bounds."""
+    for number in range(4):
+        optics = number + 32 * (number % 2) + (16 + 128 + 12 * (number < 2) + 64 * (number == 0)) * MOST
+        stage(sight.sight_kernel, 2, OPTICS=optics, BLOCK=64)
+        stage(sight.sight_backward_kernel, 2, OPTICS=optics, WITH_CAMERA=MOST, BLOCK=64)
+
+
 def of_pixels() -> None:
-    stage(composite.composite_kernel, WITH_DEPTH=MOST, WITH_MEDIAN=MOST, BATCH=16, PRECISION="ieee")
-    stage(composite.composite_backward_kernel, 8, WITH_DEPTH=MOST, WITH_T=MOST, BATCH=16)
+    for wraps in (False, True):
+        depths = {"WITH_DEPTH": MOST, "WITH_MEDIAN": MOST, "PRECISION": "ieee"}
+        stage(composite.composite_kernel, **depths, WRAPS=wraps, BATCH=16)
+        stage(composite.composite_backward_kernel, 8, WITH_DEPTH=MOST, WITH_T=MOST, WRAPS=wraps, BATCH=16)
 
 
 def of_loss() -> None:

@@ -15,7 +15,7 @@ SPILLED = 64
 
 @pytest.mark.own_process
 @pytest.mark.sliced(1)
-@pytest.mark.parametrize(("kernels", "count"), [("gaussians", 5), ("pixels", 2), ("loss", 6)])
+@pytest.mark.parametrize(("kernels", "count"), [("gaussians", 9), ("lenses", 8), ("pixels", 4), ("loss", 6)])
 @pytest.mark.parametrize("variant", ["least", "most"])
 @pytest.mark.parametrize("capability", [80, 90])
 def test_every_kernel_compiles_with_few_spills(capability, variant, kernels, count, tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from gsplat_edu.io.mesh_files import read_mesh, write_mesh
 from gsplat_edu.scene.mesh import Mesh, Texture
 
-FOLDER = Path(__file__).parents[1] / "gltf"
+FOLDER = Path(__file__).parents[1] / "npm"
 """Has the package.json and the lock with the validator's version."""
 
 
@@ -21,7 +21,7 @@ def validated(*files):
     if node is None:
         pytest.skip("node is not installed")
     if not (FOLDER / "node_modules" / "gltf-validator").is_dir():
-        pytest.skip("gltf-validator is not installed: npm ci --prefix tests/gltf")
+        pytest.skip("gltf-validator is not installed: npm ci --prefix tests/npm")
     words = [node, FOLDER / "validate.mjs", *files]
     finished = subprocess.run(words, capture_output=True, text=True, timeout=120, check=True)
     return json.loads(finished.stdout)

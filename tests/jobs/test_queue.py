@@ -31,6 +31,7 @@ def stop(number, frame):
 signal.signal(signal.SIGINT, stop)
 if "stubborn" in sys.argv:
     signal.signal(signal.SIGTERM, stop)
+emit("started", pid=os.getpid(), identity="")
 open(sys.argv[2] + ".ran", "a").write(sys.argv[2] + "\\n")
 emit("stage", name="work")
 print("printed", flush=True)
@@ -78,7 +79,7 @@ def opened(tmp_path):
             child.wait()
 
 
-def until(condition, patience=20.0):
+def until(condition, patience=120.0):
     end = time.monotonic() + patience
     while not condition():
         assert time.monotonic() < end, "the awaited state did not occur"
@@ -147,6 +148,15 @@ def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
     assert not (tmp_path / "b.ran").exists()
 
 
+def test_a_process_that_ends_without_a_word_does_not_get_that_of_an_earlier_one(opened, tmp_path):
+    queue = opened(at_once=0)
+    job = queue.submit(asked("run", str(tmp_path / "a"), "crashes"))
+    said = {"event": "failed", "time": 0, "line": "said by an earlier process", "code": 2}
+    queue.files(job.id).events.write_text(json.dumps(said) + "\n")
+    queue.at_once = 1
+    assert reached(queue, job.id, State.FAILED).line == "Traceback and all"
+
+
 def test_a_job_that_ignores_its_interrupt_is_killed(opened, tmp_path):
     queue = opened(patience={"interrupt": 0.2, "terminate": 0.2})
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits", "stubborn"))
@@ -188,8 +198,9 @@ def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_pat
     abandon(queue)
     found = opened()
     assert found.get(job.id).state is State.RUNNING and found.get(after.id).state is State.HELD
+    pid = found.get(job.id).pid  # the queue forgets it once the process has ended
     (tmp_path / "a").touch()
-    os.waitpid(found.get(job.id).pid, 0)  # init waits for an orphaned process
+    os.waitpid(pid, 0)  # init waits for an orphaned process
     assert reached(found, job.id, State.DONE).attempts == 1
     assert found.get(after.id).state is State.HELD and not (tmp_path / "b.ran").exists()
     found.resume(after.id)

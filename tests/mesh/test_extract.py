@@ -12,7 +12,7 @@ from gsplat_edu.base.threads import one_thread
 from gsplat_edu.evaluate.surface import Comparison, score_surface
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.mesh.depths import checked, neighbours_of, render_depths
-from gsplat_edu.mesh.extract import MeshSettings, default_voxel, extract_mesh
+from gsplat_edu.mesh.extract import MeshSettings, default_voxel, extract_mesh, volume_room
 from gsplat_edu.mesh.tidy import TidySettings
 from gsplat_edu.mesh.trust import seen_by
 from gsplat_edu.render.settings import RenderSettings
@@ -91,7 +91,7 @@ def test_depths_that_neighbours_see_through_are_left_out():
     fog[28:34, 28:34] = fog[1:4, 30:34] = True
     assert (depth[28:34, 28:34] > 0).all() and not depth[1:4, 30:34].any()
     depth[fog] = 2.1
-    views[10] = dataclasses.replace(views[10], depth=depth)
+    views[10] = dataclasses.replace(views[10], rendered=depth)
     kept, counts = checked(views)
     assert not kept[10].depth[fog].any() and counts.contradicted >= before.contradicted + fog.sum()
     assert np.array_equal(kept[10].depth[~fog], clean[10].depth[~fog])
@@ -124,6 +124,22 @@ def test_voxels_grow_until_the_volume_fits_and_a_given_size_does_not(result):
             load_backend("cpu"),
             MeshSettings(voxel=result.voxel, max_bytes=result.volume_bytes // 3),
         )
+
+
+def test_the_volume_gets_what_maps_and_mesh_leave():
+    cameras, least = orbit(), 450 * 2**20
+    maps = 10 * sum(camera.W * camera.H for _, camera in cameras)
+    room = volume_room(least + maps + 2**30, cameras)
+    assert 0.5 * 2**30 < room < 0.7 * 2**30
+    assert volume_room(least + maps + 2**29, cameras) == room // 2
+    with pytest.raises(NotEnoughMemoryError, match="depth maps need"):
+        volume_room(least + maps, cameras)
+    views = render_depths(ball(), cameras, SETTINGS, load_backend("cpu"))
+    kept, _ = checked(views)
+    arrays = [
+        getattr(view, name) for view in kept for name in ("rendered", "facing", "image", "clear", "kept")
+    ]
+    assert 0.8 * maps < sum(array.nbytes for array in arrays) <= maps
 
 
 def test_bounds_leave_a_hole_and_faces_are_reduced():

@@ -126,16 +126,6 @@ def test_what_stands_in_front_paints_nothing_if_the_depth_says_so():
     assert np.median(worse[near]) > 40 and np.median(wrong[near]) < 0.5 * np.median(worse[near])
 
 
-def test_the_median_ignores_what_moved_through_one_photo():
-    mesh = ball()
-    views = [photo(camera) for camera in cameras(20)]
-    red = np.zeros_like(views[7].image) + np.array([255, 0, 0], np.uint8)
-    views[7] = TextureView(views[7].camera, red, views[7].depth)
-    settings = TextureSettings(size=192, median=True)
-    plain, calm = (errors(textured(mesh, views, s))[1] for s in (SMALL, settings))
-    assert np.quantile(plain, 0.98) > 60 and np.quantile(calm, 0.98) < 40
-
-
 def test_unseen_places_take_colours_of_vertices_or_of_their_neighbours():
     mesh = ball()
     views = [photo(camera) for camera in cameras() if camera.eye[2] < 1]

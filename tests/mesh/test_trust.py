@@ -18,7 +18,9 @@ SQUARE = Mesh(
 def view(depth, name="view"):
     plane = np.full((41, 41), depth, dtype=np.float32)
     nothing = np.zeros((41, 41))
-    return DepthView(name, CAMERA, plane, plane, np.zeros((41, 41, 3), np.uint8), nothing > 0, 0)
+    return DepthView(
+        name, CAMERA, plane, np.full((41, 41), 255, np.uint8), np.zeros((41, 41, 3), np.uint8), nothing > 0, 0
+    )
 
 
 def made(views):

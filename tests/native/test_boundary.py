@@ -8,8 +8,8 @@ from gsplat_edu import _native
 from gsplat_edu.ops import kernels
 from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
-from gsplat_edu.scene.camera import orbit_camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.rig import orbit_camera
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.optimizer import Adam
 
@@ -60,7 +60,7 @@ def statistics(**changes):
 
 
 def frame(**changes):
-    fields = {"scene": scene(), "camera": camera(), "settings": settings(), "threads": 2}
+    fields = {"scene": scene(), "camera": camera(), "settings": settings(), "needed": None, "threads": 2}
     return _native.FrameF32(**fields | changes)
 
 

@@ -6,10 +6,12 @@ import shlex
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gsplat_edu.base import constants
 from gsplat_edu.cli.main import build_parser
+from gsplat_edu.scene import projection, projection_formulas, shutter, sight
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "gsplat_edu"
@@ -79,6 +81,22 @@ def test_every_constant_is_in_the_decisions():
     assert [name for name in names if name not in decisions] == []
     for name in ("DILATION", "ALPHA_MAX", "Z_NEAR", "TILE", "LAMBDA_FLOOR", "C0", "SH_OFFSET"):
         assert f"| `{name}` | {getattr(constants, name)}" in decisions, name
+
+
+def test_every_constant_of_lenses_is_in_the_decisions():
+    decisions = (ROOT / "docs" / "DECISIONS.md").read_text()
+    for module in (projection, projection_formulas, shutter, sight):
+        named = re.findall(
+            r"^([A-Z][A-Z_]+) = [\w.]+(?:\(.*\))?$", Path(module.__file__).read_text(), re.MULTILINE
+        )
+        numbers = [name for name in named if isinstance(getattr(module, name), (int, float))]
+        assert numbers, module.__name__
+        for name in numbers:
+            value = getattr(module, name)
+            angle = np.degrees(value) if name.startswith("STEEPEST") else value
+            shown = "cos 89 degrees" if name == "POLE" else f"{angle:g}"
+            assert re.search(rf"\| `{name}` \| {shown}", decisions.replace("1e-9", "1e-09")), name
+    assert pytest.approx(np.cos(np.radians(89))) == projection_formulas.POLE
 
 
 def test_the_map_of_modules_is_current():

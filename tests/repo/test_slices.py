@@ -174,6 +174,7 @@ def test_a_failure_says_how_to_repeat_its_slice(tmp_path):
     assert "name the test with :: to run it again; GSPLAT_EDU_SLICE=860" in said
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.own_process
 @pytest.mark.parametrize(
     ("words", "variables", "ends"),

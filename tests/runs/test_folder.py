@@ -178,7 +178,8 @@ def test_render_settings_come_from_the_config():
 @pytest.mark.parametrize(
     ("section", "says"),
     [
-        ({"glow": 1, "fog": 2}, "render: unknown settings fog, glow; use the version"),
+        ({"glow": 1, "fog": 2}, "render: unknown settings 'fog', 'glow'; use the version"),
+        ({"fo\ng": 1}, r"render: unknown settings 'fo\\ng'; use the version"),
         ([], "render: is not an object"),
         ({"sh_degree": 9}, "render: sh_degree: is 9"),
         ({"background": "white"}, "render: background: cannot be read"),

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+import panorama_room
+from gsplat_edu import Camera
+from gsplat_edu.data.lens_captures import LENS_SCENES, lens_photos, nearer
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
@@ -14,8 +17,12 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs import pilot
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.pilot import LEAST_GAIN, refinement_for
+from gsplat_edu.runs.trials import CONTROL
+from gsplat_edu.scene.projection import Distortion, Projection
+from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
+from lens_captures import moving_photo, room_cameras
 
 
 def options(folder, tmp_path, **data):
@@ -28,6 +35,66 @@ def shaken(view, rng):
     return View(CameraTensors.of(view.camera).moved(twist).value(), view.image, name=view.name)
 
 
+def write_garden(folder, k1):
+    """Photograph the garden by wide cameras with a distortion, and write them as pinholes."""
+    scene = LENS_SCENES["garden"]
+    given = [
+        Camera.posed(c.R, c.eye, replace(c.intrinsics, fx=48.0, fy=48.0))
+        for c in (nearer(camera, scene.target) for camera in scene.cameras(48, (96, 72)))
+    ]
+    true = [c.through(Projection(distortion=Distortion.of(k1=k1))) if k1 else c for c in given]
+    capture = lens_photos("garden", true, given, 4_000, np.random.default_rng(0))
+    views = [View(c, view.image, name=view.name) for c, view in zip(given, capture.views, strict=True)]
+    write_colmap(folder, views, capture.points, capture.colors)
+
+
+def write_moving_room(folder, pixels):
+    """Photograph the room by cameras that turn while they are read, and write them at rest."""
+    rng, views = np.random.default_rng(1), []
+    for i, camera in enumerate(room_cameras(Projection(), 24, 80)):
+        focal, axis = 64.0, rng.normal(size=3)
+        given = Camera.posed(camera.R, camera.eye, replace(camera.intrinsics, fx=focal, fy=focal))
+        shutter = RollingShutter(pixels / focal * axis / np.linalg.norm(axis), (0, 0, 0))
+        views.append(View(given, moving_photo(given.through(shutter=shutter)), name=f"{i:02}.png"))
+    rng = np.random.default_rng(0)
+    points = [
+        c + rng.random((200, 1)) * a + rng.random((200, 1)) * b for c, a, b in panorama_room.rectangles()
+    ]
+    write_colmap(folder, views, np.concatenate(points), np.full((len(points) * 200, 3), 0.5))
+
+
+def chosen_for(folder, tmp_path, lens):
+    """Return the choice for a capture, and how many pilots were trained."""
+    steps = []
+    chosen = refinement_for(options(folder, tmp_path, lens=lens), CaptureReader(folder), steps.append)
+    assert len(steps) % pilot.PILOT_STEPS == 0
+    return *chosen, len(steps) // pilot.PILOT_STEPS
+
+
+@pytest.mark.sliced(2, group="quality that comes back")
+@pytest.mark.parametrize(("k1", "kept"), [(-0.1, {"lens", "poses+lens"}), (0.0, {"none"})])
+def test_a_lens_is_learned_if_it_is_wrong(tmp_path, k1, kept):
+    """One that does not gain is trained on from what it found, before it is left out."""
+    write_garden(tmp_path / "capture", k1)
+    chosen, reason, trials, trained = chosen_for(tmp_path / "capture", tmp_path, "native")
+    assert chosen in kept, reason
+    assert any(name.endswith(CONTROL) for name in trials.posed) and "lens" in reason
+    assert trained - len(trials.posed) in ({0, 1} if k1 else {1})
+    assert ("trained on" in reason) == (trained > len(trials.posed))
+
+
+@pytest.mark.sliced(2, group="quality that comes back")
+@pytest.mark.parametrize("pixels", [12.0, 0.0])
+def test_a_shutter_is_learned_if_photos_have_one(tmp_path, pixels):
+    """Photos without one give no sign of it, so no training with a motion is spent on them."""
+    write_moving_room(tmp_path / "capture", pixels)
+    chosen, reason, trials, trained = chosen_for(tmp_path / "capture", tmp_path, "undistort")
+    assert chosen == ("shutter" if pixels else "none"), reason
+    assert ("shutter" in trials.moving) == bool(pixels)
+    assert set(trials.posed) >= set(pilot.ORDER) and "lens" not in trials.posed
+    assert trained == len(trials.posed)
+
+
 @pytest.mark.sliced(1, group="quality that comes back")
 @pytest.mark.parametrize("wrong", [False, True])
 def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
@@ -38,8 +105,8 @@ def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
     write_colmap(tmp_path / "capture", views, points, colors)
     steps = []
     reader = CaptureReader(tmp_path / "capture")
-    chosen, reason = refinement_for(options(reader.path, tmp_path), reader, lambda: steps.append(1))
-    assert len(steps) == 3 * 250
+    chosen, reason, trials = refinement_for(options(reader.path, tmp_path), reader, steps.append)
+    assert len(steps) == len(trials.posed) * 250 and steps[0] == 3 * 250
     assert (chosen != "none") == wrong, reason
     assert "dB with none" in reason and "dB with both" in reason
     assert not (tmp_path / "run").exists()
@@ -47,7 +114,7 @@ def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
 
 def test_the_smallest_refinement_without_a_clearly_better_one_is_chosen():
     def chosen(none, poses, both):
-        return pilot._choice({"none": none, "poses": poses, "both": both})[0]
+        return pilot._smallest({"none": none, "poses": poses, "both": both}, pilot.ORDER)
 
     assert chosen(20.0, 20.0 + 0.9 * LEAST_GAIN, 20.0) == "none"
     assert chosen(20.0, 20.0 + 1.1 * LEAST_GAIN, 20.0) == "poses"
@@ -62,6 +129,7 @@ def test_without_held_out_photos_nothing_is_refined(tmp_path):
     assert refinement_for(options(reader.path, tmp_path, test_every=0), reader) == (
         "none",
         "no photos are held out to judge by",
+        None,
     )
 
 

@@ -14,7 +14,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs import thin
-from gsplat_edu.runs.thin import ThinTrial, needs_trial, try_lengths
+from gsplat_edu.runs.thin import ThinTrial, longest_of, needs_trial, try_lengths
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
@@ -50,6 +50,7 @@ def given(request, tmp_path_factory):
     return request.param, options, CaptureReader(folder)
 
 
+@pytest.mark.sliced(1, group="quality that comes back")
 def test_wrong_poses_shorten_a_training_and_exact_poses_do_not(given, monkeypatch):
     error, options, reader = given
     steps = []
@@ -60,6 +61,19 @@ def test_wrong_poses_shorten_a_training_and_exact_poses_do_not(given, monkeypatc
         assert "2 training photos" in str(trial) and "check the poses" in str(trial)
     else:
         assert trial.longest is None and list(trial.scores) == list(thin.LENGTHS) and str(trial) == ""
+
+
+def test_sharp_details_out_of_place_are_trained_longer_than_the_best_psnr():
+    """PSNR says whether a training ends early, shifted PSNR where."""
+    shifted = {100: 22.0, 200: 23.0, 400: 22.9, 800: 22.0}
+    scores = {100: 20.0, 200: 19.7, 400: 19.4, 800: 19.6}
+    assert longest_of(scores, shifted) == 200
+    said = str(ThinTrial(200, scores, 2))
+    assert "20.0 dB after 100 iterations and 19.4 dB after 400; 200 show most detail" in said
+    assert longest_of(scores | {400: 19.6}, shifted) is None  # no fall of 0.45 dB
+    assert longest_of(scores | {800: 20.1}, shifted) is None  # a longer training makes the fall good
+    assert longest_of({}, {}) is None
+    assert "most detail" not in str(ThinTrial(100, scores, 2))
 
 
 def test_the_plan_follows_the_trial_and_gives_the_reason(given, monkeypatch):

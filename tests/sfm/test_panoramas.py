@@ -1,7 +1,7 @@
 """360-degree panoramas are recognised, cut, mapped as a rig, and trained like pinhole photos."""
 
-import io
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,8 +11,11 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.cli.main import main
+from gsplat_edu.data.colmap import read_images
 from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.depths import DepthSource, judged_depths
 from gsplat_edu.data.panorama import FACES, face_pinhole, face_rotations
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.textured_box import align_cameras
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
@@ -25,6 +28,7 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.sfm.panoramas import are_panoramas, cut_panoramas
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from panorama_room import held_out, panorama, photo, walk
+from sfm.engine_check import printed
 
 COUNT, WIDTH, TURN = 7, 512, 0.3
 SIDE = 163
@@ -70,6 +74,7 @@ def room(colmap, tmp_path_factory):
 def test_panoramas_become_faces_with_one_centre_each(room):
     """All faces get poses, those of one panorama share a centre, and both agree with the truth."""
     assert any("7 panoramas cut into 8 faces each of 163x163 px" in line for line in room.said)
+    assert not any("not used" in line for line in room.said)
     assert any(
         "7 of 7 panoramas have a pose (incremental mapper, a rig of 8 faces)" in line for line in room.said
     )
@@ -169,7 +174,7 @@ def files(tmp_path):
 
 
 def test_the_shape_alone_makes_no_panorama(files):
-    """A photo cropped to 2:1 is treated as a photo, and a note names the option."""
+    """Photos of 2:1 whose edges tell nothing are treated as photos, and a note names the option."""
     said = []
     assert not are_panoramas(files((64, 32), (64, 32)), "auto", said.append)
     assert "if they are 360-degree panoramas, give --panorama yes" in said[0]
@@ -180,15 +185,51 @@ def test_the_shape_alone_makes_no_panorama(files):
 
 def test_xmp_decides(files):
     said = []
-    assert are_panoramas(files((64, 32), (80, 40), xmp=(0, 1)), "auto", said.append) and not said
-    assert not are_panoramas(files((64, 32), xmp=(0,)), "no", said.append) and not said
-    assert not are_panoramas(files((64, 32), (64, 48), xmp=(0,)), "auto", said.append)
-    assert (
-        "1 of 2 photos are 360-degree panoramas according to their XMP, first 0.jpg: used as plain" in said[0]
-    )
+    assert are_panoramas(files((64, 32), (80, 40), xmp=(0, 1)), "auto", said.append)
+    assert said == [
+        "2 photos taken for 360-degree panoramas: their XMP says so; otherwise give --panorama no"
+    ]
     said.clear()
+    assert not are_panoramas(files((64, 32), xmp=(0,)), "no", said.append) and not said
+    assert not said
+    with pytest.raises(
+        DatasetError, match=r"1 of 2 photos are 360-degree panoramas, first 0\.jpg, and others are not"
+    ):
+        are_panoramas(files((64, 32), (64, 48), xmp=(0,)), "auto", said.append)
+    assert not are_panoramas(files((64, 32), (64, 48), xmp=(0,)), "no", said.append)
     # parts of the sphere
     assert not are_panoramas(files((64, 20), (64, 20), xmp=(0, 1)), "auto", said.append)
+
+
+def test_the_picture_decides(tmp_path):
+    """Panoramas without XMP are known by their edges; plain photos of the same room and crops to 2:1 are none."""
+    plain, spheres = [tmp_path / f"a{i}.jpg" for i in range(3)], [tmp_path / f"b{i}.jpg" for i in range(3)]
+    for i, eye in enumerate(walk(3)):
+        whole = panorama(eye, 0.4 * i, 256)
+        Image.fromarray(whole).save(spheres[i], quality=92)
+        crop = whole[32:96, 32:160]  # 2:1, but only half of the horizon
+        Image.fromarray(crop).resize((256, 128)).save(plain[i], quality=92)
+    said = []
+    assert are_panoramas(spheres, "auto", said.append) and "their left and right edges fit" in said[0]
+    assert not are_panoramas(spheres, "no", said.append)
+    assert not are_panoramas(plain, "auto", said.append)
+    assert "3 photos taken for plain photos, although they are twice as wide as high" in said[1]
+    Image.new("RGB", (64, 48)).save(tmp_path / "c.jpg")
+    with pytest.raises(DatasetError, match="put the panoramas into a folder of their own"):
+        are_panoramas([*spheres, tmp_path / "c.jpg"], "auto", said.append)
+
+
+@pytest.mark.parametrize("kind", ["sky", "sky over grass", "stripes"])
+def test_crops_with_alike_edges_are_no_panoramas(kind, tmp_path):
+    """Left and right edges that look alike are not enough: the first and last rows have to be of one direction."""
+    rng = np.random.default_rng(1)
+    image = np.full((128, 256, 3), (120, 160, 220), np.float64)
+    if kind == "sky over grass":
+        image[64:] = rng.uniform(30, 160, (64, 256, 1))
+    if kind == "stripes":
+        image[:] = (128 + 100 * np.sin(np.arange(256) * 2 * np.pi / 64))[:, None]
+    Image.fromarray(image.astype(np.uint8)).save(tmp_path / "a.png")
+    assert not are_panoramas([tmp_path / "a.png"], "auto", lambda sentence: None)
 
 
 def test_photos_of_another_shape_are_refused(files, capsys, tmp_path):
@@ -239,6 +280,87 @@ def test_gps_reaches_the_faces(tmp_path):
 def test_the_work_folder_lists_the_cut_panoramas(room):
     facts = json.loads((room.capture / "sfm" / "stages.json").read_text())["stages"]["faces"]["facts"]
     assert [one["name"] for one in facts["panoramas"]] == [f"p{i}.jpg" for i in range(COUNT)]
-    data = (room.capture / "images" / "p0_0.jpg").read_bytes()
-    assert data == (room.capture / "sfm" / "faces" / "p0_0.jpg").read_bytes()  # no second lossy copy
-    assert Image.open(io.BytesIO(data)).size == (SIDE, SIDE)
+
+
+@pytest.mark.sliced(1, group="captures from photos", together=True)
+def test_the_capture_has_the_panoramas_themselves(room):
+    """One photo and one pose each, without a second lossy copy: `--lens native` trains through them."""
+    for i in range(COUNT):
+        data = (room.capture / "images" / f"p{i}.jpg").read_bytes()
+        assert data == (room.folder / "photos" / f"p{i}.jpg").read_bytes()
+    assert len(list((room.capture / "images").iterdir())) == COUNT
+    truth = {}
+    for i, eye in enumerate(walk(COUNT)):
+        c, s = np.cos(TURN * i), np.sin(TURN * i)
+        truth[f"p{i}.jpg"] = Camera.panorama(
+            np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]), eye, WIDTH // 2, WIDTH
+        )
+    dataset = load_dataset(room.capture, DataSettings(test_every=0, lens="native"))
+    cameras = {view.name: view.camera for view in dataset.train}
+    assert cameras.keys() == truth.keys()
+    assert all(camera.projection.kind == "equirectangular" for camera in cameras.values())
+    found = align_cameras(cameras, truth)
+    assert found.moved.max() < 0.005 and found.turned.max() < 0.1
+    below = np.arange(WIDTH // 2) >= WIDTH * 5 // 12
+    mask = next(view for view in dataset.train if view.name == "p2.jpg").read().mask
+    assert not mask[below].any() and mask[~below].all()
+
+
+@pytest.mark.sliced(1, group="captures from photos", together=True)
+def test_points_are_seen_where_the_panoramas_show_them(room):
+    """The tracks of the model are in pixels of the panoramas."""
+    model = room.capture / "sparse" / "0"
+    poses = {pose.name: pose for pose in read_images(model / "images.bin")}
+    assert set(poses) == {f"p{i}.jpg" for i in range(COUNT)}
+    assert any("7 panoramas, whole" in line for line in room.said)
+    (line,) = [line for line in room.said if line.startswith("capture:")]
+    assert float(line.partition("mean reprojection error ")[2].partition(" ")[0]) < 1.0
+
+
+@pytest.mark.sliced(1, group="captures from photos", together=True)
+def test_faces_have_the_depth_of_their_panoramas_points(room):
+    """`--depth points` finds a face's points in the tracks of the whole panorama."""
+    views = load_dataset(room.capture, DataSettings(test_every=0)).train
+    cameras = [(view.name, view.camera) for view in views]
+    found = judged_depths(CaptureReader(room.capture), cameras, DepthSource(Path("points")))
+    assert set(found.views) <= {name for name, _ in cameras}
+    assert found.report.photos == FACES * COUNT and found.report.used > 0.8 * FACES * COUNT
+
+
+@pytest.mark.sliced(1, group="captures from photos", together=True)
+def test_panoramas_of_what_is_far_away_are_warned_of(room):
+    """In a room, matches move; if they had not, the next call with the same work folder would say so."""
+    path = room.capture / "sfm" / "stages.json"
+    stages = json.loads(path.read_text())
+    facts = stages["stages"]["mapping"]["facts"]
+    assert facts["moving"] > 0.6 and not any("by more than a turn" in line for line in room.said)
+    facts["moving"], said = 0.1, []
+    path.write_text(json.dumps(stages))
+    reconstruct(SfmOptions(room.folder / "photos", room.capture, max_features=500, threads=1), said.append)
+    assert (
+        sum("only 10 % of the matches move between the panoramas by more than a turn" in s for s in said) == 1
+    )
+
+
+@pytest.mark.usefixtures("colmap")
+def test_the_share_of_matches_that_a_turn_does_not_explain():
+    lines = printed(
+        """
+from engine.turning import _turned
+rng = np.random.default_rng(1)
+for moving in (0.05, 0.3, 0.6):
+    a = rng.normal(size=(400, 3))
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    R = pycolmap.Rotation3d(rng.normal(size=3)).matrix()
+    b = a @ R.T
+    near = np.arange(400) < 400 * moving
+    b[near] += 0.2 * rng.normal(size=(near.sum(), 3)) + [0.3, 0, 0]
+    b += 1e-3 * rng.normal(size=b.shape)
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    agree = _turned(a, b, 0.01, rng)
+    print(agree[near].mean(), agree[~near].mean())
+"""
+    )
+    for line in lines:
+        near, far = map(float, line.split())
+        assert near < 0.03 and far > 0.99

@@ -89,7 +89,7 @@ def test_points_lie_on_the_box_and_the_floor(done):
 
 def test_progress_counts_photos_and_pairs(done):
     stages = list(dict.fromkeys(stage for stage, _, _ in done.progress))
-    assert stages == ["photos", "features", "matches", "mapping", "undistorting"]
+    assert stages == ["photos", "features", "matches", "mapping", "writing photos"]
     last = {stage: (count, total) for stage, count, total in done.progress}
     pairs = 14 * 13 // 2
     assert last == {stage: (pairs, pairs) if stage == "matches" else (14, 14) for stage in stages}
@@ -122,7 +122,7 @@ class StoppedError(Exception):
 def test_an_interrupted_run_resumes_after_the_last_completed_stage(done, phone, tmp_path):
     """With one thread, an interrupted run gives the bits of an uninterrupted one."""
     options = SfmOptions(phone.folder, tmp_path / "capture", max_features=LIMIT, threads=1)
-    for finished, stage in enumerate(("photos", "features", "matches", "mapping", "undistorting")):
+    for finished, stage in enumerate(("photos", "features", "matches", "mapping", "writing photos")):
         said = []
 
         def stop(now, count, total, stage=stage):

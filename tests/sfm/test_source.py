@@ -8,7 +8,7 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.cli.main import main
-from gsplat_edu.sfm.source import check_source, needs_poses
+from gsplat_edu.sfm.source import check_source, needs_poses, too_few
 
 RNG = np.random.default_rng(0)
 
@@ -64,6 +64,11 @@ def test_two_photos_are_too_few(tmp_path):
         check_source(source, tmp_path / "out")
     Image.open(source / "0.png").save(source / "one.jpg")
     assert len(check_source(source, tmp_path / "out")) == 3
+
+
+def test_a_damaged_jpeg_is_not_told_to_become_one(tmp_path):
+    assert too_few(tmp_path, 0, ["a.jpg", "b.JPEG"]).endswith("copy them from the camera again")
+    assert too_few(tmp_path, 0, ["a.jpg", "b.raf"]).endswith("export them as JPEG")
 
 
 @pytest.mark.usefixtures("colmap")

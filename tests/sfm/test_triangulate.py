@@ -1,10 +1,17 @@
 """Points triangulated from given poses lie on the scene, and a run starts and resumes with them."""
 
 import importlib.util
+import json
 import math
+import queue
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import DataSettings, load_dataset
@@ -16,10 +23,17 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.scene.views import View
+from gsplat_edu.sfm import colmap
+from gsplat_edu.sfm.colmap import _listen
 from gsplat_edu.sfm.triangulate import LEAST_POINTS, STAGES, triangulate
 from gsplat_edu.train.config import recipe
 
+pytestmark = pytest.mark.sliced(1, group="reconstructions")
+
 pytest.importorskip("pycolmap")
+
+PATIENCE = 180.0
+"""Longest time that a test waits, seconds."""
 
 GIVEN = [
     "--strategy",
@@ -72,6 +86,52 @@ def test_the_points_lie_on_the_scene(views, tmp_path):
 def test_the_points_are_the_same_bits_for_any_number_of_threads(views, tmp_path):
     one, two = (triangulate(views, tmp_path / "work", threads=threads) for threads in (1, 2))
     assert np.array_equal(one.points, two.points) and np.array_equal(one.colors, two.colors)
+
+
+def test_only_the_job_itself_opens_the_database_while_it_runs(views, tmp_path, monkeypatch):
+    """A second process that opens or closes the file locks it for a moment, and COLMAP does not wait: the job fails."""
+
+    def refuse(*words, **options):
+        raise AssertionError("opened by another process")
+
+    monkeypatch.setattr(sqlite3, "connect", refuse)
+    told = []
+    assert triangulate(views, tmp_path / "work", lambda *told_now: told.append(told_now)) is not None
+    for stage in STAGES[:2]:
+        done = [count for name, count, _ in told if name == stage]
+        total = {total for name, _, total in told if name == stage}
+        assert done == sorted(done) and {done[-1]} == total, (stage, done, total)
+
+
+def test_a_job_whose_last_line_is_cut_off_has_ended():
+    """A process that is killed while it writes leaves half a line; the program must not wait for more."""
+    writes = 'import os; os.write(1, b\'{"done": 3}\\n{"result": {"poi\')'
+    answers = queue.SimpleQueue()
+    with subprocess.Popen([sys.executable, "-c", writes], stdout=subprocess.PIPE) as process:
+        _listen(process, answers)
+    assert [answers.get(), answers.get()] == [{"done": 3}, {"ended": True}] and answers.empty()
+
+
+@pytest.mark.own_process
+def test_a_job_whose_parent_was_killed_while_it_started_ends(views, tmp_path):
+    """Otherwise it would work on, and lock the next run's COLMAP out of the database."""
+    engine = Path(colmap.__file__).parent / "engine" / "__main__.py"
+    for view in views:
+        Image.fromarray(np.round(255 * view.read().image).astype(np.uint8)).save(tmp_path / view.name)
+    camera = views[0].camera
+    group = {
+        "names": [view.name for view in views],
+        "width": camera.W,
+        "height": camera.H,
+        "focal": camera.fx,
+    }
+    order = {"job": "features", "database": str(tmp_path / "db"), "photos": str(tmp_path), "masks": ""}
+    order |= {"groups": [group], "max_features": 500, "threads": 1, "seed": 0}
+    with subprocess.Popen(
+        [sys.executable, "-P", engine], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        said, _ = process.communicate(json.dumps(order).encode() + b"\n", timeout=PATIENCE)
+    assert process.returncode == 1 and b"result" not in said
 
 
 def test_photos_that_do_not_match_give_no_points(tmp_path):

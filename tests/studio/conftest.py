@@ -95,7 +95,6 @@ def library(tmp_path_factory):
 def visitor(browser, library):
     """Open the page in a tab without cookies or storage."""
     context = browser.new_context(accept_downloads=True, viewport={"width": 480, "height": 400})
-    context.set_default_timeout(60_000)
     made = []
 
     def visit(url=library[1]):

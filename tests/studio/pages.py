@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Error
 
+from browsers import PATIENCE
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.server import _config, _Server
 from gsplat_edu.studio.state import Studio
@@ -68,12 +69,12 @@ def served(folder, worker, limits=None):
         server = _Server(_config(app), ready.set, studio.stream.close)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]})
         thread.start()
-        assert ready.wait(10)
+        assert ready.wait(60)
         try:
             yield studio, f"http://127.0.0.1:{port}/?token={TOKEN}"
         finally:
             server.should_exit = True
-            thread.join(20)
+            thread.join(60)
             studio.close()
 
 
@@ -98,7 +99,7 @@ class Visitor:
         """The part of the address that names the screen."""
         return self.tab.evaluate("location.hash")
 
-    def reach(self, place, patience=60):
+    def reach(self, place, patience=PATIENCE / 1000):
         """Wait until the page shows a screen."""
         end = time.monotonic() + patience
         while self.place() != place:
@@ -114,7 +115,7 @@ class Visitor:
         return self.tab.get_by_role("article", name=job).get_by_role("textbox", name="command").inner_text()
 
 
-def until(tab, frame, condition, patience=60):
+def until(tab, frame, condition, patience=PATIENCE / 1000):
     """Wait until an expression is true in a frame. Playwright's function needs eval, which our policies forbid."""
     end = time.monotonic() + patience
     while not _holds(frame, condition):
@@ -146,12 +147,12 @@ def png(seed, size=(24, 18)):
 def train_and_download(person, name, iterations):
     """Click from a capture's screen to a downloaded .spz; return its bytes and the commands that were shown."""
     tab = person.tab
-    tab.locator("summary", has_text="Options").click()
+    tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill(str(iterations))
     tab.get_by_role("button", name="Start training").click()
     person.reach(f"#/runs/{name}")
     commands = [person.command(f"training of {name}")]
-    tab.get_by_role("link", name="Share it").click(timeout=120_000)
+    tab.get_by_role("link", name="Share it").click()
     person.reach(f"#/runs/{name}/share")
     tab.get_by_role("radio", name=re.compile("^SPZ")).check()
     tab.get_by_role("button", name="Export", exact=True).click()

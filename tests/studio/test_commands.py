@@ -56,7 +56,7 @@ def test_the_commands_and_their_defaults(library):
 
     assert words(command="sfm", subject="photos/a b") == ["sfm", "photos/a b", "captures/a b"]
     assert words(command="sfm", subject="photos/film", to="x") == ["sfm", "photos/film/x.mp4", "captures/x"]
-    assert words(command="train", subject="captures/a") == ["train", "captures/a", "--out", "runs/a-2"]
+    assert words(command="train", subject="captures/a") == ["train", "captures/a", "--out", "runs/a-run-2"]
     assert words(command="train", subject="captures/a", to="a", resume=True) == [
         *("train", "captures/a", "--out", "runs/a", "--resume")
     ]
@@ -71,9 +71,15 @@ def test_the_commands_and_their_defaults(library):
     assert words(command="convert", subject="scenes/a", format="html", to="My toy") == [
         *("convert", "scenes/a/toy.spz", "scenes/a/exports/My toy.html", "--verify")
     ]
+    assert words(command="convert", subject="runs/a", format="html", options={"verify": "photos"}) == [
+        *("convert", "runs/a", "runs/a/exports/a.html", "--verify", "photos")
+    ]
     (library.root / "runs" / "a" / "edits.json").touch()
     assert words(command="convert", subject="runs/a", format="spz", edits=True) == [
         *("convert", "runs/a", "runs/a/exports/a.spz", "--edits", "runs/a/edits.json", "--verify")
+    ]
+    assert words(command="clean", subject="runs/a", edits=True) == [
+        *("clean", "runs/a", "--out", "scenes/a-clean/a-clean.ply", "--edits", "runs/a/edits.json")
     ]
     assert words(command="mesh", subject="runs/a", format="mesh.glb", options={"texture": True}) == [
         *("mesh", "runs/a", "runs/a/exports/a.mesh.glb", "--texture")
@@ -90,8 +96,8 @@ REQUESTS = (
     ({"command": "sfm", "subject": "photos/a b"}, "poses of a b", "photos/a b"),
     (
         {"command": "train", "subject": "captures/a", "options": {"quality": "draft"}},
-        "training of a-2",
-        "runs/a-2",
+        "training of a-run-2",
+        "runs/a-run-2",
     ),
     ({"command": "clean", "subject": "runs/a"}, "cleaning of a", "runs/a"),
     ({"command": "convert", "subject": "scenes/a", "format": "spz"}, "export of a.spz", "scenes/a"),
@@ -150,7 +156,7 @@ def test_a_page_is_exported_with_meshes_of_its_entry(library):
 def test_a_training_resumes_once_its_run_has_begun(library):
     work = work_of(library, {"command": "train", "subject": "captures/a"})
     argv = command_line(library, work, Purpose.BEGIN).argv
-    out = library.root / "runs" / "a-2"
+    out = library.root / "runs" / "a-run-2"
     out.mkdir()
     assert command_line(library, work, Purpose.CONTINUE).argv == argv
     (out / "config.json").touch()
@@ -383,7 +389,7 @@ def test_a_training_and_jobs_that_read_its_run_wait_for_each_other(page, studio)
         return [[(other["job"], other["place"]) for other in job["waits_for"]] for job in found]
 
     expected = [[], [("000001", "runs/r")], [("000002", "runs/r")], [("000002", "runs/r")], []]
-    end = time.monotonic() + 20
+    end = time.monotonic() + 120
     while waits() != expected:
         assert time.monotonic() < end, waits()
         time.sleep(0.02)

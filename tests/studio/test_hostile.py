@@ -24,6 +24,9 @@ from studio.test_server import Server
 
 LONG = "x" * 5_000
 
+PATIENCE = 120.0
+"""Longest time that a test waits, seconds."""
+
 
 def work(command, inputs, outputs=(), **options):
     """Return the work of a job as a record has it."""
@@ -220,7 +223,7 @@ def test_a_strangers_library_runs_nothing_until_a_click_that_shows_what(tmp_path
             assert state == "S"  # the process was not stopped either
             # a click runs exactly the command that was shown
             assert server.client.post("/api/jobs/000031/resume").json()["state"] == "queued"
-            end = time.monotonic() + 20
+            end = time.monotonic() + PATIENCE
             # until it executes its program, a forked child has the server's command line
             while not (found := children(server.process.pid)) or " studio " in found[0]:
                 assert time.monotonic() < end
@@ -230,7 +233,7 @@ def test_a_strangers_library_runs_nothing_until_a_click_that_shows_what(tmp_path
             server.client.post("/api/jobs/000031/cancel")
         finally:
             server.process.send_signal(signal.SIGINT)
-            server.process.wait(30)
+            server.process.wait(PATIENCE)
             server.kill()
         assert snapshot(outside) == before and victim.poll() is None
 

@@ -1,5 +1,6 @@
 """Entries with all kinds of names are listed, adopted, renamed, removed and restored."""
 
+import json
 import re
 import shutil
 import threading
@@ -7,6 +8,10 @@ from importlib.resources import files
 
 import pytest
 
+from gsplat_edu.studio import library as library_module
+from gsplat_edu.studio.library import scene_file
+from gsplat_edu.studio.projects import newest_export
+from gsplat_edu.studio.refusal import RefusedError
 from photos import blank_png
 from studio.conftest import picture
 
@@ -226,3 +231,131 @@ def test_the_page_names_all_its_modules_at_once(page):
     assert asked == {
         path.name for path in (files("gsplat_edu.studio") / "web").iterdir() if path.suffix == ".js"
     }
+
+
+def promised(page, wish, kind="photos"):
+    answer = page.post("/api/names", json={"kind": kind, "wish": wish})
+    assert answer.status_code == 200, answer.text
+    return answer.json()["name"]
+
+
+def test_a_promised_name_is_given_once(page, studio, jpeg):
+    """Two tabs that wish for one name get two, before either has sent a file; a name that is given up is free again."""
+    assert [promised(page, "walk"), promised(page, "walk")] == ["walk", "walk-2"]
+    assert page.put("/api/photos/walk/files/a.jpg", content=jpeg).status_code == 201
+    page.delete("/api/names/photos/walk")
+    page.delete("/api/names/photos/walk-2")
+    assert promised(page, "walk") == "walk-2"
+    assert page.post("/api/names", json={"kind": "films", "wish": "a"}).status_code == 400
+
+
+@pytest.mark.parametrize("wish", [*NAMES, *REFUSED, "写" * 200, "e\u0301"], ids=ascii)
+def test_any_wish_becomes_a_name_that_is_allowed(page, studio, jpeg, wish):
+    name = promised(page, wish)
+    assert page.put(f"/api/photos/{quoted(name)}/files/a.jpg", content=jpeg).status_code == 201
+    assert listed(page, "photos") == [name] and (wish not in NAMES or name == wish)
+
+
+def test_an_adopted_folder_needs_no_name(page, studio, tmp_path, jpeg):
+    for place in ("a/trip: 1", "b/trip: 1"):
+        (tmp_path / place).mkdir(parents=True)
+    asked = [{"kind": "photos", "path": str(tmp_path / place / "trip: 1")} for place in "ab"]
+    found = [page.post("/api/adopt", json=one).json() for one in asked]
+    assert [one.get("name", one) for one in found] == ["trip_ 1", "trip_ 1-2"]
+
+
+def test_a_name_that_a_waiting_job_will_take_is_not_free(page, studio):
+    entry(studio, "captures", "box")
+    entry(studio, "captures", "other")
+    begun = page.post("/api/jobs", json={"command": "train", "subject": "captures/other", "to": "box"})
+    assert begun.status_code == 200
+    made = page.post("/api/jobs", json={"command": "train", "subject": "captures/box"}).json()
+    assert made["work"]["outputs"] == ["runs/box-run-2"]
+    assert page.post("/api/jobs", json={"command": "train", "subject": "captures/box"}).status_code == 409
+
+
+def test_a_capture_without_poses_of_a_search_is_not_trained(page, studio, jpeg):
+    folder = entry(studio, "captures", "bad", a__jpg=jpeg)
+    (folder / "sfm").mkdir()
+    assert page.get("/api/captures/bad").json()["unfinished"]
+    for command in ("train", "doctor"):
+        answer = page.post("/api/jobs", json={"command": command, "subject": "captures/bad"})
+        assert (answer.status_code, "has no poses yet" in answer.json()["error"]) == (409, True)
+    (folder / "cameras.txt").touch()
+    assert not page.get("/api/captures/bad").json()["unfinished"]
+    assert page.post("/api/jobs", json={"command": "train", "subject": "captures/bad"}).status_code == 200
+
+
+def test_entries_of_one_name_belong_together(page, studio, jpeg):
+    """A second run or search is not named like a second set of photos, and new photos are not named like a run."""
+    for kind, name in (("photos", "walk"), ("captures", "walk"), ("runs", "walk"), ("runs", "other")):
+        entry(studio, kind, name, a__jpg=jpeg)
+    run = page.post("/api/jobs", json={"command": "train", "subject": "captures/walk"}).json()
+    search = page.post("/api/jobs", json={"command": "sfm", "subject": "photos/walk"}).json()
+    assert run["work"]["outputs"] + search["work"]["outputs"] == ["runs/walk-run-2", "captures/walk-poses-2"]
+    assert [promised(page, wish) for wish in ("walk", "other")] == ["walk-2", "other-2"]
+
+
+def test_a_capture_says_what_the_search_for_its_poses_found(page, studio):
+    folder = entry(studio, "captures", "box", cameras__txt=b"")
+    assert page.get("/api/captures/box").json()["search"] is None
+    (folder / "sfm").mkdir()
+    found = {"photos": {"names": list("abc")}, "mapping": {"names": list("ab")}, "capture": {"error": 0.364}}
+    stages = {name: {"options": {}, "facts": facts} for name, facts in found.items()}
+    file = folder / "sfm" / "stages.json"
+    text = json.dumps({"stages": stages})
+    file.write_text(text)
+    assert page.get("/api/captures/box").json()["search"] == {"photos": 3, "posed": 2, "error": 0.364}
+    file.write_text(json.dumps({"stages": stages | {"faces": {"options": {}, "facts": {}}}}))
+    assert page.get("/api/captures/box").json()["search"] == {"photos": None, "posed": None, "error": 0.364}
+    unfinished = json.dumps({"stages": stages | {"capture": {"options": {}, "facts": None}}})
+    for damaged in ("[]", "{", unfinished, text.replace("0.364", "NaN")):
+        file.write_text(damaged)
+        assert page.get("/api/captures/box").json()["search"] is None
+
+
+def test_what_vanishes_while_it_is_listed_is_left_out(page, studio, jpeg, monkeypatch):
+    """Jobs replace and remove files, and other tabs rename entries, while a page reads the list."""
+    for name in ("a", "b"):
+        entry(studio, "photos", name, x__jpg=jpeg, y__jpg=jpeg)
+    within = library_module.files_within
+
+    def vanishing(folder):
+        for found in within(folder):
+            path = folder / found[0]
+            if path == studio.library.root / "photos" / "a" / "x.jpg":
+                path.unlink()
+            yield found
+
+    monkeypatch.setattr(library_module, "files_within", vanishing)
+    (first, _) = page.get("/api/library").json()["photos"]
+    assert (first["name"], first["files"], first["bytes"]) == ("a", 1, len(jpeg))
+
+    def renamed(folder):
+        if folder.name == "b":
+            folder.rename(folder.with_name("c"))
+        yield from within(folder)
+
+    monkeypatch.setattr(library_module, "files_within", renamed)
+    answer = page.get("/api/library")
+    assert answer.status_code == 200, answer.text
+    assert [found["name"] for found in answer.json()["photos"]] == ["a"]
+    assert scene_file(studio.library.root / "scenes" / "gone") is None
+    assert newest_export(studio.library.root / "runs" / "gone") is None
+
+
+def test_what_is_being_deleted_cannot_be_restored(studio, jpeg, monkeypatch):
+    entry(studio, "photos", "a", x__jpg=jpeg)
+    number = studio.library.remove("photos", "a")
+    delete, refused = library_module._delete, []
+
+    def slow(path):
+        with pytest.raises(RefusedError, match="trash/"):
+            studio.library.restore(number)
+        refused.append(number)
+        delete(path)
+
+    monkeypatch.setattr(library_module, "_delete", slow)
+    studio.library.empty_trash()
+    assert refused == [number] and studio.library.trash() == []
+    assert list(studio.library.hidden("uploads").iterdir()) == []

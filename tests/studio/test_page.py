@@ -10,7 +10,7 @@ from PIL import Image
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap
-from studio.pages import DROP, encoded, png, repeated, train_and_download, visitor_of
+from studio.pages import DROP, encoded, png, repeated, train_and_download, until, visitor_of
 
 HOSTILE = "<img src=x onerror=hacked=1>"
 
@@ -29,6 +29,15 @@ def check_that_screens_load_without_shifts(person, address):
     tab.set_viewport_size(before)
 
 
+def check_that_run_and_capture_lead_to_each_other(person):
+    person.tab.locator(".head").get_by_role("link", name="box", exact=True).click()
+    person.reach("#/captures/box")
+    runs = person.tab.get_by_role("region", name="runs")
+    runs.get_by_role("link", name="box", exact=True).click()
+    person.reach("#/runs/box")
+
+
+@pytest.mark.sliced(1, group="the studio in a browser")
 def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path):
     """A reload and a second tab show the same screen, and the printed commands give the same bytes."""
     write_colmap(tmp_path / "box", *procedural_capture(24, 14))
@@ -47,16 +56,16 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     tab.locator(".thumbs img").nth(13).wait_for()
     tab.locator(".forecast", has_text="of memory").nth(2).wait_for()
 
-    tab.locator("summary", has_text="Options").click()
+    tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill("60")
-    tab.get_by_label("What the scene is for").select_option("for a mesh: learn surfaces")
+    tab.get_by_label("Purpose").select_option("for a mesh: learn surfaces")
     tab.get_by_label("Depth to learn from").select_option("the points that photos share")
     tab.get_by_role("button", name="Start training").click()
     person.reach("#/runs/box")
     train = person.command("training of box")
     assert "--surface --depth points" in train
     tab.get_by_role("link", name="Share it").wait_for()
-    assert tab.locator(".figures-list").inner_text().split("\n")[1] == "60 of 60"
+    tab.locator(".figures-list dd", has_text="60 of 60").wait_for()
     tab.get_by_role("img", name=re.compile("^Loss: .*from")).wait_for()
 
     tab.keyboard.press("2")  # judge the result
@@ -68,6 +77,7 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     tab.keyboard.press("ArrowRight")
     assert slider.get_attribute("aria-valuetext") == "photo 51 %, render 49 %"
 
+    check_that_run_and_capture_lead_to_each_other(person)
     check_that_screens_load_without_shifts(person, address)
 
     tab.keyboard.press("4")  # share the scene
@@ -130,7 +140,7 @@ def test_hostile_names_are_text_and_refused_files_say_why(visitor):
     person.reach("#/photos/photos")
     tab.locator(".thumbs .name", has_text=HOSTILE).wait_for()
     tab.locator("summary", has_text="Rename or remove").click()
-    tab.get_by_label("Name").fill(HOSTILE)
+    tab.get_by_label("Name", exact=True).fill(HOSTILE)
     tab.get_by_role("button", name="Rename").click()
     tab.locator("h1", has_text=HOSTILE).wait_for()
     assert tab.title().startswith(HOSTILE)
@@ -157,13 +167,20 @@ def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
     tab = person.tab
     tab.evaluate(DROP, [files, ".drop"])
     tab.get_by_role("button", name="Find the poses").wait_for()
-    tab.locator("summary", has_text="Options").click()
+    tab.locator("summary", has_text="More").click()
     tab.get_by_label("the same poses to the bit every time").check()
     tab.get_by_role("button", name="Find the poses").click()
     place = person.place().removeprefix("#/photos/")
     sfm = person.command(f"poses of {place}")
-    tab.get_by_role("link", name=re.compile("^Continue with the capture")).click(timeout=240_000)
+    onward = tab.get_by_role("link", name=re.compile("^Continue with the capture"))
+    onward.wait_for(timeout=240_000)
+    found = re.compile(r"14 of 14 photos have a pose, mean error \d\.\d\d px")
+    tab.locator(".next", has_text=found).wait_for()
+    onward.click()
+    until(tab, tab, "location.hash.startsWith('#/captures/')")
     name = re.fullmatch("#/captures/(.+)", person.place())[1]
+    tab.locator("main h1", has_text=name).wait_for()
+    tab.locator(".head .facts", has_text=found).wait_for()
     data, commands = train_and_download(person, name, 200)
     root = library[0].library.root
     assert repeated([sfm, *commands], root, tmp_path / "again") == data

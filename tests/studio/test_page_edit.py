@@ -2,21 +2,43 @@
 
 import json
 import re
+import struct
 
 import pytest
 
+from accessibility import grave_faults_in_all_styles
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.formats import read_scene
-from studio.pages import until
+from studio.pages import until, visitor_of
 
 
 def opened(tab, address):
     """Go to the editor's screen and return the frame with the editor."""
     tab.goto(f"{address}#/scenes/wall/edit")
-    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
+    # by its title, because the screen before this one may have had a scene as well
+    frame = tab.wait_for_selector("iframe[title='editor of wall']:not([hidden])").content_frame()
     frame.wait_for_selector("#edit")
     until(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
     return frame
+
+
+HELD = """() => {
+  const ask = window.fetch.bind(window);
+  let open;
+  const released = new Promise((resolve) => (open = resolve));
+  window.release = open;
+  window.fetch = async (address, ...more) => {
+    if (String(address).startsWith("/api/library")) await released;
+    return ask(address, ...more);
+  };
+}"""
+"""Holds the page's questions about the library back until `release()`."""
+
+
+def shares(tab):
+    """Leave the editor for the screen that exports."""
+    tab.locator("nav.tabs").get_by_role("link", name="Share").click()
+    tab.get_by_role("button", name="Export", exact=True).wait_for()
 
 
 def select_and_delete(tab, frame, corners):
@@ -78,6 +100,62 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     assert f"{len(read_scene(out).gaussians)} of 176 left" in left
 
 
+@pytest.mark.sliced(1, group="the studio in a browser")
+def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
+    """Although the page has not yet heard from the library that there are any."""
+    person, stored = visitor(), wall_entry / "edits.json"
+    tab = person.tab
+    tab.set_viewport_size({"width": 1000, "height": 620})
+    address = tab.url.split("#")[0]
+    stored.unlink(missing_ok=True)
+    frame = opened(tab, address)
+    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    tab.evaluate(HELD)
+    frame.get_by_role("button", name="save", exact=True).click()
+    frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
+    shares(tab)
+    assert not tab.get_by_label("apply the edits").is_visible()
+    tab.get_by_role("radio", name=re.compile("^SPZ")).check()
+    tab.get_by_label("Title and name of the file").fill("at once")
+    tab.get_by_role("button", name="Export", exact=True).click()
+    tab.evaluate("release()")
+    tab.locator(".exports .name", has_text="at once.spz").wait_for()
+    assert "--edits" in person.command("export of at once.spz")
+    stored.unlink()
+
+
+@pytest.mark.sliced(1, group="the studio in a browser")
+def test_two_saves_at_once_are_no_conflict(visitor, wall_entry):
+    """Ctrl S twice, and an edit in between: the second one waits for the first one, and both are stored."""
+    person, stored = visitor(), wall_entry / "edits.json"
+    tab = person.tab
+    tab.set_viewport_size({"width": 1000, "height": 620})
+    stored.unlink(missing_ok=True)
+    frame = opened(tab, tab.url.split("#")[0])
+    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    held = []
+    tab.route(
+        "**/edits*", lambda route: held.append(route) if route.request.method == "PUT" else route.continue_()
+    )
+    save = frame.get_by_role("button", name="save", exact=True)
+    save.click()
+    frame.get_by_role("button", name="invert", exact=True).click()
+    save.click()
+    for count in (1, 2):
+        for _ in range(9000):
+            if len(held) >= count:
+                break
+            tab.wait_for_timeout(20)
+        assert len(held) == count
+        held[-1].continue_()
+    frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
+    assert frame.inner_text("#edit-message") == ""
+    done = [entry["op"] for entry in json.loads(stored.read_text())["operations"]]
+    assert done == ["select", "delete", "invert"]
+    tab.unroute("**/edits*")
+    stored.unlink()
+
+
 def focused(frame):
     return frame.evaluate("document.activeElement.textContent.trim() || document.activeElement.tagName")
 
@@ -123,3 +201,157 @@ def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
     tab.keyboard.press("Escape")
     # the element that had the focus before the list of keys
     until(tab, tab, "document.activeElement.textContent === 'Restore'")
+
+
+@pytest.mark.sliced(1, group="the studio in a browser")
+def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
+    """They come back unsaved; if others were saved meanwhile, the person chooses."""
+    person, stored = visitor(), wall_entry / "edits.json"
+    tab = person.tab
+    tab.set_viewport_size({"width": 1000, "height": 620})
+    address = tab.url.split("#")[0]
+    stored.unlink(missing_ok=True)
+    frame = opened(tab, address)
+    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    left = frame.inner_text("#edit-count")
+    tabs = tab.locator("nav.tabs")
+    tabs.get_by_role("link", name="Share").click()
+    tab.get_by_text("Edits that are not saved yet are not exported").wait_for()
+    tabs.get_by_role("link", name="Edit (unsaved)").wait_for()
+    tab.get_by_role("link", name="Library", exact=True).click()
+    person.reach("#/")
+    frame = opened(tab, address)
+    frame.locator("#edit-count", has_text=left).wait_for()
+    assert frame.inner_text("#edit-saved") == "not saved" and not stored.exists()
+
+    frame.get_by_role("button", name="save", exact=True).click()
+    frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
+    mine = json.loads(stored.read_text())
+    frame.get_by_role("button", name="undo", exact=True).click()
+    shares(tab)
+    stored.write_text(json.dumps(mine | {"operations": []}))  # as another tab does
+    frame = opened(tab, address)
+    tab.get_by_text("other edits were saved since").wait_for()
+    assert (
+        "176 of 176 left" in frame.inner_text("#edit-count")
+        and frame.inner_text("#edit-saved") != "not saved"
+    )
+    tab.get_by_role("button", name="Use mine").click()
+    assert frame.inner_text("#edit-list summary") == "operations (1)"
+    shares(tab)
+    stored.write_text(json.dumps(mine))
+    frame = opened(tab, address)
+    tab.get_by_role("button", name="Discard them").click()
+    assert frame.inner_text("#edit-list summary") == "operations (2)"
+    tabs.get_by_role("link", name="Edit", exact=True).wait_for()
+
+
+@pytest.mark.sliced(1, group="the studio in a browser")
+def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_entry):
+    """Like exports; a box switches to the scene as it was, and edits of another scene are named and left out."""
+    person, stored = visitor(), wall_entry / "edits.json"
+    tab = person.tab
+    tab.set_viewport_size({"width": 1000, "height": 620})
+    address = tab.url.split("#")[0]
+    stored.unlink(missing_ok=True)
+    tab.goto(f"{address}#/")
+    card = tab.locator("a.card", has_text="wall").locator("img")
+    tab.locator("a.card", has_text="wall").scroll_into_view_if_needed()
+    until(tab, tab, "document.querySelector('a.card[href*=wall] img').naturalWidth > 0")
+    before = card.get_attribute("src")
+    frame = opened(tab, address)
+    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    left = int(re.search(r"([\d,]+) of 176 left", frame.inner_text("#edit-count"))[1])
+    frame.get_by_role("button", name="save", exact=True).click()
+    frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
+
+    def shows(count):
+        until(
+            tab,
+            tab,
+            f"document.querySelector('.scene iframe')?.contentWindow?.viewer?.facts.count === {count}",
+        )
+
+    tab.locator("nav.tabs").get_by_role("link", name="View").click()
+    assert 0 < left < 176
+    shows(left)
+    tab.get_by_label("with the saved edits").uncheck()
+    shows(176)
+    tab.get_by_label("with the saved edits").check()
+    shows(left)
+    tab.get_by_role("link", name="Library", exact=True).click()
+    tab.locator("a.card", has_text="wall").scroll_into_view_if_needed()
+    until(
+        tab,
+        tab,
+        f"document.querySelector('a.card[href*=wall] img').naturalWidth > 0 && {before!r} !== "
+        "document.querySelector('a.card[href*=wall] img').getAttribute('src')",
+    )
+    document = json.loads(stored.read_text())
+    document["scene"]["sha256"] = "0" * 64
+    stored.write_text(json.dumps(document))
+    tab.goto(f"{address}#/scenes/wall")
+    tab.reload()
+    tab.get_by_text("The saved edits are not shown.").wait_for()
+    shows(176)
+    stored.unlink()
+
+
+@pytest.mark.sliced(1, group="the studio in a browser")
+def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wall_entry):
+    """The browser's storage has them; the editor of this scene offers them, that of another does not."""
+    person, stored = visitor(), wall_entry / "edits.json"
+    address = person.tab.url.split("#")[0]
+    stored.unlink(missing_ok=True)
+    person.tab.set_viewport_size({"width": 1000, "height": 620})
+
+    def closed_with_edits():
+        tab = visitor_of(person, address)
+        tab.set_viewport_size({"width": 1000, "height": 620})
+        frame = opened(tab, address)
+        select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+        until(tab, tab, "localStorage.length === 1")
+        tab.evaluate("for (let i = 0; i < 10000; ++i) clearInterval(i)")
+        frame.get_by_role("button", name="invert", exact=True).click()
+        left = frame.inner_text("#edit-count")
+        tab.goto("about:blank")  # a page that goes writes down what has changed since the last look
+        until(person.tab, person.tab, "Object.values(localStorage).some((text) => text.includes('invert'))")
+        tab.close()
+        return left
+
+    left = closed_with_edits()
+    tab = person.tab
+    frame = opened(tab, address)
+    notice = tab.get_by_text(re.compile(r"There are unsaved changes from .*\d:\d\d"))
+    notice.wait_for()
+    assert "176 of 176 left" in frame.inner_text("#edit-count")
+    assert grave_faults_in_all_styles(tab) == []
+    tab.wait_for_timeout(1500)  # the offer outlasts the looks at what is not saved
+    tab.get_by_role("button", name="Restore").click()
+    assert frame.inner_text("#edit-count") == left and frame.inner_text("#edit-saved") == "not saved"
+    until(tab, tab, "localStorage.length === 1")
+    frame.get_by_role("button", name="save", exact=True).click()
+    frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
+    until(tab, tab, "localStorage.length === 0")
+
+    stored.unlink()
+    tab.goto(f"{address}#/")
+    closed_with_edits()
+    other = wall_entry.parent / "other"
+    other.mkdir()
+    scene = (wall_entry / "wall.ply").read_bytes()
+    opacity = struct.pack("<f", 3.0)  # of the last splat, before three scales and a quaternion
+    assert scene[-32:-28] == struct.pack("<f", 4.0)
+    (other / "other.ply").write_bytes(scene[:-32] + opacity + scene[-28:])
+    tab.goto(f"{address}#/scenes/other/edit")
+    frame = tab.wait_for_selector("iframe[title='editor of other']:not([hidden])").content_frame()
+    until(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
+    tab.wait_for_timeout(1500)
+    assert not notice.is_visible()
+    opened(tab, address)
+    tab.get_by_role("button", name="Forget").click()
+    until(tab, tab, "localStorage.length === 0")
+    tab.reload()
+    opened(tab, address)
+    tab.wait_for_timeout(1000)
+    assert not notice.is_visible()

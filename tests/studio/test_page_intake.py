@@ -1,5 +1,6 @@
 """In Chromium, a person drops and chooses videos and folders."""
 
+import json
 import re
 
 import cv2
@@ -68,8 +69,18 @@ def test_a_dropped_video_becomes_an_entry_of_its_name(visitor, library, tmp_path
     person.reach("#/photos/a%20walk")
     person.tab.locator(".facts", has_text="1 video").wait_for()
     assert (library[0].library.root / "photos" / "a walk" / "a walk.mp4").read_bytes() == path.read_bytes()
-    person.tab.locator("summary", has_text="Options").click()
+    person.tab.locator("summary", has_text="More").click()
     assert person.tab.get_by_label("Frames of the video").is_visible()
+
+
+def without_search(route):
+    """Answer as if no search for poses had been read yet."""
+    answer = route.fetch()
+    words = answer.text()
+    known = json.loads(
+        words, object_hook=lambda entry: entry | {"search": None} if "search" in entry else entry
+    )
+    route.fulfill(response=answer, json=known)
 
 
 @pytest.mark.sliced(0)
@@ -81,10 +92,18 @@ def test_a_dropped_video_becomes_a_capture(visitor, library, tmp_path):
     tab = person.tab
     tab.evaluate(DROP, [[["orbit.mp4", encoded(path.read_bytes())]], ".drop"])
     person.reach("#/photos/orbit")
-    tab.locator("summary", has_text="Options").click()
+    tab.locator("summary", has_text="More").click()
     tab.get_by_label("Frames of the video").fill("30")
+    tab.route("**/api/library", without_search)
     tab.get_by_role("button", name="Find the poses").click()
-    tab.get_by_role("link", name=re.compile("^Continue with the capture")).click(timeout=240_000)
+    onward = tab.get_by_role("link", name=re.compile("^Continue with the capture"))
+    onward.wait_for(timeout=240_000)
+    first = onward.element_handle()
+    tab.unroute("**/api/library")
+    library[0].stream.library_changed()
+    tab.get_by_text("30 of 30 photos have a pose").first.wait_for()
+    assert first.evaluate("link => link.isConnected"), "a press while the words come would be lost"
+    onward.click()
     person.reach("#/captures/orbit")
     tab.locator(".facts", has_text="COLMAP").wait_for()
     tab.locator(".thumbs img").nth(20).wait_for()  # most of the 30 frames get a pose

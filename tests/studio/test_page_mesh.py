@@ -10,11 +10,14 @@ from gsplat_edu.io.mesh_files import read_mesh, write_mesh
 from gsplat_edu.scene.mesh import Mesh
 from studio.pages import until
 
+pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
+
 
 def viewer_frame(tab):
-    """Return the frame with the page that shows the mesh, once it is there."""
-    tab.locator("section[aria-label=mesh] iframe").wait_for()
-    return next(frame for frame in tab.frames if "surface=" in frame.url)
+    """Return the frame with the page that shows the mesh, once its address has arrived."""
+    frame = tab.locator("section[aria-label=mesh] iframe").element_handle().content_frame()
+    frame.wait_for_url(re.compile("surface="), wait_until="commit")
+    return frame
 
 
 def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library, wall_entry):
@@ -28,7 +31,7 @@ def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library,
     tab.get_by_label("Edge of a voxel").fill("0.1")
     tab.get_by_role("button", name="Make a mesh").click()
     show = section.get_by_role("button", name="Show beside the splats")
-    show.wait_for(timeout=180_000)
+    show.wait_for()
     command = person.command("mesh of wall")
     assert re.search(
         r"^gsplat-edu mesh \S*/wall\.ply \S*/scenes/wall/exports/wall\.mesh\.glb --voxel 0\.1$", command
@@ -47,7 +50,7 @@ def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library,
     assert 50 < len(mesh.faces) < 50_000
     assert frame.evaluate("viewer.meshes.surface.faces.length") == mesh.faces.size
     assert frame.evaluate("viewer.meshes.collider.faces.length") == 3
-    assert frame.evaluate("document.getElementById('mesh-line').checkVisibility()")
+    until(tab, frame, "document.getElementById('mesh-line').checkVisibility()")
 
     item = tab.locator(".exports li", has_text="wall.mesh.glb")
     with tab.expect_download() as download:
@@ -68,7 +71,7 @@ def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_ent
     box = tab.get_by_label("show the mesh")
     tab.get_by_role("button", name="Export").click()
     listed = tab.locator(".exports li")
-    listed.filter(has_text="plain.html").wait_for(timeout=180_000)
+    listed.filter(has_text="plain.html").wait_for()
     assert not box.is_visible()  # there is no mesh
     assert not page_has(tab, exports / "plain.html", "viewer.meshes")
 
@@ -90,7 +93,7 @@ def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_ent
     box.check()
     tab.get_by_label("Title and name of the file").fill("both")
     tab.get_by_role("button", name="Export").click()
-    listed.filter(has_text="both.html").wait_for(timeout=180_000)
+    listed.filter(has_text="both.html").wait_for()
     command = person.command("export of both.html")
     assert "--surface" in command and command.split()[-1] == "--verify"
     assert page_has(tab, exports / "both.html", "viewer.meshes.surface.faces.length === 6")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from browsers import chromium
+from browsers import PATIENCE, chromium
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
@@ -48,7 +48,7 @@ def shown(frame):
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), dtype=float)
 
 
-def drawn(tab, frame, as_wanted, patience=60):
+def drawn(tab, frame, as_wanted, patience=PATIENCE / 1000):
     """Wait for a picture and return it."""
     end = time.monotonic() + patience
     while not as_wanted(pixels := shown(frame)):
@@ -65,7 +65,8 @@ def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall")
     frame = framed_viewer(tab)
     frame.locator("#count", has_text="176 splats, drawn by the program that serves this page").wait_for()
-    assert "no WebGL2" in frame.inner_text("#count") and frame.locator("#message").is_hidden()
+    assert "no WebGL2" in frame.inner_text("#count")
+    frame.locator("#message").wait_for(state="hidden")
     before = drawn(tab, frame, lambda pixels: pixels.std() > 5)
 
     camera = frame.evaluate(CAMERA)
@@ -101,7 +102,7 @@ def test_a_training_is_drawn_while_it_runs(visitor, library, tmp_path):
     person = visitor()
     tab = person.tab
     tab.goto(f"{tab.url.split('#')[0]}#/captures/egg")
-    tab.locator("summary", has_text="Options").click()
+    tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill("100000")
     tab.get_by_role("button", name="Start training").click()
     person.reach("#/runs/egg")

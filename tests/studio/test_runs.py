@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsplat_edu.base.files import written_aside
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.edits.identity import identity_of
@@ -15,6 +16,7 @@ from gsplat_edu.jobs import events
 from gsplat_edu.jobs.record import Work
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.studio import runs as runs_module
 from gsplat_edu.studio.runs import GAIN
 from processes import Program
 
@@ -58,6 +60,23 @@ def test_a_run_is_listed_with_its_scores(page, run):
     assert (found["iterations"], found["finished"], found["psnr"]) == (40, False, None)
     run.config.write_text("{")
     assert page.get("/api/runs/r").json()["problem"].startswith(f"{run.config}: is not JSON")
+
+
+def test_curves_of_a_log_that_is_replaced_meanwhile_begin_anew(page, run, monkeypatch):
+    """A resumed training puts a shortened log in place of the old one, here while the old one is being read."""
+    log = run.log_file.read_text()
+    begin = runs_module.open_file
+
+    def opened(path):
+        found = begin(path)
+        with written_aside(path) as aside:
+            aside.write_text(log)
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runs_module, "open_file", opened)
+        token = page.get("/api/runs/r/curves").json()["next"]
+    assert page.get("/api/runs/r/curves", params={"after": token}).json()["reset"]
 
 
 def test_curves_are_read_as_they_grow(page, run):

@@ -2,9 +2,10 @@
 
 import asyncio
 import json
+from dataclasses import replace
 
-from gsplat_edu.jobs import events
-from gsplat_edu.jobs.record import Work
+from gsplat_edu.jobs import events, following
+from gsplat_edu.jobs.record import State, Work
 from gsplat_edu.studio import stream as stream_module
 from gsplat_edu.studio.stream import Stream
 
@@ -81,3 +82,50 @@ def test_the_events_of_jobs_are_published_once_and_in_order(studio):
         (running.id, 2, "progress"),
         (running.id, 3, "finished"),
     ]
+
+
+def test_many_changes_of_the_library_are_told_once_a_second(studio, monkeypatch):
+    """Uploads change the library with every file, and each event makes every tab read the whole list."""
+    clock = [100.0]
+    monkeypatch.setattr(stream_module, "monotonic", lambda: clock[0])
+    stream, queue = Stream(), studio.queue
+    counts = []
+    for _ in range(25):
+        stream.library_changed()
+        stream.look(queue)
+        counts.append(stream._number)
+        clock[0] += 0.1
+    assert (counts[0], counts[-1]) == (1, 3)
+    clock[0] += 10
+    stream.look(queue)
+    stream.look(queue)
+    assert stream._number == 4, "the last change is told, and only once"
+
+
+def test_a_job_that_starts_and_ends_between_two_looks_is_told_whole(studio, monkeypatch):
+    """A loaded machine looks seldom. What a short job printed would be missing on the page until it is loaded again."""
+    monkeypatch.setattr(following, "PIECE", 200)
+    studio.queue.at_once = 0
+    (studio.library.root / "captures" / "x").mkdir()
+    job = studio.queue.submit(Work("train", ("captures/x",), ("runs/x",)))
+    lines = [events.line_of(events.Message(f"line {number}"), 1.0) for number in range(20)]
+    studio.queue.files(job.id).events.write_text("".join(lines))
+    for state in (State.RUNNING, State.DONE):
+        studio.queue._note(replace(job, state=state))
+    for _ in range(2):
+        studio.stream.look(studio.queue)
+    kept = [text for _, text in studio.stream._kept if "event: event" in text]
+    told = [json.loads(text.partition("data: ")[2]) for text in kept]
+    assert [event["text"] for event in told] == [f"line {number}" for number in range(20)]
+
+
+def test_news_after_the_end_of_the_server_does_no_harm(monkeypatch):
+    """The loop ends first, and the queue's thread must go on to note how its jobs end."""
+    stream, loop = Stream(), asyncio.new_event_loop()
+    loop.close()
+    stream._loop = loop
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "is_closed", lambda: False)  # it ends right after it was asked
+        stream.publish("job", {"number": 1})
+    stream.publish("job", {"number": 2})
+    assert stream._number == 2

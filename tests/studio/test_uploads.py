@@ -9,7 +9,7 @@ import zipfile
 
 import pytest
 
-from gsplat_edu.studio import unpack as unpacking
+from gsplat_edu.studio import unpack as unpacking, uploads
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.unpack import ZipLimits, _check_directory, unpack
 from gsplat_edu.studio.uploads import Limits
@@ -52,7 +52,61 @@ def test_the_library_has_a_limit(page, studio):
     statuses = [page.put(f"/api/photos/a{i}/files/a.png", content=noise).status_code for i in range(4)]
     assert 3_000 < len(noise) < 4_000 and statuses == [201, 201, 201, 507]
     page.delete("/api/photos/a0")
+    assert page.put("/api/photos/b/files/a.png", content=noise).status_code == 507, (
+        "the trash fills the disk too"
+    )
+    page.delete("/api/trash")
     assert page.put("/api/photos/b/files/a.png", content=noise).status_code == 201
+
+
+@pytest.mark.parametrize("studio", [SMALL], indirect=True)
+def test_files_that_are_sent_and_deleted_in_turn_end_at_the_limit(page, studio):
+    noise = picture("PNG", (36, 36))
+    statuses = []
+    for index in range(6):
+        statuses.append(page.put(f"/api/photos/a{index}/files/a.png", content=noise).status_code)
+        page.delete(f"/api/photos/a{index}")
+    assert statuses == [201, 201, 201, 507, 507, 507]
+    assert "empty the trash" in page.put("/api/photos/b/files/a.png", content=noise).json()["error"]
+
+
+def weight(folder):
+    """Return the bytes of all files in a folder, hidden ones too."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+
+
+def test_the_used_space_is_that_of_the_whole_library(page, studio, tmp_path, jpeg):
+    """What jobs write counts without an upload, and so do the trash, records and thumbnails; adopted places do not."""
+    root = studio.library.root
+
+    def used():
+        return page.get("/api/library").json()["used_bytes"]
+
+    page.put("/api/photos/a/files/a.jpg", content=jpeg)
+    assert used() == weight(root)
+    (root / "runs" / "box").mkdir()
+    (root / "runs" / "box" / "scene.ply").write_bytes(bytes(50_000))  # as a training does
+    page.get("/api/photos/a/thumbs/a.jpg")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "b.jpg").write_bytes(bytes(70_000))
+    page.post("/api/adopt", json={"kind": "photos", "path": str(tmp_path / "elsewhere"), "name": "b"})
+    assert used() == weight(root) > 50_000
+    page.delete("/api/runs/box")
+    found = page.get("/api/library").json()
+    assert found["used_bytes"] == weight(root) > 50_000 <= found["trash_bytes"] < 51_000
+    page.delete("/api/trash")
+    assert used() == weight(root) < 50_000 and page.get("/api/library").json()["trash_bytes"] == 0
+
+
+@pytest.mark.parametrize("studio", [Limits(library=100_000, spare=0)], indirect=True)
+def test_what_a_job_has_written_counts_for_uploads(page, studio, jpeg, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(uploads, "monotonic", lambda: clock[0])
+    page.put("/api/photos/a/files/a.jpg", content=jpeg)
+    (studio.library.root / "runs" / "box").mkdir()
+    (studio.library.root / "runs" / "box" / "scene.ply").write_bytes(bytes(100_000))
+    clock[0] += uploads.COUNTED_FOR
+    assert page.put("/api/photos/a/files/b.jpg", content=jpeg).status_code == 507
 
 
 @pytest.mark.parametrize("studio", [SMALL], indirect=True)
@@ -63,6 +117,7 @@ def test_uploads_without_a_length_count_as_they_arrive(page, studio):
     assert page.put("/api/photos/d/files/a.png", content=in_pieces(noise)).status_code == 507
     assert nothing_left(studio)
     page.delete("/api/photos/a")
+    page.delete("/api/trash")
     again = page.put("/api/photos/d/files/a.png", content=in_pieces(noise))
     assert again.status_code == 201, "a refused upload reserves no space"
 
@@ -328,3 +383,15 @@ def test_damaged_zip_files_end_in_one_line(tmp_path, seed):
     else:
         assert count <= 2
     assert unpacking.TAIL == 65_557
+
+
+def test_a_count_that_is_forgotten_meanwhile_is_still_a_number(studio, monkeypatch):
+    """An upload counts the library while another request empties the trash, after which the count is forgotten."""
+    studio.uploads.used()
+
+    def now():
+        studio.uploads.recount()
+        return 0.0
+
+    monkeypatch.setattr(uploads, "monotonic", now)
+    assert studio.uploads.used(fresh=False) >= 0

@@ -1,5 +1,6 @@
 """The worker process answers a line by a line, and is replaced if it ends."""
 
+import subprocess
 import threading
 import time
 
@@ -9,6 +10,9 @@ from gsplat_edu.studio import workers
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.worker import answer
 from gsplat_edu.studio.workers import Worker
+
+PATIENCE = 60.0
+"""Longest time that a test waits, seconds."""
 
 
 @pytest.mark.own_process
@@ -35,9 +39,44 @@ def test_a_worker_that_hangs_is_killed(monkeypatch):
 @pytest.mark.own_process
 def test_the_number_of_waiting_requests_is_limited(monkeypatch):
     monkeypatch.setattr(workers, "COMMAND", ("sleep", "100"))
-    monkeypatch.setattr(workers, "PATIENCE", 0.5)
     monkeypatch.setattr(workers, "MOST_WAITING", 1)
     worker = Worker()
+    thread, said = asking(worker)
+    until(lambda: worker._process is not None)
+    with pytest.raises(RefusedError, match="too many requests"):
+        worker.ask("page")
+    worker.close()
+    thread.join()
+    assert "took too long" in said[0]
+
+
+@pytest.mark.own_process
+def test_closing_ends_a_process_that_a_request_is_just_starting(monkeypatch):
+    monkeypatch.setattr(workers, "COMMAND", ("sleep", "100"))
+    begins, goes_on = threading.Event(), threading.Event()
+    start = subprocess.Popen
+
+    def slow(*words, **options):
+        begins.set()
+        assert goes_on.wait(PATIENCE)
+        return start(*words, **options)
+
+    monkeypatch.setattr(workers.subprocess, "Popen", slow)
+    worker = Worker()
+    thread, said = asking(worker)
+    assert begins.wait(PATIENCE)
+    closing = threading.Thread(target=worker.close)
+    closing.start()
+    until(lambda: worker._closed)
+    goes_on.set()
+    for one in (closing, thread):
+        one.join(PATIENCE)
+        assert not one.is_alive()
+    assert "took too long" in said[0] and worker._process is None
+
+
+def asking(worker):
+    """Start a request in a thread; return the thread and the list that gets the refusal."""
     said = []
 
     def ask():
@@ -47,10 +86,14 @@ def test_the_number_of_waiting_requests_is_limited(monkeypatch):
 
     thread = threading.Thread(target=ask)
     thread.start()
-    time.sleep(0.1)
-    ask()
-    thread.join()
-    assert "too many requests" in said[0] and "took too long" in said[1]
+    return thread, said
+
+
+def until(condition):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "the awaited state did not occur"
+        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(

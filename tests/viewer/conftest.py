@@ -9,9 +9,12 @@ import torch
 
 from browsers import chromium
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.source import Source
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
+from gsplat_edu.viewer.edit_page import editing_of
 
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
@@ -77,7 +80,7 @@ class Visit:
     def camera(self):
         """Return the camera of the current view."""
         found = self.tab.evaluate("viewer.camera()")
-        for other in ("name", "held_out"):
+        for other in ("name", "held_out", "saved", "text"):
             found.pop(other, None)
         return Camera(**found)
 
@@ -185,3 +188,21 @@ def three_views(camera):
             (name, Camera(look_at(eye, (0.0, 0.0, 0.0)), eye, 180.0, 180.0, width / 2, 80.0, 160, width))
         )
     return named
+
+
+@pytest.fixture
+def edit_page(visit, tmp_path):
+    """Return a function that opens a scene's page with the editor."""
+
+    def make(gaussians, cameras=(), width=900, height=700, **options):
+        source = Source(
+            tmp_path / "s.ply", Scene(gaussians), cameras, RenderSettings(jacobian_limit=1.3), (0.0,) * 3
+        )
+        editing = editing_of(source, tmp_path / "s.ply", tmp_path / "edits.json")
+        html = page.html(source.scene, cameras, source.settings, "scene", (), editing=editing)
+        (tmp_path / "edit.html").write_bytes(html)
+        shown = visit(width=width, height=height, fresh=True, **options).open(tmp_path / "edit.html").ready()
+        shown.tab.wait_for_selector("#edit")
+        return shown
+
+    return make

@@ -18,6 +18,9 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
+from viewer.handles import touch, until
+
+pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
 
 
 def wall():
@@ -45,7 +48,7 @@ def served(tmp_path):
     write_scene(scene, Scene(wall()))
     source = open_source(scene)
     with EditServer("127.0.0.1", 0, page_parts.policy(page_parts.EDITOR), file) as server:
-        server.prepare(identity_of(source.scene.gaussians))
+        server.prepare(identity_of(source.scene.gaussians), scene)
         editing = editing_of(source, scene, file, ADDRESS)
         server.page = page.html(source.scene, (), source.settings, "wall", editing=editing)
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
@@ -169,11 +172,8 @@ def mark_points(tab):
     tab.keyboard.press("Escape")
 
 
-def test_everything_by_mouse_and_keyboard_then_saved_reopened_and_converted(opened, served, tmp_path):
-    tab = opened()
-    empty = tab.evaluate("editor.text()")
-    use_every_tool(tab)
-    mark_points(tab)
+def keep_views_and_move(tab):
+    """Keep a path, a named view and a start view; then move all splats by keys."""
     tab.keyboard.press("v")
     tab.keyboard.press("k")
     drag(tab, (300, 200), (340, 210))
@@ -181,8 +181,21 @@ def test_everything_by_mouse_and_keyboard_then_saved_reopened_and_converted(open
     assert last(tab)["op"] == "path"
     tab.click("#edit-views summary")
     tab.fill("#edit-name", "from the side")
+    tab.type("#edit-text", "A <b>step</b>.\nT, C and V are letters here.")
     tab.click("[data-do=view]")
     tab.click("[data-do=start]")
+    tab.focus("#canvas")
+    for key in ("0", "Shift+V", "Shift+X", "ArrowRight", "ArrowRight", "Enter"):
+        tab.keyboard.press(key)
+    assert last(tab)["op"] == "move" and tab.evaluate("viewer.keyframes.path.keyframes.length") == 2
+
+
+def test_everything_by_mouse_and_keyboard_then_saved_reopened_and_converted(opened, served, tmp_path):
+    tab = opened()
+    empty = tab.evaluate("editor.text()")
+    use_every_tool(tab)
+    mark_points(tab)
+    keep_views_and_move(tab)
     assert tab.inner_text("#edit-saved") == "not saved"
     tab.keyboard.press("Control+s")
     tab.wait_for_selector('#edit-saved:text-is("saved")')
@@ -198,6 +211,7 @@ def test_everything_by_mouse_and_keyboard_then_saved_reopened_and_converted(open
     np.testing.assert_array_equal(flags_after(edits.operations, wall()), flags)
     views = views_after(edits.operations)
     assert views.start is not None and views.path is not None and views.named[0].name == "from the side"
+    assert views.named[0].text == "A <b>step</b>.\nT, C and V are letters here."
     for name in ("edits.json", "downloaded.json"):
         assert (
             main(
@@ -216,6 +230,9 @@ def test_everything_by_mouse_and_keyboard_then_saved_reopened_and_converted(open
     second = opened()
     assert second.evaluate("editor.text()") == text
     assert second.evaluate("[...editor.history.flags]") == flags.tolist()
+    means = tab.evaluate("[...editor.values.means]")
+    assert second.evaluate("[...editor.values.means]") == means != wall().means.ravel().tolist()
+    until(second, "editor.values.motion.stale === null && viewer.renderer.motion.any")  # it is drawn there
     assert second.evaluate("viewer.keyframes.path.keyframes.length") == 2
     for _ in edits.operations:
         second.keyboard.press("u")
@@ -231,11 +248,15 @@ def test_everything_by_mouse_and_keyboard_then_saved_reopened_and_converted(open
 def test_the_view_moves_while_a_tool_is_chosen_and_keys_draw(opened):
     tab = opened()
     tab.keyboard.press("t")
+    moved = "viewer.view.camera.eye.some((x, i) => x !== {}[i])"
     eye = tab.evaluate("viewer.view.camera.eye")
     drag(tab, (300, 200), (330, 220), button="right")
-    tab.mouse.wheel(0, -100)
     panned = tab.evaluate("viewer.view.camera.eye")
     assert panned != eye and operations(tab) == []
+    tab.mouse.wheel(0, -100)
+    until(tab, moved.format(panned))
+    panned = tab.evaluate("viewer.view.camera.eye")
+    assert operations(tab) == []
     tab.keyboard.down("Space")
     drag(tab, (300, 200), (330, 220))
     tab.keyboard.up("Space")
@@ -262,17 +283,11 @@ def test_the_view_moves_while_a_tool_is_chosen_and_keys_draw(opened):
     assert selected(tab) == 0 and tab.evaluate("editor.history.undone.length") == 1
 
 
-def touch(session, kind, *points):
-    session.send(
-        "Input.dispatchTouchEvent",
-        {"type": kind, "touchPoints": [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]},
-    )
-
-
 def test_one_finger_draws_and_two_move_the_view_on_a_phone(opened):
     tab = opened(390, 844, has_touch=True)
     session = tab.context.new_cdp_session(tab)
     tab.tap("[data-tool=brush]")
+    tab.wait_for_selector("[data-tool=brush][aria-pressed=true]")
     eye = tab.evaluate("viewer.view.camera.eye")
     touch(session, "touchStart", (150, 250))
     touch(session, "touchMove", (240, 250))

@@ -1,6 +1,7 @@
 """The editor in a browser selects, deletes and stores exactly the splats that Python does."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,11 +9,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.edits.apply import SELECTED, flags_after, placed, views_after
-from gsplat_edu.edits.cells import MOST_TESTS, Work
+from gsplat_edu.edits.apply import SELECTED, apply_operation, edited, flags_after, placed, views_after
+from gsplat_edu.edits.cells import MOST_TESTS, EditWork
 from gsplat_edu.edits.document import parse_edits, read_edits
-from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.membership import Values, members
+from gsplat_edu.edits.runs import runs_of
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
@@ -20,18 +22,20 @@ from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.edit_page import editing_of
 
-SEEDS = 20
-GESTURES = 25
-SIZE = (360, 240)
-"""Small, so that a picture takes little time; the panel covers the lower part."""
+pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
+
+SEEDS, SIZE = 20, (360, 240)
+"""Number of sequences. Size of the picture, px: small, to take little time; the panel covers the lower part."""
 
 # Plays gestures by the events of a browser: clicks on buttons, input into fields, pointers on the canvas.
 PLAY = """async (gestures) => {
   const canvas = document.getElementById("canvas");
   const fire = (target, kind, [x, y], keys = {}) => target.dispatchEvent(new PointerEvent(kind, {
     bubbles: true, cancelable: true, pointerId: 7, button: 0, clientX: x, clientY: y, ...keys }));
-  for (const { click, fill, drag, keys, key, turn } of gestures) {
+  for (const { click, fill, drag, keys, key, turn, open, perform } of gestures) {
     if (click) document.querySelector(click).click();
+    if (open) document.querySelector(open).open = true;
+    if (perform) editor.perform(perform);
     if (fill) {
       const field = document.querySelector(fill[0]);
       field.value = fill[1];
@@ -51,7 +55,8 @@ PLAY = """async (gestures) => {
   }
 }"""
 
-STATE = """() => ({ text: editor.text(), flags: [...editor.history.flags] })"""
+STATE = """() => ({
+  text: editor.text(), flags: [...editor.history.flags], means: [...editor.values.means].map(String) })"""
 
 
 def source_of(gaussians, path="scene.ply", origin=(0.0, 0.0, 0.0)):
@@ -78,6 +83,11 @@ def edit(visit, tmp_path):
 def state(shown):
     found = shown.tab.evaluate(STATE)
     return found["text"], np.array(found["flags"], dtype=np.uint8)
+
+
+def means_of(shown):
+    """Return the centres of all splats in the page."""
+    return np.array(shown.tab.evaluate(STATE)["means"], dtype=np.float64).reshape(-1, 3)
 
 
 def tool(name):
@@ -123,12 +133,14 @@ class Hand:
         return {
             "rectangle": [tool("rectangle"), self.stroke(4)],
             "lasso": [tool("lasso"), self.stroke(30)],
+            "polygon": [tool("polygon"), *self.clicks(5), does("close-polygon")],
             "brush": [tool("brush"), fill("edit-radius", self.rng.integers(5, 30)), self.stroke(12)],
             "sphere": [tool("sphere"), {"drag": [self.point(), self.point()]}, does("select-shape")],
             "box": [
                 tool("box"),
                 {"fill": [half, str(self.number(0.1, 1))]},
                 {"fill": [center, str(self.number(-0.5, 0.5))]},
+                *self.angles(),
                 does("select-shape"),
             ],
             "color": [tool("color"), *self.clicks(1), fill("edit-tolerance", 70), does("select-color")],
@@ -138,7 +150,45 @@ class Hand:
                 does("select-opacity"),
             ],
             "size": [fill("edit-size-low", self.number(0, 0.1)), does("select-size")],
+            "distance": self.histogram("distance"),
+            "list": [{"perform": self.listed()}],
+            "shares": self.histogram(self.rng.choice(["opacity", "size"])),
         }
+
+    def listed(self):
+        """Return a selection of some of the splats by their indices."""
+        runs = runs_of(self.rng.random(300) < 0.5)
+        return {"op": "select", "how": "add", "by": "list", "reason": "by chance", "runs": runs}
+
+    def at(self, count, **operation):
+        """Return a gesture whose points need no surface below clicks."""
+        return {"perform": {**operation, "points": self.rng.normal(size=(count, 3)).tolist()}}
+
+    def histogram(self, quantity):
+        """Return gestures that select a range of the bar chart."""
+        low, high = sorted(self.rng.integers(0, 200, 2))
+        return [
+            {"open": "#edit-histogram"},
+            fill("edit-quantity", quantity),
+            fill("edit-low", low),
+            fill("edit-high", high),
+            does("select-range"),
+        ]
+
+    def near(self, name):
+        """Return gestures that grow or shrink the selection."""
+        return [fill("edit-near", self.number(0.05, 0.4)), does(name)]
+
+    def by(self):
+        places = ("first-of-type", "last-child")
+        return [{"fill": [f"#edit-by label:{place} input", self.text(-0.4, 0.4)]} for place in places]
+
+    def angles(self):
+        places = ("first-of-type", "last-child")
+        return [{"fill": [f"#edit-angles label:{place} input", self.text(-80, 80)]} for place in places]
+
+    def text(self, low, high):
+        return str(self.number(low, high))
 
     def others(self):
         """Return all other gestures."""
@@ -148,25 +198,32 @@ class Hand:
         return {
             "how": [{"click": f"[data-how={how}]"}],
             "state": [does(state)],
-            "delete": [does("delete")],
+            **{name: [does(name)] for name in ("none", "invert", "hide", "show", "delete")},
+            "grow": self.near("grow"),
+            "shrink": self.near("shrink"),
+            "front": [does("front")],
             "turn": [{"turn": self.rng.normal(0, 0.8, 2).tolist()}],
             "undo": [does("undo"), does("undo"), does("redo")],
-            "crop": [tool("box"), {"fill": ["#edit-half input", "2.5"]}, does("crop")],
-            "floor": [tool("floor"), *self.clicks(3)],
+            "crop": [tool("box"), {"fill": ["#edit-half input", "2.5"]}, *self.angles(), does("crop")],
+            "move": [tool("move"), *self.by(), *self.angles(), does("move")],
+            "floor": [tool("floor"), *self.clicks(3), self.at(3, op="upright")],
+            "distance": [self.at(2, op="scale", length=2, unit="m")],
             "scale": [tool("scale"), *self.clicks(2), fill("edit-length", 1.5), does("scale")],
-            "measure": [tool("measure"), *self.clicks(2), does("measure")],
+            "measure": [tool("measure"), *self.clicks(2), does("measure"), self.at(2, op="measure", note="")],
             "view": [fill("edit-name", name), does("view"), does("start")],
+            "order": [{"perform": {"op": "order_views", "names": ["view 2", "view 0"]}}],
+            "remove": [{"perform": {"op": "remove_view", "name": f"view {self.rng.integers(3)}"}}],
             "path": [{"key": "k"}, {"turn": [0.2, 0.1]}, {"key": "k"}],
         }
 
 
 def gestures_of(seed):
-    """Return random gestures with every tool, many of them selections, so that there are splats to delete."""
-    hand, found = Hand(seed), []
-    for _ in range(GESTURES):
-        kinds = hand.shapes() if hand.rng.random() < 0.55 else hand.others()
-        found += kinds[hand.rng.choice(list(kinds))]
-    return found
+    """Return all kinds of gestures in random order; selections twice, so that there are splats to delete."""
+    hand = Hand(seed)
+    moved = [does("all"), *hand.others()["move"]]  # at least once with a selection
+    decks = [hand.shapes(), hand.shapes(), hand.others(), {"state": hand.others()["state"], "moved": moved}]
+    gestures = [gesture for deck in decks for gesture in deck.values()]
+    return [step for k in hand.rng.permutation(len(gestures)) for step in gestures[k]]
 
 
 def exported(folder, edits, gaussians, left):
@@ -174,12 +231,19 @@ def exported(folder, edits, gaussians, left):
     words = ["convert", str(folder / "scene.ply"), "--edits", str(folder / "edits.json")]
     assert main([*words, str(folder / "out.ply")]) == (0 if left.any() else 2)
     if left.any():
-        rows = torch.from_numpy(left)
-        kept = Scene(gaussians.map(lambda tensor: tensor[rows]))
+        kept = edited(Scene(gaussians), edits.operations)
+        assert len(kept.gaussians) == left.sum()
         expected = placed(kept, views_after(edits.operations)).gaussians.tensors()
         for name, tensor in read_scene(folder / "out.ply").gaussians.tensors().items():
             assert torch.equal(tensor, expected[name]), name
 
+
+EVERY_KIND = {
+    *("rectangle", "lasso", "brush", "sphere", "box", "color", "opacity", "size", "distance", "list", "all"),
+    *("front", "grow", "shrink", "deselect", "invert", "delete", "hide", "show", "crop", "move"),
+    *("upright", "scale", "start", "view", "remove_view", "order_views", "path", "measure"),
+}
+"""Selections and operations that each scene's sequences contain."""
 
 CLICK = "([name, count]) => { for (let i = 0; i < count; ++i) document.querySelector(`[data-do=${name}]`).click(); }"
 
@@ -194,6 +258,8 @@ def test_random_sequences_select_and_delete_the_same_splats_as_the_command(
     shown = edit(gaussians)
     opened = state(shown)
     assert not opened[1].any()
+    kinds = set()
+    start, moves = means_of(shown), 0
     for seed in range(degree, SEEDS, 4):
         shown.tab.evaluate("viewer.reset()")
         shown.tab.evaluate(PLAY, gestures_of(seed))
@@ -202,37 +268,40 @@ def test_random_sequences_select_and_delete_the_same_splats_as_the_command(
         edits = read_edits(tmp_path / "edits.json")
         np.testing.assert_array_equal(flags_after(edits.operations, gaussians), flags, err_msg=f"seed {seed}")
         exported(tmp_path, edits, gaussians, flags <= SELECTED)
+        there = means_of(shown)
+        left = edited(Scene(gaussians), edits.operations).gaussians.means.double().numpy()
+        np.testing.assert_array_equal(left, there[flags <= SELECTED])
+        moves += not np.array_equal(there, start)
         if seed % 8 > 3:  # without stored states, undo repeats the operations before
             shown.tab.evaluate("editor.history.changes.forEach((_, i) => editor.history.forget(i))")
         count = len(edits.operations)
         assert count > 5
+        done = json.loads(text)["operations"]
+        kinds |= {entry.get("by", entry["op"]) for entry in done} | {
+            "front" for entry in done if "front" in entry
+        }
         shown.tab.evaluate(CLICK, ["undo", count])
         undone = state(shown)
         assert undone[0] == opened[0] and not undone[1].any()
+        np.testing.assert_array_equal(means_of(shown), start)
         shown.tab.evaluate(CLICK, ["redo", count])
         redone = state(shown)
         assert redone[0] == text
         np.testing.assert_array_equal(redone[1], flags)
+        np.testing.assert_array_equal(means_of(shown), there)
         shown.tab.evaluate(CLICK, ["undo", count])
+    assert kinds >= EVERY_KIND
+    assert moves > 0, "some of the sequences move splats"
 
 
 def test_the_random_sequences_hold_every_gesture():
     gestures = [gesture for seed in range(SEEDS) for gesture in gestures_of(seed)]
     clicked = {gesture["click"].split("=")[1].strip("]") for gesture in gestures if "click" in gesture}
+    assert clicked >= {"front", "polygon", "close-polygon"}
     assert clicked >= {"rectangle", "lasso", "brush", "sphere", "box", "color", "floor", "scale", "measure"}
-    assert clicked >= {
-        "all",
-        "none",
-        "invert",
-        "delete",
-        "hide",
-        "show",
-        "crop",
-        "view",
-        "start",
-        "undo",
-        "redo",
-    }
+    states = "all none invert grow shrink select-range delete hide show"
+    others = "crop move view start undo redo"
+    assert clicked >= {*states.split(), *others.split()}
 
 
 HOLDS = """([regions, { count, ...arrays }]) => {
@@ -240,6 +309,10 @@ HOLDS = """([regions, { count, ...arrays }]) => {
   const work = new EditWork();
   return [regions.map((region) => [...members(region, values, work)]), MOST_TESTS - work.left];
 }"""
+
+
+NUMBER = 400
+"""Splats of random values, many of which are odd."""
 
 
 def random_regions(rng, count):
@@ -262,6 +335,9 @@ def random_regions(rng, count):
         low, high = sorted(numbers(2))
         points = rng.uniform(-20, 320, (int(rng.integers(3, 40)), 2))
         half = np.abs(numbers(3)) + 0.01
+        columns, rows = rng.integers(1, 20, 2).tolist()
+        deepest = [None if rng.random() < 0.2 else float(z) for z in rng.uniform(0, 5, rows * columns)]
+        front = {"bounds": [u0, v0, u1 + 1, v1 + 1], "columns": columns, "rows": rows, "deepest": deepest}
         made += [
             {"by": "rectangle", "camera": camera(), "corners": [float(x) for x in (u0, v0, u1, v1)]},
             {"by": "lasso", "camera": camera(), "points": points.tolist()},
@@ -272,19 +348,24 @@ def random_regions(rng, count):
                 "radius": 10.0,
                 "points": points[: len(points) // 3 + 1].tolist(),
             },
+            {"by": "rectangle", "camera": camera(), "corners": [-1e6, -1e6, 1e6, 1e6], "front": front},
+            {"by": "lasso", "camera": camera(), "points": points.tolist(), "front": front},
+            {"by": "brush", "camera": camera(), "radius": 40.0, "points": points.tolist(), "front": front},
             {"by": "sphere", "center": numbers(3), "radius": float(10.0 ** rng.uniform(-2, 30))},
             {"by": "sphere", "center": [0, 0, 0], "radius": 1},
             {"by": "box", "center": numbers(3), "rotation": rotation(), "half": half.tolist()},
             {"by": "color", "low": [-1, low, -1e6], "high": [1, 1e6, high]},
             {"by": "opacity", "low": low},
             {"by": "size", "low": low, "high": high},
+            {"by": "distance", "center": numbers(3), "low": abs(low), "high": abs(low) + abs(high)},
+            {"by": "distance", "center": [0, 0, 0], "high": 1},
+            {"by": "list", "reason": "", "runs": runs_of(rng.random(NUMBER) < 0.3)},
         ]
     return made
 
 
-def test_both_languages_find_the_same_splats_of_any_values(edit, random_gaussians):
-    """Splats have NaN, infinite, denormal and huge numbers, and centres exactly on borders."""
-    rng, n = np.random.default_rng(0), 400
+def odd_arrays(rng, n):
+    """Return the values of splats with NaN, infinite, denormal and huge numbers."""
     odd = np.array([np.nan, np.inf, -np.inf, 3e38, -1e-45, 0.0, 1.0, -1.0, 0.1], dtype=np.float32)
 
     def mixed(*shape):
@@ -293,16 +374,26 @@ def test_both_languages_find_the_same_splats_of_any_values(edit, random_gaussian
         values[where] = rng.choice(odd, int(where.sum()))
         return values
 
-    arrays = {"means": mixed(n, 3), "log_scales": mixed(n, 3), "logits": mixed(n), "sh0": mixed(n, 3)}
+    return {"means": mixed(n, 3), "log_scales": mixed(n, 3), "logits": mixed(n), "sh0": mixed(n, 3)}
+
+
+def parsed(operations, count):
+    """Read operations as from a file of a scene with a number of splats."""
+    scene = Identity(count, "ab" * 32, (0.0, 0.0, 0.0)).document()
+    content = {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": operations}
+    return parse_edits(json.dumps(content).encode(), "e.json")
+
+
+def test_both_languages_find_the_same_splats_of_any_values(edit, random_gaussians):
+    """Splats have NaN, infinite, denormal and huge numbers, and centres exactly on borders."""
+    rng, n = np.random.default_rng(0), NUMBER
+    arrays = odd_arrays(rng, n)
     regions = random_regions(rng, 8)
     given = {name: array.ravel().tolist() for name, array in arrays.items()}
     found, tests = edit(random_gaussians(5)).tab.evaluate(HOLDS, [regions, {"count": n, **given}])
     values = Values(**{name: array.astype(np.float64) for name, array in arrays.items()})
-    scene = identity_of(random_gaussians(5)).document()
-    operations = [{"op": "select", "how": "add", **region} for region in regions]
-    content = {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": operations}
-    edits = parse_edits(json.dumps(content).encode(), "e.json")
-    some, work = 0, Work()
+    edits = parsed([{"op": "select", "how": "add", **region} for region in regions], n)
+    some, work = 0, EditWork()
     for select, region, inside in zip(edits.operations, regions, found, strict=True):
         expected = members(select.region, values, work)
         np.testing.assert_array_equal(np.array(inside, bool), expected, err_msg=str(region))
@@ -311,12 +402,79 @@ def test_both_languages_find_the_same_splats_of_any_values(edit, random_gaussian
     assert tests == MOST_TESTS - work.left > 0, "both count equally many tests, so both refuse the same files"
 
 
+NEAR = """([radii, states, means]) => {
+  const values = { count: states.length, means: new Float32Array(means) };
+  const flags = new Uint8Array(states);
+  const work = new EditWork();
+  return radii.map(([op, radius]) => {
+    const after = flags.slice();
+    applyOperation({ op, radius }, values, after, work);
+    return [[...after], MOST_TESTS - work.left];
+  });
+}"""
+
+
+@pytest.mark.parametrize("spread", ["odd", "grid", "far"])
+def test_both_languages_grow_and_shrink_to_the_same_splats_with_equally_many_tests(
+    edit, random_gaussians, spread
+):
+    """Centres are odd numbers, exactly a radius apart, or so far apart that most lie in the outermost cells."""
+    rng, n = np.random.default_rng(1), NUMBER
+    means = odd_arrays(rng, n)["means"]
+    if spread == "grid":
+        means = rng.integers(-6, 7, (n, 3)).astype(np.float32)
+    elif spread == "far":
+        means = (
+            (rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-8, 20, (n, 1)))
+            .clip(-1e38, 1e38)
+            .astype(np.float32)
+        )
+    flags = rng.choice(np.array([0, 1, 2, 4], np.uint8), n, p=(0.6, 0.2, 0.1, 0.1))
+    radii = [
+        (
+            str(rng.choice(["grow", "shrink", "shrink"])),
+            float(rng.choice([1.0, 10.0 ** rng.uniform(-3, 0.3)])),
+        )
+        for _ in range(40)
+    ]
+    tab = edit(random_gaussians(5)).tab
+    found = tab.evaluate(NEAR, [radii, flags.tolist(), means.ravel().tolist()])
+    gaussians = replace(random_gaussians(n), means=torch.from_numpy(means))
+    values, work, changes = Values.of(gaussians), EditWork(), 0
+    for (op, radius), (states, tests) in zip(radii, found, strict=True):
+        (operation,) = parsed([{"op": op, "radius": radius}], n).operations
+        after = flags.copy()
+        apply_operation(operation, values, after, work)
+        np.testing.assert_array_equal(np.array(states, np.uint8), after, err_msg=f"{op} {radius}")
+        assert tests == MOST_TESTS - work.left
+        changes += (after != flags).any()
+    assert changes > 10
+
+
+TOO_MANY = """() => {
+  const values = { count: 80000, means: new Float32Array(240000) };
+  const flags = new Uint8Array(80000).fill(1, 40000);
+  try { applyOperation({ op: "grow", radius: 0.5 }, values, flags, new EditWork()); } catch (error) {
+    return [error.message, flags.reduce((a, b) => a + b)];
+  }
+}"""
+
+
+def test_a_radius_that_takes_too_many_tests_is_refused_in_the_page_too(edit, random_gaussians):
+    said, selected = edit(random_gaussians(5)).tab.evaluate(TOO_MANY)
+    assert said == (
+        "A radius of 0.5 takes 1,600,000,000 tests of a splat, but 1,000,000,000 are allowed: give a smaller radius."
+    )
+    assert selected == 40_000
+
+
 def test_a_scene_without_splats_can_be_opened(edit, random_gaussians):
     shown = edit(random_gaussians(0))
     gestures = [{"click": f"[data-do={name}]"} for name in ("all", "invert", "undo", "redo")]
     shown.tab.evaluate(PLAY, [*gestures, {"click": "[data-tool=sphere]"}, {"drag": [[50, 50], [60, 60]]}])
     assert shown.tab.inner_text("#edit-count") == "0 selected · 0 of 0 left"
     assert "nothing at that point" in shown.tab.inner_text("#edit-message")
+    assert shown.tab.is_hidden("#edit-floaters"), "a page that no server sent can propose nothing"
     assert state(shown)[1].size == 0 and state(shown)[0].count('"op"') == 2
 
 

@@ -42,6 +42,12 @@ def capture(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def patient_view(monkeypatch):
+    """Let a client come back late: other programs may keep it from its next request for seconds."""
+    monkeypatch.setattr(live, "GRACE", PATIENCE)
+
+
 def test_the_first_scene_and_state_describe_the_same_paused_training(capture, tmp_path):
     with training(capture, tmp_path / "run", *ENDLESS) as made:
         client = Client(made.view.url)
@@ -78,15 +84,16 @@ def test_pause_step_and_resume(capture, tmp_path):
 
 
 def test_a_paused_training_continues_when_nobody_watches(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(live, "GRACE", 0.2)
     monkeypatch.setattr(live, "WAIT", 0.1)
     with training(capture, tmp_path / "run", *ENDLESS) as made:
         client = Client(made.view.url)
         client.state()
         client.control("pause")
         held = client.states(state="paused")["iteration"]
+        monkeypatch.setattr(live, "GRACE", 0.2)
         until(lambda: made.iteration > held + 20, "more iterations")
         client.states(state="training")
+        monkeypatch.setattr(live, "GRACE", PATIENCE)
         client.control("pause")
         assert client.states(state="paused")["iteration"] > held, "the training can be paused again"
 
@@ -276,7 +283,6 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
 
 
 def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(live, "GRACE", 0.3)
     monkeypatch.setattr(live, "WAIT", 0.1)
     with training(capture, tmp_path / "run", "--iterations", "30") as made:
         client = Client(made.view.url)
@@ -289,6 +295,29 @@ def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_
         assert (state["iteration"], state["iterations"], state["seconds_left"]) == (30, 30, None)
         assert client.scene()[0]["iteration"] == 30
         assert staying.is_alive()
+        monkeypatch.setattr(live, "GRACE", 0.3)
         staying.join(PATIENCE)
         assert not staying.is_alive() and not made.view.watched
         made.broadcast.stay(lambda: made.view.watched)  # without a browser, the view closes
+
+
+def test_a_picture_that_comes_too_late_is_not_that_of_the_next_camera(capture, tmp_path, monkeypatch):
+    run = made_run(capture, tmp_path / "run", "--iterations", "30")
+    cameras = [view.camera for view in run.dataset.train[:2]]
+    images = [run.options.renderer(run.trainer.gaussians, camera) for camera in cameras]
+    with live.LiveView(run, port=0) as view:
+        monkeypatch.setattr(live, "PICTURE_WAIT", 1.0)
+        late = threading.Thread(target=view.picture, args=(cameras[0],))
+        late.start()
+        until(lambda: view.camera() is cameras[0], "the first request")
+        late.join(PATIENCE)  # it gives up while the picture is drawn
+        monkeypatch.setattr(live, "PICTURE_WAIT", PATIENCE)
+        found = []
+        second = threading.Thread(target=lambda: found.append(view.picture(cameras[1])))
+        second.start()
+        until(lambda: view._wanted is cameras[1], "the second request")
+        view.take_picture(images[0])
+        assert view.camera() is cameras[1]
+        view.take_picture(images[1])
+        second.join(PATIENCE)
+    assert found == [live.jpeg_of(images[1])] and found != [live.jpeg_of(images[0])]

@@ -1,21 +1,32 @@
 """The page draws a mesh beside its splats as a ray caster does, and finds its surface exactly."""
 
 import base64
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.cli.main import main
+from gsplat_edu.edits.apply import moved_together
+from gsplat_edu.edits.document import parse_edits
+from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.io.edit import IDENTITY, Similarity
+from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.mesh_files import read_mesh, write_mesh
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.runs.source import Source, file_settings
+from gsplat_edu.runs.source import Source, file_settings, open_source
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.mesh import Mesh, Texture
 from gsplat_edu.viewer import page, page_mesh
 from gsplat_edu.viewer.edit_page import editing_of
+from gsplat_edu.viewer.edited import edited_meshes
 from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
 from viewer.conftest import described
+
+pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
 
 BACKGROUND = (0.2, 0.5, 0.8)
 
@@ -321,6 +332,123 @@ def test_meshes_follow_the_origin_the_unit_and_moves_of_the_scene(tmp_path, rand
     moved = found.moved(turn).surface.vertices
     np.testing.assert_allclose(moved, 2 * found.surface.vertices @ turn.R.T + [1, 2, 3], atol=1e-12)
     assert open_meshes(None, None, source) is None
+
+
+TURN = Rotation.from_rotvec((0.4, -0.3, 0.9)).as_matrix().tolist()
+
+WHOLE = [
+    {"op": "select", "how": "replace", "by": "sphere", "center": [0.2, 0.1, 0.0], "radius": 0.4},
+    {"op": "delete"},
+    {"op": "invert"},
+    {"op": "move", "rotation": TURN, "translation": [0.3, -0.1, 0.2], "center": [0.5, 0.5, -0.5]},
+    {"op": "move", "rotation": TURN, "translation": [0.0, 0.05, 0.0], "center": [0.0, 0.0, 0.0]},
+]
+"""Moves all splats that are left, twice."""
+
+PART = [
+    {"op": "select", "how": "replace", "by": "sphere", "center": [0.0, 0.0, 0.0], "radius": 0.7},
+    {"op": "move", "rotation": TURN, "translation": [1.0, 0.0, 0.0], "center": [0.0, 0.0, 0.0]},
+]
+
+
+def editor_of(visit, tmp_path, gaussians, mesh):
+    """Open the editor with a mesh beside the splats; return the page and the source."""
+    scene = Scene(gaussians)
+    source = Source(tmp_path / "scene.ply", scene, (("view", VIEW),), file_settings(scene))
+    editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
+    tour, settings = page.Tour(meshes=Meshes(mesh, mesh)), replace(source.settings, background=BACKGROUND)
+    html = page.html(scene, source.cameras, settings, "scene", (), tour, editing)
+    (tmp_path / "edit.html").write_bytes(html)
+    shown = visit(width=1200, height=600).open(tmp_path / "edit.html").ready()
+    shown.tab.wait_for_selector("#edit")
+    return shown, source
+
+
+def test_a_mesh_follows_a_move_of_all_splats(visit, opened, tmp_path, random_gaussians):
+    """The editor draws it where an exported page has it, finds its surface there, and undo takes it back."""
+    mesh = Mesh(ball().vertices.astype(np.float32).astype(np.float64), ball().faces, ball().colors)
+    shown, source = editor_of(visit, tmp_path, random_gaussians(60), mesh)
+    tab, note = shown.tab, shown.tab.locator("#mesh-stays")
+    before = drawn(shown)
+    tab.evaluate("(operations) => operations.forEach((operation) => editor.perform(operation))", WHOLE)
+    edits = parse_edits(tab.evaluate("editor.text()").encode(), "e.json")
+    moved = edited_meshes(Meshes(mesh, mesh), source, edits)
+    assert not moved.stays and note.is_hidden()
+    assert np.abs(moved.surface.vertices - mesh.vertices).max() > 0.3
+    after = drawn(shown)
+    exported = drawn(opened(moved.surface)).astype(int)
+    on_mesh = (np.abs(exported - 255 * np.array(BACKGROUND)) > 2).any(axis=2)
+    assert on_mesh.sum() > 1000 and (after != before)[on_mesh].mean() > 0.1
+    assert np.quantile(np.abs(after.astype(int) - exported), 0.99) <= 2  # but for the edges of faces
+    x, y, z = VIEW.world_to_cam(moved.surface.vertices.mean(axis=0)[None])[0]
+    column, row = float(VIEW.fx * x / z + VIEW.cx), float(VIEW.fy * y / z + VIEW.cy)
+    directions = rays(VIEW, np.array([column]), np.array([row]))
+    _, depth, _ = cast(moved.surface, np.array(VIEW.eye)[None], directions)
+    found = tab.evaluate(
+        "([camera, u, v]) => viewer.meshes.depthAt(camera, u, v)", [described(VIEW), column, row]
+    )
+    assert found == pytest.approx(depth[0], abs=1e-5)
+    # afterwards a part is moved alone: the mesh stays where the whole was
+    tab.evaluate("(operations) => operations.forEach((operation) => editor.perform(operation))", PART)
+    assert note.is_visible() and (drawn(shown) == after).all()
+    edits = parse_edits(tab.evaluate("editor.text()").encode(), "e.json")
+    apart = edited_meshes(Meshes(mesh), source, edits)
+    assert apart.stays and (apart.surface.vertices == moved.surface.vertices).all()
+    assert opened(apart.surface).tab.locator("#mesh-stays").is_hidden()
+    path = written(tmp_path, random_gaussians, apart)
+    assert visit().open(path).ready().tab.locator("#mesh-stays").is_visible()
+    tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(WHOLE) + len(PART))
+    assert note.is_hidden() and (drawn(shown) == before).all()
+
+
+def test_page_and_command_agree_on_what_moves_together(visit, tmp_path, random_gaussians):
+    gaussians = random_gaussians(40)
+    shown, _ = editor_of(visit, tmp_path, gaussians, ball())
+    rng = np.random.default_rng(5)
+    found = []
+    for _ in range(12):
+        operations = []
+        for _ in range(5):
+            wide = float(rng.choice([0.8, 50.0], p=[0.3, 0.7]))
+            region = {"by": "sphere", "center": rng.normal(0, 0.3, 3).tolist(), "radius": wide}
+            R = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix().tolist()
+            operations += [{"op": "select", "how": "replace", **region}]
+            operations += [{"op": str(rng.choice(["hide", "delete", "show"]))}] if wide < 1 else []
+            by, center = rng.normal(0, 0.2, 3).tolist(), rng.normal(0, 1, 3).tolist()
+            operations += [{"op": "move", "rotation": R, "translation": by, "center": center}]
+        whole, some = shown.tab.evaluate(
+            """(operations) => {
+              operations.forEach((operation) => editor.perform(operation));
+              const { whole, some } = movedTogether(editor.values, editor.history.flags);
+              return [whole, some];
+            }""",
+            operations,
+        )
+        edits = parse_edits(shown.tab.evaluate("editor.text()").encode(), "e.json")
+        move, partly = moved_together(edits.operations, gaussians)
+        np.testing.assert_allclose(whole["R"], move.R, atol=1e-12)
+        np.testing.assert_allclose(whole["t"], move.t, atol=1e-12)
+        assert some == partly
+        found.append((move is IDENTITY, some))
+        shown.tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(operations))
+    assert {(False, True), (False, False)} <= set(found)
+
+
+def test_convert_moves_the_mesh_and_says_where_it_stays(tmp_path, random_gaussians, capsys):
+    write_scene(tmp_path / "a.ply", Scene(random_gaussians(30)))
+    write_mesh(tmp_path / "a.glb", ball())
+    source = open_source(tmp_path / "a.ply")
+    for operations, line in ((WHOLE, False), (PART, True)):
+        scene = {
+            "count": 30,
+            "sha256": identity_of(source.scene.gaussians, source.origin).sha256,
+            "origin": [0, 0, 0],
+        }
+        edits = {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": operations}
+        (tmp_path / "e.json").write_text(json.dumps(edits))
+        words = ["convert", tmp_path / "a.ply", tmp_path / "a.html", "--edits", tmp_path / "e.json"]
+        assert main([*map(str, words), "--surface", str(tmp_path / "a.glb")]) == 0
+        assert ("the mesh shows them where they were" in capsys.readouterr().out) is line
 
 
 def test_too_many_triangles_and_a_collider_alone_are_refused(tmp_path, random_gaussians, monkeypatch):

@@ -5,6 +5,8 @@ import pytest
 
 from gsplat_edu.render.settings import RenderSettings
 
+pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
+
 PARTS = """async () => {
   const { renderer } = viewer;
   if (!viewer.isWhole) await viewer.followed(); // a slow browser still draws the page's first picture

@@ -1,6 +1,7 @@
 """The camera path of a page in a browser: the same motion as in Python, saved views, and the downloaded file."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import look_at
 from gsplat_edu.viewer import page
+from viewer.handles import until
 
 ORIGIN = (500.0, -64.0, 8.0)
 
@@ -40,6 +42,11 @@ def around(*times, count=5):
     )
 
 
+def holding(keyframes, *holds):
+    """Return keyframes that rest for these seconds."""
+    return tuple(replace(keyframe, hold=hold) for keyframe, hold in zip(keyframes, holds, strict=True))
+
+
 AROUND = around()
 PATHS = {
     "open": KeyframePath(AROUND, False),
@@ -55,6 +62,15 @@ PATHS = {
     ),
     "all equal": KeyframePath(AROUND[:1] * 3, False),
     "full turn on the spot": KeyframePath(tuple(turned((0, i * 2.0944, 0)) for i in range(3)), True),
+    "slow at the ends": KeyframePath(AROUND, False, 7.0, "ends"),
+    "slow at every view": KeyframePath((*AROUND[:3], AROUND[2], *AROUND[3:]), False, None, "views"),
+    "loop slow at every view": KeyframePath(AROUND, True, None, "views"),
+    "times, holds, slow at the ends": KeyframePath(
+        holding(around(1.0, 1.6, 4.0, 6.2, 8.0), 0.5, 0.0, 0.0, 0.7, 1.5), False, None, "ends"
+    ),
+    "loop with times and holds": KeyframePath(
+        holding(around(-1.0, 1.5, 4.0, 4.2, 8.0), 0.0, 2.0, 0.0, 0.0, 1.0), True, 12.0, "views"
+    ),
     "upside down": KeyframePath(
         tuple(turned((3.0 - i * 0.4, i * 0.7, 0.2), (i, 0, 0)) for i in range(6)), False
     ),
@@ -66,9 +82,8 @@ def opened(visit, tmp_path, random_gaussians, three_views):
     """Return a function that opens the page of a scene with an origin, with or without a path."""
 
     def make(path=None, **options):
-        page.write(
-            tmp_path / "scene.html", Scene(random_gaussians(60)), three_views, tour=page.Tour(path, ORIGIN)
-        )
+        scene, tour = Scene(random_gaussians(60)), page.Tour(path, ORIGIN)
+        (tmp_path / "scene.html").write_bytes(page.html(scene, three_views, title="scene", tour=tour))
         return visit(width=640, height=480, **options).open(tmp_path / "scene.html").ready()
 
     return make
@@ -110,7 +125,7 @@ def test_an_embedded_path_is_played_to_its_end_and_stops_when_somebody_moves(ope
     shown.tab.check("#loop")
     shown.tab.keyboard.press("p")
     shown.tab.wait_for_selector('#play[aria-pressed="true"]')
-    shown.tab.wait_for_function("viewer.journey.began !== null")
+    until(shown.tab, "viewer.journey.began !== null")
     shown.tab.mouse.move(450, 300)
     shown.tab.mouse.wheel(0, 100)
     shown.tab.wait_for_selector('#play[aria-pressed="false"]')

@@ -42,7 +42,7 @@ def server():
 
 def ask(server, method="GET", path="/", **headers):
     """Return status, headers and body of the answer to one request."""
-    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=PATIENCE)
     try:
         connection.putrequest(method, path, skip_host="Host" in headers)
         for name, value in headers.items():
@@ -57,7 +57,7 @@ def ask(server, method="GET", path="/", **headers):
 
 def ask_raw(server, request):
     """Send bytes, HTTP or not; return the whole answer."""
-    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+    with socket.create_connection(server.server_address[:2], timeout=PATIENCE) as connection:
         connection.sendall(request)
         connection.shutdown(socket.SHUT_WR)
         answer = b""
@@ -195,7 +195,7 @@ def test_connections_beyond_the_limit_are_closed(server, monkeypatch):
     """Waiting connections occupy all threads, so the next one gets no answer. Once they close, the server answers
     again."""
     server._room = threading.Semaphore(3)
-    waiting = [socket.create_connection(server.server_address[:2], timeout=10) for _ in range(3)]
+    waiting = [socket.create_connection(server.server_address[:2], timeout=PATIENCE) for _ in range(3)]
     try:
         deadline = time.monotonic() + PATIENCE
         while server._room._value:
@@ -240,7 +240,7 @@ def test_only_names_of_this_computer_are_accepted(header, bound, is_ours):
 
 def test_a_browser_that_disconnects_midway_does_no_harm(server, capsys):
     for _ in range(3):
-        with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        with socket.create_connection(server.server_address[:2], timeout=PATIENCE) as connection:
             connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
             assert connection.recv(100).startswith(b"HTTP/1.0 200")
     assert ask(server)[2] == PAGE

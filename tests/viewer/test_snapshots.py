@@ -2,8 +2,10 @@
 
 import json
 import os
+import shutil
 import threading
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -84,15 +86,17 @@ def test_a_watcher_gets_state_and_scene_of_the_same_iteration(capture, tmp_path)
     run = tmp_path / "run"
     LiveFolder(run).ask()
     LiveFolder(run).set_paused(True)
-    with Watched(capture, run, "--iterations", "500") as made:
+    with Watched(capture, run, "--iterations", "100000") as made:  # it is stopped long before
         live = made.live
-        state = until(lambda: (s := live.read_state()) and s["state"] == "paused" and s, "the state")
+        state = until(
+            lambda: (live.ask(), (s := live.read_state()) and s["state"] == "paused" and s)[1], "the state"
+        )
         assert made.said == [f"paused; remove {live.pause} to continue"]
         trainer = made.run.trainer
         assert state["iteration"] == state["scene"] == trainer.iteration == 1
         header, shown = scene_of(live.scene)
         assert header == header_of(live.scene) and header["iteration"] == 1
-        assert (state["count"], state["iterations"], state["pid"]) == (len(shown), 500, os.getpid())
+        assert (state["count"], state["iterations"], state["pid"]) == (len(shown), 100_000, os.getpid())
         assert state["history"]["iteration"] == [1] and state["history"]["loss"] == [state["loss"]]
         assert torch.equal(shown.means, trainer.gaussians.means.detach()), "means are exact"
         facts = live.read_page()
@@ -111,8 +115,7 @@ def test_a_watcher_gets_state_and_scene_of_the_same_iteration(capture, tmp_path)
 
 def test_no_files_are_written_after_the_watcher_left(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "100000") as made:
-        made.live.ask()
-        until(made.live.scene.exists, "a scene")
+        until(lambda: (made.live.ask(), made.live.scene.exists())[1], "a scene")
         os.utime(made.live.wanted, (0, 0))
         held = made.run.trainer.iteration
         until(lambda: made.run.trainer.iteration > held + 20, "many more iterations")
@@ -158,8 +161,7 @@ def test_stopping_the_program_ends_a_pause(capture, tmp_path):
 def test_a_folder_that_cannot_be_written_ends_the_watching_but_not_the_training(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "100000") as made:
         made.live.page.mkdir(parents=True)  # a folder of the file's name makes the renaming fail
-        made.live.ask()
-        until(lambda: made.said, "the failure")
+        until(lambda: (made.live.ask(), made.said)[1], "the failure")
         held = made.run.trainer.iteration
         until(lambda: made.run.trainer.iteration > held + 20, "more iterations")
         (sentence,) = made.said
@@ -222,3 +224,29 @@ def test_the_curves_keep_few_points(capture, tmp_path, monkeypatch):
     iterations = [point[0] for point in figures.points]
     assert len(iterations) <= 8 and iterations[0] == 1 and iterations[-1] > 40
     assert len({b - a for a, b in pairwise(iterations)}) == 1, "the kept points are evenly spaced"
+
+
+def test_a_watcher_and_a_training_may_make_and_remove_the_folder_at_the_same_time(tmp_path, monkeypatch):
+    live, touch = LiveFolder(tmp_path), Path.touch
+
+    def removed_first(path, *words, **options):
+        monkeypatch.setattr(Path, "touch", touch)
+        live.clear()
+        return touch(path, *words, **options)
+
+    for wish in (live.ask, lambda: live.set_paused(True)):
+        monkeypatch.setattr(Path, "touch", removed_first)
+        wish()
+        assert any(live.path.iterdir())
+        shutil.rmtree(live.path)
+
+    live.path.mkdir()
+    remove = Path.rmdir
+
+    def asked_first(path):
+        live.ask()
+        remove(path)
+
+    monkeypatch.setattr(Path, "rmdir", asked_first)
+    live.clear()
+    assert live.path.is_dir()

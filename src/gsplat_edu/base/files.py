@@ -8,10 +8,11 @@ import os
 import re
 import secrets
 import socket
+import stat
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
@@ -36,12 +37,14 @@ def written_aside(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
     try:  # the name is known before the file exists, so that an interruption never leaves it
         with named_failure(path):
-            os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+            handle = os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+            try:  # the umask itself can be read only by changing it, for all threads
+                permissions = stat.S_IMODE(os.fstat(handle).st_mode)
+            finally:
+                os.close(handle)
         with named_failure(path, aside):
             yield aside
-            umask = os.umask(0)
-            os.umask(umask)
-            aside.chmod(0o666 & ~umask)  # until now only the owner could read it
+            aside.chmod(permissions)  # the writer may have made the file anew
             aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
@@ -153,10 +156,13 @@ def remove_leftovers(folder: Path, *, below: bool = True) -> None:
         folder: The folder; it need not exist.
         below: Include all subfolders.
     """
-    for path in folder.rglob(".*") if below else folder.glob(".*"):
-        match = _LEFTOVER.fullmatch(path.name)
-        if match and path.is_file() and not path.is_symlink() and _is_leftover(path, match[1], int(match[2])):
-            path.unlink(missing_ok=True)
+    for place, folders, names in os.walk(folder):  # rglob fails if a folder vanishes meanwhile
+        for name in names:
+            match, path = _LEFTOVER.fullmatch(name), Path(place, name)
+            if match and not path.is_symlink() and _is_leftover(path, match[1], int(match[2])):
+                path.unlink(missing_ok=True)
+        if not below:
+            folders.clear()
 
 
 def _is_leftover(path: Path, machine: str, pid: int) -> bool:
@@ -181,6 +187,15 @@ def _runs(pid: int) -> bool:
     return True
 
 
+def newest_first(paths: Iterable[Path]) -> list[Path]:
+    """Sort files and folders by the time of their last change; those that have just been removed are left out."""
+    times = {}
+    for path in paths:
+        with suppress(FileNotFoundError):
+            times[path] = path.stat().st_mtime_ns
+    return sorted(times, key=lambda path: -times[path])
+
+
 def check_folder(name: str, path: Path) -> None:
     """Check, before hours of work, that files can be written to a folder. Creates nothing.
 
@@ -198,6 +213,9 @@ def check_folder(name: str, path: Path) -> None:
         with tempfile.TemporaryFile(dir=nearest):
             pass
     except OSError as error:
+        if not nearest.exists():  # another program has just removed it
+            check_folder(name, path)
+            return
         raise ArgumentError(
             f"{name}: cannot write to {nearest} ({error.strerror}); choose another place"
         ) from None

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import socket
+import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -30,7 +31,13 @@ _held: set[int] = set()
 
 @contextmanager
 def locked(
-    name: str, folder: Path, what: str, say: Callable[[str], None], patience: float = 0.0
+    name: str,
+    folder: Path,
+    what: str,
+    say: Callable[[str], None],
+    patience: float = 0.0,
+    file: str = LOCK,
+    place: Path | None = None,
 ) -> Iterator[None]:
     """Keep other processes from writing to a folder inside the block. The folder is created if missing.
 
@@ -43,17 +50,18 @@ def locked(
         what: The activity of this process, for the message shown to another process.
         say: Receives a sentence if the file system has no locks; the block then runs without one.
         patience: Seconds to wait for another process that holds the lock.
+        file: Name of the lock file. Locks of different names do not exclude one another.
+        place: What the messages say is in use; None for the folder.
 
     Raises:
         ArgumentError: another process holds the lock (the message names it), the folder is not writable, or the lock
             file is a link.
     """
     check_folder(name, folder)
-    made = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / LOCK
+    made = [parent for parent in (folder, *folder.absolute().parents) if not parent.exists()]
+    path = folder / file
     try:
-        handle = _acquired(name, path, time.monotonic() + patience)
+        handle = _acquired(name, path, time.monotonic() + patience, place or folder)
         if handle is None:
             say(
                 f"{folder}: its file system has no locks; do not let two commands write to it at the same time"
@@ -69,18 +77,41 @@ def locked(
         finally:
             _release(handle, path)
     finally:
-        for place in made:
+        for parent in made:
             with contextlib.suppress(OSError):  # not empty: it holds the block's output
-                place.rmdir()
+                parent.rmdir()
 
 
-def _acquired(name: str, path: Path, until: float) -> int | None:
+@contextmanager
+def locked_file(name: str, path: Path, what: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Keep other processes from writing a file, and files that belong to it, inside the block; see `locked`.
+
+    The lock is a hidden file beside it. Other files of the folder may be written meanwhile.
+
+    Args:
+        name: The user's name for the file, for messages.
+        path: The file.
+        what: The activity of this process.
+        say: Receives a sentence if the file system has no locks.
+
+    Raises:
+        ArgumentError: another process writes the file (the message names the process), or as for `locked`.
+    """
+    with locked(name, path.parent, what, say, file=f".{path.name}{LOCK}", place=path):
+        yield
+
+
+def _acquired(name: str, path: Path, until: float, place: Path) -> int | None:
     """Return an open, locked file; None if the file system has no locks."""
     while True:
-        if path.is_symlink() or (path.exists() and not path.is_file()):  # it would be emptied
+        if _is_other(path):  # it would be emptied
             raise ArgumentError(f"{name}: {path} is a link or no file; remove it")
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-        handle = os.open(path, flags, 0o666)  # child processes do not inherit it
+        path.parent.mkdir(parents=True, exist_ok=True)  # the previous holder removes it if it leaves it empty
+        try:
+            handle = os.open(path, flags, 0o666)  # child processes do not inherit it
+        except FileNotFoundError:  # removed between our two calls
+            continue
         try:
             _lock(handle)
         except (BlockingIOError, PermissionError):
@@ -90,7 +121,7 @@ def _acquired(name: str, path: Path, until: float) -> int | None:
                 time.sleep(POLL)
                 continue
             raise ArgumentError(
-                f"{name}: {path.parent} is in use by {holder}; wait until it ends, or choose another folder"
+                f"{name}: {place} is in use by {holder}; wait until it ends, or choose another place"
             ) from None
         except OSError:
             os.close(handle)
@@ -125,6 +156,14 @@ def _lock(handle: int) -> None:
         import fcntl
 
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _is_other(path: Path) -> bool:
+    """Return whether something lies at a path that is no plain file. One call: its holder may just remove the file."""
+    try:
+        return not stat.S_ISREG(path.lstat().st_mode)
+    except FileNotFoundError:
+        return False
 
 
 def _is_at(path: Path, handle: int) -> bool:

@@ -32,6 +32,30 @@ RAW_BYTES = 0xDC80, 0xDCFF
 """Lone surrogates that represent the bytes 0x80 to 0xFF."""
 
 
+class Told(str):
+    """A text for the command line, which may name commands, options and files, with the words of a page for the same.
+
+    Operations on the text (`+`, f-strings) return a plain `str` with the words for the command line.
+
+    Args:
+        text: For the command line.
+        plain: For a page, which has buttons instead; empty if a page has nothing to say.
+    """
+
+    plain: str
+
+    def __new__(cls, text: str, plain: str) -> Told:
+        """Make the text, and keep the words of the page with it."""
+        made = super().__new__(cls, text)
+        made.plain = plain
+        return made
+
+
+def plain_of(text: str) -> str:
+    """Return the words of a page for a text: those of `Told`, or the text itself."""
+    return text.plain if isinstance(text, Told) else text
+
+
 def short_number(value: float, digits: int) -> str:
     """Write a number with a few significant digits; a large one with all digits of its whole part, not 1e+03.
 

@@ -28,8 +28,9 @@ from gsplat_edu.scene.camera import Camera
 Points = Float64[np.ndarray, "N 3"]
 Pair = tuple[float, float]
 
-MARGIN = 0.2
-"""Width of the margin around a cell, as a fraction of the cell's side (VastGaussian, Lin et al. 2024)."""
+MARGIN = 0.025
+"""Width of the margin around a cell, as a fraction of the cell's side; both blocks learn what it shows. 0.05 costs
+0.04 dB (benchmarks/archive/RESULTS-2026-11.md)."""
 
 OUTLIERS = 0.01
 """The ground's rectangle leaves out this fraction of the points on each side, but no camera."""

@@ -67,9 +67,12 @@ def strip_mask(
         depth = render(gaussians, camera).mean_depth
     assert depth is not None
     z = depth.double().numpy(force=True).ravel()
-    columns, rows = np.meshgrid(np.arange(camera.W), np.arange(camera.H))
-    x, y = (columns.ravel() - camera.cx) / camera.fx * z, (rows.ravel() - camera.cy) / camera.fy * z
-    points = np.stack([x, y, z], axis=1) @ camera.R + camera.eye
+    if camera.pinhole:
+        columns, rows = np.meshgrid(np.arange(camera.W), np.arange(camera.H))
+        x, y = (columns.ravel() - camera.cx) / camera.fx * z, (rows.ravel() - camera.cy) / camera.fy * z
+        points = np.stack([x, y, z], axis=1) @ camera.R + camera.eye
+    else:  # NaN where a lens has no ray, which is near no cut
+        points = camera.origins().reshape(-1, 3) + z[:, None] * camera.rays().reshape(-1, 3)
     near = near_a_cut(area.ground.coordinates(points), cells, strip_width(area, cells))
     return np.asarray((near & (z > 0)).reshape(camera.H, camera.W))
 

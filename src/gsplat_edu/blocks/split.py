@@ -11,27 +11,25 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.blocks.counted import Counted
 from gsplat_edu.blocks.layout import PLAN, BlocksFolder, file_digest
 from gsplat_edu.blocks.plan import Block, BlockPlan, automatic_count, measured_area
 from gsplat_edu.blocks.same import write_views
-from gsplat_edu.blocks.views import LEAST_VIEWS, assigned, in_any_view, seen_shares
+from gsplat_edu.blocks.views import LEAST_VIEWS, assigned, feature_renderer, seen_shares
 from gsplat_edu.budget.costs import wanted_gaussians
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.io.ply import save_ply
-from gsplat_edu.render.api import render
-from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.start import scene_file, scene_start
-from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.length import planned_iterations
+from gsplat_edu.train.overlap import separate_views
 
 OPAQUE = 0.1
 """Gaussians of the coarse model above this opacity count as points of the scene."""
@@ -39,9 +37,9 @@ OPAQUE = 0.1
 ROOM = 1.5
 """fast: the cap of a block is at least this multiple of its start Gaussians."""
 
-MARGIN_ROOM = 1.25
-"""Cap of a block as a multiple of its cell's share of the whole scene's cap; the rest is for the margin, which merging
-removes. `gsplat_edu.blocks.merge` keeps the cap of the whole."""
+MARGIN_ROOM = 1.1
+"""Number of Gaussians for a cell with its margin, as a multiple of that for the cell. Merging removes those of the
+margin, and keeps the cap of the whole (`gsplat_edu.blocks.merge`)."""
 
 Say = Callable[[str], None]
 
@@ -92,6 +90,13 @@ def check_recipe(folder: Path, plan: BlockPlan, options: RunOptions) -> None:
             )
 
 
+def _check_region(dataset: Dataset) -> None:
+    if dataset.region is not None:
+        raise ArgumentError(
+            "--blocks: cannot train in the box of the capture's region.json only; add --set region=none"
+        )
+
+
 def split_capture(
     options: RunOptions, coarse: Path, split: SplitOptions, say: Say, reader: CaptureReader | None = None
 ) -> BlockPlan:
@@ -111,6 +116,7 @@ def split_capture(
     """
     folder, config = BlocksFolder(options.out), options.config
     dataset = Dataset.of(reader_for(options.data, reader), options.data_settings)
+    _check_region(dataset)
     for note in dataset.notes:
         say(str(note))
     gaussians = _coarse_gaussians(coarse, config, dataset, say)
@@ -119,7 +125,8 @@ def split_capture(
     points = means[solid if solid.any() else slice(None)]
     area = measured_area([view.camera for view in dataset.train], points)
     wanted = automatic_count(len(dataset.train)) if split.count is None else split.count
-    measure = functools.partial(seen_shares, area, gaussians, functools.partial(_render, options))
+    renderer = feature_renderer(options)
+    measure = functools.partial(seen_shares, area, gaussians, renderer)
     blocks = assigned(dataset, area, points, wanted, measure, split.least_views)
     if split.count is not None and len(blocks) < wanted:
         say(
@@ -130,13 +137,12 @@ def split_capture(
     places = area.ground.coordinates(means)
     made = []
     for number, block in enumerate(blocks):
-        stays = block.core.enlarged(area.low, area.high).holds(places)
-        stays |= in_any_view(gaussians, [cameras[name] for name in block.train])
-        kept = torch.from_numpy(np.flatnonzero(stays))
+        counted = Counted(area, block.core, gaussians, renderer)
+        kept = torch.from_numpy(np.flatnonzero(counted.start([cameras[name] for name in block.train])))
         start = gaussians.map(functools.partial(torch.index_select, dim=0, index=kept))
         save_ply(folder.start(number), start, dataset.origin, config.antialiased)
         inside = int(block.core.holds(places).sum())
-        cap = _cap(options, dataset, block, len(kept), inside / len(gaussians))
+        cap = _cap(options, dataset, block, len(kept) - inside, inside, len(gaussians))
         views = len(block.train)
         length = split.iterations_of(views, config.batch)
         digest = file_digest(folder.start(number))
@@ -166,29 +172,32 @@ def _coarse_gaussians(coarse: Path, config: TrainConfig, dataset: Dataset, say: 
     return gaussians
 
 
-def _render(options: RunOptions, gaussians: Gaussians, camera: Camera, features: Tensor) -> RenderOutput:
-    return render(
-        gaussians, camera, settings=options.render_settings, features=features, backend=options.backend
-    )
+def _cap(
+    options: RunOptions, dataset: Dataset, block: Block, outside: int, inside: int, all_gaussians: int
+) -> int | None:
+    """Return the cap of a block: its cell's share of the scene's cap and room for the margin, or the recipe's plan.
 
-
-def _cap(options: RunOptions, dataset: Dataset, block: Block, start: int, share: float) -> int | None:
-    """Return the cap of a block: its cell's share of the scene's cap plus room for the margin, or the recipe's plan.
+    Gaussians outside the cell hide parts of it. Their pixels do not count, so their number stays.
 
     Args:
         options: Options of the run in blocks.
         dataset: The capture.
         block: The block.
-        start: Number of Gaussians that the block starts with, those of the margin included.
-        share: Share of the coarse model's Gaussians that lie in the cell.
+        outside: Number of start Gaussians outside the cell.
+        inside: Number of start Gaussians in the cell.
+        all_gaussians: Number of Gaussians of the coarse model.
     """
     config = options.config
     if config.max_gaussians is not None:
-        return max(int(MARGIN_ROOM * config.max_gaussians * share), start)
+        share = inside / all_gaussians
+        return max(round(MARGIN_ROOM * config.max_gaussians * share), inside, 1) + outside
     if config.strategy != "fast":
         return None
     pixels = np.mean([view.camera.W * view.camera.H for view in dataset.train])
-    return max(wanted_gaussians(config, start, float(pixels), len(block.train)), int(ROOM * start))
+    names, start = set(block.train), inside + outside
+    separate = separate_views([view.camera for view in dataset.train if view.name in names], dataset.points)
+    planned = wanted_gaussians(config, start, float(pixels), len(block.train), separate)
+    return max(planned, int(ROOM * start))
 
 
 def coarse_scene(options: RunOptions) -> Path:

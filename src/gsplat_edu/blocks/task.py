@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import platform
 import socket
@@ -14,11 +15,15 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.json_fields import checked_choice
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.reading import stored_path
+from gsplat_edu.blocks.counted import Counted, counted_views
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
+from gsplat_edu.blocks.views import feature_renderer
+from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.io.ply import load_ply
 from gsplat_edu.ops.kernels import REASON, native
 from gsplat_edu.render.settings import BACKENDS
 from gsplat_edu.runs.options import RunOptions
@@ -111,13 +116,43 @@ def train_block(
         start = folder.start(number)
         if not start.is_file() or file_digest(start) != plan.blocks[number].start:
             raise CheckpointError(f"{start}: is missing or not as it was split; restore it, or split again")
-        capture = CaptureRun(options, say, check=functools.partial(check_views, folder, plan), reader=reader)
+        prepare = functools.partial(_prepared, folder, plan, number, options)
+        capture = CaptureRun(options, say, prepare=prepare, reader=reader)
         if capture.train(stop, callbacks):
             return None
         capture.finish()
         done = _record(folder, plan, number, capture)
         done.write(folder)  # last: it marks the block as finished
     return done
+
+
+def pixels_of_block(folder: BlocksFolder, plan: BlockPlan, number: int, options: RunOptions) -> Counted:
+    """Return what finds the pixels that count in a block, by the Gaussians from which it starts.
+
+    Args:
+        folder: The run in blocks.
+        plan: Its plan.
+        number: The block.
+        options: Those of `block_options`.
+    """
+    start = load_ply(folder.start(number), plan.origin)
+    return Counted(plan.area, plan.blocks[number].core, start, feature_renderer(options))
+
+
+def _prepared(
+    folder: BlocksFolder, plan: BlockPlan, number: int, options: RunOptions, dataset: Dataset
+) -> Dataset:
+    """Return the block's dataset, in which the pixels count that show its cell; refuse one that was not split.
+
+    Raises:
+        CheckpointError: a file of the split is missing or was changed.
+        DatasetError: the capture is not the one that was split.
+    """
+    check_views(folder, plan, dataset)
+    if len(plan.blocks) == 1:
+        return dataset
+    counted = pixels_of_block(folder, plan, number, options)
+    return dataclasses.replace(dataset, train=counted_views(dataset.train, counted))
 
 
 def _record(folder: BlocksFolder, plan: BlockPlan, number: int, capture: CaptureRun) -> Done:

@@ -7,10 +7,11 @@ import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError
 from gsplat_edu.base.text import spelled_seconds
-from gsplat_edu.budget.costs import Facts, Measurements, wanted_gaussians
+from gsplat_edu.budget.costs import Facts, Measurements
 from gsplat_edu.budget.forecast import Forecast, predict
 from gsplat_edu.budget.on_device import check_room, room_of
 from gsplat_edu.budget.probe import probe
@@ -115,7 +116,7 @@ class Prospect:
         image_memory: Bytes of photos kept in memory.
         eval_every: Iterations between evaluations; 0 for none.
         save_every: Iterations between checkpoints; 0 for none.
-        has_depth: Whether it learns from given depth.
+        depth: As for `RunOptions`: where depth comes from that it learns from; None for none.
     """
 
     dataset: Dataset
@@ -125,7 +126,7 @@ class Prospect:
     image_memory: int = 4 * 2**30
     eval_every: int = RunOptions.eval_every
     save_every: int = RunOptions.save_every
-    has_depth: bool = False
+    depth: Path | None = None
 
     @classmethod
     def of(cls, options: RunOptions, reader: CaptureReader) -> Prospect:
@@ -151,18 +152,18 @@ class Prospect:
             options.data_settings.image_memory,
             options.eval_every,
             options.save_every,
-            options.depth is not None,
+            options.depth,
         )
         if config.strategy in ("fast", "mcmc") and config.max_gaussians is None:
             facts = found.facts
-            cap = max(wanted_gaussians(config, facts.points, facts.pixels, facts.train), facts.points)
+            cap = max(facts.wanted(config), facts.points)
             found = dataclasses.replace(found, config=config.changed(max_gaussians=cap))
         return found
 
     @functools.cached_property
     def facts(self) -> Facts:
         """The properties of the capture that determine the cost."""
-        facts = Facts.of(self.dataset, self.full)
+        facts = Facts.of(self.dataset, self.full, depth=self.depth)
         return facts if self.scene is None else dataclasses.replace(facts, points=len(self.scene))
 
     def measured(self, backend: str) -> Measurements:
@@ -208,7 +209,7 @@ def choose_backend(prospect: Prospect, *, allow_software: bool = False) -> Chose
 
     decision = decide(
         listed_outside(),
-        leaves_device(prospect.config, prospect.has_depth),
+        leaves_device(prospect.config, prospect.depth is not None),
         lambda: _failure(prospect),
         seconds,
         wanted=os.environ.get(ADAPTER_VARIABLE, ""),

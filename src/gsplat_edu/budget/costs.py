@@ -12,6 +12,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -19,12 +20,15 @@ from jaxtyping import Float64, Int64
 from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.depths import POINTS
 from gsplat_edu.engine.room import PIXEL_BYTES, REPEATED_PHOTOS, Load, Room, kept_photos
+from gsplat_edu.ops.lenses import RAY_ROOM
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
 from gsplat_edu.scene.sh import num_coefficients
 from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
+from gsplat_edu.train.overlap import separate_views
 from gsplat_edu.train.patches import PHOTO_ROOM
 from gsplat_edu.train.schedule import photo_factor, planned_counts
 
@@ -70,6 +74,12 @@ SURFACE_TIME = 3.0
 """Further time of a step that learns from normals and flatness, in times of a plain one
 (benchmarks/archive/RESULTS-2026-11.md, "Surfaces")."""
 
+RAY_BYTES = 12
+"""Bytes of a pixel's ray in float32."""
+
+DEPTH_TIME = {"points": 0.2, "maps": 1.0}
+"""Further time of a step that compares its depth with given depth, in times of a plain one, by what gives it. Maps are
+taken to have a value for each pixel of a photo (benchmarks/archive/RESULTS-2026-11.md, "What the depth term costs")."""
 
 Amount = TypeVar("Amount", float, np.ndarray)
 """A number, or an array with one number for each iteration."""
@@ -90,6 +100,9 @@ class Facts:
         workers: Number of photos decoded at the same time.
         decoding: Bytes per pixel of the file during decoding, most for HEIC and 16 bits.
         measured: Whether the start points are points of the scene; otherwise they are random.
+        depth: What gives the depth that the training learns from, of `DEPTH_TIME`; empty if nothing does.
+        separate: Of the training views, as `gsplat_edu.train.overlap.separate_views` counts them.
+        lens_pixels: Pixels of one training view for each lens that is kept; pinholes have none.
     """
 
     train: int
@@ -102,14 +115,18 @@ class Facts:
     workers: int
     decoding: int = BYTES_PER_PIXEL
     measured: bool = True
+    depth: str = ""
+    separate: float = 1.0
+    lens_pixels: float = 0.0
 
     @classmethod
-    def of(cls, dataset: Dataset, full: Dataset | None = None) -> Facts:
+    def of(cls, dataset: Dataset, full: Dataset | None = None, *, depth: Path | None = None) -> Facts:
         """Collect the facts of a dataset.
 
         Args:
             dataset: The capture at training size.
             full: The capture at the size of its files; None if that is the training size.
+            depth: As for `RunOptions`, if the training learns from depth that its views do not carry yet.
         """
         sizes, decoded = (
             [v.camera.W * v.camera.H for v in (*d.train, *d.test)] for d in (dataset, full or dataset)
@@ -125,7 +142,14 @@ class Facts:
             dataset.images.workers,
             dataset.images.decoding,
             dataset.measured,
+            _depth_of(dataset) if depth is None else "points" if depth == POINTS else "maps",
+            separate_views([view.camera for view in dataset.train], dataset.points),
+            _lens_pixels(dataset),
         )
+
+    def wanted(self, config: TrainConfig) -> int:
+        """Estimate how many Gaussians the images need (`wanted_gaussians`)."""
+        return wanted_gaussians(config, self.points, self.pixels, self.train, self.separate)
 
     def smaller(self, factor: float) -> Facts:
         """Return the facts with width and height of every view divided by a factor."""
@@ -135,6 +159,7 @@ class Facts:
             pixels=self.pixels / area,
             largest=self.largest / area,
             photo_bytes=int(self.photo_bytes / area),
+            lens_pixels=self.lens_pixels / area,
         )
 
 
@@ -248,11 +273,19 @@ def pixel_share(config: TrainConfig) -> float:
     return float(np.mean([photo_factor(config, iteration) ** -2 for iteration in some]))
 
 
-def surface_factors(config: TrainConfig) -> Float64[np.ndarray, " iterations"]:
-    """Return the time of each iteration as a multiple of its time without `surface`, averaged over `surface_every`."""
-    more = SURFACE_TIME / config.surface_every if config.surface else 0.0
+def term_factors(config: TrainConfig, depth: str = "") -> Float64[np.ndarray, " iterations"]:
+    """Return the time of each iteration as a multiple of its time without surface and depth.
+
+    The steps that compute these terms share their time with the others (`surface_every`, `depth_every`).
+
+    Args:
+        config: The run.
+        depth: What gives depth, as for `Facts`.
+    """
+    compared = DEPTH_TIME[depth] / config.depth_every if depth else 0.0
+    surface = SURFACE_TIME / config.surface_every if config.surface else 0.0
     late = np.arange(config.iterations) >= config.surface_start
-    return np.where(late, 1.0 + more, 1.0)
+    return np.where(late, 1.0 + compared + surface, 1.0 + compared)
 
 
 def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.ndarray, " iterations"]:
@@ -266,32 +299,34 @@ def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.
     counts = expected_counts(config, facts.points, facts.pixels)
     factors = np.array([photo_factor(config, iteration) for iteration in range(config.iterations)])
     seconds = speed.seconds(counts.astype(np.float64), facts.pixels / factors**2)
-    return np.array(seconds * surface_factors(config))
+    return np.array(seconds * term_factors(config, facts.depth))
 
 
 def photo_copies(config: TrainConfig, facts: Facts) -> int:
-    """Return how many bytes the training's own copies of photos add to the peak memory.
+    """Return how many bytes the training's own copies of photos, and the rays of lenses, add to the peak memory.
 
     Only training photos have copies: reduced ones early, with at most half of their pixels, and for patches those
-    without colours, which stay. All reduced ones are freed before training uses full size. While they exist, a step
-    therefore takes at most half of the memory that the evaluation takes for images, and only what exceeds the other
-    half raises the peak.
+    without colours, which stay, as rays do. All reduced ones are freed before training uses full size. While they
+    exist, a step therefore takes at most half of the memory that the evaluation takes for images, and only what exceeds
+    the other half raises the peak.
 
     Args:
         config: The run.
         facts: The capture at training size.
     """
-    grey = 0
+    kept = min(RAY_ROOM, RAY_BYTES * math.ceil(facts.lens_pixels)) if config.surface else 0
     if config.surface and config.patch_weight > 0:
-        grey = min(PHOTO_ROOM, GREY_BYTES * math.ceil(facts.pixels) * facts.train)
+        kept += min(PHOTO_ROOM, GREY_BYTES * math.ceil(facts.pixels) * facts.train)
     if photo_factor(config, 0) <= 1.0:
-        return grey
+        return kept
     share = facts.train / max(facts.train + facts.test, 1)
     copies = min(REDUCED_ROOM, int(share * facts.photo_bytes) // 2)
-    return grey + max(copies - int(PER_PIXEL * facts.largest) // 2, 0)
+    return kept + max(copies - int(PER_PIXEL * facts.largest) // 2, 0)
 
 
-def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int = PLANNED_VIEWS) -> int:
+def wanted_gaussians(
+    config: TrainConfig, points: int, pixels: float, views: int = PLANNED_VIEWS, separate: float = 1.0
+) -> int:
     """Estimate how many Gaussians the images need: the plan of fast, or the growth of adc within the given iterations.
 
     Args:
@@ -299,11 +334,24 @@ def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int
         points: Number of start points.
         pixels: Pixels of a view.
         views: Number of training views.
+        separate: As for `gsplat_edu.train.capacity.planned_gaussians`.
     """
     if config.strategy == "fast":
-        return planned_gaussians(pixels, views)
+        return planned_gaussians(pixels, views, separate)
     window = min(config.adc.densify_stop, config.iterations) - config.densify_start
     return points + _added(points, pixels) * max(window // config.densify_every, 0)
+
+
+def _lens_pixels(dataset: Dataset) -> float:
+    """Return `Facts.lens_pixels` of a capture."""
+    lenses = {view.camera.intrinsics for view in dataset.train if not view.camera.pinhole}
+    return float(sum(lens.W * lens.H for lens in lenses))
+
+
+def _depth_of(dataset: Dataset) -> str:
+    """Return what gives the depth that the training views carry, by the first one that has some."""
+    read = next((view.depth for view in dataset.train if view.depth is not None), None)
+    return "" if read is None else "points" if read().sparse else "maps"
 
 
 def _added(points: int, pixels: float) -> int:

@@ -15,7 +15,7 @@ from gsplat_edu.budget.costs import (
     expected_counts,
     photo_copies,
     pixel_share,
-    surface_factors,
+    term_factors,
 )
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings
@@ -113,7 +113,7 @@ def predict(
     speed, last = measured.speed, config.iterations - 1
     missing = 1.0 - min(image_memory / max(facts.photo_bytes, 1), 1.0)
     reading_again = measured.read * missing / torch.get_num_threads()
-    longer = surface_factors(config)
+    longer = term_factors(config, facts.depth)
     plain = speed.seconds(float(counts.mean()), facts.pixels * pixel_share(config))
     each = plain * float(longer.mean()) + reading_again
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.text import easily_read, spelled_seconds
+from gsplat_edu.base.text import Told, easily_read, spelled_seconds
 from gsplat_edu.budget.costs import (
     LATER,
     Facts,
@@ -25,7 +25,6 @@ from gsplat_edu.budget.costs import (
     Measurements,
     photo_copies,
     step_profile,
-    wanted_gaussians,
 )
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
@@ -41,6 +40,7 @@ from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.start import scene_start
 from gsplat_edu.runs.thin import ThinTrial
 from gsplat_edu.runs.training import RunOptions
+from gsplat_edu.train.capacity import SEPARATE
 from gsplat_edu.train.config import RECIPE_ITERATIONS, TrainConfig
 
 FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
@@ -199,7 +199,7 @@ class Request:
         caps += self.device_caps(config, factor)
         if config.strategy in ("mcmc", "fast") or (self.by_time and config.strategy == "adc"):
             facts = self.facts.smaller(factor)
-            wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+            wanted = facts.wanted(config)
             guarded = config.strategy == "adc"
             caps.append(easily_read(math.ceil(GUARD * wanted)) if guarded else max(wanted, self.least))
         return dataclasses.replace(config, max_gaussians=min(caps) if caps else None)
@@ -207,7 +207,7 @@ class Request:
     def wanted(self, config: TrainConfig, factor: float) -> int:
         """Return the Gaussians that a run plans, or for adc may be expected to reach, without regard to memory."""
         facts = self.facts.smaller(factor)
-        wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+        wanted = facts.wanted(config)
         return math.ceil(GUARD * wanted) if config.strategy == "adc" else wanted
 
     def device_caps(self, config: TrainConfig, factor: float) -> list[int]:
@@ -302,7 +302,7 @@ def _measured(
     if "resolution" not in fixed:
         side = min(min(view.camera.W, view.camera.H) for view in (*files.train, *files.test))
         factors += tuple(factor for factor in FACTORS if factor > 1 and side / factor >= SMALLEST_SIDE)
-    facts, scene = Facts.of(dataset, files), None
+    facts, scene = Facts.of(dataset, files, depth=options.depth), None
     if options.scene is not None:
         scene, _ = scene_start(options.scene, options.config, dataset.origin)
         facts = dataclasses.replace(facts, points=len(scene))
@@ -324,14 +324,18 @@ def _with_planned_count(options: RunOptions, given: Collection[str], reader: Cap
     if config.max_gaussians is not None or not (config.strategy == "fast" or room is not None):
         return Plan(options)
     dataset = Dataset.of(reader, options.data_settings, points=options.points)
-    facts = Facts.of(dataset)
+    facts = Facts.of(dataset, depth=options.depth)
     if options.scene is not None:
         facts = dataclasses.replace(facts, points=len(scene_start(options.scene, config, dataset.origin)[0]))
     request = Request(options, Limits(), frozenset({*given, "iterations"}), True, facts, room=room)
     config = request.config(config.iterations, 1.0, None)
     sentences = _device_sentences(request, config)
     if config.strategy == "fast" and not sentences:
-        sentences = (f"the recipe plans {config.max_gaussians:,} Gaussians; --max-gaussians changes that",)
+        planned = f"the recipe plans {config.max_gaussians:,}"
+        much = facts.separate > SEPARATE
+        why = f", because the photos show as much as {facts.separate:g} that do not overlap" if much else ""
+        said = f"{planned} Gaussians{why}; --max-gaussians changes that"
+        sentences = (Told(said, f"{planned} splats{why}"),)
     return Plan(dataclasses.replace(options, config=config), sentences=sentences)
 
 
@@ -396,7 +400,7 @@ def _within_memory(
         reduced = photo_copies(request.options.config, facts)
         config = request.config(iterations, factor, None)
         footprint = Footprint(facts, process + reduced, pairs, config.sh_degree, config.batch, request.room)
-        wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+        wanted = facts.wanted(config)
         if config.strategy == "none":
             wanted = facts.points
         wanted = min(wanted, config.max_gaussians or wanted)

@@ -133,7 +133,7 @@ def _without_changes(config: TrainConfig, steps: int, gaussians: int) -> TrainCo
         fast_start_factor=1.0,
         fast_stop=steps + 1,
         max_gaussians=max(gaussians, config.max_gaussians or 0),
-        surface=False,  # `costs.surface_factors` adds its time
+        surface=False,  # `costs.term_factors` adds its time
         **dict.fromkeys(("refine", "appearance", "transients", "sky"), "none"),
     )
 
@@ -203,5 +203,5 @@ def halved(view: View) -> View:
     )
     H, W = -(-camera.H // 2), -(-camera.W // 2)
     assert image is not None  # every photo has an image
-    small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(W, H))
+    small = camera.scaled(W, H)
     return View(small, image, alpha=alpha, mask=mask)

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
+from gsplat_edu.clean.sight import largest_weights
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
@@ -127,12 +128,8 @@ def peak_weights(
     """
     found: Float32[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.float32)
     for view in views:
-        some = replace(gaussians, logit_opacities=gaussians.logit_opacities.detach().clone().requires_grad_())
-        output = render(some, view.camera, settings=settings, backend=backend)
-        weights = output.collect("weight_max")
-        torch.autograd.grad(output.image, some.logit_opacities, torch.zeros_like(output.image))
-        ids = output.visible.numpy()
-        found[ids] = np.maximum(found[ids], weights()["weight_max"].numpy())
+        ids, weights = largest_weights(gaussians, view.camera, settings, backend)
+        found[ids] = np.maximum(found[ids], weights)
     return found
 
 

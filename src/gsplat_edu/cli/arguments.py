@@ -15,13 +15,14 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn, TextIO
 
 from gsplat_edu.base.constants import AUTO, LOOPBACK
 from gsplat_edu.base.errors import BackendWarning, SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.headroom import shortage
-from gsplat_edu.base.text import bounded, printable
+from gsplat_edu.base.text import bounded, plain_of, printable
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.cli.ranks import is_first, speaks_for_all
 from gsplat_edu.jobs import emitter
@@ -243,9 +244,9 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
             command()
     except KeyboardInterrupt as interruption:
         if is_first() and speaks_for_all():
-            said = f"{program}: {str(interruption) or 'interrupted'}"
-            complain(said)
-            emitter.emit(Interrupted(said))
+            said = interruption.args[0] if interruption.args else "interrupted"
+            complain(f"{program}: {said}")
+            emitter.emit(Interrupted(plain_of(said)))
         return EXIT_INTERRUPTED
     except Exception as error:
         if (line := _line(program, error)) is None:
@@ -279,6 +280,46 @@ def _terminable() -> Iterator[None]:
     finally:
         # None stands for a handler that Python did not install and cannot put back
         signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+@contextmanager
+def interruptible_imports() -> Iterator[None]:
+    """Let Ctrl-C end imports in the block even if a module that is being imported catches the interruption.
+
+    The signal handlers of the block's beginning raise the interruption. If it was caught, the end of the block raises
+    it again. Only the main thread may set signal handlers; other threads get none of these signals.
+
+    Raises:
+        KeyboardInterrupt: the user, or a queue of jobs, interrupted the block.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[KeyboardInterrupt] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        handler = before[signal.Signals(number)]
+        try:
+            if callable(handler):
+                handler(number, frame)
+        except KeyboardInterrupt as interruption:
+            came.append(interruption)
+            raise
+
+    changed = {number: handler for number, handler in before.items() if callable(handler)}
+    for number in changed:
+        signal.signal(number, note)
+    try:
+        yield
+    except Exception:
+        if not came:
+            raise  # else the interruption is what made the import fail
+    finally:
+        for number, handler in changed.items():
+            signal.signal(number, handler)
+    if came:
+        raise came[0]
 
 
 @contextmanager

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.locks import locked_file
+from gsplat_edu.base.reading import open_file
+from gsplat_edu.base.text import write_text
 from gsplat_edu.clean.guard import clean
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
+from gsplat_edu.edits.carry import for_part
+from gsplat_edu.edits.document import parse_edits
+from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.edits.stored import MOST_BYTES
 from gsplat_edu.io.formats import format_of
 from gsplat_edu.io.ply import ORIGIN, save_ply
 from gsplat_edu.jobs import emitter
@@ -19,9 +27,12 @@ from gsplat_edu.runs.cleaning import SIGNALS, default_target, open_subject, prev
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
 
+EDITS = "edits.json"
+"""Name of the edits of a cleaned scene, beside it."""
+
 
 def run(arguments: argparse.Namespace) -> None:
-    """Judge the scene, report, and write the requested files."""
+    """Check the outputs, and clean while no other command writes them."""
     console = Terminal()
     scene = open_source(arguments.source).path
     out = arguments.out or default_target(scene)
@@ -31,6 +42,22 @@ def run(arguments: argparse.Namespace) -> None:
             raise ArgumentError(f"--out: {out} is the scene itself; give another file")
     if arguments.preview is not None:
         export.check_target("--preview", arguments.preview)
+
+    def say(sentence: str) -> None:
+        console.print(sentence, soft_wrap=True)
+
+    with ExitStack() as held:
+        if not arguments.dry_run:
+            held.enter_context(locked_file("--out", out, "gsplat-edu clean", say))
+        _clean(arguments, out, console)
+
+
+def _clean(arguments: argparse.Namespace, out: Path, console: Terminal) -> None:
+    """Judge the scene, report, and write the requested files; `out` belongs to this process."""
+    carried, edited = None, None
+    if arguments.edits is not None:
+        edited = open_source(arguments.source)
+        carried = _checked_edits(arguments.edits, edited, out)
     backend = load_backend("cpu")  # no other one collects the statistics of each splat
     subject = open_subject(arguments.source, arguments.dataset, backend)
     for note in subject.dataset.notes:
@@ -65,6 +92,27 @@ def run(arguments: argparse.Namespace) -> None:
         return
     kept = cleaning.apply(source.scene.gaussians)
     _write(out, replace(source, scene=replace(source.scene, gaussians=kept)), console)
+    if carried is not None and edited is not None:
+        written = open_source(out)
+        part = identity_of(written.scene.gaussians, written.origin)
+        text = for_part(carried, str(arguments.edits), edited.scene.gaussians, cleaning.kept, part)
+        write_text(out.with_name(EDITS), text)
+        console.print(f"wrote {out.with_name(EDITS)}: the edits for this scene", soft_wrap=True)
+
+
+def _checked_edits(file: Path, source: Source, out: Path) -> bytes:
+    """Read an edits file of the scene, which must not be overwritten by that of the cleaned one.
+
+    Raises:
+        ArgumentError: it is none of this scene, or the edits of the cleaned scene have no place.
+        OSError: it cannot be read.
+    """
+    if out.with_name(EDITS).exists():
+        raise ArgumentError(f"--out: there is an {EDITS} beside {out}; give a file in another folder")
+    with open_file(file) as opened:
+        data = opened.read(MOST_BYTES + 1)
+    parse_edits(data, str(file)).check_scene(identity_of(source.scene.gaussians, source.origin), str(file))
+    return data
 
 
 def _write(out: Path, source: Source, console: Terminal) -> None:
@@ -73,7 +121,7 @@ def _write(out: Path, source: Source, console: Terminal) -> None:
     if ply and source.origin != ORIGIN:
         save_ply(out, source.scene.gaussians, source.origin, source.scene.antialiased)
     else:
-        for note in export.losses(out, source.scene):
+        for note in export.losses(out, source):
             console.print(note, soft_wrap=True)
         if source.origin != ORIGIN:
             where = ", ".join(f"{x:.6g}" for x in source.origin)

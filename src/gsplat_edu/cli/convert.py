@@ -13,32 +13,42 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.locks import locked_file
 from gsplat_edu.base.reading import read_text
 from gsplat_edu.cli.arguments import numbers_text
 from gsplat_edu.cli.exporting import check_and_say
-from gsplat_edu.cli.options.convert import MOVES
+from gsplat_edu.cli.options.convert import MOVES, photos_asked
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
-from gsplat_edu.edits.apply import Views, edited, placed, views_after
-from gsplat_edu.edits.document import Edits, read_edits
-from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.edits.apply import views_after
+from gsplat_edu.edits.document import read_edits
 from gsplat_edu.edits.operations import Measure
-from gsplat_edu.evaluate.keyframes import KeyframePath, read_path
+from gsplat_edu.evaluate.keyframes import read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.io.formats import LOD_META, TILESET
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.lod.tiles import tile_options
-from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.sfm.scale_text import points_of
-from gsplat_edu.viewer import export, page
-from gsplat_edu.viewer.edit_page import tour_of
+from gsplat_edu.viewer import export
+from gsplat_edu.viewer.edited import edited_meshes, edited_source, toured
+from gsplat_edu.viewer.page import Tour
 from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
+from gsplat_edu.viewer.page_proof import Proof, photos_of, seen_of, training_cameras
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Convert, report the written file, and verify it if requested."""
+    """Convert, report the written file, and verify it if requested; no other command writes it meanwhile."""
+    console = Terminal()
+    _check(arguments)
+    with locked_file(
+        "OUT", arguments.out, "gsplat-edu convert", functools.partial(console.print, soft_wrap=True)
+    ):
+        _convert(arguments, console)
+
+
+def _convert(arguments: argparse.Namespace, console: Terminal) -> None:
     keep = Filter(arguments.min_opacity, arguments.crop, arguments.sh_degree)
     move = IDENTITY
     for text in arguments.transform:
@@ -47,20 +57,17 @@ def run(arguments: argparse.Namespace) -> None:
         given = points_of(arguments.scale)
         move = Similarity(np.eye(3), given.length / given.apart, np.zeros(3)).after(move)
     backend = resolve_backend(arguments.backend) if arguments.verify or arguments.lod_refine else ""
-    _check(arguments)
     along = None if arguments.path is None else read_path(arguments.path)
     edits = None if arguments.edits is None else read_edits(arguments.edits)
     views = views_after(() if edits is None else edits.operations)
     options = _levels(arguments)
-    console = Terminal()
     columns = (
         Field("{task.description}"),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    quiet = not console.is_terminal
-    with Bar(*columns, console=console, transient=True, disable=quiet) as bar:
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         steps = bar.add_task("reading", total=len(arguments.sources) + 1)
         sources: list[Source] = []
         meshes: Meshes | None = None
@@ -69,20 +76,21 @@ def run(arguments: argparse.Namespace) -> None:
             source = open_source(path)
             meshes = open_meshes(arguments.surface, arguments.collider, source) if not sources else meshes
             if edits is not None:
-                source = _after_edits(source, edits, views, arguments)
+                meshes = meshes if sources else edited_meshes(meshes, source, edits)
+                source = edited_source(source, edits, str(arguments.edits), arguments.edits_anyway)
             sources.append(_filtered(source, keep, move))
             bar.advance(steps)
         source = _joined(sources)
         if arguments.scale is not None:
             source = replace(source, scene=replace(source.scene, unit=given.unit))
         say = functools.partial(console.print, soft_wrap=True)
-        for note in (*_origins(sources), *export.losses(arguments.out, source.scene)):
+        for note in (*_origins(sources), *export.losses(arguments.out, source)):
             say(note)
         total = move if views.move is IDENTITY else move.after(views.move)
         for measure in views.measures:
             say(_measured(measure, total.s, source.scene.unit))
-        source, tour = _toured(source, views, total, along)
-        tour = replace(tour, meshes=meshes and meshes.moved(total))
+        source, tour = toured(source, views, total, along)
+        tour = _proven(replace(tour, meshes=meshes and meshes.moved(total)), source, arguments, bar, say)
         bar.update(steps, description=f"writing {arguments.out}")
         if arguments.lod_refine is None:
             export.write(arguments.out, source, tour, options)
@@ -99,42 +107,32 @@ def run(arguments: argparse.Namespace) -> None:
             check_and_say(arguments.out, source, backend, bar, say)
 
 
+def _proven(
+    tour: Tour, source: Source, arguments: argparse.Namespace, bar: Bar, say: Callable[[str], None]
+) -> Tour:
+    """Return the tour with the evidence that --verify photos asks for, and say what it takes."""
+    most = photos_asked(arguments)
+    if most is None:
+        return tour
+    photos = photos_of(source, arguments.dataset, most)
+    task = bar.add_task("what photos saw", total=len(training_cameras(source)))
+    proof = Proof(seen_of(source, lambda: bar.advance(task)), photos)
+    bar.remove_task(task)
+    say(proof.line())
+    return replace(tour, proof=proof)
+
+
 def _say_written(path: Path, source: Source, meshes: Meshes | None, say: Callable[[str], None]) -> None:
     """Say what a written file contains, and the size of a page with a mesh."""
     count, degree = len(source.scene.gaussians), export.kept_degree(path, source.scene)
     more = ""
+    if meshes is not None and meshes.stays:
+        say("--edits: move some splats without the others; the mesh shows them where they were")
     if meshes is not None:
         more = f"; mesh of {len(meshes.surface.faces):,} triangles; {path.stat().st_size:,} bytes"
     say(f"wrote {path}: {count:,} splats, SH degree {degree}{more}")
     if export.has_levels(path):
         say(export.levels_line(path))
-
-
-def _after_edits(source: Source, edits: Edits, views: Views, arguments: argparse.Namespace) -> Source:
-    """Apply the operations of an edits file."""
-    scene, name = source.scene, str(arguments.edits)
-    edits.check_scene(identity_of(scene.gaussians, source.origin), name, arguments.edits_anyway)
-    left = edited(scene, edits.operations)
-    if not len(left.gaussians):
-        raise ArgumentError(
-            f"{name}: leaves none of {len(scene.gaussians):,} splats; remove a deletion from it"
-        )
-    cameras = source.cameras
-    if views.move is not IDENTITY:
-        cameras = tuple((name, views.move.camera(camera)) for name, camera in cameras)
-    return replace(source, scene=placed(left, views), cameras=cameras)
-
-
-def _toured(
-    source: Source, views: Views, move: Similarity, along: KeyframePath | None
-) -> tuple[Source, page.Tour]:
-    """Return the scene with the origin of its coordinates after all moves, and the tour of its page."""
-    path = views.path if along is None else along.shifted(-np.array(source.origin))
-    if path is not None:
-        path = path.placed(move.R, move.s, move.t)
-    if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
-        source = replace(source, origin=ORIGIN)
-    return source, tour_of(source, views, move, path)
 
 
 def _measured(measure: Measure, scale: float, unit: str | None) -> str:

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.text import plain_of
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.options.depth import check_depth
 from gsplat_edu.cli.terminal import Bar, Terminal
@@ -61,13 +62,15 @@ def run(arguments: argparse.Namespace) -> None:
             Found(
                 finding.name,
                 finding.severity.name.lower(),
-                finding.sentence,
-                finding.advice,
+                plain_of(finding.sentence),
+                plain_of(finding.advice),
                 finding.images,
                 finding.values,
+                finding.options,
             )
         )
-    emitter.emit(Diagnosed(diagnosis.facts, diagnosis.fine, tuple(diagnosis.advice)))
+    advice = tuple(filter(None, map(plain_of, diagnosis.advice)))
+    emitter.emit(Diagnosed(diagnosis.facts, diagnosis.fine, advice))
     console.print(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis), sep="\n", soft_wrap=True)
     if diagnosis.hopeless:
         emitter.finish()
@@ -97,7 +100,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
     auto = arguments.backend == AUTO
     if arguments.no_forecast or diagnosis.hopeless:
         return diagnosis, [*_gpu_lines(backend), *(_auto_lines(usual_choice()) if auto else ())]
-    from gsplat_edu.budget.costs import Facts, wanted_gaussians
+    from gsplat_edu.budget.costs import Facts
 
     if arguments.resolution is None and (side := side_for_training(survey)) is not None:
         settings = DataSettings(resolution=float(side))  # as the command in the advice trains
@@ -106,9 +109,9 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         facts = Facts.of(dataset)
         length = arguments.iterations or planned_iterations(DEFAULT_QUALITY, facts.train, facts.measured)
         config = recipe(length, strategy=DEFAULT_STRATEGY)
-        cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+        cap = facts.wanted(config)
         config = dataclasses.replace(config, max_gaussians=cap)
-        prospect = Prospect(dataset, full, config)
+        prospect = Prospect(dataset, full, config, depth=arguments.depth)
         chosen = choose_backend(prospect) if auto else None
         backend = backend if chosen is None else chosen.backend
         measured = None if chosen is None else chosen.measured.get(backend)

@@ -33,9 +33,10 @@ def run(arguments: argparse.Namespace) -> None:
     folder, into = RunFolder(arguments.run_folder), None
     if arguments.out is not None:
         into = RunFolder(arguments.out)
-        _check_apart(into)
     name, place = ("RUN", folder.path) if into is None else ("--out", into.path)
     with locked(name, place, "gsplat-edu eval", say):
+        if into is not None:
+            _check_apart(into)  # what another command has just written there counts too
         _evaluate(arguments, folder, into, console, say)
 
 

@@ -35,7 +35,7 @@ def export_all(
     """Write a scene to every path, check each file, and return the entries for metrics.json."""
     written = []
     for path in paths:
-        for note in export.losses(path, source.scene):
+        for note in export.losses(path, source):
             say(note)
         export.write(path, source)
         emitter.report_output(path)

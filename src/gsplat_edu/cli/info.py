@@ -18,7 +18,8 @@ from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, Check
 from gsplat_edu.base.text import short_number
 from gsplat_edu.budget.choice import usual_choice
 from gsplat_edu.cli.terminal import Terminal
-from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.engine import adapters
 from gsplat_edu.io import ply
@@ -28,6 +29,7 @@ from gsplat_edu.render.backends import BACKENDS, gpu_of, unavailable
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
 
 PERCENTILES = (1, 25, 50, 75, 99)
 
@@ -212,7 +214,8 @@ def _scores(scores: Mapping[str, Any]) -> list[str]:
 
 
 def _dataset_facts(path: Path) -> list[Fact]:
-    dataset = load_dataset(path, DataSettings())
+    reader = CaptureReader(path)
+    dataset = Dataset.of(reader, DataSettings())
     views = (*dataset.train, *dataset.test)
     cameras = [view.camera for view in views]
     sizes = Counter(f"{camera.W}x{camera.H}" for camera in cameras)
@@ -223,6 +226,8 @@ def _dataset_facts(path: Path) -> list[Fact]:
         ("layout", str(dataset.layout)),
         ("photos", f"{len(views)}: {_counted(sizes)}"),
         ("cameras", _counted(lenses)),
+        ("lens", _counted(Counter(file.lens.described for _, file in dataset.files))),
+        *_shutter_facts([frame.shutter for frame in reader.capture.frames]),
         ("split", f"{len(dataset.train)} for training, {len(dataset.test)} held out"),
         ("extent", f"{short_number(scene_extent(cameras), 4)} world units"),
         ("positions", _bounds(eyes)),
@@ -236,6 +241,21 @@ def _dataset_facts(path: Path) -> list[Fact]:
     if np.any(dataset.origin):
         facts.append(("origin", f"shifted to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
     return facts + [("note", str(note)) for note in dataset.notes]
+
+
+def _shutter_facts(shutters: Sequence[RollingShutter | None]) -> list[Fact]:
+    """Describe the rolling shutters and the motion blur of a capture's photos, if there are any."""
+    moving = [shutter for shutter in shutters if shutter is not None]
+    rolling = [shutter for shutter in moving if shutter.readout != AT_ONCE]
+    blurred = [shutter for shutter in moving if shutter.exposure]
+    blur = [("motion blur", f"in {len(blurred)} of {len(shutters)} photos, by their exposure time")]
+    if not rolling:
+        return blur if blurred else []
+    turn = float(np.median([np.linalg.norm(shutter.turn) for shutter in rolling]))
+    shift = float(np.median([np.linalg.norm(shutter.shift) for shutter in rolling]))
+    motion = f"turn {np.degrees(turn):.2g} degrees, shift {short_number(shift, 3)} world units (medians)"
+    facts = [("shutter", f"rolling in {len(rolling)} of {len(shutters)} photos: {motion}")]
+    return facts + (blur if blurred else [])
 
 
 def _section(values: Mapping[str, Any], key: str) -> Mapping[str, Any]:

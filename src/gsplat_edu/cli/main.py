@@ -11,7 +11,13 @@ from importlib.metadata import version
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import option_flag
-from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
+from gsplat_edu.cli.arguments import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERRUPTED,
+    OneLineParser,
+    interruptible_imports,
+    run_command,
+)
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.jobs import emitter
@@ -34,6 +40,8 @@ COMMANDS = {
     "view": "show a scene or a run in the browser",
     "studio": "take photos to a finished scene on one page in the browser",
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
+    "leave-out": "take photos out of use in a capture, or bring them back; their files stay",
+    "mask": "exclude parts of a photo by its mask, or restore the mask as it was",
     "info": "summarise a capture, a run, a scene file or this computer on one screen",
 }
 """Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `cli.options`."""
@@ -52,7 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     escape_unencodable_characters()
     emitter.start_reporting()
     try:
-        parser = build_parser(words)
+        with interruptible_imports():
+            parser = build_parser(words)
         parsed = parser.parse_args(words)
         if parsed.command is None:
             parser.print_help()
@@ -75,7 +84,7 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=summary, description=summary)
         if name not in words:
             continue
-        options = importlib.import_module(f"gsplat_edu.cli.options.{name}")
+        options = importlib.import_module(f"gsplat_edu.cli.options.{_module(name)}")
         command.epilog = options.EXAMPLE
         options.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="print the traceback of an error")
@@ -86,16 +95,23 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
+def _module(command: str) -> str:
+    """Return the name of a command's modules."""
+    return command.replace("-", "_")
+
+
 def _run(name: str, arguments: argparse.Namespace) -> None:
     """Check the options, import the command, which takes seconds if it needs torch, and run it."""
     if "backend" in arguments:
         check_backend(arguments.backend)
-    options = importlib.import_module(f"gsplat_edu.cli.options.{name}")
+    options = importlib.import_module(f"gsplat_edu.cli.options.{_module(name)}")
     try:
         if hasattr(options, "check"):
             options.check(arguments)
-        module = options.runner(arguments) if hasattr(options, "runner") else name
-        importlib.import_module(f"gsplat_edu.cli.{module}").run(arguments)
+        module = options.runner(arguments) if hasattr(options, "runner") else _module(name)
+        with interruptible_imports():
+            command = importlib.import_module(f"gsplat_edu.cli.{module}")
+        command.run(arguments)
     except ArgumentError as error:
         if (told := _as_option(str(error), "settings" in arguments)) == str(error):
             raise

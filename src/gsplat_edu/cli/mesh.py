@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
-from gsplat_edu.base.locks import locked
+from gsplat_edu.base.locks import locked, locked_file
 from gsplat_edu.base.text import short_number, spelled_bytes
 from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS, TEXTURE_FACES
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
@@ -28,7 +28,7 @@ from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
 from gsplat_edu.mesh.convex import convex_parts, farthest_outside
 from gsplat_edu.mesh.depths import render_depths
-from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh
+from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh, volume_room
 from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings
 from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust, trust_of
 from gsplat_edu.render.backend import Backend
@@ -54,6 +54,16 @@ def run(arguments: argparse.Namespace) -> None:
     """Make the mesh, write it, and say how far it can be trusted."""
     console, backend = Terminal(), load_backend(arguments.backend)
     check_writable("OUT", arguments.out)
+
+    def say(sentence: str) -> None:
+        console.print(sentence, soft_wrap=True)
+
+    # the files beside an OBJ, its material and its image, are covered too
+    with locked_file("OUT", arguments.out, "gsplat-edu mesh", say):
+        _make(arguments, backend, console)
+
+
+def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal) -> None:
     if arguments.out.suffix.lower() == ".usdz":
         require_usd()  # before the work of minutes
     truth = None if arguments.truth is None else read_mesh(arguments.truth)
@@ -68,7 +78,9 @@ def run(arguments: argparse.Namespace) -> None:
     result = _extracted(source, cameras, backend, settings, console)
     for sentence in result.notes:
         console.print(sentence, soft_wrap=True)
-    mesh = result.mesh if dataset is None else painted(result.mesh, dataset, result.views)
+    mesh = result.mesh
+    if dataset is not None:
+        mesh = painted(mesh, dataset, result.views, run_of(source.path))
     facts = _written(arguments, mesh, result, source, console)
     scores = None
     if truth is not None:
@@ -204,7 +216,7 @@ def _settings(
     if arguments.bounds is not None:
         bounds = np.array(arguments.bounds).reshape(2, 3) - np.array(source.origin)
     tidy = TidySettings(share, arguments.keep == "largest", faces=faces)
-    return MeshSettings(voxel, bounds, arguments.max_memory, tidy)
+    return MeshSettings(voxel, bounds, volume_room(arguments.max_memory, cameras), tidy)
 
 
 def _moved(mesh: Mesh, origin: tuple[float, float, float]) -> Mesh:

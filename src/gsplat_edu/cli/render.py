@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE
+from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE, lens_choice
+from gsplat_edu.cli.shot import PLAN, Shot, check_lens, median_depth, plan_asked_for, through_lens
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.edits.apply import Views, edited, placed, views_after
@@ -34,47 +35,26 @@ from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
-from gsplat_edu.render.backends import device_of, resolve_backend
+from gsplat_edu.render.backends import device_of, load_backend, resolve_backend
+from gsplat_edu.render.field import within_field
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import MAPS, RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
-from gsplat_edu.runs.source import file_settings, relative_to
+from gsplat_edu.runs.source import file_settings, relative_to, scene_up, up_and_unit
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.scene.rig import through_lenses
 
 MOST_FRAMES = 100_000
 """Largest number of frames of a path unless --frames gives more: an hour at 28 frames per second."""
 
 
-@dataclass(frozen=True)
-class Shot:
-    """The images to render.
-
-    Args:
-        gaussians: The scene.
-        cameras: One per image.
-        names: File names of the images in a folder; None numbers them.
-        settings: Render settings.
-        path: The kind of camera path and the reason for it; "" for the dataset's cameras and for keyframes.
-        maps: Names of the maps to write beside the images.
-        origin: Subtracted from the coordinates of the scene's file and of the cameras.
-    """
-
-    gaussians: Gaussians
-    cameras: Sequence[Camera]
-    names: Sequence[str] | None
-    settings: RenderSettings
-    path: str = ""
-    maps: Sequence[str] = ()
-    origin: Sequence[float] = ORIGIN
-
-
 def run(arguments: argparse.Namespace) -> None:
     """Render and report the written files, or write the path."""
-    backend = resolve_backend(arguments.backend)
     _check_numbers(arguments)
+    lens = lens_choice(arguments.camera_model)
+    backend = _backend(arguments.backend, lens.kind)
     maps = _chosen_maps(arguments)
     folder = RunFolder(arguments.source)
     edits = None if arguments.edits is None else read_edits(arguments.edits)
@@ -82,7 +62,9 @@ def run(arguments: argparse.Namespace) -> None:
     has_path = arguments.path is not None or (
         edits is not None and views_after(edits.operations).path is not None
     )
-    name = _output_name(has_path, orbit, bool(maps))
+    planned = plan_asked_for(arguments, has_path)
+    check_lens(arguments, maps, planned)
+    name = PLAN if planned else _output_name(has_path, orbit, bool(maps))
     if folder.exists():
         shot = _run_shot(arguments, folder, orbit, edits)
         out = arguments.out or folder.renders / name
@@ -95,6 +77,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     else:
         raise ArgumentError(f"{arguments.source}: does not exist; give a run folder or a scene file")
+    shot = through_lens(shot, lens, arguments.size, planned)
     console = Terminal()
     if shot.path:
         console.print(shot.path, soft_wrap=True)
@@ -112,7 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
                 yield frame
                 bar.advance(task)
 
-        written = write_frames(out, advanced(), fps=arguments.fps, names=shot.names)
+        written = write_frames(out, advanced(), arguments.fps, shot.names, shot.sphere)
     emitter.report_output(out)
     each = 1e3 * (time.perf_counter() - started) / len(shot.cameras)
     first = shot.cameras[0]
@@ -120,6 +103,17 @@ def run(arguments: argparse.Namespace) -> None:
     what = f"{len(shot.cameras)} images{also} of {len(shot.gaussians):,} Gaussians"
     what += f", {first.W}x{first.H}, {each:.0f} ms each"
     console.print(f"wrote {out}{'' if written == [out] else '/'}: {what}", soft_wrap=True)
+
+
+def _backend(name: str, lens: str) -> str:
+    """Return the backend to render with: "auto" takes one that has the lens."""
+    found = resolve_backend(name)
+    if lens == "pinhole" or "lens" not in load_backend(found).lacks:
+        return found
+    if name == "auto":
+        return resolve_backend("cpu")
+    load_backend(found).require("lens", f"--camera-model: {lens}")
+    return found
 
 
 def _check_numbers(arguments: argparse.Namespace) -> None:
@@ -201,9 +195,10 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool, edi
     if arguments.dataset not in (None, RUNS_CAMERAS):
         return _dataset_shot(arguments, load_ply(scene), settings, data_settings(config), orbit)
     origin = config.get("origin") or ORIGIN
-    left, views = _after_edits(arguments, Scene(load_ply(scene, origin)), origin, edits)
-    gaussians = left.gaussians
     cameras = folder.read_cameras(origin)
+    up, unit = up_and_unit(config, [camera for _, _, camera in cameras])
+    left, views = _after_edits(arguments, Scene(load_ply(scene, origin), up=up, unit=unit), origin, edits)
+    gaussians, up = left.gaussians, left.up or WORLD_UP
     named = [(name, camera) for name, _, camera in cameras]
     if views.move is not IDENTITY:
         named = [(name, views.move.camera(camera)) for name, camera in named]
@@ -212,8 +207,10 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool, edi
     if (path := _path_of(arguments, origin, views)) is not None:
         first = named[0][1] if arguments.size is None else resized(named[0][1], arguments.size)
         along = _path_cameras(arguments, path, first.W, first.H)
-        return Shot(gaussians, along, None, settings)
-    return replace(_shot(arguments, gaussians, named, settings, orbit), origin=origin)
+        lenses = through_lenses(camera for _, camera in named)
+        return Shot(gaussians, along, None, settings, up=up, through_lenses=lenses)
+    shot = _shot(arguments, gaussians, named, settings, orbit)
+    return replace(shot, origin=origin, up=up, unit=left.unit)
 
 
 def _file_shot(arguments: argparse.Namespace, orbit: bool, edits: Edits | None) -> Shot:
@@ -223,14 +220,14 @@ def _file_shot(arguments: argparse.Namespace, orbit: bool, edits: Edits | None) 
     settings = _settings(file_settings(scene), arguments)
     if arguments.dataset is not None:
         return _dataset_shot(arguments, scene.gaussians, settings, DataSettings(), orbit)
-    side = arguments.size or SCENE_SIZE
+    side, up = arguments.size or SCENE_SIZE, scene.up or WORLD_UP
     if (path := _path_of(arguments, ORIGIN, views)) is not None:
-        return Shot(scene.gaussians, _path_cameras(arguments, path, side, side), None, settings)
-    cameras = orbit_of_scene(scene.gaussians, _orbit_frames(arguments), side, scene.up or WORLD_UP)
+        return Shot(scene.gaussians, _path_cameras(arguments, path, side, side), None, settings, up=up)
+    cameras = orbit_of_scene(scene.gaussians, _orbit_frames(arguments), side, up)
     description = (
         "a scene file has no cameras: using a full circle; --dataset PATH follows a capture's cameras"
     )
-    return Shot(scene.gaussians, cameras, None, settings, description)
+    return Shot(scene.gaussians, cameras, None, settings, description, up=up, unit=scene.unit)
 
 
 def _dataset_shot(
@@ -244,7 +241,7 @@ def _dataset_shot(
     gaussians = relative_to(gaussians, dataset.origin)  # in the coordinate frame of the cameras
     named = [(view.name, view.camera) for view in (*dataset.train, *dataset.test)]
     shot = _shot(arguments, gaussians, named, settings, orbit)
-    return replace(shot, origin=tuple(dataset.origin.tolist()))
+    return replace(shot, origin=tuple(dataset.origin.tolist()), up=scene_up([camera for _, camera in named]))
 
 
 def _shot(
@@ -259,26 +256,19 @@ def _shot(
     cameras = [camera for _, camera in named]
     names, description = None, ""
     if orbit:
-        path = path_along(cameras, _orbit_frames(arguments), _depth(gaussians, cameras[0]))
+        path = path_along(cameras, _orbit_frames(arguments), median_depth(gaussians, cameras[0]))
         cameras, description = path.cameras, path.description
     else:
         names = image_file_names([name for name, _ in named])
     if arguments.size is not None:
         cameras = [resized(camera, arguments.size) for camera in cameras]
-    return Shot(gaussians, cameras, names, settings, description)
+    lenses = through_lenses(camera for _, camera in named)
+    return Shot(gaussians, cameras, names, settings, description, through_lenses=lenses)
 
 
 def _settings(settings: RenderSettings, arguments: argparse.Namespace) -> RenderSettings:
     changes: dict[str, Any] = {"background": (1.0, 1.0, 1.0)} if arguments.white_background else {}
     return replace(settings, depth=False, **changes)
-
-
-def _depth(gaussians: Gaussians, camera: Camera) -> float:
-    """Return the median depth of the Gaussians in front of a camera, without a sky: about its subject's distance."""
-    means = gaussians.means.numpy(force=True)
-    depths = camera.world_to_cam(means[~far_shell(means)])[:, 2]
-    ahead = depths[depths > 0]
-    return float(np.median(ahead)) if ahead.size else 1.0
 
 
 def _chosen_maps(arguments: argparse.Namespace) -> list[str]:
@@ -298,11 +288,13 @@ def _frames(shot: Shot, backend: str, out: Path) -> Iterator[Float[np.ndarray, "
     scales: dict[str, dict[str, float]] = {}
     for index, camera in enumerate(shot.cameras):
         with torch.no_grad():
-            maps, view = render_maps(shot.gaussians, camera, shot.maps, shot.settings, backend)
+            shown = within_field(shot.gaussians, camera) if shot.through_lenses else shot.gaussians
+            maps, view = render_maps(shown, camera, shot.maps, shot.settings, backend)
+        arrays = {name: tensor.numpy(force=True) for name, tensor in maps.items()}
+        image, arrays = shot.within(view.image.numpy(force=True), arrays)
         if shot.maps:
             stem = f"frame_{index:04d}" if shot.names is None else Path(shot.names[index]).stem
-            arrays = {name: tensor.numpy(force=True) for name, tensor in maps.items()}
             scales |= write_maps(out, stem, arrays)
-        yield view.image.numpy(force=True)
+        yield image
     if shot.maps:
         write_list(out, scales)

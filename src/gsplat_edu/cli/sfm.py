@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from gsplat_edu.base.locks import locked
+from gsplat_edu.base.text import Told
 from gsplat_edu.cli.options.sfm import options_from
 from gsplat_edu.cli.terminal import Bar, Terminal, TimeLeft
 from gsplat_edu.jobs import emitter
@@ -33,10 +34,13 @@ def run(arguments: argparse.Namespace) -> None:
             reconstruct(options, say, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                "interrupted; the same command resumes after the last completed stage"
+                Told(
+                    "interrupted; the same command resumes after the last completed stage",
+                    "stopped; it can be continued after the last completed step",
+                )
             ) from None
     emitter.report_output(options.out)
-    say(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN")
+    say(Told(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN", ""))
 
 
 @contextmanager

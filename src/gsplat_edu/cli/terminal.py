@@ -9,7 +9,7 @@ from rich.progress import Progress, ProgressColumn, Task, TaskID, TextColumn, Ti
 from rich.table import Column
 from rich.text import Text
 
-from gsplat_edu.base.text import printable
+from gsplat_edu.base.text import plain_of, printable
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Message
 
@@ -30,10 +30,10 @@ class Terminal(Console):
         super().__init__(highlight=False, markup=False, emoji=False)
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401
-        """Print like rich, each text on one line; a job also reports them (`gsplat_edu.jobs`)."""
+        """Print like rich, each text on one line; a job also reports them, in the words of a page."""
         for text in objects:
-            if isinstance(text, str):
-                emitter.emit(Message(printable(text)))
+            if isinstance(text, str) and (plain := plain_of(text)):
+                emitter.emit(Message(printable(plain)))
         super().print(*(printable(o) if isinstance(o, str) else o for o in objects), **options)
 
     def shows(self, characters: str) -> bool:

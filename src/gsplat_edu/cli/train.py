@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.locks import locked
-from gsplat_edu.base.text import option_flag
+from gsplat_edu.base.text import Told, option_flag
 from gsplat_edu.budget.choice import Prospect, choose_backend, resumed_backend
 from gsplat_edu.budget.deadline import Deadline, stopwatch
 from gsplat_edu.budget.pace import Pace
@@ -41,7 +41,7 @@ from gsplat_edu.doctor.finding import Remedy
 from gsplat_edu.doctor.remedies import CHOICES, remedies_for, transients_for
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.runs.cleaning import cleaner
-from gsplat_edu.runs.pilot import ORDER, PILOT_STEPS, refinement_for
+from gsplat_edu.runs.pilot import refinement_for
 from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
@@ -51,6 +51,7 @@ from gsplat_edu.sfm.source import needs_poses
 from gsplat_edu.train.capacity import advised_side
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.poses import NEED_LENSES
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
@@ -67,6 +68,12 @@ NAME_WIDTH = 20
 
 PSNR_EVERY = 20
 """Iterations between two updates of the last view's loss and PSNR, which cost a few milliseconds each."""
+
+STOPPED_LATE = Told(
+    "interrupted during the evaluation; the scene is saved, and --resume repeats the evaluation",
+    "stopped during the evaluation; the scene is saved, and the evaluation can be repeated",
+)
+"""What an interrupted evaluation says."""
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -153,10 +160,7 @@ def _run(
         with progress_bar(console, "{task.fields[state]}") as bar:
             ended = train_with_bar(capture, bar, ends, [*callbacks, broadcast.show])
         if interrupted() or (ended and team.size > 1 and not ends()):  # or another process was
-            raise KeyboardInterrupt(
-                f"interrupted after {capture.trainer.iteration} iterations;"
-                " add --resume to the same command to continue"
-            )
+            raise KeyboardInterrupt(_stopped(capture.trainer.iteration))
         if pace is not None and pace.outcome is not None:
             say(pace.outcome)
         with progress_bar(console, "") as bar:
@@ -164,9 +168,7 @@ def _run(
 
             def scored(split: str, score: ImageScore) -> None:
                 if interrupted():
-                    raise KeyboardInterrupt(
-                        "interrupted during the evaluation; the scene is saved, and --resume repeats the evaluation"
-                    )
+                    raise KeyboardInterrupt(STOPPED_LATE)
                 bar.advance(task)
                 broadcast.update("evaluating")
 
@@ -177,6 +179,14 @@ def _run(
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
             broadcast.stay(lambda: view.watched)
+
+
+def _stopped(iterations: int) -> Told:
+    """Return the line that says that a training was interrupted and how to resume it."""
+    return Told(
+        f"interrupted after {iterations} iterations; add --resume to the same command to continue",
+        f"stopped after {iterations:,} iterations; it can be continued from there",
+    )
 
 
 def with_points(
@@ -248,13 +258,16 @@ def with_poses(
             say(f"{found}: using the poses that this run started with; {options.data} is not read again")
             return replace(options, data=found)
     say(f"{options.data}: has no poses; finding them first and writing them to {found}")
-    with stage_bars(console) as progress:
+    with locked("--out", found, "gsplat-edu train", say), stage_bars(console) as progress:
         try:
             chosen = SfmOptions(options.data, found, panorama=arguments.panorama, scale=arguments.scale)
             reconstruct(chosen, say, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                "interrupted while finding poses; the same command resumes after the last completed stage"
+                Told(
+                    "interrupted while finding poses; the same command resumes after the last completed stage",
+                    "stopped while finding poses; it can be continued after the last completed step",
+                )
             ) from None
     return replace(options, data=found)
 
@@ -310,9 +323,16 @@ def _with_resolution(options: RunOptions, reader: CaptureReader, say: Callable[[
     W, H = max(sizes, key=max)
     side = advised_side(sizes, len(dataset.train))
     if side is None:
-        say(f"--resolution auto: photos of up to {W}x{H} keep their size")
+        kept = f"photos of up to {W}x{H} keep their size"
+        say(Told(f"--resolution auto: {kept}", kept))
         return options
-    say(f"--resolution {side}: the planned Gaussians do not resolve more of photos of up to {W}x{H}")
+    finer = f"of photos of up to {W}x{H}"
+    say(
+        Told(
+            f"--resolution {side}: the planned Gaussians do not resolve more {finer}",
+            f"photos are reduced to {side} px: the planned splats do not resolve more {finer}",
+        )
+    )
     return replace(options, data_settings=replace(options.data_settings, resolution=float(side)))
 
 
@@ -323,11 +343,11 @@ def with_choices(
     console: Console,
     say: Callable[[str], None],
 ) -> RunOptions:
-    """Choose the settings whose option is auto, and say which were chosen and why."""
+    """Choose the settings whose option is auto, judge a lens or shutter to learn, and say what was found."""
 
     def take(options: RunOptions, name: str, remedy: Remedy) -> RunOptions:
         if remedy.reason:
-            say(f"{option_flag(name)} {remedy.value}: {remedy.reason}")
+            say(Told(f"{option_flag(name)} {remedy.value}: {remedy.reason}", remedy.reason))
         return replace(options, config=options.config.changed(**{name: remedy.value}))
 
     if by_photos := [name for name in names if name in CHOICES]:
@@ -338,11 +358,15 @@ def with_choices(
     if "transients" in names:
         count = len(Dataset.of(reader, options.data_settings, points=options.points).train)
         options = take(options, "transients", transients_for(count))
-    if "refine" in names:
+    asked = "" if "refine" in names else options.config.refine
+    if "refine" in names or (asked in NEED_LENSES and not (options.resume and options.folder.exists())):
         with progress_bar(console, "") as bar:
-            task = bar.add_task("short trainings", total=len(ORDER) * PILOT_STEPS)
-            chosen = refinement_for(options, reader, progress=lambda: bar.advance(task))
-        options = take(options, "refine", Remedy(*chosen))
+            task = bar.add_task("short trainings", total=None)
+            chosen = refinement_for(
+                options, reader, lambda total: bar.update(task, advance=1, total=total), asked
+            )
+        options = replace(options, trials=chosen.trials)
+        options = take(options, "refine", Remedy(chosen.refine, chosen.reason))
     return options
 
 
@@ -454,7 +478,10 @@ def interruptible(patient: bool = False) -> Iterator[Callable[[], bool]]:
         nonlocal came
         if came and not patient:
             raise KeyboardInterrupt(
-                "interrupted; saved checkpoints are intact, --resume continues from the last one"
+                Told(
+                    "interrupted; saved checkpoints are intact, --resume continues from the last one",
+                    "stopped at once; it can be continued from its last saved state",
+                )
             )
         came = True
 

@@ -1,4 +1,4 @@
-"""`gsplat-edu view`: show a scene in the browser."""
+"""`gsplat-edu view`: show a scene or a capture in the browser."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsplat_edu.cli.screen import has_screen, open_in_browser
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.evaluate.keyframes import read_path
-from gsplat_edu.io.formats import LOD_META, file_in
+from gsplat_edu.io.formats import LOD_META, SOG_META, file_in
 from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
@@ -30,6 +30,9 @@ def run(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     console = Terminal()
     _check_is_no_page(arguments.source)
+    if _is_capture(arguments.source):
+        _run_capture(arguments, console)
+        return
     file = file_in(arguments.source)
     levels = file.name.lower() == LOD_META
     if arguments.budget is not None and not levels:
@@ -43,15 +46,58 @@ def run(arguments: argparse.Namespace) -> None:
     # before loading the scene, so that a port in use is reported at once
     with _server(arguments, levels) as server:
         (_prepare_levels if levels else _prepare)(server, console, arguments)
-        if warning := exposure(arguments.host, does, token=editing):
-            console.print(warning, soft_wrap=True)
+        _serve(server, console, arguments, does, editing)
+
+
+def _is_capture(path: Path) -> bool:
+    """Return whether a path is to be read as a capture, and not as a scene or a run."""
+    if path.is_file():
+        return path.suffix.lower() == ".json" and path.name.lower() not in (LOD_META, SOG_META)
+    if not path.is_dir() or RunFolder(path).exists() or file_in(path) != path:
+        return False
+    from gsplat_edu.data.reader import is_capture
+
+    return is_capture(path)
+
+
+def _run_capture(arguments: argparse.Namespace, console: Terminal) -> None:
+    """Serve the page of a capture until Ctrl-C; meanwhile, the doctor examines its photos."""
+    from gsplat_edu.viewer import capture_page
+    from gsplat_edu.viewer.capture_serve import CaptureServer, Examination
+
+    for name in ("path", "surface", "collider", "budget", "edit"):
+        if getattr(arguments, name) is not None:
+            raise ArgumentError(
+                f"--{name}: {arguments.source} is a capture; this option is for scenes and runs"
+            )
+    path: Path = arguments.source
+    with CaptureServer(arguments.host, arguments.port, capture_page.policy(), path) as server:
+        found = server.prepare(_title(path))
+        console.print(
+            f"{path}: {len(found.frames):,} photos, {found.facts['count']:,} points", soft_wrap=True
+        )
+        console.print(found.facts["gap_sentence"], soft_wrap=True)
+        examination = Examination(server)
+        examination.start()
+        try:
+            _serve(server, console, arguments, "sees the photos and leaves them out", True)
+        finally:
+            examination.stop()
+
+
+def _serve(
+    server: PageServer, console: Terminal, arguments: argparse.Namespace, does: str, token: bool
+) -> None:
+    """Print the address of a server's page, open it, and answer until Ctrl-C."""
+    if warning := exposure(arguments.host, does, token=token):
+        console.print(warning, soft_wrap=True)
+    try:  # Ctrl-C may come as soon as the line is printed
         console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
         if not arguments.no_open and has_screen():
             open_in_browser(server.url)
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            console.print("ended")
+        server.serve_forever()
+    except KeyboardInterrupt:
+        console.print("ended")
 
 
 def _server(arguments: argparse.Namespace, levels: bool) -> PageServer:
@@ -86,7 +132,7 @@ def _prepare(server: PageServer, console: Terminal, arguments: argparse.Namespac
     editing = None
     if isinstance(server, EditServer):
         editing = editing_of(source, arguments.source, server.file, ADDRESS)
-        server.prepare(identity_of(source.scene.gaussians, source.origin))
+        server.prepare(identity_of(source.scene.gaussians, source.origin), arguments.source)
         console.print(f"edits: {server.file}", soft_wrap=True)
     server.page = page.html(
         source.scene, source.cameras, source.settings, title, source.held_out, tour, editing

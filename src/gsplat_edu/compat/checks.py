@@ -14,13 +14,13 @@ from torch import Tensor
 
 from gsplat_edu.base.constants import DILATION_MAX, SPLAT_LIMIT
 from gsplat_edu.base.errors import ArgumentError, ShapeError
-from gsplat_edu.base.validation import flag, in_range, one_of, whole_number
+from gsplat_edu.base.validation import flag, in_range, one_of, quoted, whole_number
 from gsplat_edu.ops.kernels import SUFFIXES
 from gsplat_edu.scene.gaussians import check_tensor
 
 
 class RollingShutterType(Enum):
-    """gsplat's names of shutters. Only GLOBAL is supported."""
+    """gsplat's names of shutters."""
 
     ROLLING_TOP_TO_BOTTOM = 0
     ROLLING_LEFT_TO_RIGHT = 1
@@ -35,23 +35,22 @@ MOST_PIXELS = 2**31 - 1
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 """Values of `render_mode`."""
 
+CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
+"""Values of `camera_model`."""
+
+RADIAL = {"pinhole": 6, "fisheye": 4}
+"""Number of radial coefficients of those that may be distorted."""
+
 ONLY_VALUES = {
     "sparse_grad": False,
     "distributed": False,
-    "camera_model": "pinhole",
-    "with_ut": False,
     "with_eval3d": False,
     "return_normals": False,
     "global_z_order": True,
     "rays": None,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
     "ftheta_coeffs": None,
     "lidar_coeffs": None,
     "external_distortion_coeffs": None,
-    "rolling_shutter": RollingShutterType.GLOBAL,
-    "viewmats_rs": None,
     "ut_params": None,
     "renderer_config": None,
 }
@@ -62,17 +61,18 @@ REMEDIES = {
     "distributed": "render on one machine",
     "return_normals": "gsplat_edu.render.maps.render_maps renders normals",
     "global_z_order": "Gaussians are sorted by camera depth",
-    "rays": "give pinhole cameras by viewmats and Ks",
-    "lidar_coeffs": "give pinhole cameras by viewmats and Ks",
+    "with_eval3d": "leave it out, because Gaussians are evaluated on the image plane",
+    "rays": "give cameras by viewmats, Ks and camera_model",
+    "ftheta_coeffs": "fit radial_coeffs of camera_model='fisheye' to the lens, or undistort the photos",
+    "lidar_coeffs": "give cameras by viewmats, Ks and camera_model",
+    "external_distortion_coeffs": "undistort the photos first",
     "ut_params": "leave it out, because the projection has no unscented transform",
     "renderer_config": "leave it out, because there is one rasteriser",
 }
-"""What to do instead, where it is not `UNDISTORT`."""
+"""What to do instead."""
 
 DEFAULT_RENDERER = "RendererConfig_MixedBatch"
 """Name of the class that gsplat takes for `renderer_config=None`."""
-
-UNDISTORT = "undistort the photos first"
 
 DEGREES = {"colors": "sh_degree", "extra_signals": "extra_signals_sh_degree"}
 """Which argument is the degree of which coefficients."""
@@ -118,22 +118,24 @@ class Arguments:
         rasterize_mode: "classic", or "antialiased": opacities times sqrt(det0 / det).
         channel_chunk: No effect: any number of channels is composited, 32 beside the first three at a time.
         distributed: False.
-        camera_model: "pinhole".
+        camera_model: "pinhole", "ortho" (a focal length is px per world unit) or "fisheye" (the angle to the axis is
+            proportional to the radius). z decides what is near, far and in front, of all three.
         segmented: No effect: it selects a sort in gsplat.
         covars: (..., N, 3, 3) covariances, world units²; the upper triangle is read.
-        with_ut: False.
+        with_ut: No effect: distortion and shutter have exact Jacobians here (`gsplat_edu.compat.lenses`).
         with_eval3d: False.
         return_normals: False.
         global_z_order: True.
         rays: None.
-        radial_coeffs: None.
-        tangential_coeffs: None.
-        thin_prism_coeffs: None.
+        radial_coeffs: (..., C, 6) k1 to k6 of OpenCV's rational model of a pinhole, (..., C, 4) of a fisheye.
+        tangential_coeffs: (..., C, 2) p1 and p2 of a pinhole.
+        thin_prism_coeffs: (..., C, 4) s1 to s4 of a pinhole.
         ftheta_coeffs: None.
         lidar_coeffs: None.
         external_distortion_coeffs: None.
-        rolling_shutter: GLOBAL, ours or gsplat's.
-        viewmats_rs: None.
+        rolling_shutter: A member of `RollingShutterType`, ours or gsplat's. Unless it is GLOBAL, `viewmats` are the
+            poses of the row or column that is read first,
+        viewmats_rs: (..., C, 4, 4) and these of the one that is read last.
         ut_params: None.
         extra_signals: (..., N, E) or (..., C, N, E) further channels, composited with the weights of the colours into
             `meta["render_extra_signals"]`; with `extra_signals_sh_degree` (N, K, E) coefficients, shared by all scenes.
@@ -199,7 +201,7 @@ class Arguments:
             _check_only(name, getattr(self, name), only)
         one_of("render_mode", self.render_mode, RENDER_MODES)
         one_of("rasterize_mode", self.rasterize_mode, ("classic", "antialiased"))
-        for name in ("packed", "absgrad", "segmented"):
+        for name in ("packed", "absgrad", "segmented", "with_ut"):
             flag(name, getattr(self, name))
         check_size(self.width, self.height)
         for name in ("tile_size", "channel_chunk"):
@@ -212,6 +214,7 @@ class Arguments:
         C = check_cameras(self.viewmats, self.Ks, batch, self.means)
         for name, value in (("batch", batch), ("N", N), ("C", C)):
             object.__setattr__(self, name, value)
+        self._check_lens()
         colors = self._check_colors()
         drawn = (0 if self.render_mode in DEPTH_ONLY else colors) + self._check_extra_signals()
         if self.backgrounds is not None:
@@ -219,6 +222,34 @@ class Arguments:
             # Backgrounds that no channel is composited over have no effect; gsplat takes them.
             channels = drawn or colors or (0, *self.backgrounds.shape)[-1]
             expect("backgrounds", self.backgrounds, (*self.batch, self.C, channels), self.means)
+
+    def _check_lens(self) -> None:
+        """Check distortion and shutter."""
+        check_camera_model(self.camera_model)
+        radial = RADIAL.get(self.camera_model, 0)
+        counts = {"radial_coeffs": radial, "tangential_coeffs": 2, "thin_prism_coeffs": 4}
+        for name, count in counts.items():
+            tensor = getattr(self, name)
+            if tensor is None:
+                continue
+            if self.camera_model == "ortho" or (self.camera_model == "fisheye" and name != "radial_coeffs"):
+                raise ArgumentError(
+                    f"{name}: a camera with camera_model={self.camera_model!r} has none; leave it out"
+                )
+            expect(name, tensor, (*self.batch, self.C, count), self.means)
+        shutter = getattr(self.rolling_shutter, "name", None)
+        if not isinstance(shutter, str) or shutter not in RollingShutterType.__members__:
+            raise ArgumentError(
+                f"rolling_shutter: is {quoted(self.rolling_shutter)}, but has to be a member of RollingShutterType"
+            )
+        if (shutter == RollingShutterType.GLOBAL.name) != (self.viewmats_rs is None):
+            raise ArgumentError(
+                "viewmats_rs: is None; a rolling shutter needs the poses of what is read last"
+                if self.viewmats_rs is None
+                else "viewmats_rs: is given, but rolling_shutter is GLOBAL; name the direction of the readout"
+            )
+        if self.viewmats_rs is not None:
+            expect("viewmats_rs", self.viewmats_rs, (*self.batch, self.C, 4, 4), self.means)
 
     def _check_colors(self) -> int:
         """Check colours or coefficients; return the number of their channels."""
@@ -292,16 +323,12 @@ class Arguments:
 
 def _check_only(name: str, value: object, only: object) -> None:
     """Check an argument of which one value is supported."""
-    if name == "rolling_shutter":
-        value, only = getattr(value, "name", value), RollingShutterType.GLOBAL.name
     if name == "renderer_config" and type(value).__name__ == DEFAULT_RENDERER:
         return
     if type(value) is not type(only) or value != only:
         plain = isinstance(value, bool | int | float | str | Enum)
         shown = repr(value) if plain else f"of type {type(value).__name__}"
-        raise ArgumentError(
-            f"{name}: is {shown}, but only {only!r} is supported; {REMEDIES.get(name, UNDISTORT)}"
-        )
+        raise ArgumentError(f"{name}: is {shown}, but only {only!r} is supported; {REMEDIES[name]}")
 
 
 def real_tensor(name: str, tensor: Any) -> Tensor:  # noqa: ANN401
@@ -326,9 +353,18 @@ def check_limits(near_plane: float, far_plane: float, radius_clip: float, eps2d:
 
 
 def check_projection_options(sparse_grad: bool, camera_model: str) -> None:
-    """Check the arguments of `fully_fused_projection` of which one value is supported."""
+    """Check the arguments of `fully_fused_projection` of which not all values are supported."""
     _check_only("sparse_grad", sparse_grad, False)
-    _check_only("camera_model", camera_model, "pinhole")
+    check_camera_model(camera_model)
+
+
+def check_camera_model(value: object) -> None:
+    """Check a camera model."""
+    if isinstance(value, str) and value in ("ftheta", "lidar"):
+        raise ArgumentError(
+            f"camera_model: is {value!r}, which is not supported; {REMEDIES[f'{value}_coeffs']}"
+        )
+    one_of("camera_model", value, CAMERA_MODELS)
 
 
 def check_scene(named: Mapping[str, Tensor | None], from_covars: bool) -> tuple[tuple[int, ...], int]:

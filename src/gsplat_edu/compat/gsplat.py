@@ -36,6 +36,7 @@ from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
 from gsplat_edu.compat.harmonics import evaluate, spherical_harmonics
 from gsplat_edu.compat.images import Splats, absgrad_store, composite
+from gsplat_edu.compat.lenses import cameras_of
 from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_covar_preci, world_to_cam
 from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
 from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
@@ -118,7 +119,7 @@ def rasterization(
         ShapeError: a shape differs.
         ArgumentError: a value is not finite, out of range or not supported.
 
-    Differentiable in: means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds, extra_signals.
+    Differentiable in: every tensor, those of the cameras and their lenses included.
     """
     return _rasterize(Arguments(**without_bad_gaussians(dict(locals()))))
 
@@ -140,10 +141,10 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     )
     lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
     triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
-    viewmats, Ks = a.viewmats.reshape(-1, a.C, 4, 4), a.Ks.reshape(-1, a.C, 3, 3)
+    (viewmats, model), Ks = cameras_of(a), a.Ks.reshape(-1, a.C, 3, 3)
     flat, antialiased = a.opacities.reshape(a.batches, a.N), a.rasterize_mode == "antialiased"
     solids = solids_of(a.means, triangle, a.quats, a.scales)
-    found = project(solids, viewmats, Ks, lens, flat, antialiased)
+    found = project(solids, viewmats, Ks, lens, flat, antialiased, model)
     positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
     check_spreads("scales" if a.covars is None else "covars", found.spreads, positions, a.batch)
     images = positions // max(a.N, 1)
@@ -247,6 +248,9 @@ def _extra_signals(a: Arguments, signals: Tensor, drawn: _Drawn) -> Float[Tensor
 
 def _directions(a: Arguments, drawn: _Drawn) -> Float[Tensor, "nnz 3"]:
     """Return the vectors from the cameras to the drawn Gaussians."""
-    eyes = torch.inverse(a.viewmats)[..., :3, 3].reshape(-1, 3)
+    eyes = torch.inverse(a.viewmats)[..., :3, 3]
+    if a.viewmats_rs is not None:
+        eyes = 0.5 * (eyes + torch.inverse(a.viewmats_rs)[..., :3, 3])
+    eyes = eyes.reshape(-1, 3)
     means = _rows(a.means, a.means.ndim - 1).index_select(0, drawn.scenes * a.N + drawn.gaussians)
     return means - eyes.index_select(0, drawn.images)

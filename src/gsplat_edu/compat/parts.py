@@ -12,7 +12,9 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import first_index, flag
 from gsplat_edu.compat.checks import check_projection_options, check_size, expect, real_tensor
 from gsplat_edu.compat.projection import MARGIN, TRIANGLE
+from gsplat_edu.render.torch_sight import TORCH
 from gsplat_edu.scene.gaussians import check_tensor, quat_to_R_t
+from gsplat_edu.scene.projection_formulas import OnPlane, fisheye, orthographic
 
 
 def quat_scale_to_covar_preci(
@@ -92,7 +94,7 @@ def world_to_cam(means: Tensor, covars: Tensor, viewmats: Tensor) -> tuple[Tenso
 def proj(
     means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: int, camera_model: str = "pinhole"
 ) -> tuple[Tensor, Tensor]:
-    """Project Gaussians in camera axes: centres and J Sigma J', x/z and y/z clamped in J as by gsplat.
+    """Project Gaussians in camera axes: centres and J Sigma J'. A pinhole's J has clamped x/z and y/z, as gsplat's.
 
     Args:
         means: (..., C, N, 3) centres in camera axes.
@@ -100,7 +102,7 @@ def proj(
         Ks: (..., C, 3, 3) intrinsics, px; skew is not read.
         width: Width of the images, px.
         height: Height of the images, px.
-        camera_model: "pinhole".
+        camera_model: "pinhole", "ortho" or "fisheye".
 
     Returns:
         (..., C, N, 2) centres, px, and (..., C, N, 2, 2) covariances, px², before eps2d.
@@ -120,18 +122,30 @@ def proj(
     expect("covars", covars, (*batch, N, 3, 3), means)
     expect("Ks", Ks, (*batch, 3, 3), means)
     points, K = means.double(), Ks.double()
-    z, zero = points[..., 2], torch.zeros_like(points[..., 2])
-    centre, rows = [], []
-    for k, size in enumerate((width, height)):
-        focal, middle, ratio = K[..., k, k, None], K[..., k, 2, None], points[..., k] / z
-        low, high = -MARGIN * size - middle, (1 + MARGIN) * size - middle
-        clamped = torch.minimum(torch.maximum(ratio, low / focal), high / focal)
-        centre.append(focal * ratio + middle)
-        slope = [zero, zero, -focal * clamped / z]
-        slope[k] = focal / z
-        rows.append(torch.stack(slope, dim=-1))
+    x, y, z = points.unbind(-1)
+    focals, middles = [K[..., k, k, None] for k in (0, 1)], [K[..., k, 2, None] for k in (0, 1)]
+    if camera_model == "pinhole":
+        a, b, *slopes = _clamped_perspective((x, y, z), focals, middles, (width, height))
+    else:
+        a, b, *slopes = fisheye(x, y, z, TORCH) if camera_model == "fisheye" else orthographic(x, y, z)
+    rows = [
+        focal[..., None] * torch.stack(slope, dim=-1) for focal, slope in zip(focals, slopes, strict=True)
+    ]
+    centre = [focal * at + middle for focal, at, middle in zip(focals, (a, b), middles, strict=True)]
     J = torch.stack(rows, dim=-2)
     return torch.stack(centre, dim=-1).to(means.dtype), (J @ covars.double() @ J.mT).to(means.dtype)
+
+
+def _clamped_perspective(
+    point: tuple[Tensor, Tensor, Tensor], focals: list[Tensor], middles: list[Tensor], size: tuple[int, int]
+) -> OnPlane:
+    """Return x/z and y/z, and their derivatives at the clamped ratios."""
+    x, y, z = point
+    zero, clamped = torch.zeros_like(z), []
+    for ratio, focal, middle, side in zip((x / z, y / z), focals, middles, size, strict=True):
+        low, high = -MARGIN * side - middle, (1 + MARGIN) * side - middle
+        clamped.append(torch.minimum(torch.maximum(ratio, low / focal), high / focal))
+    return OnPlane(x / z, y / z, (1 / z, zero, -clamped[0] / z), (zero, 1 / z, -clamped[1] / z))
 
 
 @torch.no_grad()

@@ -2,9 +2,9 @@
 
     p = R x + t,   u = fx px/pz + cx,   Sigma2d = J R Sigma R' J' + eps2d I,   compensation = sqrt(det0 / det)
 
-R and t come from the viewmat as any matrix, so that its gradient has all entries. det0, the determinant before eps2d,
-is the squared length of a cross product where quaternions and scales are known: a c - b² would cancel for thin
-Gaussians.
+These are the formulas of the pinhole; `gsplat_edu.compat.lenses` has other lenses and rolling shutters. R and t come
+from the viewmat as any matrix, so that its gradient has all entries. det0, the determinant before eps2d, is the squared
+length of a cross product where quaternions and scales are known: a c - b² would cancel for thin Gaussians.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from gsplat_edu.compat.checks import (
     check_size,
     expect,
 )
+from gsplat_edu.compat.lenses import KINDS_BY_MODEL, CameraModel, see
 from gsplat_edu.scene.gaussians import quat_to_R_t
 
 MARGIN = 0.15
@@ -37,6 +38,10 @@ EXTENT = 3.33
 
 TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 """Rows and columns of a covariance's upper triangle, in the order of six numbers."""
+
+
+PLAIN_MODEL = CameraModel()
+"""gsplat's pinhole."""
 
 
 class Lens(NamedTuple):
@@ -96,6 +101,7 @@ def project(
     lens: Lens,
     opacities: Float[Tensor, "B N"] | None,
     compensated: bool,
+    model: CameraModel = PLAIN_MODEL,
 ) -> Projected:
     """Project every Gaussian into every camera of its batch.
 
@@ -106,11 +112,12 @@ def project(
         lens: Size of the image and limits.
         opacities: Make the radii tighter; None for radii that suit every opacity.
         compensated: Whether the compensations will multiply the opacities, for the radii.
+        model: Lens and shutter; z at half time decides what is near and far.
 
     Everything is computed in float64 and returned in the dtype of the means. Only the spreads stay float64, because the
     determinants of thin Gaussians would lose their digits in float32.
 
-    Differentiable in: solids, viewmats, Ks.
+    Differentiable in: solids, viewmats, Ks, model.
     """
     dtype = solids.means.dtype
     solids = Solids(solids.means.double(), *(None if each is None else each.double() for each in solids[1:]))
@@ -120,7 +127,37 @@ def project(
     points = solids.means[:, None] @ viewmats[..., :3, :3].mT + viewmats[..., None, :3, 3]
     depths = points[..., 2]
     before = (depths >= lens.near) & (depths <= lens.far)
-    z = torch.where(before, depths, 1.0)
+    if model.plain:
+        centre, rows = _through_pinhole(points, torch.where(before, depths, 1.0), R, Ks, lens)
+    else:
+        size = (lens.width, lens.height)
+        centre, jacobian, before = see(solids.means, viewmats, Ks, size, model, before)
+        rows = [jacobian[..., k, :] for k in (0, 1)]
+    a, b, c, det0 = _screen_covariances(solids, *rows)
+    variances = torch.stack([a, c], dim=-1) + lens.eps2d
+    det = det0 + lens.eps2d * (a + c) + lens.eps2d**2
+    thick = det > THINNEST * variances.sum(dim=-1)  # others are not drawn
+    floor = torch.where(thick, det, 1.0)
+    compensations = torch.sqrt(det0.clamp(min=DET_FLOOR) / floor)
+    bright = None if opacities is None else opacities[:, None] * (compensations if compensated else 1.0)
+    return Projected(
+        _radii(centre, variances, before & thick, bright, lens),
+        centre.to(dtype),
+        depths.to(dtype),
+        torch.stack([variances[..., 1] / floor, -b / floor, variances[..., 0] / floor], dim=-1).to(dtype),
+        compensations.to(dtype),
+        torch.stack([a, b, c], dim=-1),
+    )
+
+
+def _through_pinhole(
+    points: Float[Tensor, "B C N 3"],
+    z: Float[Tensor, "B C N"],
+    R: Float[Tensor, "B C 1 3 3"],
+    Ks: Float[Tensor, "B C 3 3"],
+    lens: Lens,
+) -> tuple[Float[Tensor, "B C N 2"], list[Float[Tensor, "B C N 3"]]]:
+    """Return the centres and the two rows of J R, with x/z and y/z clamped in J as by gsplat."""
     focals, centers = [Ks[..., k, k, None] for k in (0, 1)], [Ks[..., k, 2, None] for k in (0, 1)]
     centre, rows = [], []
     for k, size in enumerate((lens.width, lens.height)):
@@ -129,22 +166,7 @@ def project(
         clamped = torch.minimum(torch.maximum(ratio, low / focals[k]), high / focals[k])
         centre.append(focals[k] * ratio + centers[k])
         rows.append((focals[k] / z)[..., None] * (R[..., k, :] - clamped[..., None] * R[..., 2, :]))
-    a, b, c, det0 = _screen_covariances(solids, *rows)
-    variances = torch.stack([a, c], dim=-1) + lens.eps2d
-    det = det0 + lens.eps2d * (a + c) + lens.eps2d**2
-    thick = det > THINNEST * variances.sum(dim=-1)  # others are not drawn
-    floor = torch.where(thick, det, 1.0)
-    compensations = torch.sqrt(det0.clamp(min=DET_FLOOR) / floor)
-    means2d = torch.stack(centre, dim=-1)
-    bright = None if opacities is None else opacities[:, None] * (compensations if compensated else 1.0)
-    return Projected(
-        _radii(means2d, variances, before & thick, bright, lens),
-        means2d.to(dtype),
-        depths.to(dtype),
-        torch.stack([variances[..., 1] / floor, -b / floor, variances[..., 0] / floor], dim=-1).to(dtype),
-        compensations.to(dtype),
-        torch.stack([a, b, c], dim=-1),
-    )
+    return torch.stack(centre, dim=-1), rows
 
 
 def _screen_covariances(
@@ -237,8 +259,9 @@ def fully_fused_projection(
     C = check_cameras(viewmats, Ks, batch, means)
     lens = Lens(width, height, eps2d, near_plane, far_plane, radius_clip)
     flat = None if opacities is None else opacities.reshape(math.prod(batch), N)
+    model = CameraModel(KINDS_BY_MODEL[camera_model])
     views = (viewmats.reshape(-1, C, 4, 4), Ks.reshape(-1, C, 3, 3))
-    found = project(solids_of(means, covars, quats, scales), *views, lens, flat, calc_compensations)
+    found = project(solids_of(means, covars, quats, scales), *views, lens, flat, calc_compensations, model)
     results = [*found[:4], found.compensations if calc_compensations else None]
     if not packed:
         return tuple(None if each is None else each.view(*batch, C, N, *each.shape[3:]) for each in results)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -15,11 +16,13 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable
 from gsplat_edu.data.images import UPRIGHT, PhotoFile, PhotoHeaders, upright_size
 from gsplat_edu.data.lens import Lens
+from gsplat_edu.data.native_lens import WIDEST_PANORAMA, is_native, native_intrinsics
 from gsplat_edu.data.notes import Note
 from gsplat_edu.data.panorama import FaceLens, face_rotations
 from gsplat_edu.data.scale import Scale
-from gsplat_edu.data.settings import FACTOR_BELOW
+from gsplat_edu.data.settings import FACTOR_BELOW, DataSettings
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.shutter import RollingShutter
 
 ROTATION_SLACK = 1e-2
 """Largest entry of R R' - I that is accepted as a rotation written with few digits."""
@@ -52,6 +55,8 @@ class Frame:
             "".
         orientation: EXIF orientation by which the stored photo has to be turned to fit its pose; 1 for as stored.
         depth: File of the photo's depth map, if the capture names one; it may be missing.
+        shutter: How the camera moved while the photo was read, if the capture says so. Rows are those of the upright
+            photo.
     """
 
     name: str
@@ -63,6 +68,7 @@ class Frame:
     part: str = ""
     orientation: int = UPRIGHT
     depth: Path | None = None
+    shutter: RollingShutter | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,28 +258,46 @@ def faces_of(frame: Frame) -> list[Frame]:
     ]
 
 
+def file_name(frame: Frame) -> str:
+    """Return a frame's name in the capture's files: a face has that of its panorama."""
+    if not isinstance(frame.lens, FaceLens):
+        return frame.name
+    path = PurePosixPath(frame.name)
+    return str(path.with_name(path.stem.removesuffix(f"_{frame.lens.number}") + path.suffix))
+
+
+def whole_panoramas(frames: Sequence[Frame]) -> list[Frame]:
+    """Return frames with the faces of each panorama replaced by the panorama itself: the inverse of `faces_of`."""
+    found = []
+    for frame in frames:
+        if not isinstance(frame.lens, FaceLens):
+            found.append(frame)
+        elif frame.lens.number == 0:
+            found.append(replace(frame, name=file_name(frame), R=face_rotations()[0].T @ frame.R))
+    return found
+
+
 def photo_file(
     frame: Frame,
-    resolution: float | None,
-    background: tuple[float, float, float] | None,
+    settings: DataSettings,
     headers: PhotoHeaders,
 ) -> tuple[PhotoFile, Camera, bool]:
     """Determine a view's image file, how to load it, and the resulting camera.
 
     Args:
         frame: The frame.
-        resolution: Below `FACTOR_BELOW`, the divisor of the size; else the longest side, px; None keeps the size.
-        background: As for `PhotoFile`.
+        settings: Resolution, background, and which photos keep their lens.
         headers: Reads the files' headers.
 
     Returns:
-        The photo; its camera, a pinhole of the final size; and whether the file's size differs from the frame's, in
-        which case the intrinsics were rescaled.
+        The photo; its camera of the final size, a pinhole at rest unless the photo keeps its lens or shutter; and
+        whether the file's size differs from the frame's, in which case the intrinsics were rescaled.
 
     Raises:
         DatasetError: a file is not an image, the sizes of photo, mask and camera are inconsistent, or the photo cannot
             be undistorted.
     """
+    resolution = settings.resolution
     path, orientation = frame.image, frame.orientation
     size = upright_size(headers.size(path), orientation)
     rescaled = size != (frame.lens.W, frame.lens.H)
@@ -289,15 +313,28 @@ def photo_file(
         path, orientation = smaller, UPRIGHT if orientation == UPRIGHT else headers.orientation(smaller)
         W, H = upright_size(headers.size(path), orientation)
         lens = _fitted(frame, path, (W, H))
-    try:
-        pinhole = lens.undistorted()
-        if isinstance(lens, FaceLens):
-            W, H = _target(pinhole.W, pinhole.H, resolution if smaller is None else None)
-        pinhole = pinhole.scaled(W, H)
-    except DatasetError as error:
-        raise DatasetError(f"{frame.name}: {error}", error.reason) from None
-    camera = Camera.posed(frame.R, frame.eye, pinhole)
-    return PhotoFile(path, frame.mask, lens, W, H, background, orientation), camera, rescaled
+    moving = frame.shutter is not None and settings.lens != "undistort"
+    # what undistortion leaves of a photo's rows is curved, so a shutter needs the photo's own lens
+    mode = "native" if moving else settings.lens
+    kept = native_intrinsics(lens) if is_native(lens, mode) else None
+    if kept is not None:
+        if isinstance(lens, FaceLens) and resolution is None:
+            W, H = _target(W, H, float(WIDEST_PANORAMA)) if W > WIDEST_PANORAMA else (W, H)
+        seen = kept.scaled(W, H)
+    else:
+        try:
+            seen = lens.undistorted()
+            if isinstance(lens, FaceLens):
+                W, H = _target(seen.W, seen.H, resolution if smaller is None else None)
+            seen = seen.scaled(W, H)
+        except DatasetError as error:
+            raise DatasetError(f"{frame.name}: {error}", error.reason) from None
+    source = PhotoFile(
+        path, frame.mask, lens, W, H, settings.background, orientation, native=kept is not None
+    )
+    shutter = frame.shutter if moving and not source.resampled else None
+    camera = Camera.posed(frame.R, frame.eye, seen, shutter)
+    return source, camera, rescaled
 
 
 def fits_camera(lens: Lens, size: tuple[int, int]) -> bool:

@@ -14,32 +14,42 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.data.capture import Capture, Cloud, Frame, photo_file
+from gsplat_edu.data.capture import Capture, Cloud, Frame, photo_file, whole_panoramas
 from gsplat_edu.data.images import UPRIGHT, ImageStore, PhotoFile, PhotoHeaders
+from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
 from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
 from gsplat_edu.data.loading_notes import (
     CroppedPhotos,
     DistortedPhotos,
+    IgnoredShutters,
     LoadingNote,
+    MotionBlurs,
+    NativeLenses,
     OnlyOnePhoto,
     PanoramaFaces,
     PhotosExceedMemory,
     RandomStart,
     RescaledIntrinsics,
+    RollingShutters,
     SharedCentres,
     TurnedPhotos,
     UnevenFocalLengths,
     UnlistedPhotos,
 )
-from gsplat_edu.data.notes import Background, UnreadColors
+from gsplat_edu.data.notes import Background, LeftOutPhotos, OnlyInRegion, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.points import random_cloud
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.region import read_region
+from gsplat_edu.data.region_masks import views_of_region
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.visible_cloud import cloud_in_cube, cloud_in_view
-from gsplat_edu.scene.camera import Camera, scene_extent as scene_extent
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.region import Region
+from gsplat_edu.scene.rig import scene_extent as scene_extent
+from gsplat_edu.scene.shutter import AT_ONCE
 from gsplat_edu.scene.views import View
 
 TEST_EVERY = 8
@@ -66,6 +76,7 @@ class Dataset:
         files: Name and files of each photo, sorted by name.
         scale: What a unit of the coordinates is; None if unknown.
         measured: Whether the points come from a capture or a file; otherwise they are random.
+        region: The box that the pixels show which count, in the cameras' coordinates; None if all count.
     """
 
     path: Path
@@ -80,6 +91,7 @@ class Dataset:
     files: tuple[tuple[str, PhotoFile], ...] = ()
     scale: Scale | None = None
     measured: bool = True
+    region: Region | None = None
 
     @classmethod
     def of(
@@ -101,8 +113,12 @@ class Dataset:
         """
         path, capture, headers, placed = reader.path, reader.capture, reader.headers, reader.placed(points)
         notes = list(placed.notes)
-        frames = oriented(_listed(path, placed.frames, settings), headers)
-        made = [photo_file(frame, settings.resolution, settings.background, headers) for frame in frames]
+        placed_frames = placed.frames if settings.lens == "undistort" else whole_panoramas(placed.frames)
+        listed = _listed(path, placed_frames, settings)
+        about: list[LoadingNote] = []  # the choice of photos
+        chosen, parts = _used(path, listed, _split(path, listed, settings, about), settings, about)
+        frames = oriented(chosen, headers)
+        made = [photo_file(frame, settings, headers) for frame in frames]
         sources = [source for source, *_ in made]
         decoding = max(headers.of(source.path).decoding for source in sources)
         store = ImageStore(settings.image_memory, sources, decoding, reader.watch)
@@ -110,11 +126,17 @@ class Dataset:
             View.stored(camera, partial(store.read, source), frame.name)
             for frame, (source, camera, _) in zip(frames, made, strict=True)
         ]
-        notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
+        if (region := _region(path, settings, placed.origin)) is not None:
+            views, notes = list(views_of_region(views, region)), [*notes, OnlyInRegion()]
+        notes += _lens_notes(frames, sources, [rescaled for _, _, rescaled in made])
+        notes += _shutter_notes(frames, [camera for _, camera, _ in made], settings)
         notes += _file_notes(frames, sources, headers) + _alpha_notes(capture, sources, settings, headers)
         if store.needed > store.budget:
             notes.append(PhotosExceedMemory(store.needed, store.budget))
-        train, test = _split(path, views, [frame.part for frame in frames], settings, notes)
+        notes += about
+        train, test = (
+            tuple(v for v, p in zip(views, parts, strict=True) if p == part) for part in ("train", "test")
+        )
         start = placed.cloud or _random_start(capture, [view.camera for view in train], notes, placed.origin)
         return cls(
             path,
@@ -129,6 +151,7 @@ class Dataset:
             tuple((frame.name, source) for frame, source in zip(frames, sources, strict=True)),
             capture.scale,
             placed.cloud is not None,
+            region,
         )
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
@@ -178,6 +201,15 @@ def load_dataset(
     return Dataset.of(CaptureReader(path), settings, points=points)
 
 
+def _region(path: Path, settings: DataSettings, origin: Float64[np.ndarray, "3"]) -> Region | None:
+    """Return the region of interest in the dataset's coordinates; None if there is none."""
+    if settings.region is None:
+        found = read_region(path)
+    else:
+        found = Region.of_numbers(settings.region) if settings.region else None
+    return None if found is None else found.moved(-origin)
+
+
 def _listed(path: Path, frames: Sequence[Frame], settings: DataSettings) -> Sequence[Frame]:
     """Return the frames that the settings name, or all if they name none."""
     if settings.train_views is None:
@@ -192,11 +224,16 @@ def _listed(path: Path, frames: Sequence[Frame], settings: DataSettings) -> Sequ
     return [by_name[name] for name in sorted(set(names))]
 
 
-def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[LoadingNote]:
-    """Report changes of the intrinsics."""
-    faces = [frame for frame in frames if isinstance(frame.lens, FaceLens)]
+def _lens_notes(
+    frames: Sequence[Frame], sources: Sequence[PhotoFile], rescaled: Sequence[bool]
+) -> list[LoadingNote]:
+    """Report changes of the intrinsics, and photos that keep their lens."""
+    resampled = [frame for frame, source in zip(frames, sources, strict=True) if source.resampled]
+    faces = [frame for frame in resampled if isinstance(frame.lens, FaceLens)]
     notes: list[LoadingNote] = [PanoramaFaces(len(faces), len(frames))] if faces else []
-    distorted = [frame for frame in frames if frame.lens.distorts and not isinstance(frame.lens, FaceLens)]
+    if kept := sum(source.native for source in sources):
+        notes.append(NativeLenses(kept, len(frames)))
+    distorted = [frame for frame in resampled if not isinstance(frame.lens, FaceLens)]
     if distorted:
         notes.append(DistortedPhotos(len(distorted), len(frames)))
     if wide := [frame.name for frame in distorted if frame.lens.cropped]:
@@ -204,10 +241,30 @@ def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[Loadi
         notes.append(CroppedPhotos(len(wide), len(frames), wide[0], seen, shown))
     if others := [frame for frame, is_it in zip(frames, rescaled, strict=True) if is_it]:
         notes.append(RescaledIntrinsics(len(others), len(frames), others[0].name))
-    uneven = [frame for frame in frames if frame.lens.uneven]
+    uneven = [frame for frame in frames if frame.lens.uneven and not isinstance(frame.lens, FaceLens)]
     if uneven:
         lens = uneven[0].lens
         notes.append(UnevenFocalLengths(len(uneven), len(frames), lens.fx, lens.fy))
+    return notes
+
+
+def _shutter_notes(
+    frames: Sequence[Frame], cameras: Sequence[Camera], settings: DataSettings
+) -> list[LoadingNote]:
+    """Report rolling shutters, and those that are ignored."""
+    notes: list[LoadingNote] = []
+    moved = [camera.shutter for camera in cameras if camera.shutter is not None]
+    rolling = [shutter for shutter in moved if shutter.readout != AT_ONCE]
+    if turns := [float(np.linalg.norm(shutter.turn)) for shutter in rolling]:
+        notes.append(RollingShutters(len(turns), len(frames), math.degrees(float(np.median(turns)))))
+    if blurred := sum(shutter.exposure > 0 for shutter in moved):
+        notes.append(MotionBlurs(blurred, len(frames)))
+    moving = zip(frames, cameras, strict=True)
+    ignored = [frame for frame, camera in moving if frame.shutter is not None and camera.shutter is None]
+    if ignored:
+        notes.append(
+            IgnoredShutters(len(ignored), len(frames), ignored[0].name, settings.lens == "undistort")
+        )
     return notes
 
 
@@ -241,45 +298,66 @@ def _file_notes(
 
 
 def _split(
-    path: Path, views: Sequence[View], parts: Sequence[str], settings: DataSettings, notes: list[LoadingNote]
-) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """Divide views, sorted by name, into training and test views."""
-    test_every = settings.test_every
+    path: Path, frames: Sequence[Frame], settings: DataSettings, notes: list[LoadingNote]
+) -> list[str]:
+    """Divide frames, sorted by name, into training and test views: return the part of each.
+
+    Parts are "train", "test", and "left out" of frames that the capture's lists do not name.
+    """
+    test_every, count = settings.test_every, len(frames)
     if settings.train_views is not None:
         held_out = frozenset(settings.test_views)
-        train = tuple(view for view in views if view.name not in held_out)
-        test = tuple(view for view in views if view.name in held_out)
-    elif test_every is None and any(parts):
-        train, test = (
-            tuple(v for v, p in zip(views, parts, strict=True) if p == part) for part in ("train", "test")
-        )
-        if left_out := len(views) - len(train) - len(test):
-            notes.append(UnlistedPhotos(left_out, len(views)))
-    elif test_every == 0 or (test_every is None and len(views) == 1):
-        train, test = tuple(views), ()
+        parts = ["test" if frame.name in held_out else "train" for frame in frames]
+    elif test_every is None and any(frame.part for frame in frames):
+        parts = [frame.part for frame in frames]
+        if unlisted := count - sum(part in ("train", "test") for part in parts):
+            notes.append(UnlistedPhotos(unlisted, count))
+    elif test_every == 0 or (test_every is None and count == 1):
+        parts = ["train"] * count
         if test_every is None:
             notes.append(OnlyOnePhoto())
     else:
-        every, places = test_every or TEST_EVERY, _places([view.camera for view in views])
+        every, places = test_every or TEST_EVERY, _places([frame.eye for frame in frames])
         if max(places) == 0:  # all views have one centre: the capture is one panorama
-            places = list(range(len(views)))
-        elif (count := max(places) + 1) < len(views):
-            notes.append(SharedCentres(len(views), count))
-        train = tuple(view for i, view in zip(places, views, strict=True) if i % every)
-        test = tuple(view for i, view in zip(places, views, strict=True) if i % every == 0)
-    if not train:
+            places = list(range(count))
+        elif (centres := max(places) + 1) < count:
+            notes.append(SharedCentres(count, centres))
+        parts = ["train" if place % every else "test" for place in places]
+    if "train" not in parts:
         raise DatasetError(
-            f"{path}: the split leaves none of its {len(views)} photos for training; set test_every to 0"
+            f"{path}: the split leaves none of its {count} photos for training; set test_every to 0"
         )
-    return train, test
+    return parts
 
 
-def _places(cameras: Sequence[Camera]) -> list[int]:
+def _used(
+    path: Path,
+    frames: Sequence[Frame],
+    parts: Sequence[str],
+    settings: DataSettings,
+    notes: list[LoadingNote],
+) -> tuple[list[Frame], list[str]]:
+    """Return the frames that are not left out, with their parts, and report the others."""
+    if settings.train_views is not None:
+        return list(frames), list(parts)
+    listed = read_left_out(path) if settings.left_out is None else settings.left_out
+    out = [is_left_out(frame, path, listed) for frame in frames]
+    if any(out):
+        notes.append(LeftOutPhotos(sum(out), len(frames), frames[out.index(True)].name))
+    kept = [part for part, gone in zip(parts, out, strict=True) if not gone]
+    if "train" not in kept:
+        raise DatasetError(
+            f"{path}: {LEFT_OUT} leaves out every photo for training; take some off it, or set test_every to 0"
+        )
+    return [frame for frame, gone in zip(frames, out, strict=True) if not gone], kept
+
+
+def _places(centres: Sequence[Float64[np.ndarray, "3"]]) -> list[int]:
     """Number the centres of cameras in the order in which they occur; centres within `ONE_PLACE` are one.
 
     Only the centres of a panorama's faces agree so well; poses estimated photo by photo never do.
     """
-    eyes = np.stack([camera.eye for camera in cameras])
+    eyes = np.stack(centres)
     near = ONE_PLACE * float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
     tree, number = cKDTree(eyes), list[int]()
     found = dict[int, int]()

@@ -1,7 +1,7 @@
 """Compare depth maps with the points that photos see: find unit and kind, or a scale and a shift for each photo.
 
-A map holds camera depth z, the length of the ray, or a network's inverse depth, which is 1 / z up to a scale and a
-shift that differ from photo to photo.
+A map holds camera depth z, the length of the ray, or a network's inverse depth, which is 1 / z (for a fisheye or a
+panorama, 1 / distance) up to a scale and a shift that differ from photo to photo.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ class Matches(NamedTuple):
     """Points in a photo, and what its map says there."""
 
     values: Float64[np.ndarray, " n"]  # of the map, in its unit
-    depths: Float64[np.ndarray, " n"]  # z of the points, world units
+    depths: Float64[np.ndarray, " n"]  # z of the points (for inverse depth, the lens's depth), world units
     lengths: Float64[np.ndarray, " n"]  # length of the point's ray at z = 1
 
 
 class PhotoFit(NamedTuple):
-    """How the map of a photo becomes depth: z = scale value, scale value / length, or 1 / (scale value + shift)."""
+    """How a map becomes depth: z = scale value, distance = scale value, or depth = 1 / (scale value + shift)."""
 
     scale: float
     shift: float = 0.0
@@ -118,7 +118,11 @@ class _Line(NamedTuple):
 
 
 def fit_depths(
-    matches: Mapping[str, Matches], kind: str = AUTO_KIND, unit: float = 0.0, where: str = "depth"
+    matches: Mapping[str, Matches],
+    kind: str = AUTO_KIND,
+    unit: float = 0.0,
+    where: str = "depth",
+    usual: str = Z,
 ) -> DepthFit:
     """Find how maps become depth.
 
@@ -127,6 +131,7 @@ def fit_depths(
         kind: One of `KINDS`.
         unit: World units for a unit of the maps; 0 to find it.
         where: Where the maps are, for messages.
+        usual: "z" or "ray", which auto takes where the points do not tell.
 
     Raises:
         DatasetError: there are too few points to find what is not named, the maps agree with them in no unit, or the
@@ -137,12 +142,14 @@ def fit_depths(
     if kind == INVERSE:
         return _inverse(matches, where)
     if count < LEAST_POINTS:
-        return _unchecked(matches, count, kind, unit, where)
+        return _unchecked(
+            matches, count, usual if kind == AUTO_KIND else kind, unit, where, kind != AUTO_KIND
+        )
     every = Matches(*(np.concatenate(column) for column in zip(*matches.values(), strict=True)))
     ratio, length = np.log(every.depths / every.values), np.log(every.lengths)
     line = _robust_line(length, ratio)
     points_tell = line.error < CERTAIN
-    kind_of_points = RAY if points_tell and line.scale < -0.5 else Z
+    kind_of_points = usual if not points_tell else RAY if line.scale < -0.5 else Z
     named = None if kind == AUTO_KIND else kind
     power = 1.0 if (named or kind_of_points) == RAY else 0.0
     level = float(np.median(ratio + power * length))
@@ -157,12 +164,7 @@ def fit_depths(
             "leave depth_kind out",
         )
     if unit > 0 and abs(math.log(found / unit)) > UNIT_OFF:
-        times = short_number(max(found / unit, unit / found), 3)
-        larger = "large" if unit > found else "small"
-        reason = (
-            f"with depth_unit={unit:g}, depth is {times} times too {larger} at {count:,} points of the photos"
-        )
-        raise DepthMisfitError(where, reason, f"leave depth_unit out, or give {short_number(found, 4)}")
+        raise DepthMisfitError(where, *_other_unit(unit, found, count))
     used = unit if unit > 0 else found
     reasons = {
         name: _why_rejected(np.log(each.depths / each.values) + power * np.log(each.lengths) - math.log(used))
@@ -174,7 +176,9 @@ def fit_depths(
     return DepthFit(named or kind_of_points, used, count, spread, certain, photos, rejected)
 
 
-def _unchecked(matches: Mapping[str, Matches], count: int, kind: str, unit: float, where: str) -> DepthFit:
+def _unchecked(
+    matches: Mapping[str, Matches], count: int, kind: str, unit: float, where: str, certain: bool
+) -> DepthFit:
     """Take unit and kind as they are named, because too few points tell them."""
     if unit <= 0:
         raise DepthMisfitError(
@@ -183,7 +187,17 @@ def _unchecked(matches: Mapping[str, Matches], count: int, kind: str, unit: floa
             "name it with --set depth_unit=U, the world units for a unit of the maps",
         )
     fits = dict.fromkeys(matches, PhotoFit(unit))
-    return DepthFit(Z if kind == AUTO_KIND else kind, unit, 0, 0.0, kind != AUTO_KIND, fits, ())
+    return DepthFit(kind, unit, 0, 0.0, certain, fits, ())
+
+
+def _other_unit(unit: float, found: float, count: int) -> tuple[str, str]:
+    """Describe a named unit that the points contradict, and what to do."""
+    times = short_number(max(found / unit, unit / found), 3)
+    larger = "large" if unit > found else "small"
+    reason = (
+        f"with depth_unit={unit:g}, depth is {times} times too {larger} at {count:,} points of the photos"
+    )
+    return reason, f"leave depth_unit out, or give {short_number(found, 4)}"
 
 
 def _why_rejected(off: Float64[np.ndarray, " n"]) -> str | None:
@@ -290,7 +304,7 @@ def _thinned(matches: Matches) -> Matches:
     return Matches(*(column[rows] for column in matches))
 
 
-def no_jumps(depth: Float64[np.ndarray, "h w"], jump: float) -> Bool[np.ndarray, "h w"]:
+def no_jumps(depth: Float64[np.ndarray, "h w"], jump: float, wraps: bool = False) -> Bool[np.ndarray, "h w"]:
     """Return the pixels with depth that lie beside no jump from one surface to another.
 
     At the edge of an object, a sensor's pixel mixes two depths, and it lies beside the photo's edge. On a plane, the
@@ -300,14 +314,16 @@ def no_jumps(depth: Float64[np.ndarray, "h w"], jump: float) -> Bool[np.ndarray,
     Args:
         depth: NaN where there is none.
         jump: The fraction.
+        wraps: Whether the first and the last column are neighbours.
     """
     held: Bool[np.ndarray, "h w"] = np.isfinite(depth)
     with np.errstate(invalid="ignore", divide="ignore"):
-        for w, kept in ((1 / depth, held), (1 / depth.T, held.T)):
-            before, here, after = w[:-2], w[1:-1], w[2:]
+        for w, kept, closed in ((1 / depth, held, False), (1 / depth.T, held.T, wraps)):
+            here, inner = (w, kept) if closed else (w[1:-1], kept[1:-1])
+            before, after = (np.roll(w, 1, 0), np.roll(w, -1, 0)) if closed else (w[:-2], w[2:])
             step = np.maximum(np.abs(here - before), np.abs(after - here))
             bend = np.abs(before - 2 * here + after)
-            kept[1:-1][np.minimum(step, bend) > jump * here] = False  # NaN is no jump
+            inner[np.minimum(step, bend) > jump * here] = False  # NaN is no jump
     return held
 
 

@@ -2,6 +2,9 @@
 
 Everything is judged before a training: `judged_depths` reads each map once, finds unit and kind from the points that
 the photos see, and says what is missing or rejected. A view reads its map again when a step needs it.
+
+The map of a photo that keeps its lens is read in the lens's own pixels, without resampling. Its depth is that of the
+lens's projection: z, or the distance from the camera for a fisheye or a panorama (`Projection.along_ray`).
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import short_number
-from gsplat_edu.data.capture import Frame, fits_camera, is_folder
+from gsplat_edu.data.capture import Frame, file_name, fits_camera, is_folder, whole_panoramas
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.depth_fit import (
     AUTO_KIND,
@@ -26,6 +29,7 @@ from gsplat_edu.data.depth_fit import (
     Matches,
     PhotoFit,
     Rejected,
+    Z,
     fit_depths,
     matched,
     no_jumps,
@@ -33,6 +37,7 @@ from gsplat_edu.data.depth_fit import (
 from gsplat_edu.data.depth_folder import GEOMETRIC_MAPS, DepthFile, confidence_of, depth_files, read_map
 from gsplat_edu.data.images import turned, upright_size
 from gsplat_edu.data.lens import Lens, bands, undistortion
+from gsplat_edu.data.native_lens import native_intrinsics
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.reader import CaptureReader
@@ -53,6 +58,13 @@ MOST_SAMPLES = 2**16
 
 FEW_POINTS = 20
 """Points of a photo below which its tracks say little."""
+
+LEAST_COSINE = 0.1
+"""Smallest cosine of the angle to the optical axis at which z tells the distance: nearer to 90 degrees, a small error
+of z is a large one of the distance."""
+
+FEW_PIXELS = 33
+"""Width and height at which a lens is examined for rays that look behind."""
 
 READABLE_MAPS = 3
 """Reasons that are named in a sentence about rejected maps."""
@@ -124,7 +136,8 @@ def _kind_text(fit: DepthFit) -> str:
     unit = f"{what} in a unit of {short_number(fit.unit, 4)} world units"
     if not fit.points:
         return f"{unit}, unchecked: no points lie where the maps have depth"
-    sure = "" if fit.certain else " (or ray length: the photos are too narrow to tell)"
+    other = "z" if fit.kind == RAY else "ray length"
+    sure = "" if fit.certain else f" (or {other}: the photos are too narrow to tell)"
     return f"{unit}{sure}; {agree}"
 
 
@@ -175,23 +188,28 @@ def judged_depths(
         points: A PLY that replaces the capture's points.
 
     Raises:
-        DatasetError: there is no depth, a file is damaged or has another shape than its photo, or maps agree with the
-            points in no unit.
+        DatasetError: there is no depth, a file is damaged or has another shape than its photo, maps agree with the
+            points in no unit, or they are of panoramas that are cut into faces.
     """
     seen = _seen(reader, cameras, points, source.path == POINTS)
     if source.path == POINTS:
         return _of_points(reader.path, cameras, seen)
-    frames = {frame.name: frame for frame in oriented(reader.placed(points).frames, reader.headers)}
+    kept = {name for name, camera in cameras if not camera.projection.plain}
+    faces = reader.placed(points).frames
+    frames = {frame.name: frame for frame in oriented([*faces, *whole_panoramas(faces)], reader.headers)}
     chosen = [frames[name] for name, _ in cameras]
-    if panorama := next((frame.name for frame in chosen if isinstance(frame.lens, FaceLens)), None):
+    cut = (frame.name for frame in chosen if isinstance(frame.lens, FaceLens) and frame.name not in kept)
+    if face := next(cut, None):
         raise DatasetError(
-            f"{reader.path}: {panorama} is part of a panorama, whose depth maps are not supported"
+            f"{reader.path}: {face} is one of a panorama's faces, which have no depth maps; train with --lens native,"
+            " which keeps panoramas whole"
         )
     files = _files(reader.path, chosen, source.path)
-    placed = {name: _Placed(file, frames[name]) for name, file in files.items()}
-    matches = {name: each.matches(seen.get(name)) for name, each in placed.items()}
+    placed = {name: _Placed(file, frames[name], name in kept) for name, file in files.items()}
+    matches = {name: each.matches(seen.get(name), source.kind) for name, each in placed.items()}
     where = str(reader.path if source.path == CAPTURE else source.path)
-    fit = fit_depths(matches, source.kind, source.unit, where)
+    usual = RAY if any(map(_sees_behind, {camera.intrinsics for _, camera in cameras})) else Z
+    fit = fit_depths(matches, source.kind, source.unit, where, usual)
     views = {name: partial(placed[name].samples, fit.kind, found) for name, found in fit.photos.items()}
     missing = tuple(name for name, _ in cameras if name not in files)
     return Depths(views, DepthReport(source.path, len(cameras), len(views), missing, fit))
@@ -220,10 +238,11 @@ def _seen(
     tracked = tracked_points(reader.path) if reader.capture.layout == "COLMAP" else None
     if tracked is not None:
         near = tracked.points - placed.origin
+        listed = {frame.name: file_name(frame) for frame in placed.frames}
         return {
-            name: sparse_depth(camera, near[tracked.seen[name]])
+            name: sparse_depth(camera, near[tracked.seen[listed.get(name, name)]])
             for name, camera in cameras
-            if name in tracked.seen
+            if listed.get(name, name) in tracked.seen
         }
     if tracks_only or placed.cloud is None:
         return {}
@@ -250,19 +269,28 @@ def _same(depth: GivenDepth) -> GivenDepth:
     return depth
 
 
+def _sees_behind(lens: Intrinsics) -> bool:
+    """Return whether a lens has rays at 90 degrees or more to its axis, where there is no positive z."""
+    if not lens.projection.along_ray:
+        return False
+    along = Camera.posed(np.eye(3), np.zeros(3), lens.scaled(FEW_PIXELS, FEW_PIXELS)).rays()[..., 2]
+    return bool((along <= 0).any())  # NaN, of a pixel without a ray, is not
+
+
 class _Placed:
     """A depth map and the camera that its photo has.
 
     Args:
         file: The map.
         frame: The photo.
+        native: Whether the photo keeps its lens.
     """
 
-    def __init__(self, file: DepthFile, frame: Frame) -> None:
-        self._file, self._frame = file, frame
+    def __init__(self, file: DepthFile, frame: Frame, native: bool) -> None:
+        self._file, self._frame, self._native = file, frame, native
 
     def _read(self) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"], Intrinsics]:
-        """Return values and weights of the undistorted map, and its pinhole.
+        """Return values and weights of the map and its lens; undistorted, with a pinhole, unless the lens is kept.
 
         Raises:
             DatasetError: the map has another aspect ratio than the photo.
@@ -278,43 +306,71 @@ class _Placed:
                 f"{self._file.path}: is {w}x{h} px, but the camera of {self._frame.name} {lens.W}x{lens.H}, another"
                 " aspect ratio; was one of the two cropped or turned?"
             )
+        kept = native_intrinsics(lens) if self._native else None
+        if kept is not None:
+            return values.astype(np.float64), weights.astype(np.float64), kept.scaled(w, h)
         small = lens.scaled(w, h)
         if not lens.distorts:
             return values.astype(np.float64), weights.astype(np.float64), small.undistorted()
         return _undistorted(values, small, np.nan), _undistorted(weights, small, 0.0), small.undistorted()
 
-    def matches(self, seen: GivenDepth | None) -> Matches:
+    def matches(self, seen: GivenDepth | None, kind: str) -> Matches:
         """Return the values of the map where the photo sees points."""
-        values, weights, pinhole = self._read()
+        values, weights, lens = self._read()
         if seen is None:
             return Matches(np.zeros(0), np.zeros(0), np.zeros(0))
         h, w = values.shape
         rays, z = seen.rays.astype(np.float64), seen.depths.astype(np.float64)
-        u = np.rint(pinhole.fx * rays[:, 0] + pinhole.cx).astype(np.int64)
-        v = np.rint(pinhole.fy * rays[:, 1] + pinhole.cy).astype(np.int64)
+        u = np.rint(lens.fx * rays[:, 0] + lens.cx).astype(np.int64)
+        v = np.rint(lens.fy * rays[:, 1] + lens.cy).astype(np.int64)
+        u = u % w if lens.projection.wraps else u
         held = (u >= 0) & (u < w) & (v >= 0) & (v < h)
         u, v, rays, z = u[held], v[held], rays[held], z[held]
         found = values[v, u]
         known = np.isfinite(found) & (weights[v, u] > 0)
-        return Matches(found[known], z[known], np.sqrt(1 + (rays[known] ** 2).sum(axis=1)))
+        found, rays, z = found[known], rays[known], z[known]
+        if lens.projection.plain:
+            return Matches(found, z, np.sqrt(1 + (rays**2).sum(axis=1)))
+        along, length = _ray_of_depth_1(lens, rays[:, 0], rays[:, 1])
+        if kind == INVERSE:
+            return Matches(found, z, np.ones_like(z))
+        ahead = np.isfinite(along)
+        return Matches(found[ahead], (z * along)[ahead], (length / along)[ahead])
 
     def samples(self, kind: str, fit: PhotoFit) -> GivenDepth:
         """Return the depth of the map's pixels."""
-        values, weights, pinhole = self._read()
+        values, weights, lens = self._read()
         h, w = values.shape
-        x, y = np.meshgrid((np.arange(w) - pinhole.cx) / pinhole.fx, (np.arange(h) - pinhole.cy) / pinhole.fy)
-        with np.errstate(divide="ignore"):
+        x, y = np.meshgrid((np.arange(w) - lens.cx) / lens.fx, (np.arange(h) - lens.cy) / lens.fy)
+        along, length = _ray_of_depth_1(lens, x, y)
+        with np.errstate(divide="ignore", invalid="ignore"):
             if kind == INVERSE:
                 inverse = fit.scale * values + fit.shift
                 depth = np.where(inverse * fit.farthest > 1, 1 / inverse, np.nan)
             else:
-                depth = fit.scale * values / (np.sqrt(1 + x * x + y * y) if kind == RAY else 1.0)
+                depth = fit.scale * values / (length if kind == RAY else along)
         step = int(np.ceil(np.sqrt(h * w / MOST_SAMPLES)))
-        held = no_jumps(depth, JUMP) & (weights > 0)
+        held = no_jumps(depth, JUMP, lens.projection.wraps) & (weights > 0) & np.isfinite(length)
         chosen = np.zeros_like(held)
         chosen[step // 2 :: step, step // 2 :: step] = True
         held &= chosen
         return GivenDepth(np.stack([x[held], y[held]], axis=1), depth[held], weights[held])
+
+
+def _ray_of_depth_1(
+    lens: Intrinsics, a: Float64[np.ndarray, "*n"], b: Float64[np.ndarray, "*n"]
+) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
+    """Return z and the length of the ray of depth 1 through each place (a, b) on the lens's plane.
+
+    Both are NaN where there is no ray, z where it does not tell the distance (`LEAST_COSINE`).
+    """
+    if lens.projection.plain:
+        return np.ones_like(a), np.sqrt(1 + a * a + b * b)
+    camera = Camera.posed(np.eye(3), np.zeros(3), lens)
+    rays = lens.projection.directions(a, b, camera.widest)
+    along, length = rays[..., 2], np.sqrt((rays * rays).sum(axis=-1))
+    tells = (along > LEAST_COSINE) if lens.projection.along_ray else np.isfinite(along)
+    return np.where(tells, along, np.nan), length
 
 
 def _undistorted(values: np.ndarray, lens: Lens, missing: float) -> Float64[np.ndarray, "h w"]:

@@ -13,8 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int8, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int8, UInt8
 
+from gsplat_edu.data.fine_rays import fine_rays
 from gsplat_edu.data.garden_paint import MATERIALS, SUN, Directions, Values, ground_colors, paint, sky_colors
 from gsplat_edu.scene.camera import Camera, look_at
 
@@ -97,7 +98,10 @@ class GardenPhoto(NamedTuple):
     """A photo, and what each pixel shows."""
 
     image: UInt8[np.ndarray, "H W 3"]  # RGB
-    material: Int8[np.ndarray, "H W"]  # index in MATERIALS, of one ray of the pixel
+    material: Int8[np.ndarray, "H W"]  # index in MATERIALS, of a ray 1/4 px left of and above the centre
+    points: Float32[
+        np.ndarray, "H W 3"
+    ]  # where that ray ends, world units; NaN in the sky and where there is no ray
 
 
 def garden_camera(azimuth: float, elevation: float = 0.28, size: tuple[int, int] = (320, 240)) -> Camera:
@@ -121,22 +125,19 @@ def photograph_garden(camera: Camera) -> GardenPhoto:
     """Trace a photo of the garden.
 
     Args:
-        camera: A camera above the ground and outside the solids; pixel centres have integer coordinates.
+        camera: A camera above the ground and outside the solids, of any lens and shutter; pixel centres have integer
+            coordinates. Pixels without a ray are black.
     """
     s = RAYS_PER_SIDE
-    inside = (np.arange(s) + 0.5) / s - 0.5
-    u, v = ((np.arange(n)[:, None] + inside).ravel() for n in (camera.W, camera.H))
-    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-    rays = np.tensordot(camera.R.T, np.stack([x, y, np.ones_like(x)]), axes=1).astype(np.float32)
-
+    eyes, rays, there = _beam(camera, s)
     with np.errstate(divide="ignore"):
-        nearest = np.where(rays[1] > 1e-6, np.float32(-camera.eye[1]) / rays[1], np.float32(np.inf))
+        nearest = np.where(rays[1] > 1e-6, -eyes[1] / rays[1], np.float32(np.inf))
     owner = np.where(np.isfinite(nearest), GROUND, SKY).astype(np.int8)
-    eye = camera.eye.astype(np.float32)[:, None]
     windows = [_window(solid, camera, s) for solid in SOLIDS]
     for number, (solid, part) in enumerate(zip(SOLIDS, windows, strict=True)):
         beam = np.ascontiguousarray(rays[(slice(None), *part)])
-        at = solid.hit(eye, beam.reshape(3, -1)).reshape(beam.shape[1:])
+        start = eyes if camera.pinhole else eyes[(slice(None), *part)]
+        at = solid.hit(start.reshape(3, -1), beam.reshape(3, -1)).reshape(beam.shape[1:])
         closer = at < nearest[part]
         nearest[part][closer], owner[part][closer] = at[closer], number
 
@@ -146,11 +147,32 @@ def photograph_garden(camera: Camera) -> GardenPhoto:
         chosen = owner[part] == number
         distance = nearest[part][chosen]
         heading = rays[(slice(None), *part)][:, chosen]
-        points = eye + np.nan_to_num(distance, posinf=0) * heading
+        start = np.broadcast_to(eyes, rays.shape)[(slice(None), *part)][:, chosen]
+        points = start + np.nan_to_num(distance, posinf=0) * heading
         heading /= np.linalg.norm(heading, axis=0)
         color[part][chosen], material[part][chosen] = _seen(number, points, distance, heading)
+    color[~there] = 0.0
     image = color.reshape(camera.H, s, camera.W, s, 3).mean(axis=(1, 3))
-    return GardenPhoto(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), material[::s, ::s].copy())
+    with np.errstate(invalid="ignore"):
+        ends = np.where(there & (owner != SKY), eyes + nearest * rays, np.nan)[:, ::s, ::s]
+    pixels = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
+    return GardenPhoto(pixels, material[::s, ::s].copy(), np.moveaxis(ends, 0, -1).astype(np.float32))
+
+
+def _beam(
+    camera: Camera, s: int
+) -> tuple[Float32[np.ndarray, "3 #h #w"], Float32[np.ndarray, "3 h w"], Bool[np.ndarray, "h w"]]:
+    """Return where s × s rays per pixel begin, their directions, and which exist; the others look up."""
+    if not camera.pinhole:
+        eyes, rays = (np.moveaxis(each, -1, 0) for each in fine_rays(camera, s))
+        there = np.isfinite(rays[0])
+        up = np.array([0.0, -1.0, 0.0])[:, None, None]
+        return eyes.astype(np.float32), np.where(there, rays, up).astype(np.float32), there
+    inside = (np.arange(s) + 0.5) / s - 0.5
+    u, v = ((np.arange(n)[:, None] + inside).ravel() for n in (camera.W, camera.H))
+    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    rays = np.tensordot(camera.R.T, np.stack([x, y, np.ones_like(x)]), axes=1).astype(np.float32)
+    return camera.eye.astype(np.float32)[:, None, None], rays, np.ones(x.shape, bool)
 
 
 def _seen(
@@ -167,7 +189,9 @@ def _seen(
 
 
 def _window(solid: Solid, camera: Camera, s: int) -> tuple[slice, slice]:
-    """Return the rows and columns of the grid of rays that a solid can cover."""
+    """Return the rows and columns of the grid of rays that a solid can cover: all of them for other than a pinhole."""
+    if not camera.pinhole:
+        return slice(None), slice(None)
     seen = (solid.corners() - camera.eye) @ camera.R.T
     if seen[:, 2].min() < 0.05:
         return slice(None), slice(None)

@@ -19,6 +19,7 @@ from gsplat_edu.base.errors import DatasetError, NotEnoughMemoryError, SplatErro
 from gsplat_edu.data.colors import conversion_of, to_srgb
 from gsplat_edu.data.deep_pixels import DEEP_BYTES_PER_PIXEL, is_deep, rounded_image
 from gsplat_edu.data.lens import Lens, bands, undistortion
+from gsplat_edu.data.native_lens import native_intrinsics, pixels_with_rays
 from gsplat_edu.data.panorama import FaceLens, cut_face
 from gsplat_edu.data.watch import FileWatch
 from gsplat_edu.photos.image_files import (
@@ -67,6 +68,7 @@ class PhotoFile:
         H: Height after downscaling, px.
         background: (r, g, b), 0 to 1, behind transparent pixels; None keeps the alpha.
         orientation: EXIF orientation by which the stored photo is turned; lens and mask refer to the turned photo.
+        native: Whether the photo keeps its lens: it is not undistorted.
     """
 
     path: Path
@@ -76,6 +78,12 @@ class PhotoFile:
     H: int
     background: tuple[float, float, float] | None
     orientation: int = UPRIGHT
+    native: bool = False
+
+    @property
+    def resampled(self) -> bool:
+        """Whether the photo is undistorted or cut from a panorama."""
+        return self.lens.distorts and not self.native
 
 
 @dataclass(frozen=True)
@@ -268,6 +276,8 @@ def load_photo(source: PhotoFile) -> Photo:
             raise DatasetError(f"{path}: its size changed while it was in use; load the capture again")
     if alpha is not None and source.background is not None:
         image, alpha = np.asarray(Photo(image, alpha).over(source.background)), None
+    if source.native:
+        return _through_own_lens(source, Photo(image, alpha, mask, lens_only=source.mask is None))
     if isinstance(source.lens, FaceLens):
         return Photo(*cut_face(image, alpha, mask, source.lens.R, source.W))
     if not source.lens.distorts and (source.W, source.H) == (source.lens.W, source.lens.H):
@@ -287,6 +297,17 @@ def load_photo(source: PhotoFile) -> Photo:
         None if plane is None else smaller_mask(plane, source.W, source.H) for plane in (mask, outside)
     )
     return Photo(image, alpha, counts, excluded, lens_only=source.mask is None)
+
+
+def _through_own_lens(source: PhotoFile, photo: Photo) -> Photo:
+    """Downscale a photo that keeps its lens. Pixels without a ray, as around a fisheye's circle, do not count."""
+    small = photo.scaled(source.W, source.H)
+    intrinsics = native_intrinsics(source.lens)
+    rays = None if intrinsics is None else pixels_with_rays(intrinsics.scaled(source.W, source.H))
+    if rays is None:
+        return small
+    counts = rays if small.mask is None else small.mask & rays
+    return Photo(small.image, small.alpha, counts, small.excluded, small.lens_only)
 
 
 class ImageStore:

@@ -111,6 +111,15 @@ class Lens(Intrinsics):
         return self.model != PINHOLE_LIKE
 
     @property
+    def described(self) -> str:
+        """The model and its coefficients in words, such as "perspective, k1 -0.1, k2 0.02"; a pinhole is "pinhole"."""
+        if not self.distorts:
+            return "pinhole"
+        names = FORMULAS[self.model].names
+        given = zip(names, self.coefficients, strict=False)
+        return ", ".join([self.model, *(f"{name} {value:.4g}" for name, value in given if value)])
+
+    @property
     def cropped(self) -> bool:
         """Whether the photo sees more than `MAX_ANGLE`, so that its pinhole shows only `CROPPED_ANGLE`.
 

@@ -57,6 +57,92 @@ class PanoramaFaces:
 
 
 @dataclass(frozen=True)
+class NativeLenses:
+    """Photos that keep their lens: they are rendered through it, not undistorted.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+    """
+
+    photos: int
+    total: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.photos} of {self.total} photos are trained through their own lens, without resampling"
+
+
+@dataclass(frozen=True)
+class RollingShutters:
+    """Photos that were read row by row by a moving camera, and are rendered so.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+        turn: Median angle by which their cameras turn meanwhile, degrees.
+    """
+
+    photos: int
+    total: int
+    turn: float
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} of {self.total} photos have a rolling shutter, during which the camera turns by "
+            f"{self.turn:.2g} degrees (median): each row has its own pose"
+        )
+
+
+@dataclass(frozen=True)
+class MotionBlurs:
+    """Photos whose camera moved while they were exposed, and that are rendered so.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+    """
+
+    photos: int
+    total: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} of {self.total} photos are rendered with the motion blur of their exposure time, so that "
+            "the scene becomes sharp"
+        )
+
+
+@dataclass(frozen=True)
+class IgnoredShutters:
+    """Photos whose rolling shutter or motion blur is ignored: their cameras count as resting.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+        first: Name of the first such photo.
+        undistorted: Whether the photos may not keep their lens; otherwise the renderer lacks their lens model.
+    """
+
+    photos: int
+    total: int
+    first: str
+    undistorted: bool
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        remedy = (
+            "train --lens native renders it" if self.undistorted else "the renderer does not have their lens"
+        )
+        return (
+            f"{self.photos} of {self.total} photos have a rolling shutter or motion blur, which is ignored, first "
+            f"{self.first}: {remedy}"
+        )
+
+
+@dataclass(frozen=True)
 class DistortedPhotos:
     """Photos that are undistorted.
 
@@ -269,6 +355,10 @@ LoadingNote = (
     | IgnoredPoints
     | MovedOrigin
     | PanoramaFaces
+    | NativeLenses
+    | RollingShutters
+    | MotionBlurs
+    | IgnoredShutters
     | DistortedPhotos
     | CroppedPhotos
     | RescaledIntrinsics

@@ -223,6 +223,36 @@ class Background:
         return f"{said}; published scores of Blender scenes are on white, as with --white-background"
 
 
+@dataclass(frozen=True)
+class LeftOutPhotos:
+    """Photos that the capture's list of photos to leave out names.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+        first: Name of the first one.
+    """
+
+    photos: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.photos} of {self.total} photos are left out by the capture's left_out.txt, first {self.first}"
+
+
+@dataclass(frozen=True)
+class OnlyInRegion:
+    """The capture has a box, and only the pixels count that may show something in it."""
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            "only what the photos show of the box of region.json counts; --set region=none uses all of them"
+        )
+
+
 Note = (
     Background
     | MissingPhotos
@@ -234,4 +264,6 @@ Note = (
     | UnusedSplit
     | TwoLayouts
     | UnreadColors
+    | LeftOutPhotos
+    | OnlyInRegion
 )

@@ -77,6 +77,11 @@ class FaceLens(Lens):
         return cls(W, H, focal, focal, (W - 1) / 2, (H - 1) / 2, (), PANORAMIC, number)
 
     @property
+    def described(self) -> str:
+        """The model in words."""
+        return "equirectangular panorama"
+
+    @property
     def cropped(self) -> bool:
         """False: other faces show the rest of the panorama."""
         return False

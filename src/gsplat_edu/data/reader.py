@@ -113,13 +113,27 @@ def read_capture(path: Path) -> Capture:
         return replace(read_colmap(path, model), scale=read_scale(path))
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
     looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
-    folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
-    if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in entries(folder)):
+    if _has_photos(path):
         raise DatasetError(
             f"{path}: holds photos but no camera poses; find the poses with "
             f"`gsplat-edu sfm {path} OUT` (looked for {looked})"
         )
     raise DatasetError(f"{path}: is not a capture; looked for {looked}")
+
+
+def is_capture(path: Path) -> bool:
+    """Return whether a folder has the files of a layout, or photos, which then lack poses.
+
+    Args:
+        path: The folder.
+    """
+    files = (path / TRAIN_FILE, path / "transforms.json")
+    return any(map(is_file, files)) or find_model(path) is not None or _has_photos(path)
+
+
+def _has_photos(path: Path) -> bool:
+    folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
+    return any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in entries(folder))
 
 
 def _near_origin(

@@ -5,10 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.validation import float64_array, in_range, whole_number
+from gsplat_edu.base.validation import float64_array, in_range, one_of, whole_number
+from gsplat_edu.scene.region import Region
 
 FACTOR_BELOW = 32
 """A resolution below this is a divisor of the size; from here on it is the longest side, px."""
+
+LENS_MODES = ("undistort", "native", "auto")
+"""Which photos are trained through their own lens: none; all whose model the renderer has; or fisheyes, panoramas,
+photos with a rolling shutter, and photos of which undistortion would crop more than a tenth."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,11 @@ class DataSettings:
         train_views: Names of the training views, at least one; only these and `test_views` are read, and no split is
             made. None uses every view.
         test_views: Names of the test views to go with `train_views`.
+        left_out: Photos that are not used, as `gsplat_edu.data.left_out` names them; None uses the capture's own list.
+            With `train_views`, it means nothing.
+        region: The region of interest as `gsplat_edu.scene.region.Region.numbers` gives it, in the capture's
+            coordinates; () for none. None uses the capture's region.json, if there is one.
+        lens: Which photos keep their lens instead of being undistorted, one of `LENS_MODES`.
 
     Raises:
         ArgumentError: a value is out of range, or the split would leave no training view.
@@ -37,6 +47,9 @@ class DataSettings:
     image_memory: int = 4 * 2**30
     train_views: tuple[str, ...] | None = None
     test_views: tuple[str, ...] = ()
+    lens: str = "undistort"
+    left_out: tuple[str, ...] | None = None
+    region: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.resolution is not None and (in_range("resolution", self.resolution, 1.0) > 1e6):
@@ -51,6 +64,9 @@ class DataSettings:
                 for i, value in enumerate(float64_array("background", self.background, (3,)))
             )
             object.__setattr__(self, "background", (r, g, b))
+        one_of("lens", self.lens, LENS_MODES)
+        if self.region:
+            object.__setattr__(self, "region", Region.of_numbers(self.region).numbers)
         whole_number("image_memory", self.image_memory, 0)
         if self.train_views is not None and not self.train_views:
             raise ArgumentError("train_views: is empty; name at least one view, or give None for all")

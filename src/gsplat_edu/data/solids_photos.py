@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt8
 
 from gsplat_edu.base.validation import one_of, whole_number
+from gsplat_edu.data.fine_rays import fine_rays
 from gsplat_edu.data.solids import SolidScene, solids
-from gsplat_edu.data.solids_shapes import Points, SolidShape, Values, gradient, lengths
+from gsplat_edu.data.solids_shapes import Points, SolidShape, Values, along_and_beside, gradient, lengths
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.views import View
 
@@ -56,6 +57,10 @@ BEHIND = np.array([0.36, 0.38, 0.42], np.float32)
 """RGB behind the scene, 0 to 1."""
 
 
+Eyes = Float64[np.ndarray, "... 3"]
+"""Where rays begin: (3,) for all of them, or (n, 3)."""
+
+
 class Finish(NamedTuple):
     """What the surfaces of the objects look like; the floor is always textured."""
 
@@ -88,7 +93,7 @@ class SolidsPhoto(NamedTuple):
     image: UInt8[np.ndarray, "H W 3"]  # RGB
     depth: Float64[
         np.ndarray, "H W"
-    ]  # along the optical axis at the pixel's centre, world units; 0 for no surface
+    ]  # along the optical axis at the pixel's centre, or as the projection has it; world units; 0 for no surface
     normals: Float64[np.ndarray, "H W 3"]  # outward unit normals at the centre, world axes; 0 for no surface
     part: Int8[np.ndarray, "H W"]  # index in `SolidScene.parts` at the centre, -1 for no surface
 
@@ -159,14 +164,16 @@ def photograph_solids(scene: SolidScene, camera: Camera, finish: str = "textured
 
     Args:
         scene: The solids.
-        camera: A camera outside them; pixel centres have integer coordinates.
+        camera: A camera outside them, of any lens and shutter; pixel centres have integer coordinates. Pixels without
+            a ray are black.
         finish: A name in `FINISHES`.
 
     Raises:
         ArgumentError: the finish is unknown.
     """
     one_of("finish", finish, list(FINISHES))
-    image = np.concatenate([_pixels(scene, camera, band, finish) for band in _bands(camera)])
+    beam = None if camera.pinhole else fine_rays(camera, RAYS_PER_SIDE)
+    image = np.concatenate([_pixels(scene, camera, beam, band, finish) for band in _bands(camera)])
     return SolidsPhoto(image, *scan_solids(scene, camera))
 
 
@@ -179,7 +186,8 @@ def scan_solids(
         scene: The solids.
         camera: A camera outside them.
     """
-    bands = [_exact(scene, camera, band) for band in _bands(camera)]
+    beam = None if camera.pinhole else fine_rays(camera, 1)
+    bands = [_exact(scene, camera, beam, band) for band in _bands(camera)]
     depth, normals, part = (np.concatenate(values) for values in zip(*bands, strict=True))
     return depth, normals, part
 
@@ -190,44 +198,77 @@ def _bands(camera: Camera) -> list[slice]:
     return [slice(top, min(top + rows, camera.H)) for top in range(0, camera.H, rows)]
 
 
-def _pixels(scene: SolidScene, camera: Camera, band: slice, finish: str) -> UInt8[np.ndarray, "h W 3"]:
+Beam = tuple[Float64[np.ndarray, "fine_H fine_W 3"], Float64[np.ndarray, "fine_H fine_W 3"]] | None
+"""Origins and directions of a whole photo's rays; None for a pinhole, which has formulas."""
+
+
+def _pixels(
+    scene: SolidScene, camera: Camera, beam: Beam, band: slice, finish: str
+) -> UInt8[np.ndarray, "h W 3"]:
     """Return some rows of a photo."""
     s = RAYS_PER_SIDE
-    rays = _rays(camera, band, s)
-    at, owner = trace(scene, camera.eye, rays, exact=False)
+    eyes, rays = _beam(camera, beam, band, s)
+    at, owner = _met(scene, eyes, rays, exact=False)
     colors = np.tile(BEHIND, (len(rays), 1))
+    colors[np.isnan(rays[:, 0])] = 0.0
     for index, part in enumerate(scene.parts):
         mine = np.flatnonzero(owner == index)
-        points = camera.eye + at[mine, None] * rays[mine]
+        points = _of(eyes, mine) + at[mine, None] * rays[mine]
         kind = FINISHES["textured"] if part.name == "floor" else FINISHES[finish]
-        colors[mine] = _shaded(part.name, part.shape, points, camera.eye, kind)
+        colors[mine] = _shaded(part.name, part.shape, points, _of(eyes, mine), kind)
     mean = colors.reshape(-1, s, camera.W, s, 3).mean(axis=(1, 3))
     return np.asarray(np.round(255 * np.clip(mean, 0, 1)).astype(np.uint8))
 
 
 def _exact(
-    scene: SolidScene, camera: Camera, band: slice
+    scene: SolidScene, camera: Camera, beam: Beam, band: slice
 ) -> tuple[Float64[np.ndarray, "h W"], Float64[np.ndarray, "h W 3"], Int8[np.ndarray, "h W"]]:
     """Return depth, normals and part of some rows of pixels."""
-    rays = _rays(camera, band, 1)
-    at, owner = trace(scene, camera.eye, rays)
+    eyes, rays = _beam(camera, beam, band, 1)
+    at, owner = _met(scene, eyes, rays)
     normals = np.zeros((len(rays), 3))
     for index, part in enumerate(scene.parts):
         mine = np.flatnonzero(owner == index)
-        normals[mine] = gradient(part.shape, camera.eye + at[mine, None] * rays[mine])
+        normals[mine] = gradient(part.shape, _of(eyes, mine) + at[mine, None] * rays[mine])
     shape = (-1, camera.W)
-    depth = np.where(owner < 0, 0.0, at)  # rays have z = 1 in the camera's frame, so this is depth already
+    depth = np.where(owner < 0, 0.0, at)  # rays have depth 1, so this is depth already
     return depth.reshape(shape), normals.reshape(*shape, 3), owner.reshape(shape)
 
 
+def _beam(camera: Camera, beam: Beam, band: slice, s: int) -> tuple[Eyes, Points]:
+    """Return where the rays of some rows begin, and their directions."""
+    if beam is None:
+        return camera.eye, _rays(camera, band, s)
+    rows = slice(s * band.start, s * band.stop)
+    origins, rays = (part[rows].reshape(-1, 3) for part in beam)
+    return origins, rays
+
+
+def _of(eyes: Eyes, rows: Int64[np.ndarray, " m"]) -> Eyes:
+    """Return where some rays begin."""
+    return eyes if eyes.ndim == 1 else eyes[rows]
+
+
+def _met(
+    scene: SolidScene, eyes: Eyes, rays: Points, exact: bool = True
+) -> tuple[Values, Int8[np.ndarray, " n"]]:
+    """Trace rays of which some are NaN and miss."""
+    there = np.flatnonzero(np.isfinite(rays[:, 0]))
+    if len(there) == len(rays):
+        return trace(scene, eyes, rays, exact)
+    at, owner = np.full(len(rays), np.inf), np.full(len(rays), -1, np.int8)
+    at[there], owner[there] = trace(scene, _of(eyes, there), rays[there], exact)
+    return at, owner
+
+
 def trace(
-    scene: SolidScene, eye: Float64[np.ndarray, "3"], rays: Points, exact: bool = True
+    scene: SolidScene, eye: Eyes, rays: Points, exact: bool = True
 ) -> tuple[Values, Int8[np.ndarray, " n"]]:
     """Return where each ray first meets the surface, and which part it meets.
 
     Args:
         scene: The solids.
-        eye: (3,) start of the rays, outside the solids.
+        eye: (3,) start of the rays, or (n, 3), outside the solids.
         rays: (n, 3) directions of any length.
         exact: Whether the hits are within `EXACT` of the surface; else within `CLOSE`, in less time.
 
@@ -239,32 +280,24 @@ def trace(
     squared = np.einsum("ij,ij->i", rays, rays)
     for index, part in enumerate(scene.parts):
         rows = _towards(part.shape, eye, rays, squared)
-        near, far = part.shape.reach(eye, rays[rows])
+        near, far = part.shape.reach(_of(eye, rows), rays[rows])
         before = (far > 0) & (near < at[rows])
         rows, near, far = rows[before], np.maximum(near[before], 0.0), far[before]
-        found = _first_hit(part.shape, eye, rays[rows], near, far)
+        found = _first_hit(part.shape, _of(eye, rows), rays[rows], near, far)
         if exact:
-            found = _polished(part.shape, eye, rays[rows], found)
+            found = _polished(part.shape, _of(eye, rows), rays[rows], found)
         closer = found < at[rows]
         at[rows[closer]], owner[rows[closer]] = found[closer], index
     return at, owner
 
 
-def _towards(
-    shape: SolidShape, eye: Float64[np.ndarray, "3"], rays: Points, squared: Values
-) -> Int64[np.ndarray, " m"]:
+def _towards(shape: SolidShape, eye: Eyes, rays: Points, squared: Values) -> Int64[np.ndarray, " m"]:
     """Return the rays that meet the bounding sphere of a shape; `squared` are the squares of their lengths."""
-    away = shape.center - eye
-    beside = away @ away - shape.radius**2
-    if beside <= 0:
-        return np.arange(len(rays))
-    along = rays @ away
-    return np.flatnonzero((along > 0) & (along * along > beside * squared))
+    along, beside = along_and_beside(shape.center - eye, rays, shape.radius)
+    return np.flatnonzero((beside <= 0) | ((along > 0) & (along * along > beside * squared)))
 
 
-def _first_hit(
-    shape: SolidShape, eye: Float64[np.ndarray, "3"], rays: Points, near: Values, far: Values
-) -> Values:
+def _first_hit(shape: SolidShape, eye: Eyes, rays: Points, near: Values, far: Values) -> Values:
     """Return where rays meet one shape between `near` and `far`, infinity where they miss."""
     at = near.copy()
     length = lengths(rays)
@@ -272,7 +305,7 @@ def _first_hit(
     for _ in range(MOST_STEPS):
         if not len(left):
             break
-        away = shape.distance(eye + at[left, None] * rays[left])
+        away = shape.distance(_of(eye, left) + at[left, None] * rays[left])
         at[left] += np.where(away > CLOSE, away / length[left], 0.0)
         missed = at[left] > far[left]
         at[left[missed]] = np.inf
@@ -281,7 +314,7 @@ def _first_hit(
     return at
 
 
-def _polished(shape: SolidShape, eye: Float64[np.ndarray, "3"], rays: Points, at: Values) -> Values:
+def _polished(shape: SolidShape, eye: Eyes, rays: Points, at: Values) -> Values:
     """Return where rays meet the surface exactly, from places at most `CLOSE` before it; infinity if they pass it.
 
     Each step follows the slope of the distance along the ray. Steps that approach too slowly are those of sphere
@@ -291,7 +324,7 @@ def _polished(shape: SolidShape, eye: Float64[np.ndarray, "3"], rays: Points, at
     at = at.copy()
     left = np.flatnonzero(np.isfinite(at))
     for _ in range(MOST_STEPS):
-        points = eye + at[left, None] * rays[left]
+        points = _of(eye, left) + at[left, None] * rays[left]
         away = shape.distance(points)
         wide = np.abs(away) > EXACT
         left, away, points = left[wide], away[wide], points[wide]
@@ -317,7 +350,7 @@ def _rays(camera: Camera, band: slice, s: int) -> Points:
 
 
 def _shaded(
-    name: str, shape: SolidShape, points: Points, eye: Float64[np.ndarray, "3"], finish: Finish
+    name: str, shape: SolidShape, points: Points, eye: Eyes, finish: Finish
 ) -> Float32[np.ndarray, "n 3"]:
     """Return the RGB of points of one part as seen from a place."""
     normals = gradient(shape, points)
@@ -379,13 +412,14 @@ def _start(
         if not len(shown):
             continue
         chosen = rng.choice(shown, number)
-        places = camera.eye + photo.depth.ravel()[chosen, None] * _rays(camera, slice(None), 1)[chosen]
+        eyes, rays = _beam(camera, None if camera.pinhole else fine_rays(camera, 1), slice(0, camera.H), 1)
+        places = _of(eyes, chosen) + photo.depth.ravel()[chosen, None] * rays[chosen]
         shades = np.zeros((number, 3))
         for index, part in enumerate(scene.parts):
             mine = photo.part.ravel()[chosen] == index
             kind = FINISHES["textured"] if part.name == "floor" else finish
             shades[mine] = _shaded(
-                part.name, part.shape, places[mine], camera.eye, Finish(kind.contrast, 0.0)
+                part.name, part.shape, places[mine], _of(eyes, chosen[mine]), Finish(kind.contrast, 0.0)
             )
         points.append(places)
         colors.append(np.clip(shades, 0.0, 1.0))

@@ -41,7 +41,7 @@ class SolidShape(Protocol):
     def distance(self, points: Points) -> Values:
         """Return the distance of points to the surface, negative inside, world units. Exact inside and outside."""
 
-    def reach(self, origin: Float64[np.ndarray, "3"], rays: Points) -> tuple[Values, Values]:
+    def reach(self, origin: Float64[np.ndarray, "*n 3"], rays: Points) -> tuple[Values, Values]:
         """Return where rays enter and leave a volume around the shape, as multiples of their length.
 
         Infinity and -infinity if they miss it.
@@ -82,7 +82,7 @@ class Block:
         most = np.maximum(np.maximum(beyond[:, 0], beyond[:, 1]), beyond[:, 2])
         return np.asarray(lengths(np.maximum(beyond, 0.0)) + np.minimum(most, 0.0))
 
-    def reach(self, origin: Float64[np.ndarray, "3"], rays: Points) -> tuple[Values, Values]:
+    def reach(self, origin: Float64[np.ndarray, "*n 3"], rays: Points) -> tuple[Values, Values]:
         """Return where rays enter and leave the box, as multiples of their length."""
         return slab(upright(self.turn), self.center, self.half, (origin, rays))
 
@@ -137,7 +137,7 @@ class Rod:
         rest = away - along[:, None] * axis
         return lengths(rest) - self.thickness
 
-    def reach(self, origin: Float64[np.ndarray, "3"], rays: Points) -> tuple[Values, Values]:
+    def reach(self, origin: Float64[np.ndarray, "*n 3"], rays: Points) -> tuple[Values, Values]:
         """Return where rays enter and leave a box around the rod, as multiples of their length."""
         frame = np.stack(_frame(self.end - self.start), axis=1)
         half = np.array([self.thickness, self.thickness, self.radius])
@@ -189,7 +189,7 @@ class Torus:
         height, out = _cylindrical(points - self.center, self.axis)
         return np.asarray(np.hypot(out - self.ring, height) - self.tube)
 
-    def reach(self, origin: Float64[np.ndarray, "3"], rays: Points) -> tuple[Values, Values]:
+    def reach(self, origin: Float64[np.ndarray, "*n 3"], rays: Points) -> tuple[Values, Values]:
         """Return where rays enter and leave a box around the torus, as multiples of their length."""
         frame = np.stack(_frame(self.axis), axis=1)
         return slab(frame, self.center, np.array([self.radius, self.radius, self.tube]), (origin, rays))
@@ -246,7 +246,7 @@ class Bowl:
         to_rim = np.hypot(out - rim[0], depth - rim[1])
         return np.asarray(np.where(beside, to_sphere, to_rim)) - self.wall
 
-    def reach(self, origin: Float64[np.ndarray, "3"], rays: Points) -> tuple[Values, Values]:
+    def reach(self, origin: Float64[np.ndarray, "*n 3"], rays: Points) -> tuple[Values, Values]:
         """Return where rays enter and leave the bounding sphere, as multiples of their length."""
         return ball(self.center, self.radius, origin, rays)
 
@@ -268,19 +268,19 @@ class Bowl:
 
 
 def ball(
-    center: Float64[np.ndarray, "3"], radius: float, origin: Float64[np.ndarray, "3"], rays: Points
+    center: Float64[np.ndarray, "3"], radius: float, origin: Float64[np.ndarray, "*n 3"], rays: Points
 ) -> tuple[Values, Values]:
     """Return where rays enter and leave a sphere, as multiples of their length; infinity and -infinity if they miss.
 
     Args:
         center: (3,) world units.
         radius: World units.
-        origin: (3,) start of all rays.
+        origin: (3,) start of all rays, or (n, 3) of each.
         rays: (n, 3) directions of any length.
     """
     away = center - origin
-    squared, along = np.einsum("ij,ij->i", rays, rays), rays @ away
-    root = along**2 - squared * (away @ away - radius**2)
+    squared, (along, beside) = np.einsum("ij,ij->i", rays, rays), along_and_beside(away, rays, radius)
+    root = along**2 - squared * beside
     half, met = np.sqrt(np.maximum(root, 0.0)), root > 0
     return np.where(met, (along - half) / squared, np.inf), np.where(met, (along + half) / squared, -np.inf)
 
@@ -289,7 +289,7 @@ def slab(
     frame: Float64[np.ndarray, "3 3"],
     center: Float64[np.ndarray, "3"],
     half: Float64[np.ndarray, "3"],
-    beam: tuple[Float64[np.ndarray, "3"], Points],
+    beam: tuple[Float64[np.ndarray, "*n 3"], Points],
 ) -> tuple[Values, Values]:
     """Return where rays enter and leave a box, as multiples of their length; infinity and -infinity if they miss.
 
@@ -297,7 +297,7 @@ def slab(
         frame: (3, 3) unit vectors along its sides, in columns.
         center: (3,) world units.
         half: (3,) half of its sides, world units.
-        beam: (3,) start of all rays, and (n, 3) their directions.
+        beam: (3,) start of all rays or (n, 3) of each, and (n, 3) their directions.
     """
     origin, rays = beam
     start, heading = (origin - center) @ frame, rays @ frame
@@ -306,6 +306,21 @@ def slab(
     (a, b, c), (d, e, f) = np.minimum(one, two).T, np.maximum(one, two).T
     near, far = np.maximum(np.maximum(a, b), c), np.minimum(np.minimum(d, e), f)
     return np.where(near < far, near, np.inf), np.where(near < far, far, -np.inf)
+
+
+def along_and_beside(
+    away: Float64[np.ndarray, "*n 3"], rays: Points, radius: float
+) -> tuple[Values, Float64[np.ndarray, "*n"]]:
+    """Return the products of rays with the vector to a sphere's centre, and |vector|² - radius².
+
+    Args:
+        away: (3,) from the start of all rays to the centre, or (n, 3) from that of each.
+        rays: (n, 3) directions.
+        radius: World units.
+    """
+    if away.ndim == 1:
+        return rays @ away, np.asarray(away @ away - radius**2)
+    return np.einsum("ij,ij->i", rays, away), np.einsum("ij,ij->i", away, away) - radius**2
 
 
 def lengths(vectors: Points) -> Values:

@@ -38,14 +38,18 @@ class TrackedPoints(NamedTuple):
     ]  # rows of the points in each photo's tracks, by the photo's name
 
 
-def tracked_points(folder: Path) -> TrackedPoints | None:
+def tracked_points(
+    folder: Path, most_error: float = MAX_ERROR, least_views: int = LEAST_VIEWS
+) -> TrackedPoints | None:
     """Read the tracks of a COLMAP model.
 
-    Points with an error above `MAX_ERROR`, in fewer than `LEAST_VIEWS` photos or with NaN are left out. The tracks of
+    Points with a larger error, in fewer photos or with NaN are left out. The tracks of
     captures that this project writes were computed from poses and points, which is as good for depth.
 
     Args:
         folder: The capture.
+        most_error: Largest reprojection error, px.
+        least_views: Smallest number of photos that see a point.
 
     Returns:
         The points; None if there is no model, or it has no points.
@@ -67,7 +71,9 @@ def tracked_points(folder: Path) -> TrackedPoints | None:
     views = np.zeros(len(order), np.int64)
     for rows in seen.values():
         views[rows] += 1
-    good = (tracked.errors <= MAX_ERROR) & (views >= LEAST_VIEWS) & np.isfinite(tracked.positions).all(axis=1)
+    good = (
+        (tracked.errors <= most_error) & (views >= least_views) & np.isfinite(tracked.positions).all(axis=1)
+    )
     if not good.any():
         return None
     new = np.cumsum(good) - 1
@@ -89,12 +95,20 @@ def _rows(
 
 
 def sparse_depth(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> GivenDepth:
-    """Return the depth of points in a photo that sees them; points behind the camera or outside are left out.
+    """Return the depth of points in a photo that sees them; points that its lens does not see are left out.
 
     Args:
-        camera: The photo's camera.
+        camera: The photo's camera, of any projection and shutter.
         points: World units, in the camera's coordinate frame.
     """
+    if not camera.pinhole:
+        seen = camera.sight(points)
+        u, v, valid = seen.u, seen.v, np.asarray(seen.valid)
+        inside = valid & (v >= 0) & (v <= camera.H - 1)
+        if not camera.projection.wraps:
+            inside &= (u >= 0) & (u <= camera.W - 1)
+        places = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=1)
+        return GivenDepth(places[inside], np.asarray(seen.depth)[inside], sparse=True)
     at = camera.world_to_cam(points)
     at = at[at[:, 2] > 0]
     rays, z = at[:, :2] / at[:, 2:], at[:, 2]

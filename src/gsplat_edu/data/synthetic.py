@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gsplat_edu.render.numpy_reference import render_gaussians
-from gsplat_edu.scene.camera import Camera, orbit_camera
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.rig import orbit_camera
 from gsplat_edu.scene.sphere_shell import sphere_shell
 from gsplat_edu.scene.views import View
 

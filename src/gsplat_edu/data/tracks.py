@@ -1,7 +1,8 @@
 """Find the points that each photo sees, for the tracks of a COLMAP model that was not made from matches.
 
-A photo sees a point if the point is before its camera, inside the image, and not hidden: a point hides farther points
-in its cell of the image. Cells are large enough to contain some points of an evenly covered surface.
+A photo sees a point if its lens does (a pinhole: what is before it), the point is inside the image, and not hidden: a
+point hides farther points in its cell of the image. Cells are large enough to contain some points of an evenly covered
+surface.
 """
 
 from __future__ import annotations
@@ -50,9 +51,14 @@ class Track(NamedTuple):
 
 def visible_points(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> VisiblePoints:
     """Return the points that a camera sees, with occlusion by other points."""
-    at = camera.world_to_cam(points)
-    before = np.flatnonzero(at[:, 2] > 0)
-    u, v, depth = camera.project(at[before])
+    if camera.pinhole:
+        at = camera.world_to_cam(points)
+        before = np.flatnonzero(at[:, 2] > 0)
+        u, v, depth = camera.project(at[before])
+    else:
+        sight = camera.sight(points)
+        before = np.flatnonzero(sight.valid)
+        u, v, depth = (np.asarray(each)[before] for each in (sight.u, sight.v, sight.depth))
     inside = (u >= -0.5) & (u < camera.W - 0.5) & (v >= -0.5) & (v < camera.H - 0.5)
     rows, u, v, depth = before[inside], u[inside], v[inside], depth[inside]
     edge = max(1.0, float(np.sqrt(PER_CELL * camera.W * camera.H / max(len(rows), 1))))

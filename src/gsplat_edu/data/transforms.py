@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -38,6 +39,7 @@ from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
 from gsplat_edu.data.points import read_points_ply
+from gsplat_edu.data.shutter_keys import SHUTTER_KEYS, shutter_from_keys
 
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 
@@ -148,6 +150,7 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
     frames, missing, outside = list[Frame](), list[str](), list[Path]()
     parts, listings = _parts(path, contents), Listings()
     shared = {key: value for key, value in contents.items() if key in INTRINSICS}
+    moving = {key: value for key, value in contents.items() if key in SHUTTER_KEYS}
     common: Lens | None = None  # shared by all frames without their own intrinsics
     for number, frame in enumerate(contents["frames"]):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
@@ -170,8 +173,8 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
         outside += [mask] if mask and is_outside(path.parent, _tidy(str(frame["mask_path"]))) else []
         depth = _depth(where, path.parent, frame)
         outside += [depth] if depth and is_outside(path.parent, _tidy(frame["depth_file_path"])) else []
-        given = Frame(legible(name), image, lens, R, eye, mask, its_part, depth=depth)
-        frames.append(checked_frame(where, given))
+        given = checked_frame(where, Frame(legible(name), image, lens, R, eye, mask, its_part, depth=depth))
+        frames.append(replace(given, shutter=shutter_from_keys(where, {**moving, **frame}, given.R)))
     return Found(frames, missing, outside)
 
 

@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float64
 
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import RANDOM_POINTS, random_cloud
-from gsplat_edu.scene.camera import Camera, point_nearest_axes, scene_extent
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.rig import point_nearest_axes, scene_extent
 
 LEAST_VIEWS = 2
 """A start point lies in at least this many photos, or in all of them if there are fewer."""
@@ -40,10 +41,16 @@ def seen_by(
     counts = np.zeros(len(points), dtype=np.int64)
     for camera in cameras:
         local = camera.world_to_cam(points)
-        x, y, z = np.moveaxis(local, -1, 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            counts += (z > 0) & (u >= 0) & (u <= camera.W - 1) & (v >= 0) & (v <= camera.H - 1)
+        if camera.projection.plain:
+            x, y, z = np.moveaxis(local, -1, 0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+                ahead = z > 0
+        else:
+            u, v, _ = camera.project(local)
+            ahead = np.isfinite(u)
+        with np.errstate(invalid="ignore"):
+            counts += ahead & (u >= 0) & (u <= camera.W - 1) & (v >= 0) & (v <= camera.H - 1)
     return counts >= least
 
 
@@ -82,7 +89,12 @@ def cloud_in_view(cameras: Sequence[Camera]) -> Cloud | None:
         for camera, count in zip(cameras, _shares(RANDOM_POINTS, len(cameras)), strict=True):
             u, v = rng.uniform(0, camera.W - 1, count), rng.uniform(0, camera.H - 1, count)
             z = 1.0 / rng.uniform(1.0 / (FARTHEST * size), 1.0 / (NEAREST * size), count)
-            local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+            a, b = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+            if camera.projection.plain:
+                local = np.stack([a * z, b * z, z], axis=1)
+            else:
+                local = camera.projection.directions(a, b, camera.widest) * z[:, None]
+                local = local[np.isfinite(local).all(axis=1)]
             candidates.append(local @ camera.R + camera.eye)
         points = np.concatenate(candidates)
         found.append(points[seen_by(points, cameras, least)])

@@ -16,13 +16,29 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import Cloud
+from gsplat_edu.data.colmap import SPHERE
+from gsplat_edu.data.colmap_files import MODELS
+from gsplat_edu.data.lens_formulas import FISHEYE as FISHEYE_NAMES, PERSPECTIVE as PERSPECTIVE_NAMES
+from gsplat_edu.data.native_lens import ARIA, POLYNOMIAL, RATIONAL
 from gsplat_edu.data.points import write_points_ply
+from gsplat_edu.data.shutter_keys import keys_of_shutter
 from gsplat_edu.data.tracks import UNMEASURED, VisiblePoints, tracks_of, visible_points
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.projection import COEFFICIENTS
 from gsplat_edu.scene.views import Photo, View
 
-PINHOLE = 1
-"""COLMAP's model number for a pinhole with two focal lengths."""
+Intrinsic = tuple[str, int, int, tuple[float, ...]]
+"""COLMAP's model, width, height and parameters."""
+
+Names = tuple[tuple[str, dict[str, str]], ...]
+"""Models of COLMAP, and our names of those coefficients that have another name."""
+
+OF_KIND: dict[tuple[str, bool], Names] = {
+    ("perspective", False): (("PINHOLE", {}), ("OPENCV", RATIONAL), ("FULL_OPENCV", RATIONAL)),
+    ("fisheye", False): (("OPENCV_FISHEYE", {}), ("THIN_PRISM_FISHEYE", POLYNOMIAL)),
+    ("fisheye", True): (("RAD_TAN_THIN_PRISM_FISHEYE", ARIA),),
+}
+"""The models by kind of projection and `Distortion.radial_first`, the simplest first."""
 
 
 def write_colmap(
@@ -72,7 +88,7 @@ def write_model(
     cloud = _cloud(points, colors)
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
-    lenses: dict[tuple[float, ...], int] = {}
+    lenses: dict[Intrinsic, int] = {}
     for _, camera in cameras:
         lenses.setdefault(_intrinsics(camera), len(lenses) + 1)
     poses = [
@@ -99,7 +115,7 @@ def write_transforms(
 
     Args:
         folder: The capture; created if missing.
-        views: Views with different names that end in .png.
+        views: Views with different names that end in .png. A rolling shutter is written, too.
         points: (N, 3) world units, the initial cloud; None for none.
         colors: (N, 3) 0 to 1, rounded to 8 bits; required with points.
         extra: Additional keys for the file, such as `test_filenames`.
@@ -115,16 +131,16 @@ def write_transforms(
             "transform_matrix": _camera_to_world(camera),
             "w": camera.W,
             "h": camera.H,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx + 0.5,
-            "cy": camera.cy + 0.5,
+            **_nerfstudio_lens(view.name, camera),
+            **keys_of_shutter(camera),
         }
         _save_photo(folder / "images" / view.name, photo)
         if _save_mask(folder / "masks" / f"{view.name}.png", photo):
             frame["mask_path"] = f"masks/{view.name}.png"
         frames.append(frame)
-    contents: dict[str, Any] = {"camera_model": "PINHOLE", "frames": frames, **(extra or {})}
+    plain = all(view.camera.projection.plain for view in views)
+    contents: dict[str, Any] = {"camera_model": "PINHOLE"} if plain else {}
+    contents |= {"frames": frames, **(extra or {})}
     folder.mkdir(parents=True, exist_ok=True)
     if points is not None and colors is not None:
         write_points_ply(folder / "points.ply", _cloud(points, colors))
@@ -168,6 +184,26 @@ def _check_blender(view: View, first: Camera) -> None:
         )
 
 
+def _nerfstudio_lens(name: str, camera: Camera) -> dict[str, Any]:
+    """Return the keys of a frame's lens in transforms.json.
+
+    Raises:
+        ArgumentError: the format has no model for the camera's projection.
+    """
+    model, _, _, values = _intrinsics(camera)
+    if model not in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"):
+        raise ArgumentError(
+            f"{name}: transforms.json has no model for its lens; write COLMAP's layout instead"
+        )
+    fx, fy, cx, cy, *coefficients = values
+    found: dict[str, Any] = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    if camera.projection.plain:
+        return found
+    names = {"OPENCV_FISHEYE": FISHEYE_NAMES}.get(model, PERSPECTIVE_NAMES)
+    found["camera_model"] = "OPENCV_FISHEYE" if model == "OPENCV_FISHEYE" else "OPENCV"
+    return found | dict(zip(names, coefficients, strict=False))
+
+
 def _cloud(points: ArrayLike, colors: ArrayLike) -> Cloud:
     sizes: dict[str, int] = {}
     return Cloud(
@@ -175,8 +211,22 @@ def _cloud(points: ArrayLike, colors: ArrayLike) -> Cloud:
     )
 
 
-def _intrinsics(camera: Camera) -> tuple[float, ...]:
-    return camera.W, camera.H, camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5
+def _intrinsics(camera: Camera) -> Intrinsic:
+    """Return a camera in COLMAP's terms; a rolling shutter has no place in them.
+
+    Raises:
+        ArgumentError: no model of COLMAP has the camera's projection.
+    """
+    pinhole = tuple(float(v) for v in (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5))
+    if camera.projection.kind == "equirectangular":
+        return SPHERE, camera.W, camera.H, (float(camera.W), float(camera.H))
+    given = dict(zip(COEFFICIENTS, camera.coefficients or (0.0,) * len(COEFFICIENTS), strict=True))
+    if camera.projection.kind in ("perspective", "fisheye"):
+        for name, ours in OF_KIND[camera.projection.kind, camera.projection.radial_first]:
+            names = [ours.get(key, key) for key in dict(MODELS)[name].split()[len(pinhole) :]]
+            if all(value == 0.0 for key, value in given.items() if key not in names):
+                return name, camera.W, camera.H, (*pinhole, *(given[key] for key in names))
+    raise ArgumentError(f"camera: COLMAP has no model for its {camera.projection.kind} projection")
 
 
 def _camera_to_world(camera: Camera) -> list[list[float]]:
@@ -212,14 +262,15 @@ _Pose = tuple[int, tuple[float, ...], np.ndarray, int, str]
 
 def _write_bin(
     model: Path,
-    cameras: dict[tuple[float, ...], int],
+    cameras: dict[Intrinsic, int],
     poses: Sequence[_Pose],
     seen: Sequence[VisiblePoints],
     cloud: tuple[np.ndarray, np.ndarray],
 ) -> None:
     data = struct.pack("<Q", len(cameras))
-    for (W, H, *values), camera in cameras.items():
-        data += struct.pack("<IiQQ4d", camera, PINHOLE, int(W), int(H), *values)
+    numbers = {name: number for number, (name, _) in enumerate(MODELS)}
+    for (name, W, H, values), camera in cameras.items():
+        data += struct.pack(f"<IiQQ{len(values)}d", camera, numbers[name], W, H, *values)
     (model / "cameras.bin").write_bytes(data)
     data = struct.pack("<Q", len(poses))
     for (image, quat, shift, camera, name), shown in zip(poses, seen, strict=True):
@@ -238,7 +289,7 @@ def _write_bin(
 
 def _write_txt(
     model: Path,
-    cameras: dict[tuple[float, ...], int],
+    cameras: dict[Intrinsic, int],
     poses: Sequence[_Pose],
     seen: Sequence[VisiblePoints],
     cloud: tuple[np.ndarray, np.ndarray],
@@ -247,8 +298,8 @@ def _write_txt(
         return " ".join(v if isinstance(v, str) else repr(v) for v in values) + "\n"
 
     text = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-    for values, camera in cameras.items():
-        text += line(camera, "PINHOLE", int(values[0]), int(values[1]), *(float(v) for v in values[2:]))
+    for (name, W, H, values), camera in cameras.items():
+        text += line(camera, name, W, H, *values)
     (model / "cameras.txt").write_text(text, encoding="utf-8")
     text = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points\n"
     for (image, quat, shift, camera, name), shown in zip(poses, seen, strict=True):

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsplat_edu.base.text import spelled_seconds
-from gsplat_edu.doctor.appearance import EXPOSURE
+from gsplat_edu.base.text import Told, spelled_seconds
+from gsplat_edu.doctor.appearance import CORRECTED, EXPOSURE
 from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
@@ -175,9 +175,14 @@ def _otherwise(run: Trained) -> tuple[str, ...]:
     """Return advice for scenes with few problems."""
     longer = run.reached < run.longest and run.rising is not False
     return (
-        f"view it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}",
-        f"a smaller file: {command('convert', run.path, 'scene.spz', '--min-opacity', str(FAINT))}",
-        _train_longer(run) if longer else f"a better scene needs better photos{_what_photos_lack(run)}",
+        Told(f"view it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}", ""),
+        Told(f"a smaller file: {command('convert', run.path, 'scene.spz', '--min-opacity', str(FAINT))}", ""),
+        _train_longer(run)
+        if longer
+        else Told(
+            f"a better scene needs better photos{_what_photos_lack(run)}",
+            "a better scene needs better photos",
+        ),
     )
 
 
@@ -186,12 +191,18 @@ def _what_photos_lack(run: Trained) -> str:
 
 
 def _train_longer(run: Trained) -> str:
+    plain = f"train for {run.longest:,} iterations{_at_its_pace(run)}"
     if run.capture is None:
-        return f"train for {run.longest:,} iterations"
+        return Told(f"train for {run.longest:,} iterations", plain)
     name = f"{run.path.resolve().name}_{run.longest}"
     length = ("--iterations", str(run.longest))
     words = command("train", run.capture, *length, *run.options, "--out", new_run(name))
-    return f"train for longer{_at_its_pace(run)}: {words}"
+    return Told(f"train for longer{_at_its_pace(run)}: {words}", plain)
+
+
+def _longer(run: Trained) -> tuple[tuple[str, str], ...]:
+    """Return the options of the advised longer training."""
+    return (("iterations", str(run.longest)),)
 
 
 def _at_its_pace(run: Trained) -> str:
@@ -238,20 +249,24 @@ def _mean(views: Sequence[Residual]) -> float:
 def _length(run: Trained) -> list[Finding]:
     if run.planned is not None and run.reached < run.planned:
         what = f"the scene was saved at iteration {run.reached:,} of {run.planned:,}"
-        advice = "finish the training: repeat its command with --resume"
+        advice = Told(
+            "finish the training: repeat its command with --resume",
+            "finish the training: Resume continues it",
+        )
         return [Finding("unfinished", Severity.WARNING, what, advice)]
     if run.reached >= run.usual:
         return []
     what = f"{run.reached:,} iterations; the recipe has {run.usual:,}"
     if run.rising is False:
         held = "the test views' PSNR no longer rises" if run.test else "the loss no longer falls"
-        advice = f"more iterations alone will not help much; better photos may{_what_photos_lack(run)}"
+        useless = "more iterations alone will not help much; better photos may"
+        advice = Told(f"{useless}{_what_photos_lack(run)}", useless)
         return [Finding("short training", Severity.NOTE, f"{what}, but {held}", advice)]
     if run.rising:
         what += ", and " + (
             "the test views' PSNR was still rising" if run.test else "the loss was still falling"
         )
-    return [Finding("short training", Severity.WARNING, what, _train_longer(run))]
+    return [Finding("short training", Severity.WARNING, what, _train_longer(run), options=_longer(run))]
 
 
 def _fit(run: Trained) -> list[Finding]:
@@ -260,9 +275,14 @@ def _fit(run: Trained) -> list[Finding]:
     what = f"the training views reach only {_mean(run.train):.1f} dB on average: the scene does not fit even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
     advice = f"check poses and intrinsics{place}; if they are a little off, train with --refine auto"
+    plain = "examine the capture's poses; if they are a little off, refine them in the training"
+    options: tuple[tuple[str, str], ...] = (("refine", "auto"),)
     if run.reached < run.usual and run.rising:  # too few iterations may be the only cause
-        advice = f"train for longer first; if they do not improve, {advice}"
-    return [Finding("poor fit", Severity.WARNING, what, advice)]
+        advice, plain = (
+            f"train for longer first; if they do not improve, {words}" for words in (advice, plain)
+        )
+        options = (*_longer(run), *options)
+    return [Finding("poor fit", Severity.WARNING, what, Told(advice, plain), options=options)]
 
 
 def _outliers(run: Trained) -> list[Finding]:
@@ -273,18 +293,28 @@ def _outliers(run: Trained) -> list[Finding]:
     names = tuple(view.name for view in low)
     scores = tuple(f"{view.psnr:.1f} dB" for view in low)
     what = f"{len(low)} of {len(run.train) + len(run.test)} photos differ strongly from their renders"
-    return [Finding("unexplained", Severity.WARNING, what, _about_outliers(run, low), names, scores)]
+    options: tuple[tuple[str, str], ...] = ()
+    if _median_fit(run) < FITTED:
+        longer = _longer(run) if run.reached < run.longest else ()
+        options = (("max_gaussians", str(2 * len(run.gaussians))), *longer)
+    return [Finding("unexplained", Severity.WARNING, what, _about_outliers(run, low), names, scores, options)]
+
+
+def _median_fit(run: Trained) -> float:
+    """Return the median PSNR of the training views, dB; infinity without any."""
+    return float(np.median([view.psnr for view in run.train])) if run.train else float(np.inf)
 
 
 def _about_outliers(run: Trained, low: Sequence[Residual]) -> str:
     """Return advice. A badly fitted photo is suspicious only if the scene fits the others."""
-    usual = float(np.median([view.psnr for view in run.train])) if run.train else np.inf
+    usual = _median_fit(run)
     if usual < FITTED:
-        more = f"train with more Gaussians (--max-gaussians {2 * len(run.gaussians)})"
-        more += " or for longer" if run.reached < run.longest else ""
-        return (
-            f"{more} before you judge single photos: the scene fits most training photos badly too "
-            f"(median {usual:.1f} dB)"
+        number = 2 * len(run.gaussians)
+        longer = " or for longer" if run.reached < run.longest else ""
+        why = f"the scene fits most training photos badly too (median {usual:.1f} dB)"
+        return Told(
+            f"train with more Gaussians (--max-gaussians {number}){longer} before you judge single photos: {why}",
+            f"train with more splats{longer} before you judge single photos: {why}",
         )
     trained = [view for view in low if any(view is other for other in run.train)]
     if not trained:
@@ -293,9 +323,8 @@ def _about_outliers(run: Trained, low: Sequence[Residual]) -> str:
             "pose is wrong"
         )
     name = trained[0].name
-    return (
-        f"compare {name} with its render: if it is blurred, in shadow or has a wrong pose, train without it"
-    )
+    wrong = f"compare {name} with its render: if it is blurred, in shadow or has a wrong pose,"
+    return Told(f"{wrong} train without it", f"{wrong} remove it from the photos and find the poses again")
 
 
 def _far_below(views: Sequence[Residual]) -> list[Residual]:
@@ -314,9 +343,14 @@ def _moved(run: Trained) -> list[Finding]:
         return []
     names = tuple(name for name, _ in run.moved)
     shares = tuple(f"{100 * share:.1f} %" for _, share in run.moved)
-    what = f"{counted(len(names), 'photo')} show things or shadows that the others do not, in per cent of their pixels"
-    advice = f"train with --transients mask, which masks what moved; compare {names[0]} with its render first"
-    return [Finding("moved", Severity.WARNING, what, advice, names, shares)]
+    photos = counted(len(names), "photo")
+    what = f"things or shadows that the other photos do not show in {photos}, in per cent of their pixels"
+    first = f"compare {names[0]} with its render first"
+    advice = Told(
+        f"train with --transients mask, which masks what moved; {first}",
+        f"mask what moved in a training; {first}",
+    )
+    return [Finding("moved", Severity.WARNING, what, advice, names, shares, (("transients", "mask"),))]
 
 
 def _gap(run: Trained) -> list[Finding]:
@@ -326,8 +360,18 @@ def _gap(run: Trained) -> list[Finding]:
     if gap < OVERFITTED:
         return []
     what = f"test views are {gap:.1f} dB below the training views: the scene overfits its {len(run.train)} photos"
-    advice = "take more photos between the existing ones; with the present ones, stop earlier or lower --max-gaussians"
-    return [Finding("overfitted", Severity.WARNING, what, advice)]
+    photos = "take more photos between the existing ones"
+    if _improves(run):  # fewer iterations or splats would contradict the advice of the other checks
+        return [Finding("overfitted", Severity.WARNING, what, photos)]
+    fewer, rest = max(len(run.gaussians) // 2, 1), "with the present ones, stop earlier or"
+    advice = Told(f"{photos}; {rest} lower --max-gaussians", f"{photos}; {rest} train with fewer splats")
+    return [Finding("overfitted", Severity.WARNING, what, advice, options=(("max_gaussians", str(fewer)),))]
+
+
+def _improves(run: Trained) -> bool:
+    """Return whether another check advises more iterations or more splats."""
+    advised = [finding.options for check in (_length, _fit, _outliers) for finding in check(run)]
+    return any(name in ("iterations", "max_gaussians") for options in advised for name, _ in options)
 
 
 def _exposure(run: Trained) -> list[Finding]:
@@ -338,8 +382,9 @@ def _exposure(run: Trained) -> list[Finding]:
     names = tuple(view.name for view in off)
     stops = tuple(f"{view.stops - usual:+.1f}" for view in off)
     what = f"{counted(len(off), 'photo')} brighter or darker than the scene, in stops"
-    advice = "train with --appearance exposure, or remove the photos: the scene reproduces the jumps with fog"
-    found = [Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops)] if off else []
+    fog = "or remove the photos: the scene reproduces the jumps with fog"
+    advice = Told(f"train with --appearance exposure, {fog}", f"train with exposure correction, {fog}")
+    found = [Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops, CORRECTED)] if off else []
     # A scene that fits photos of differing exposure hides the difference, so findings from the photos alone count too.
     hidden = "the scene fits them nevertheless, with fog or view-dependent colours"
     unexplained = {view.name for views in (run.train, run.test) for view in _far_below(views)}
@@ -360,9 +405,10 @@ def _floaters(run: Trained) -> list[Finding]:
     names = tuple(view.name for view in veiled)
     shares = tuple(f"{100 * view.veiled:.0f} %" for view in veiled)
     what = f"{counted(len(veiled), 'view')} with splats floating close to the camera"
-    advice = (
-        "remove them with gsplat-edu clean, or train with --clean; they are fewer with real start points and no"
-        " exposure jumps"
+    fewer = "they are fewer with real start points and no exposure jumps"
+    advice = Told(
+        f"remove them with gsplat-edu clean, or train with --clean; {fewer}",
+        f"remove them with Clean under Share; {fewer}",
     )
     return [Finding("floaters", Severity.WARNING, what, advice, names, shares)]
 
@@ -381,8 +427,9 @@ def _splats(run: Trained) -> list[Finding]:
     faint = float((run.gaussians.opacities < FAINT).double().mean())
     if faint > FAINT_SHARE:
         what = f"{100 * faint:.0f} % of the splats have an opacity below {FAINT}: they cost time and are hardly visible"
-        advice = (
-            f"remove faint splats: {command('convert', run.path, 'scene.ply', '--min-opacity', str(FAINT))}"
+        advice = Told(
+            f"remove faint splats: {command('convert', run.path, 'scene.ply', '--min-opacity', str(FAINT))}",
+            "leave faint splats out of an export under Share",
         )
         found.append(Finding("faint splats", Severity.NOTE, what, advice))
     sizes = run.gaussians.scales.amax(dim=1)
@@ -390,9 +437,10 @@ def _splats(run: Trained) -> list[Finding]:
     huge = float(((sizes > run.extent) & (run.gaussians.opacities >= FAINT) & ~sky).double().mean())
     if huge > HUGE_SHARE:
         what = f"{100 * huge:.1f} % of the splats are larger than the cameras' extent and look like haze"
-        advice = (
-            "check the photos for exposure jumps, and train with --sky shell if they show sky; distant start points"
-            " become such splats too"
+        jumps, points = "check the photos for exposure jumps", "distant start points become such splats too"
+        advice = Told(
+            f"{jumps}, and train with --sky shell if they show sky; {points}",
+            f"{jumps}, and train with a sky if they show one; {points}",
         )
-        found.append(Finding("huge splats", Severity.WARNING, what, advice))
+        found.append(Finding("huge splats", Severity.WARNING, what, advice, options=(("sky", "shell"),)))
     return found

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from gsplat_edu.base.text import Told
 from gsplat_edu.doctor.cameras import facing_away
 from gsplat_edu.doctor.finding import Finding, Severity, counted
 from gsplat_edu.doctor.geometry import inside
@@ -22,6 +23,9 @@ from gsplat_edu.doctor.survey import Shot, Survey
 
 EXPOSURE = "exposure"
 """Name of findings about brightness, before and after training."""
+
+CORRECTED = (("appearance", "exposure"),)
+"""Options of a training that corrects exposures."""
 
 ENOUGH = 3
 """A photo with fewer neighbours than this is compared with all photos instead."""
@@ -224,21 +228,29 @@ def check_exposure(survey: Survey) -> list[Finding]:
         names = tuple(survey.names[i] for i in jumping)
         stops = tuple(f"{light[i]:+.1f}" for i in jumping)
         what = f"{len(names)} of {len(light)} photos are brighter or darker than neighbours that see the same, in stops"
-        advice = (
-            f"check {names[0]}: if the exposure jumped, train with --appearance exposure;"
-            " if your shadow fell on the scene, remove the photo"
+        first = f"check {names[0]}: if the exposure jumped"
+        shadow = "if your shadow fell on the scene, remove the photo"
+        advice = Told(
+            f"{first}, train with --appearance exposure; {shadow}",
+            f"{first}, train with exposure correction; {shadow}",
         )
-        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops))
+        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops, CORRECTED))
     elif (share := gains.differing(unsure * JUMP)) > DIFFERING:
         what = f"{100 * share:.0f} % of consecutive photos differ by more than {unsure * JUMP:.1f} stops"
-        advice = "train with --appearance exposure; next time, lock the exposure while you take photos"
-        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice))
+        advice = _correct("lock the exposure")
+        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, options=CORRECTED))
     if len(tinted := [i for i in np.argsort(-tint) if tint[i] > unsure * TINT]):
         names = tuple(survey.names[i] for i in tinted)
         what = f"{len(names)} of {len(tint)} photos have another tint than neighbours that see the same"
-        advice = "train with --appearance exposure; next time, lock the white balance while you take photos"
-        found.append(Finding("white balance", Severity.WARNING, what, advice, names))
+        advice = _correct("lock the white balance")
+        found.append(Finding("white balance", Severity.WARNING, what, advice, names, options=CORRECTED))
     return found
+
+
+def _correct(later: str) -> Told:
+    """Advise to correct exposures now, and what to do at the next capture."""
+    then = f"next time, {later} while you take photos"
+    return Told(f"train with --appearance exposure; {then}", f"train with exposure correction; {then}")
 
 
 class Gains:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from gsplat_edu.base.text import short_number
+from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.notes import Background, MissingPhotos, Note
 from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure
 from gsplat_edu.doctor.cameras import (
@@ -126,15 +126,19 @@ def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
     cloud = (
         ()
         if len(survey.points)
-        else ("start points help: add points from structure from motion with --points X.ply",)
+        else (
+            Told(
+                "start points help: add points from structure from motion with --points X.ply",
+                "start points help: finding the poses of the photos makes them",
+            ),
+        )
     )
-    trial = (
-        "a short run shows in minutes whether the poses are right: "
-        + command("train", survey.path, "--quality", "draft", "--out", short),
-    )
+    draft = command("train", survey.path, "--quality", "draft", "--out", short)
+    why = "a short run shows in minutes whether the poses are right"
+    trial = (Told(f"{why}: {draft}", f"{why}: train with the quality Draft"),)
     return (
-        f"train: {command('train', survey.path, *options, '--out', out)}",
+        Told(f"train: {command('train', survey.path, *options, '--out', out)}", ""),
         *cloud,
         *(() if options else trial),
-        f"check the run afterwards: {command('doctor', out)}",
+        Told(f"check the run afterwards: {command('doctor', out)}", ""),
     )

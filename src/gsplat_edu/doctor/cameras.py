@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
-from gsplat_edu.base.text import short_number
+from gsplat_edu.base.constants import AUTO
+from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.dataset import TEST_EVERY
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.doctor.finding import Finding, Severity
@@ -175,8 +176,11 @@ def check_resolution(survey: Survey) -> list[Finding]:
         return []
     W, H = max((shot.size for shot in survey.shots), key=max)
     what = f"photos of {1e-6 * W * H:.1f} megapixels cost time, but the planned Gaussians do not resolve them"
-    advice = f"train with --resolution auto, which reduces the photos to {side} px"
-    return [Finding("resolution", Severity.NOTE, what, advice)]
+    advice = Told(
+        f"train with --resolution auto, which reduces the photos to {side} px",
+        f"train with photos that are reduced to {side} px",
+    )
+    return [Finding("resolution", Severity.NOTE, what, advice, options=(("resolution", AUTO),))]
 
 
 def check_parallax(survey: Survey) -> list[Finding]:

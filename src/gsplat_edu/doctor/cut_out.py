@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from gsplat_edu.base.text import Told
 from gsplat_edu.doctor.finding import Finding, Remedy, Severity
 from gsplat_edu.doctor.survey import Survey
 
@@ -97,10 +98,18 @@ def check_masks(survey: Survey) -> list[Finding]:
     remedy = outside_masks_of(survey)
     if not remedy.reason:
         return []
-    sentence = (
-        f"{remedy.reason} (--outside-masks {remedy.value}, which auto chooses, the recipe fast's default)"
+    sentence = Told(
+        f"{remedy.reason} (--outside-masks {remedy.value}, which auto chooses, the recipe fast's default)",
+        remedy.reason,
     )
     other = "ignore" if remedy.value == "empty" else "empty"
-    return [
-        Finding("masks", Severity.NOTE, sentence, f"to decide otherwise, train with --outside-masks {other}")
-    ]
+    advice = Told(
+        f"to decide otherwise, train with --outside-masks {other}",
+        "to decide otherwise, "
+        + (
+            "keep the scene empty outside the masks"
+            if other == "empty"
+            else "let the scene show anything there"
+        ),
+    )
+    return [Finding("masks", Severity.NOTE, sentence, advice, options=(("outside_masks", other),))]

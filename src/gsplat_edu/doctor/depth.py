@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.text import Told
 from gsplat_edu.data.capture import is_folder
 from gsplat_edu.data.depth_fit import DepthMisfitError
 from gsplat_edu.data.depth_folder import GEOMETRIC_MAPS
@@ -47,7 +48,8 @@ def judge_depth(
             Finding(NAME, Severity.WARNING, f"the depth maps do not fit: {error.reason}", error.advice)
         ]
     except DatasetError as error:
-        advice = "repair what the depth check names, or train without --depth"
+        repair = "repair what the depth check names"
+        advice = Told(f"{repair}, or train without --depth", f"{repair}, or train without depth")
         return None, [Finding(NAME, Severity.WARNING, str(error), advice)]
     return report, check_depth(report)
 
@@ -87,6 +89,10 @@ def check_depth(report: DepthReport) -> list[Finding]:
         found.append(Finding(NAME, Severity.NOTE, what, "compare a known distance after a short training"))
     elif fit is not None and not fit.certain:
         what = "the photos see too narrow an angle to tell camera depth (z) from lengths of rays"
-        advice = "look up what the device writes, and train with --set depth_kind=z or depth_kind=ray"
+        look = "look up what the device writes"
+        advice = Told(
+            f"{look}, and train with --set depth_kind=z or depth_kind=ray",
+            f"{look}; training from the command line has a setting that says which of the two the maps hold",
+        )
         found.append(Finding(NAME, Severity.NOTE, what, advice))
     return found

@@ -39,6 +39,8 @@ class Finding:
         advice: What to do about it.
         images: Names of the affected images; empty if the whole capture is affected.
         values: A measured value for each of these images, as text; empty if there is none.
+        options: Options of `train`, by their names in Python, and the values that the advice proposes; empty if it
+            proposes none.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Finding:
     advice: str
     images: tuple[str, ...] = ()
     values: tuple[str, ...] = ()
+    options: tuple[tuple[str, str], ...] = ()
 
     @property
     def labels(self) -> tuple[str, ...]:

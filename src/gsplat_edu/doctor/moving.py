@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsplat_edu.base.text import Told
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.doctor.finding import command, counted
 from gsplat_edu.render.settings import RenderSettings
@@ -67,12 +68,12 @@ def moved_line(
     """
     doctor = command("doctor", folder)
     if render is None or dataset.images.needed > dataset.images.budget:
-        return f"to find photos that do not fit the scene: {doctor}"
+        return Told(f"to find photos that do not fit the scene: {doctor}", "")
     moved = moved_parts(gaussians, dataset.train, render, settings)
     if not moved:
         return ""
     (name, share), photos = moved[0], counted(len(moved), "photo")
-    return (
-        f"{photos} show things or shadows that the others do not, most of all {name} ({100 * share:.1f} %): see "
-        f"{doctor}; --transients mask leaves them out"
+    what = f"things or shadows that the other photos do not show in {photos}, most of all {name} ({100 * share:.1f} %)"
+    return Told(
+        f"{what}: see {doctor}; --transients mask leaves them out", f"{what}: examine the run under Judge"
     )

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsplat_edu.base.text import Told
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.appearance import Gains
 from gsplat_edu.doctor.cut_out import outside_masks_of
@@ -97,7 +98,10 @@ def check_sky(survey: Survey) -> list[Finding]:
     """Report a sky, which needs far splats."""
     if sky_of(survey).value == "none":
         return []
-    advice = "train with --sky shell, which --sky auto of the recipe fast chooses by itself"
+    advice = Told(
+        "train with --sky shell, which --sky auto of the recipe fast chooses by itself",
+        "nothing: a training adds a sky by itself",
+    )
     return [Finding("sky", Severity.NOTE, _sky_sentence(_sky(survey), survey), advice)]
 
 

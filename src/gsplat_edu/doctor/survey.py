@@ -16,11 +16,13 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
 from gsplat_edu.data.depths import DepthReport
 from gsplat_edu.data.images import PhotoHeaders
+from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
 from gsplat_edu.data.lens import Lens
-from gsplat_edu.data.notes import Note, UnreadColors
+from gsplat_edu.data.notes import LeftOutPhotos, Note, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.depth import judge_depth
 from gsplat_edu.doctor.finding import Finding
 from gsplat_edu.doctor.geometry import Geometry
@@ -129,7 +131,13 @@ def prepare(
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
     capture, headers = reader.capture, reader.headers
-    frames = oriented(sorted(capture.frames, key=lambda frame: frame.name), headers)
+    listed = read_left_out(reader.path)
+    used = [frame for frame in capture.frames if not is_left_out(frame, reader.path, listed)]
+    if not used:
+        raise DatasetError(f"{reader.path}: {LEFT_OUT} leaves out every photo; take some off it")
+    gone = sorted({frame.name for frame in capture.frames} - {frame.name for frame in used})
+    left = [LeftOutPhotos(len(gone), len(capture.frames), gone[0])] if gone else []
+    frames = oriented(sorted(used, key=lambda frame: frame.name), headers)
     shots, refused = list[Shot](), list[Refused]()
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
@@ -152,7 +160,7 @@ def prepare(
         tuple(refused),
         _unposed(capture),
         _points(capture),
-        (*capture.notes, *UnreadColors.of([(shot.name, shot.colors) for shot in shots])),
+        (*capture.notes, *left, *UnreadColors.of([(shot.name, shot.colors) for shot in shots])),
         observed_points(reader.path) if capture.layout == "COLMAP" else {},
         judged,
     )
@@ -161,13 +169,13 @@ def prepare(
 def _shot(headers: PhotoHeaders, sharpness: bool, frame: Frame) -> Shot | Refused:
     """Measure a photo, or return the reason why it cannot be used."""
     try:
-        source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0), headers)
+        source, camera, _ = photo_file(frame, DataSettings(), headers)
         colors = headers.of(source.path).problem
         stats = measure_photo(source, sharpness)
     except DatasetError as error:
         return Refused(frame.name, error.reason)
     h, w = stats.thumbnail.shape[:2]
-    small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(w, h))
+    small = camera.scaled(w, h)
     return Shot(frame.name, frame.lens, (camera.W, camera.H), small, stats, colors)
 
 

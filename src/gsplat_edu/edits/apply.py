@@ -10,8 +10,10 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 
 from gsplat_edu.edits import operations as ops
-from gsplat_edu.edits.cells import Work
+from gsplat_edu.edits.cells import EditWork
 from gsplat_edu.edits.membership import Members, Values, members
+from gsplat_edu.edits.moves import Moved, move_means, moved_gaussians, similarity_of
+from gsplat_edu.edits.neighbours import within_radius
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.edit import IDENTITY, Similarity
 from gsplat_edu.io.scene import Scene
@@ -36,7 +38,7 @@ class Views:
         unit: The unit after `scale`; None if no operation sets it.
         upright: Whether the floor was levelled.
         start: The view in which a page opens.
-        named: The named views, in the order in which they were first named.
+        named: The named views, in the order in which they were first named, or that of the last `OrderViews`.
         path: The camera path.
         measures: The measured distances.
     """
@@ -60,11 +62,19 @@ def flags_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Fl
     Raises:
         ArgumentError: the operations take more than `MOST_TESTS` tests of a splat.
     """
+    return _after(operations, gaussians)[0]
+
+
+def _after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> tuple[Flags, Values, list[Moved]]:
+    """Return the states after some operations, the values with the means that they left, and the moves."""
     flags = np.zeros(len(gaussians), dtype=np.uint8)
-    values, work = Values.of(gaussians), Work()
+    values, work = Values.of(gaussians), EditWork()
+    moves: list[Moved] = []
     for operation in operations:
-        _step(operation, values, flags, work)
-    return flags
+        moved = apply_operation(operation, values, flags, work)
+        if moved is not None:
+            moves.append(moved)
+    return flags, values, moves
 
 
 def kept_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
@@ -74,12 +84,37 @@ def kept_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Boo
 
 
 def edited(scene: Scene, operations: Sequence[ops.Operation]) -> Scene:
-    """Return the remaining scene, in its coordinates; the same object if nothing is removed."""
-    stays = kept_after(operations, scene.gaussians)
-    if stays.all():
-        return scene
-    rows = torch.from_numpy(stays).to(scene.gaussians.means.device)
-    return replace(scene, gaussians=scene.gaussians.map(lambda tensor: tensor[rows]))
+    """Return the remaining scene, in its coordinates; the same object if nothing is removed or moved."""
+    flags, values, moves = _after(operations, scene.gaussians)
+    stays = flags <= SELECTED
+    gaussians = moved_gaussians(scene.gaussians, moves, values.means)
+    if not stays.all():
+        rows = torch.from_numpy(stays).to(gaussians.means.device)
+        gaussians = gaussians.map(lambda tensor: tensor[rows])
+    return scene if gaussians is scene.gaussians else replace(scene, gaussians=gaussians)
+
+
+def moved_together(operations: Sequence[ops.Operation], gaussians: Gaussians) -> tuple[Similarity, bool]:
+    """Return what the moves of all splats that are left do together, and whether there were moves of some of them only.
+
+    Args:
+        operations: In order. Their level floor and scale are not part of the result.
+        gaussians: The scene.
+
+    Raises:
+        ArgumentError: the operations take more than `MOST_TESTS` tests of a splat.
+    """
+    together, some = IDENTITY, False
+    if not any(isinstance(operation, ops.Move) for operation in operations):
+        return together, some
+    flags, _, moves = _after(operations, gaussians)
+    left = flags <= SELECTED
+    for moved in moves:
+        number, count = int(left[moved.rows].sum()), int(left.sum())
+        some |= 0 < number < count
+        if 0 < number == count:
+            together = similarity_of(moved.move).after(together)
+    return together, some
 
 
 def views_after(operations: Sequence[ops.Operation]) -> Views:
@@ -101,6 +136,8 @@ def views_after(operations: Sequence[ops.Operation]) -> Views:
                 named[name] = operation
             case ops.RemoveView(name):
                 named.pop(name, None)
+            case ops.OrderViews(names):
+                named = {**{name: named[name] for name in names if name in named}, **named}
             case ops.CameraPath(path):
                 pass
     move = IDENTITY
@@ -149,9 +186,22 @@ def upright_rotation(upright: ops.Upright) -> Float64[np.ndarray, "3 3"]:
     return turn
 
 
-def _step(operation: ops.Operation, values: Values, flags: Flags, work: Work) -> None:
-    """Apply one operation to the states, in place; an operation on them counts as one test of each splat."""
-    if isinstance(operation, ops.Deselect | ops.Invert | ops.Delete | ops.Hide | ops.Show):
+def apply_operation(operation: ops.Operation, values: Values, flags: Flags, work: EditWork) -> Moved | None:
+    """Apply one operation to states and means, in place; an operation on them counts as one test of each splat.
+
+    Args:
+        operation: The operation.
+        values: N splats.
+        flags: (N,) their states.
+        work: Counts the tests.
+
+    Returns:
+        The splats that the operation moved; None if it is no `Move`.
+
+    Raises:
+        ArgumentError: the work is too much.
+    """
+    if isinstance(operation, ops.Deselect | ops.Invert | ops.Delete | ops.Hide | ops.Show | ops.Move):
         work.add(len(flags))
     match operation:
         case ops.Select(how, region):
@@ -160,6 +210,10 @@ def _step(operation: ops.Operation, values: Values, flags: Flags, work: Work) ->
             flags[flags == SELECTED] = 0
         case ops.Invert():
             flags[flags <= SELECTED] ^= SELECTED
+        case ops.Grow(radius):
+            flags[within_radius(values.means, flags == 0, flags == SELECTED, radius, work)] = SELECTED
+        case ops.Shrink(radius):
+            flags[within_radius(values.means, flags == SELECTED, flags == 0, radius, work)] = 0
         case ops.Delete():
             flags[flags == SELECTED] = DELETED
         case ops.Hide():
@@ -168,6 +222,9 @@ def _step(operation: ops.Operation, values: Values, flags: Flags, work: Work) ->
             flags[flags == HIDDEN] = 0
         case ops.Crop(box):
             flags[~members(box, values, work)] = DELETED
+        case ops.Move():
+            return move_means(operation, values.means, flags == SELECTED)
+    return None
 
 
 def _select(how: str, inside: Members, flags: Flags) -> None:

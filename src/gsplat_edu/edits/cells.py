@@ -25,7 +25,7 @@ Column = Float64[np.ndarray, " N"]
 Indices = Int64[np.ndarray, " K"]
 
 
-class Work:
+class EditWork:
     """Counts the tests of a list of operations.
 
     Args:
@@ -58,7 +58,7 @@ class Cells:
         work: Counts the points that `touched` returns.
     """
 
-    def __init__(self, u: Column, v: Column, work: Work) -> None:
+    def __init__(self, u: Column, v: Column, work: EditWork) -> None:
         self._work = work
         self._u, self._v = _axis(u), _axis(v)
         cells = _place(v, self._v) * SIDE + _place(u, self._u)

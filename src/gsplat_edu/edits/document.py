@@ -26,7 +26,9 @@ from gsplat_edu.base.json_fields import (
 )
 from gsplat_edu.base.reading import open_file, parse_json
 from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.front import Front, parsed_front
 from gsplat_edu.edits.identity import Identity
+from gsplat_edu.edits.runs import end_of, parsed_runs
 from gsplat_edu.edits.stored import MOST_BYTES
 from gsplat_edu.evaluate.keyframes import Keyframe, check_keyframe, parsed_keyframe, parsed_path
 from gsplat_edu.io.ply_comments import UNITS
@@ -50,7 +52,7 @@ LARGEST_RAW = 1e6
 SMALLEST = 1e-30
 """Smallest radius, half extent or focal length."""
 
-LONGEST_NAME, LONGEST_NOTE = 200, 1000
+LONGEST_NAME, LONGEST_NOTE, LONGEST_TEXT = 200, 1000, 2000
 
 LEAST_SINE = 1e-6
 """Sine of the angle between two sides of three floor points, below which they lie on one line."""
@@ -151,7 +153,14 @@ def _parsed(found: object) -> Edits:
     check_keys("", found, ("format", "version", "scene", "operations"))
     scene = Identity.of_document("scene", found["scene"])
     entries = checked_list("operations", found["operations"], MOST_OPERATIONS)
-    return Edits(scene, tuple(_operation(f"operations[{i}]", entry) for i, entry in enumerate(entries)))
+    edits = Edits(scene, tuple(_operation(f"operations[{i}]", entry) for i, entry in enumerate(entries)))
+    for i, operation in enumerate(edits.operations):
+        region = operation.region if isinstance(operation, ops.Select) else None
+        if isinstance(region, ops.List) and end_of(region.runs) > scene.count:
+            raise ArgumentError(
+                f"operations[{i}].runs: end at {end_of(region.runs)}, but the scene has {scene.count} splats"
+            )
+    return edits
 
 
 Fields = dict[str, Any]
@@ -164,7 +173,7 @@ def _operation(where: str, value: object) -> ops.Operation:
     kind = checked_choice(f"{where}.op", entry["op"], tuple(_OPERATIONS))
     keys, parse = _OPERATIONS[kind]
     if kind != "select":
-        check_keys(f"{where}: ", entry, ("op", *keys))
+        check_keys(f"{where}: ", entry, ("op", *keys), _OPTIONAL.get(kind, ()))
     return parse(where, entry)
 
 
@@ -226,22 +235,30 @@ def _pixels(where: str, value: object, least: int) -> tuple[ops.Numbers, ...]:
     return tuple(numbers_within(f"{where}[{i}]", entry, 2, FARTHEST_PIXEL) for i, entry in enumerate(entries))
 
 
+def _front(where: str, entry: Fields) -> Front | None:
+    if "front" not in entry:
+        return None
+    return parsed_front(f"{where}.front", entry["front"], FARTHEST_PIXEL, FARTHEST)
+
+
 def _rectangle(where: str, entry: Fields) -> ops.PictureRectangle:
     u0, v0, u1, v1 = numbers_within(f"{where}.corners", entry["corners"], 4, FARTHEST_PIXEL)
     if u0 > u1 or v0 > v1:
         raise ArgumentError(f"{where}.corners: u0, v0 must not exceed u1, v1")
-    return ops.PictureRectangle(_picture(f"{where}.camera", entry["camera"]), (u0, v0, u1, v1))
+    return ops.PictureRectangle(
+        _picture(f"{where}.camera", entry["camera"]), (u0, v0, u1, v1), _front(where, entry)
+    )
 
 
 def _lasso(where: str, entry: Fields) -> ops.Lasso:
     points = _pixels(f"{where}.points", entry["points"], 3)
-    return ops.Lasso(_picture(f"{where}.camera", entry["camera"]), points)
+    return ops.Lasso(_picture(f"{where}.camera", entry["camera"]), points, _front(where, entry))
 
 
 def _brush(where: str, entry: Fields) -> ops.Brush:
     points = _pixels(f"{where}.points", entry["points"], 1)
     radius = _length(f"{where}.radius", entry["radius"], FARTHEST_PIXEL)
-    return ops.Brush(_picture(f"{where}.camera", entry["camera"]), radius, points)
+    return ops.Brush(_picture(f"{where}.camera", entry["camera"]), radius, points, _front(where, entry))
 
 
 def _sphere(where: str, entry: Fields) -> ops.Sphere:
@@ -262,14 +279,32 @@ def _color(where: str, entry: Fields) -> ops.Color:
     return ops.Color(low, high)
 
 
-def _range(where: str, entry: Fields) -> tuple[float | None, float | None]:
+def _distance(where: str, entry: Fields) -> ops.Distance:
+    return ops.Distance(_point(f"{where}.center", entry["center"]), *_range(where, entry, 0.0, FARTHEST))
+
+
+def _list(where: str, entry: Fields) -> ops.List:
+    reason = checked_text(f"{where}.reason", entry["reason"], LONGEST_NOTE)
+    return ops.List(reason, parsed_runs(f"{where}.runs", entry["runs"]))
+
+
+def _range(
+    where: str, entry: Fields, least: float = -LARGEST_RAW, most: float = LARGEST_RAW
+) -> tuple[float | None, float | None]:
     low, high = (
-        number_within(f"{where}.{key}", entry[key], -LARGEST_RAW, LARGEST_RAW) if key in entry else None
+        number_within(f"{where}.{key}", entry[key], least, most) if key in entry else None
         for key in ("low", "high")
     )
     if low is None and high is None:
         raise ArgumentError(f"{where}: lacks 'low' and 'high'; give one of them, or both")
     return low, high
+
+
+def _move(where: str, entry: Fields) -> ops.Move:
+    columns = _axes(f"{where}.rotation", entry["rotation"])
+    first, second, third = zip(*columns, strict=True)
+    translation, center = (_point(f"{where}.{key}", entry[key]) for key in ("translation", "center"))
+    return ops.Move((first, second, third), translation, center)
 
 
 def _upright(where: str, entry: Fields) -> ops.Upright:
@@ -325,6 +360,24 @@ def _name(where: str, entry: Fields) -> str:
     return checked_text(f"{where}.name", entry["name"], LONGEST_NAME, 1)
 
 
+def _named(where: str, entry: Fields) -> ops.NamedView:
+    text = entry.get("text", "")
+    lines = text.split("\n") if isinstance(text, str) and len(text) <= LONGEST_TEXT else [text]
+    for line in lines:  # only line breaks are allowed of the control characters
+        checked_text(f"{where}.text", line, LONGEST_TEXT)
+    return ops.NamedView(_name(where, entry), _view(where, entry), text)
+
+
+def _order(where: str, entry: Fields) -> ops.OrderViews:
+    first: dict[str, int] = {}
+    entries = checked_list(f"{where}.names", entry["names"], MOST_OPERATIONS)
+    names = [checked_text(f"{where}.names[{i}]", name, LONGEST_NAME, 1) for i, name in enumerate(entries)]
+    for i, name in enumerate(names):
+        if first.setdefault(name, i) != i:
+            raise ArgumentError(f"{where}.names[{i}]: is {as_json(name)} again; name each view once")
+    return ops.OrderViews(tuple(names))
+
+
 def _path(where: str, entry: Fields) -> ops.CameraPath:
     if entry["path"] is None:
         return ops.CameraPath(None)
@@ -341,14 +394,16 @@ def _measure(where: str, entry: Fields) -> ops.Measure:
 
 
 _REGIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[str, Fields], ops.Region]]] = {
-    "rectangle": (("camera", "corners"), (), _rectangle),
-    "lasso": (("camera", "points"), (), _lasso),
-    "brush": (("camera", "radius", "points"), (), _brush),
+    "rectangle": (("camera", "corners"), ("front",), _rectangle),
+    "lasso": (("camera", "points"), ("front",), _lasso),
+    "brush": (("camera", "radius", "points"), ("front",), _brush),
     "sphere": (("center", "radius"), (), _sphere),
     "box": (("center", "rotation", "half"), (), _box),
     "color": (("low", "high"), (), _color),
     "opacity": ((), ("low", "high"), lambda where, entry: ops.Opacity(*_range(where, entry))),
     "size": ((), ("low", "high"), lambda where, entry: ops.Size(*_range(where, entry))),
+    "distance": (("center",), ("low", "high"), _distance),
+    "list": (("reason", "runs"), (), _list),
     "all": ((), (), lambda where, entry: ops.Everything()),
 }
 """Kinds of selection: needed keys, optional keys, parser."""
@@ -357,16 +412,23 @@ _OPERATIONS: dict[str, tuple[tuple[str, ...], Callable[[str, Fields], ops.Operat
     "select": ((), _select),
     "deselect": ((), lambda where, entry: ops.Deselect()),
     "invert": ((), lambda where, entry: ops.Invert()),
+    "grow": (("radius",), lambda where, entry: ops.Grow(_length(f"{where}.radius", entry["radius"]))),
+    "shrink": (("radius",), lambda where, entry: ops.Shrink(_length(f"{where}.radius", entry["radius"]))),
     "delete": ((), lambda where, entry: ops.Delete()),
     "hide": ((), lambda where, entry: ops.Hide()),
     "show": ((), lambda where, entry: ops.Show()),
     "crop": (("center", "rotation", "half"), lambda where, entry: ops.Crop(_box(where, entry))),
+    "move": (("rotation", "translation", "center"), _move),
     "upright": (("points",), _upright),
     "scale": (("points", "length", "unit"), _scale),
     "start": ((*VIEW, "pivot"), _start),
-    "view": (("name", *VIEW), lambda where, entry: ops.NamedView(_name(where, entry), _view(where, entry))),
+    "view": (("name", *VIEW), _named),
     "remove_view": (("name",), lambda where, entry: ops.RemoveView(_name(where, entry))),
+    "order_views": (("names",), _order),
     "path": (("path",), _path),
     "measure": (("points", "note"), _measure),
 }
 """Kinds of operations: needed keys, parser."""
+
+_OPTIONAL: dict[str, tuple[str, ...]] = {"view": ("text",)}
+"""Keys that an operation may lack; `_REGIONS` has those of selections."""

@@ -17,8 +17,10 @@ import torch
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.edits import operations as ops
-from gsplat_edu.edits.cells import Cells, Column, Work
+from gsplat_edu.edits.cells import Cells, Column, EditWork
 from gsplat_edu.edits.document import NEAR
+from gsplat_edu.edits.front import Front, in_front
+from gsplat_edu.edits.runs import mask_of
 from gsplat_edu.scene.gaussians import Gaussians
 
 Members = Bool[np.ndarray, " N"]
@@ -50,7 +52,7 @@ class Values:
         return cls(means, log_scales, logits, sh0[:, 0])
 
 
-def members(region: ops.Region, values: Values, work: Work | None = None) -> Members:
+def members(region: ops.Region, values: Values, work: EditWork | None = None) -> Members:
     """Return which splats a region holds.
 
     Args:
@@ -61,24 +63,25 @@ def members(region: ops.Region, values: Values, work: Work | None = None) -> Mem
     Raises:
         ArgumentError: the work is too much.
     """
-    work = Work() if work is None else work
+    work = EditWork() if work is None else work
     work.add(len(values.means))
     with np.errstate(all="ignore"):  # infinite splats
         found: Members = _members(region, values, work)
     return found
 
 
-def _members(region: ops.Region, values: Values, work: Work) -> Any:  # noqa: ANN401
+def _members(region: ops.Region, values: Values, work: EditWork) -> Any:  # noqa: ANN401
     match region:
-        case ops.PictureRectangle(picture, (u0, v0, u1, v1)):
-            u, v, seen = _seen(picture, values.means)
-            return seen & (u >= u0) & (u <= u1) & (v >= v0) & (v <= v1)
-        case ops.Lasso(picture, points):
-            u, v, seen = _seen(picture, values.means)
-            return _chosen(u, v, seen, lambda u, v: _in_polygon(u, v, points, work))
-        case ops.Brush(picture, radius, points):
-            u, v, seen = _seen(picture, values.means)
-            return _chosen(u, v, seen, lambda u, v: _on_stroke(u, v, radius, points, work))
+        case ops.PictureRectangle(picture, (u0, v0, u1, v1), front):
+            return _drawn(
+                picture, front, values.means, work, lambda u, v: (u >= u0) & (u <= u1) & (v >= v0) & (v <= v1)
+            )
+        case ops.Lasso(picture, points, front):
+            return _drawn(picture, front, values.means, work, lambda u, v: _in_polygon(u, v, points, work))
+        case ops.Brush(picture, radius, points, front):
+            return _drawn(
+                picture, front, values.means, work, lambda u, v: _on_stroke(u, v, radius, points, work)
+            )
         case ops.Sphere(center, radius):
             x, y, z = (values.means[:, i] - center[i] for i in range(3))
             return (x * x + y * y) + z * z <= radius * radius
@@ -92,27 +95,43 @@ def _members(region: ops.Region, values: Values, work: Work) -> Any:  # noqa: AN
         case ops.Size(lowest, highest):
             x, y, z = values.log_scales.T
             return _between(_larger(_larger(x, y), z), lowest, highest)
+        case ops.Distance(center, lowest, highest):
+            x, y, z = (values.means[:, i] - center[i] for i in range(3))
+            squares = [None if end is None else end * end for end in (lowest, highest)]
+            return _between((x * x + y * y) + z * z, *squares)
+        case ops.List(_, runs):
+            return mask_of(runs, len(values.means))
     return np.ones(len(values.means), dtype=bool)
 
 
-def _seen(picture: ops.Picture, means: Float64[np.ndarray, "N 3"]) -> tuple[Column, Column, Members]:
-    """Project centres: u = (fx x) / z + cx, v = (fy y) / z + cy, for those in front of the camera."""
+def _drawn(
+    picture: ops.Picture,
+    front: Front | None,
+    means: Float64[np.ndarray, "N 3"],
+    work: EditWork,
+    shape: Callable[[Column, Column], Members],
+) -> Members:
+    """Apply a shape in a picture to the splats that are seen, then the limit of their depths."""
+    u, v, z = _seen(picture, means)
+    at = np.flatnonzero(z > NEAR)
+    at = at[shape(u[at], v[at])]
+    if front is not None:
+        at = at[in_front(front, u[at], v[at], z[at], work)]
+    result = np.zeros(len(u), dtype=bool)
+    result[at] = True
+    return result
+
+
+def _seen(picture: ops.Picture, means: Float64[np.ndarray, "N 3"]) -> tuple[Column, Column, Column]:
+    """Project centres to (u, v, z): u = (fx x) / z + cx, v = (fy y) / z + cy. A picture sees those with z > NEAR."""
     a, b, c = (means[:, i] - picture.position[i] for i in range(3))
     x, y, z = ((row[0] * a + row[1] * b) + row[2] * c for row in picture.rotation)
     u = (picture.fx * x) / z + picture.cx
     v = (picture.fy * y) / z + picture.cy
-    return u, v, z > NEAR
+    return u, v, z
 
 
-def _chosen(u: Column, v: Column, seen: Members, test: Callable[[Column, Column], Members]) -> Members:
-    """Apply a test to the splats that are seen."""
-    at = np.flatnonzero(seen)
-    result = np.zeros(len(u), dtype=bool)
-    result[at] = test(u[at], v[at])
-    return result
-
-
-def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...], work: Work) -> Members:
+def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...], work: EditWork) -> Members:
     """Even-odd rule within the polygon's bounds: count the edges that cross the ray towards larger u."""
     columns, rows = [p[0] for p in points], [p[1] for p in points]
     near = (u >= min(columns)) & (u <= max(columns)) & (v >= min(rows)) & (v <= max(rows))
@@ -132,7 +151,9 @@ def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...], work: Wor
     return result
 
 
-def _on_stroke(u: Column, v: Column, radius: float, points: tuple[ops.Numbers, ...], work: Work) -> Members:
+def _on_stroke(
+    u: Column, v: Column, radius: float, points: tuple[ops.Numbers, ...], work: EditWork
+) -> Members:
     """Within the radius of a segment, and of the segment's bounds widened by the radius."""
     columns, rows = np.array([p[0] for p in points]), np.array([p[1] for p in points])
     near = (u >= columns.min() - radius) & (u <= columns.max() + radius)

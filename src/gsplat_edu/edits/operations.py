@@ -1,8 +1,8 @@
 """The operations of an edits file, as values. `docs/EDITS.md` describes each.
 
 Positions, lengths and rotations are in the coordinates of the opened scene: for a run whose capture lies far from zero,
-those relative to the run's origin. No operation moves splats, so all operations of a file share these coordinates;
-`Upright` and `Scale` take effect when the result is written.
+those relative to the run's origin. All operations of a file share these coordinates. `Move` moves selected splats in
+them; `Upright` and `Scale` take effect on the whole scene when the result is written.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from gsplat_edu.edits.front import Front
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 
 Numbers: TypeAlias = tuple[float, ...]
@@ -41,10 +42,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class PictureRectangle:
-    """Splats whose centres are seen within a rectangle of a picture, u0 <= u <= u1 and v0 <= v <= v1, px."""
+    """Splats whose centres are seen within a rectangle of a picture, u0 <= u <= u1 and v0 <= v <= v1, px.
+
+    As for `Lasso` and `Brush`, `front` limits them to the visible surface; None takes those behind it, too.
+    """
 
     picture: Picture
     corners: Numbers
+    front: Front | None = None
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,7 @@ class Lasso:
 
     picture: Picture
     points: tuple[Numbers, ...]
+    front: Front | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,7 @@ class Brush:
     picture: Picture
     radius: float
     points: tuple[Numbers, ...]
+    front: Front | None = None
 
 
 @dataclass(frozen=True)
@@ -112,13 +119,37 @@ class Size:
 
 
 @dataclass(frozen=True)
+class Distance:
+    """Splats whose centres have a distance from a point in a range, world units; None leaves an end open."""
+
+    center: Numbers
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class List:
+    """Splats by their indices in the scene.
+
+    Args:
+        reason: Why these, for people.
+        runs: Start and count of each run of indices, one after the other, increasing and with gaps.
+    """
+
+    reason: str
+    runs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Everything:
     """All splats."""
 
 
-Region: TypeAlias = PictureRectangle | Lasso | Brush | Sphere | Box | Color | Opacity | Size | Everything
+Region: TypeAlias = (
+    PictureRectangle | Lasso | Brush | Sphere | Box | Color | Opacity | Size | Distance | List | Everything
+)
 
-BY_VALUE = (Color, Opacity, Size)
+BY_VALUE = (Color, Opacity, Size, List)
 """Regions that depend on more than the positions of splats."""
 
 
@@ -141,6 +172,20 @@ class Invert:
 
 
 @dataclass(frozen=True)
+class Grow:
+    """Select also the visible splats within a radius of a selected one, centre to centre, world units."""
+
+    radius: float
+
+
+@dataclass(frozen=True)
+class Shrink:
+    """Deselect the splats within a radius of a visible one that is not selected, centre to centre, world units."""
+
+    radius: float
+
+
+@dataclass(frozen=True)
 class Delete:
     """Delete the selected splats."""
 
@@ -160,6 +205,21 @@ class Crop:
     """Delete all splats outside a box, hidden ones too."""
 
     box: Box
+
+
+@dataclass(frozen=True)
+class Move:
+    """Turn the selected splats about a point, and shift them: m' = R (m - center) + center + translation.
+
+    Args:
+        rotation: Rows of R.
+        translation: World units.
+        center: The point.
+    """
+
+    rotation: tuple[Numbers, Numbers, Numbers]
+    translation: Numbers
+    center: Numbers
 
 
 @dataclass(frozen=True)
@@ -188,10 +248,11 @@ class StartView:
 
 @dataclass(frozen=True)
 class NamedView:
-    """A view by name; another one of the same name replaces it."""
+    """A view by name; another one of the same name replaces it. With a text, it is a step of the page's guided tour."""
 
     name: str
     view: Keyframe
+    text: str = ""
 
 
 @dataclass(frozen=True)
@@ -199,6 +260,13 @@ class RemoveView:
     """Forget a named view."""
 
     name: str
+
+
+@dataclass(frozen=True)
+class OrderViews:
+    """Put the named views in this order; those that are not listed follow, and names without a view have no effect."""
+
+    names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -220,15 +288,19 @@ Operation: TypeAlias = (
     Select
     | Deselect
     | Invert
+    | Grow
+    | Shrink
     | Delete
     | Hide
     | Show
     | Crop
+    | Move
     | Upright
     | Scale
     | StartView
     | NamedView
     | RemoveView
+    | OrderViews
     | CameraPath
     | Measure
 )

@@ -31,7 +31,7 @@ struct Pixel {
 fn blended(start: Pixel, pixel: vec2<f32>, count: u32, fell: ptr<function, u32>) -> Pixel {
     var state = start;
     for (var j = 0u; j < count; j++) {
-        let a = batch[j].a;
+        let a = placed(batch[j].a, u32(pixel.x));
         let power = power_at(a, batch[j].b, pixel - a.xy);
         if (power >= LOG2_ALPHA_MIN && state.T > 0.0) {
             let paint = batch[j].paint;

@@ -102,7 +102,8 @@ fn composite_backward(@builtin(workgroup_id) id: vec3<u32>, @builtin(num_workgro
         if (mine) {
             slot = slot_of[k + thread];
             let i = owner[slot];
-            splat = Splat(records[4u * i], records[4u * i + 1u], records[4u * i + 2u]);
+            let a = placed(records[4u * i], pixel_of(tile, 0u).x);
+            splat = Splat(a, records[4u * i + 1u], records[4u * i + 2u]);
         }
         var sums = Sums(vec4<f32>(0.0), 0.0, vec2<f32>(0.0), vec3<f32>(0.0));
         for (var turn = 0u; turn < PIXELS + count - 1u; turn++) {

@@ -16,8 +16,8 @@ JOB_BYTES = 32
 SLICE = 256
 """Bytes between the jobs of two passes: the alignment of uniforms that every device accepts."""
 
-VIEW_BYTES = 512
-"""Bytes of the uniform block that all passes of a part share: camera and settings."""
+VIEW_BYTES = 640
+"""Bytes of the uniform block that all passes of a part share: camera, settings, a step's numbers, and a lens."""
 
 Call = tuple[Any, Any, Any, int, int, int]
 """Pipeline, uniforms, storage, offset of the job, workgroups in two dimensions."""

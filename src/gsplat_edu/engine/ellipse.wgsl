@@ -60,3 +60,22 @@ fn columns_of(e: Ellipse, row: i32) -> vec2<i32> {
     let c1 = i32(max(min(floor(x1), width - 1.0), -1.0));
     return vec2<i32>(c0 / TILE, select(0, c1 / TILE - c0 / TILE + 1, c0 <= c1));
 }
+
+// The same of one of the `COPIES` of an ellipse, 360 degrees apart: the tiles to which that one is the nearest.
+fn run_of(e: Ellipse, row: i32, copy: i32) -> vec2<i32> {
+    if (COPIES == 1) {
+        return columns_of(e, row);
+    }
+    let shift = f32(copy - 1) * f32(view.size.x);
+    var moved = e;
+    moved.uv.x += shift;
+    moved.slack += rim_slack(abs(shift)) - RIM_SLACK;
+    var run = columns_of(moved, row);
+    while (run.y > 0 && seam_shift(u32(run.x * TILE), e.uv.x) != shift) {
+        run += vec2<i32>(1, -1);
+    }
+    while (run.y > 0 && seam_shift(u32((run.x + run.y - 1) * TILE), e.uv.x) != shift) {
+        run.y -= 1;
+    }
+    return run;
+}

@@ -32,9 +32,14 @@ from gsplat_edu.engine.passes import (
 from gsplat_edu.engine.statistics import Asked, collect
 from gsplat_edu.engine.view import DeviceView
 
-CORE, OUT, RECORD, SLOT, PIXEL, GRADS, CAMERA_NUMBERS = 14, 16, 16, 10, 6, 5, 16
-"""Numbers of a Gaussian without its higher harmonics, of their gradient, a record, a slot, a pixel, its gradient, and
-of the camera's gradient."""
+CORE, OUT, RECORD, SLOT, PIXEL, GRADS = 14, 16, 16, 10, 6, 5
+"""Numbers of a Gaussian without its higher harmonics, of their gradient, a record, a slot, a pixel, its gradient."""
+
+CAMERA_NUMBERS = {"pinhole": 16, "lens": 37, "panorama": 37}
+"""Numbers of a camera's gradient, by `gsplat_edu.engine.view.OPTICS`."""
+
+SEAM, LENS = {"panorama": "_seam"}, {"lens": "_lens", "panorama": "_lens"}
+"""Ends of the names of modules that differ for panoramas, and of those that differ for any lens, by the same."""
 
 VISIBLE, PAIRS, SPARE, LIVE = 0, 1, 2, 4
 """Places in `live`, and its length."""
@@ -58,18 +63,19 @@ GAUSSIANS, PAIR, EDGES = Size("gaussians"), Size("pairs"), Size("edges")
 
 
 @functools.cache
-def program(tile_bits: int, with_features: bool) -> Program:
+def program(tile_bits: int, with_features: bool, optics: str = "pinhole") -> Program:
     """Return the program of a render.
 
     Args:
         tile_bits: Bits of the number of tiles, by which pairs are sorted.
         with_features: Whether it also composites features, four at a time.
+        optics: One of `gsplat_edu.engine.view.OPTICS`.
     """
-    buffers = render_buffers()
+    buffers = render_buffers(optics)
     parts = {
-        "render": render_passes(tile_bits),
-        "composite_backward": (_composite_backward("records", "image", "slots"),),
-        "project_backward": _project_backward(),
+        "render": render_passes(tile_bits, optics),
+        "composite_backward": (_composite_backward("records", "image", "slots", optics),),
+        "project_backward": _project_backward(optics),
     }
     if with_features:
         buffers += (
@@ -80,11 +86,11 @@ def program(tile_bits: int, with_features: bool) -> Program:
             *(Buffer("painted", Size("gaussians", RECORD)), Buffer("feature_slots", Size("pairs", SLOT))),
             Buffer("feature_image", Size("pixels", PIXEL)),
         )
-        parts |= _feature_parts()
+        parts |= _feature_parts(optics)
     return Program(buffers, parts)
 
 
-def render_buffers() -> tuple[Buffer, ...]:
+def render_buffers(optics: str = "pinhole") -> tuple[Buffer, ...]:
     """Return the buffers of a render and its gradients, without those of features."""
     return (
         *(Buffer("core", Size("gaussians", CORE)), Buffer("rest", Size("rest"))),
@@ -99,7 +105,8 @@ def render_buffers() -> tuple[Buffer, ...]:
         *(Buffer("image", Size("pixels", PIXEL)), Buffer("grads", Size("pixels", GRADS))),
         Buffer("slots", Size("pairs", SLOT)),
         *(Buffer("core_grads", Size("gaussians", OUT)), Buffer("rest_grads", Size("rest"))),
-        *(Buffer("camera_sums", Size("gaussians", CAMERA_NUMBERS, 64)), Buffer("live", Size("live"))),
+        Buffer("camera_sums", Size("gaussians", CAMERA_NUMBERS[optics], 64)),
+        Buffer("live", Size("live")),
     )
 
 
@@ -127,18 +134,19 @@ def render_counts(
     }
 
 
-def render_passes(tile_bits: int) -> tuple[Pass, ...]:
-    """Return the passes of a render whose pairs are sorted by so many bits."""
+def render_passes(tile_bits: int, optics: str = "pinhole") -> tuple[Pass, ...]:
+    """Return the passes of a render whose pairs are sorted by so many bits, by `gsplat_edu.engine.view.OPTICS`."""
     sources, lists = ("live", "order", "spans", "records"), ("live", "records", "order", "starts")
+    project = f"project{(LENS | SEAM).get(optics, '')}"
     return (
-        Pass("project", "project", ("core", "rest"), ("records", "seen", "spans"), GAUSSIANS, 64),
+        Pass(project, "project", ("core", "rest"), ("records", "seen", "spans"), GAUSSIANS, 64),
         *scan("seen", "gaussian_sums", GAUSSIANS, VISIBLE),
         Pass("order", "list_seen", ("records", "seen"), ("depth_keys", "order"), GAUSSIANS, 256),
         *sort("depth_keys", "order", "depth_sort", "gaussians", VISIBLE, 32, SPARE),
         Pass("order", "gather_spans", sources, ("starts", "radii"), GAUSSIANS, 256, VISIBLE),
         *scan("starts", "gaussian_sums", GAUSSIANS, PAIRS),
         Pass(
-            "intersect",
+            f"intersect{SEAM.get(optics, '')}",
             "emit_pairs",
             lists,
             ("spans", "tile_keys", "slot_of", "owner"),
@@ -148,39 +156,41 @@ def render_passes(tile_bits: int) -> tuple[Pass, ...]:
         ),
         *sort("tile_keys", "slot_of", "tile_sort", "pairs", PAIRS, tile_bits, SPARE),
         Pass("intersect", "find_ranges", ("live", "tile_keys"), ("tiles",), EDGES, 256, PAIRS),
-        _composite("records", "image", 0),
+        _composite("records", "image", 0, optics),
     )
 
 
-def _composite(records: str, image: str, without_background: int) -> Pass:
-    reads = (records, "owner", "slot_of", "tiles")
-    return Pass("composite", "composite", reads, ("done", image), EDGES, 1, shift=without_background)
+def _composite(records: str, image: str, without_background: int, optics: str) -> Pass:
+    reads, module = (records, "owner", "slot_of", "tiles"), f"composite{SEAM.get(optics, '')}"
+    return Pass(module, "composite", reads, ("done", image), EDGES, 1, shift=without_background)
 
 
-def _composite_backward(records: str, image: str, slots: str) -> Pass:
+def _composite_backward(records: str, image: str, slots: str, optics: str) -> Pass:
     reads = (records, "owner", "slot_of", "tiles", "done", image, "grads")
-    return Pass("composite_backward", "composite_backward", reads, (slots,), EDGES, 1)
+    return Pass(f"composite_backward{SEAM.get(optics, '')}", "composite_backward", reads, (slots,), EDGES, 1)
 
 
-def gradient_passes() -> tuple[Pass, ...]:
+def gradient_passes(optics: str = "pinhole") -> tuple[Pass, ...]:
     """Return the passes from the gradient of the image to those of the Gaussians."""
-    return (_composite_backward("records", "image", "slots"), *_project_backward())
+    return (_composite_backward("records", "image", "slots", optics), *_project_backward(optics))
 
 
-def _project_backward() -> tuple[Pass, ...]:
+def _project_backward(optics: str) -> tuple[Pass, ...]:
     reads, writes = ("core", "rest", "spans", "slots"), ("core_grads", "rest_grads", "camera_sums")
-    return (Pass("project_backward", "project_backward", reads, writes, GAUSSIANS, 64),)
+    return (
+        Pass(f"project_backward{LENS.get(optics, '')}", "project_backward", reads, writes, GAUSSIANS, 64),
+    )
 
 
-def _feature_parts() -> dict[str, tuple[Pass, ...]]:
+def _feature_parts(optics: str) -> dict[str, tuple[Pass, ...]]:
     sums = ("spans", "feature_slots")
     return {
         "features": (
             Pass("features", "paint", ("records", "features"), ("painted",), GAUSSIANS, 256),
-            _composite("painted", "feature_image", 1),
+            _composite("painted", "feature_image", 1, optics),
         ),
         "features_backward": (
-            _composite_backward("painted", "feature_image", "feature_slots"),
+            _composite_backward("painted", "feature_image", "feature_slots", optics),
             Pass("features", "add_moments", ("live", "feature_slots"), ("slots",), PAIR, 256, PAIRS),
             Pass("features", "sum_features", sums, ("feature_grads",), GAUSSIANS, 64),
         ),
@@ -246,7 +256,8 @@ class FrameGradients:
         core: (N, 14) float32, as `Scene.core`.
         rest: (N, K, 3).
         norms: (N,), |(gu W/2, gv H/2)| with the gradient (gu, gv) of the position in the image.
-        camera: (16,) float64: R row by row, the eye, fx, fy, cx, cy.
+        camera: (16,) float64: R row by row, the eye, fx, fy, cx, cy; (37,) of any camera but a
+            pinhole at rest: the same, then the coefficients of the distortion, turn and shift of the shutter.
         features: (N, C), or None.
         statistics: (N, 6) as `gsplat_edu.engine.statistics.collect` returns them, or None. Absolute gradients are sums
             over the colours and each group of `GROUP` features.
@@ -333,7 +344,7 @@ def draw_frame(pool: Pool, scene: Scene, view: DeviceView) -> DeviceFrame:
     """
     n, H, W = len(scene.core), view.camera.H, view.camera.W
     wanted, room = (
-        program(sort_bits(view.tiles.bit_length()), scene.features is not None),
+        program(sort_bits(view.tiles.bit_length()), scene.features is not None, view.optics),
         pool.room(n, view.tiles),
     )
     while True:
@@ -406,7 +417,8 @@ def differentiate_frame(
             statistics[:, :STEEP] += steep
     found = memory.play("project_backward", read=("core_grads", "rest_grads", "camera_sums"))
     core = found["core_grads"].view(np.float32)[: n * OUT].reshape(n, OUT)
-    sums = found["camera_sums"].view(np.float32)[: -(-n // 64) * CAMERA_NUMBERS].reshape(-1, CAMERA_NUMBERS)
+    width = next(one.size.words for one in memory.program.buffers if one.name == "camera_sums")
+    sums = found["camera_sums"].view(np.float32)[: -(-n // 64) * width].reshape(-1, width)
     return FrameGradients(
         core[:, :CORE],
         found["rest_grads"].view(np.float32)[: scene.rest.size].reshape(scene.rest.shape),

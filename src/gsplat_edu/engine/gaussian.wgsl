@@ -1,8 +1,8 @@
 // A Gaussian on the screen, from its raw parameters; project and project_backward both begin here.
 //
-//     Sigma2d = J W Sigma W' J' + d I, d: dilation,   u = fx x/z + cx,   v = fy y/z + cy
+//     Sigma2d = J W Sigma W' J' + d I + g g', d: dilation, g: motion blur
 //
-// Names are those of native/gaussian_math.h.
+// `project_mean` is that of pinhole.wgsl or of sight.wgsl. Names are those of native/gaussian_math.h.
 
 const CORE = 14u;            // mean 3, quaternion 4, log scales 3, sh0 3, logit 1
 
@@ -23,12 +23,15 @@ struct Projected {
     r0: vec3<f32>,           // rows of J W M, M = R S, and their cross product
     r1: vec3<f32>,
     n: vec3<f32>,
-    a: f32,                  // dilated covariance
+    blur: vec2<f32>,         // g, px; 0 without an exposure
+    blurred: bool,           // whether the camera has an exposure
+    still: f32,              // determinant after the dilation, before the blur
+    a: f32,                  // dilated and blurred covariance
     b: f32,
     c: f32,
     det0: f32,               // determinant before dilation
     det: f32,
-    opacity: f32,            // before antialiasing's compensation
+    opacity: f32,            // before the factor of antialiasing and blur
     transparency: f32,       // 1 - opacity
     compensation: f32,
     uv: vec2<f32>,
@@ -38,24 +41,6 @@ struct Projected {
 
 fn core3(at: u32) -> vec3<f32> {
     return vec3<f32>(core[at], core[at + 1u], core[at + 2u]);
-}
-
-fn project_mean(i: u32, g: ptr<function, Projected>) {
-    let mean = core3(i * CORE);
-    let offset = kept3(mean - view.eye.xyz) - view.eye_rest.xyz;
-    let p = vec3<f32>(dot(view.R0.xyz, offset), dot(view.R1.xyz, offset), dot(view.R2.xyz, offset));
-    (*g).valid = finite3(mean) && finite(p.x + p.y + p.z * p.z) && p.z > view.z_near;
-    let z = select(1.0, p.z, (*g).valid);
-    (*g).offset = offset;
-    (*g).p = vec3<f32>(p.xy, z);
-    let plain = p.xy / z;
-    (*g).ratio = clamp(plain, view.low, view.high);
-    (*g).clamped = vec2<bool>(plain.x < view.low.x || plain.x > view.high.x, plain.y < view.low.y || plain.y > view.high.y);
-    (*g).t0 = view.focal.x / z * (view.R0.xyz - (*g).ratio.x * view.R2.xyz);
-    (*g).t1 = view.focal.y / z * (view.R1.xyz - (*g).ratio.y * view.R2.xyz);
-    (*g).uv = view.focal * plain + view.middle;
-    (*g).valid = (*g).valid && finite((*g).uv.x) && finite((*g).uv.y);
-    (*g).nearest = clamp((*g).uv, vec2<f32>(0.0), vec2<f32>(view.size) - 1.0);
 }
 
 fn project_covariance(i: u32, g: ptr<function, Projected>) {
@@ -98,7 +83,16 @@ fn project_shape(i: u32) -> Projected {
     let falling = exp_exact(clamp(-logit, -SCALE_MOST, SCALE_MOST));
     g.opacity = 1.0 / (1.0 + falling);
     g.transparency = falling / (1.0 + falling);
+    g.still = g.det;
     g.compensation = 1.0;
+    if (g.blurred) {                             // no term of the determinants' difference is negative
+        let along = g.blur.x * g.r1 - g.blur.y * g.r0;
+        g.det += dot(along, along) + d * dot(g.blur, g.blur);
+        g.a += g.blur.x * g.blur.x;
+        g.b += g.blur.x * g.blur.y;
+        g.c += g.blur.y * g.blur.y;
+        g.compensation = sqrt(g.still / g.det);
+    }
     if (view.antialiased != 0u) {
         g.compensation = sqrt(max(g.det0, DET_FLOOR) / g.det);
     }

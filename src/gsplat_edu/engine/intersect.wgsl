@@ -35,11 +35,13 @@ fn emit_pairs(@builtin(workgroup_id) id: vec3<u32>, @builtin(num_workgroups) gro
     spans[i].y = slot;
     let e = ellipse_of(records[4u * i], records[4u * i + 1u], records[4u * i + 3u]);
     for (var row = e.first; row <= e.last; row++) {
-        let columns = columns_of(e, row);
-        let first = u32(row) * view.tiles_x + u32(columns.x);
-        for (var column = 0; column < columns.y && slot < end; column++) {
-            write_pair(slot, first + u32(column), i);
-            slot += 1u;
+        for (var copy = 0; copy < COPIES; copy++) {
+            let columns = run_of(e, row, copy);
+            let first = u32(row) * view.tiles_x + u32(columns.x);
+            for (var column = 0; column < columns.y && slot < end; column++) {
+                write_pair(slot, first + u32(column), i);
+                slot += 1u;
+            }
         }
     }
     for (; slot < end; slot += 1u) {

@@ -228,6 +228,9 @@ def rates_of(one: Pass, counters: Counters) -> Rates:
         "at < end": sorted_part,
         "first + k < end": sorted_part,
         # compositing
+        "COPIES == 1": 1.0,  # of a pinhole's image
+        "run_of.while": 0.0,
+        "run_of.while#2": 0.0,
         "composite.k": batches,
         "blended.j": batch,
         "composite: lane < count": batch / PIXELS,

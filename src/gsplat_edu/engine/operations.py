@@ -38,7 +38,7 @@ LEAVES = frozenset({"return", "break", "continue"})
 
 
 @dataclass
-class Work:
+class ThreadWork:
     """What a thread does on average.
 
     Args:
@@ -51,7 +51,7 @@ class Work:
     loaded: dict[str, float] = field(default_factory=dict)
     stored: dict[str, float] = field(default_factory=dict)
 
-    def add(self, other: Work, times: float = 1.0) -> None:
+    def add(self, other: ThreadWork, times: float = 1.0) -> None:
         """Add another one, so many times."""
         self.operations += times * other.operations
         for mine, theirs in ((self.loaded, other.loaded), (self.stored, other.stored)):
@@ -103,7 +103,7 @@ class Shader:
             }
             self.functions[name] = _Function(parameters, returns, TOKEN.findall(body))
 
-    def work(self, entry: str, rates: Rates) -> Work:
+    def work(self, entry: str, rates: Rates) -> ThreadWork:
         """Return what a thread of an entry point does.
 
         Args:
@@ -130,7 +130,7 @@ class _Reader:
         function = shader.functions[name]
         self.tokens, self.at = function.body, 0
         self.types = dict(function.parameters)
-        self.work = Work()
+        self.work = ThreadWork()
         self._product = False  # whether what was read last is a product
         self._seen: dict[str, int] = {}
         self._folded: set[str] = set()  # variables of unrolled loops
@@ -142,7 +142,7 @@ class _Reader:
         """Read statements; return whether the last one leaves."""
         outer, left, leaves = self.work, 1.0, False
         while self.at < end:
-            self.work = Work()
+            self.work = ThreadWork()
             leaves = self._peek() in LEAVES
             taken = self._statement()
             outer.add(self.work, left)
@@ -175,7 +175,7 @@ class _Reader:
         self._take("if")
         condition = self._condition()
         first, leaves = self._braces()
-        other = Work()
+        other = ThreadWork()
         if self._peek() == "else":
             self._next()
             if self._peek() == "if":
@@ -469,7 +469,7 @@ class _Reader:
                 return at
         raise ValueError(f"{self.name}: a bracket is not closed")
 
-    def _braces(self) -> tuple[Work, bool]:
+    def _braces(self) -> tuple[ThreadWork, bool]:
         """Read a block; return its work, and whether it ends by leaving."""
         end = self._closing()
         self._take("{")
@@ -479,9 +479,9 @@ class _Reader:
         return inside, leaves
 
     @contextmanager
-    def _apart(self) -> Iterator[Work]:
+    def _apart(self) -> Iterator[ThreadWork]:
         """Count into a value of its own."""
-        outer, self.work = self.work, Work()
+        outer, self.work = self.work, ThreadWork()
         inside = self.work
         try:
             yield inside

@@ -17,27 +17,46 @@ FOLDER = Path(__file__).parent
 MODULES: dict[str, tuple[str, ...]] = {
     "scan": ("job", "scan"),
     "sort": ("job", "sort"),
-    "project": ("job", "view", "constants", "elementary", "gaussian", "harmonics", "ellipse", "project"),
+    "project": (
+        *("job", "view", "constants", "elementary", "gaussian", "pinhole"),
+        *("harmonics", "flat", "ellipse", "project"),
+    ),
     "order": ("job", "order"),
-    "intersect": ("job", "view", "constants", "ellipse", "intersect"),
-    "composite": ("job", "view", "constants", "splat", "composite"),
-    "composite_backward": ("job", "view", "constants", "splat", "composite_backward"),
-    "statistics": ("job", "view", "constants", "splat", "statistics"),
+    "intersect": ("job", "view", "constants", "flat", "ellipse", "intersect"),
+    "composite": ("job", "view", "constants", "flat", "splat", "composite"),
+    "composite_backward": ("job", "view", "constants", "flat", "splat", "composite_backward"),
+    "statistics": ("job", "view", "constants", "flat", "splat", "statistics"),
     "features": ("job", "features"),
     "project_backward": (
-        "job",
-        "view",
-        "constants",
-        "elementary",
-        "gaussian",
-        "harmonics",
-        "project_backward",
+        *("job", "view", "constants", "elementary", "gaussian", "pinhole"),
+        *("harmonics", "project_backward", "pinhole_backward"),
     ),
     "loss": ("job", "view", "constants", "step", "loss"),
     "adam": ("job", "view", "step", "elementary", "adam"),
     "noise": ("job", "view", "step", "elementary", "noise"),
 }
-"""Shader modules, and the WGSL files that are joined to each."""
+"""Shader modules, and the WGSL files that are joined to each; those of lenses and panoramas are added below."""
+
+LENS_FILES: dict[str, tuple[str, ...]] = {
+    "pinhole": ("lens", "sight"),
+    "pinhole_backward": ("lens_backward", "sight_backward"),
+}
+"""The WGSL files in place of a pinhole's for any other lens, and for a rolling shutter."""
+
+SEAM_FILES: dict[str, tuple[str, ...]] = {"flat": ("seam",)}
+"""The same for a panorama, whose left and right edges meet."""
+
+
+def _with(module: str, files: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the WGSL files of a module with some of them replaced."""
+    return tuple(name for file in MODULES[module] for name in files.get(file, (file,)))
+
+
+MODULES |= {f"{module}_lens": _with(module, LENS_FILES) for module in ("project", "project_backward")}
+MODULES |= {
+    f"{module}_seam": _with(module, LENS_FILES | SEAM_FILES)
+    for module in ("project", "intersect", "composite", "composite_backward", "statistics")
+}
 
 BLOCK = 1024
 """Items that a workgroup of scan and sort takes."""

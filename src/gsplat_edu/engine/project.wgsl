@@ -14,7 +14,9 @@
 fn count_tiles(e: Ellipse) -> u32 {
     var total = 0;
     for (var row = e.first; row <= e.last; row++) {
-        total += columns_of(e, row).y;
+        for (var copy = 0; copy < COPIES; copy++) {
+            total += run_of(e, row, copy).y;
+        }
     }
     return u32(total);
 }

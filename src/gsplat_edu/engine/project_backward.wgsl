@@ -3,19 +3,17 @@
 //     moments of h -> J W M -> (J W, quaternion, log scale) -> mean;   colour -> (coefficients, direction -> mean)
 //
 // Sigma2d^-1 = L' L, y = L d: moments are taken in y, where they are of order 1; in d they grow with the ellipse and cancel.
-// With r = (J W) M, w = L r and N the matrix of moments: dL/dr = L' N w.
+// With r = (J W) M, w = L r and N the matrix of moments: dL/dr = L' N w. From J W and the position to the mean, `through_camera` is
+// that of pinhole_backward.wgsl or of sight_backward.wgsl.
 
 const OUT = 16u;             // as `core`, then |(gu W/2, gv H/2)|, and one unused
 const SLOT = 10u;
-const CAMERA = 16u;          // R row by row, eye, fx, fy, cx, cy
 
 @group(1) @binding(2) var<storage, read> spans: array<vec2<u32>>;
 @group(1) @binding(3) var<storage, read> slots: array<f32>;
 @group(1) @binding(4) var<storage, read_write> core_grads: array<f32>;
 @group(1) @binding(5) var<storage, read_write> rest_grads: array<f32>;
 @group(1) @binding(6) var<storage, read_write> camera_sums: array<f32>;
-
-var<workgroup> camera_parts: array<f32, 1024>;   // 64 threads x CAMERA
 
 struct Sums {
     color: vec3<f32>,
@@ -28,7 +26,7 @@ struct Sums {
 struct Moments {
     L: vec3<f32>,            // sx, sy, ty
     m: vec2<f32>,            // sum h y
-    m00: f32,                // sum h y y', minus sum h on the diagonal with antialiasing
+    m00: f32,                // sum h y y', minus sum h on the diagonal with antialiasing or motion blur
     m01: f32,
     m11: f32,
 }
@@ -38,6 +36,7 @@ struct Through {             // gradients on their way
     d1: vec3<f32>,
     total: f32,              // d0 . t0 + d1 . t1
     uv: vec2<f32>,           // of the position in the image
+    blur: vec2<f32>,
     p: vec3<f32>,            // of the mean in camera axes
     mean: vec3<f32>,
 }
@@ -69,7 +68,7 @@ fn whiten(g: Projected, sums: Sums) -> Moments {
         + w.L.x * (w.L.x * sums.second.x + 2.0 * w.L.y * sums.second.y) + w.L.y * w.L.y * sums.second.z;
     w.m01 = s * (t * sums.h + down) + t * along + w.L.z * (w.L.x * sums.second.y + w.L.y * sums.second.z);
     w.m11 = t * (t * sums.h + 2.0 * down) + w.L.z * w.L.z * sums.second.z;
-    if (view.antialiased != 0u) {                // the opacity's factor contains det^(-1/2)
+    if (view.antialiased != 0u || g.blurred) {   // the opacity's factor contains det^(-1/2)
         w.m00 -= sums.h;
         w.m11 -= sums.h;
     }
@@ -81,31 +80,48 @@ fn turn_gradient(q: vec4<f32>, torque: vec3<f32>) -> vec4<f32> {
     return 2.0 * vec4<f32>(-dot(q.yzw, torque), q.x * torque + cross(q.yzw, torque));
 }
 
-// Propagates the moments to scales and quaternion, which it stores, and to the rows of J W. `lit` is antialiasing's part:
-// the opacity's factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r with Sigma before the dilation.
+// Propagates the moments to scales and quaternion, which it stores, to the rows of J W, and to the blur, a fourth column of r. `lit` is
+// the opacity's part: its factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r with Sigma before the dilation or, with motion blur
+// and no antialiasing, after: then `lit_dilation` is not 0.
 //
 // With p = (J W) R, r = p S and W = L p: dL/dr = B r with a symmetric B, so with Q = p' B p the scales get s_k² Q_kk and a
 // turn about axis i gets Q_jk (s_j² - s_k²). That is exactly 0 for a round Gaussian, whose quaternion Adam would move otherwise,
 // by a whole step for each rounding error. With f = t0 x t1 in the Gaussian's axes, antialiasing's part of Q_jk is
-// -lit s_i² f_j f_k, and that of Q_kk is lit (s_i² f_j² + s_j² f_i²): no term cancels.
-fn shape_gradient(i: u32, g: Projected, m: Moments, lit: f32, to: ptr<function, Through>) {
+// -lit s_i² f_j f_k, and that of Q_kk is lit (s_i² f_j² + s_j² f_i²): no term cancels. The dilation's part of Q is
+// lit d (p0' p0 + p1' p1).
+fn shape_gradient(i: u32, g: Projected, m: Moments, lit: f32, lit_dilation: f32, to: ptr<function, Through>) {
     let p0 = g.t0 * g.R;
     let p1 = g.t1 * g.R;
     let flat = cross(g.t0, g.t1) * g.R;
     let ss = g.s * g.s;
     let across0 = cross(p1 * ss, flat);          // (c0 r0 - b0 r1) / s
     let across1 = cross(flat, p0 * ss);          // (a0 r1 - b0 r0) / s
-    let w0 = m.L.x / g.c * (view.dilation * p0 + across0);        // sx p0 + sy p1 = sx (p0 - b/c p1)
+    var w0 = m.L.x / g.c * (view.dilation * p0 + across0);        // sx p0 + sy p1 = sx (p0 - b/c p1)
     let w1 = m.L.z * p1;
+    let even = lit * lit_dilation;
+    if (g.blurred) {
+        w0 += m.L.x / g.c * g.blur.y * (g.blur.y * p0 - g.blur.x * p1);
+        let along = g.blur.x * g.r1 - g.blur.y * g.r0;
+        let b0 = m.L.x / g.c * (view.dilation * g.blur.x + dot(g.r1, along));
+        let b1 = m.L.z * g.blur.y;
+        let db0 = m.m00 * b0 + m.m01 * b1;
+        (*to).blur = vec2<f32>(m.L.x * db0, m.L.y * db0 + m.L.z * (m.m01 * b0 + m.m11 * b1));
+    }
     let dw0 = m.m00 * w0 + m.m01 * w1;
     let dw1 = m.m01 * w0 + m.m11 * w1;
-    let extra0 = lit * across0;
-    let extra1 = lit * across1;
-    let scale = ss * (w0 * dw0 + w1 * dw1 + lit * (ss.yzx * flat.zxy * flat.zxy + ss.zxy * flat.yzx * flat.yzx));
+    var extra0 = lit * across0;
+    var extra1 = lit * across1;
+    var scale = ss * (w0 * dw0 + w1 * dw1 + lit * (ss.yzx * flat.zxy * flat.zxy + ss.zxy * flat.yzx * flat.yzx));
+    var Q = w0.yzx * dw0.zxy + w1.yzx * dw1.zxy - lit * ss * flat.yzx * flat.zxy;
+    if (g.blurred) {
+        extra0 += even * p0;
+        extra1 += even * p1;
+        scale += even * ss * (p0 * p0 + p1 * p1);
+        Q += even * (p0.yzx * p0.zxy + p1.yzx * p1.zxy);
+    }
     (*to).d0 = g.R * (ss * (m.L.x * dw0 + extra0));
     (*to).d1 = g.R * (ss * (m.L.y * dw0 + m.L.z * dw1 + extra1));
     (*to).total = scale.x + scale.y + scale.z;
-    let Q = w0.yzx * dw0.zxy + w1.yzx * dw1.zxy - lit * ss * flat.yzx * flat.zxy;
     let torque = Q * (g.s.yzx - g.s.zxy) * (g.s.yzx + g.s.zxy);
     let dq = turn_gradient(g.q, torque) / g.q_length;
     for (var k = 0u; k < 4u; k++) {
@@ -114,18 +130,6 @@ fn shape_gradient(i: u32, g: Projected, m: Moments, lit: f32, to: ptr<function, 
     for (var k = 0u; k < 3u; k++) {
         core_grads[i * OUT + 7u + k] = scale[k];
     }
-}
-
-// Propagates to the mean in camera axes. J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³
-// W_2. A clamped x/z is a constant.
-fn mean_gradient(g: Projected, depth: f32, to: ptr<function, Through>) {
-    let plain = g.p.xy / g.p.z;
-    let along = vec2<f32>(dot((*to).d0, view.R2.xyz), dot((*to).d1, view.R2.xyz));
-    let w = select(along, vec2<f32>(0.0), g.clamped);
-    let f = view.focal / g.p.z;
-    let flat = f * (*to).uv - f / g.p.z * w;
-    let deep = (dot(f * plain, w) - (*to).total) / g.p.z - dot(plain * f, (*to).uv) + depth;
-    (*to).p = vec3<f32>(flat, deep);
 }
 
 // Propagates the colour's gradient to the coefficients, which it stores, and returns that of the direction to the mean.
@@ -152,30 +156,6 @@ fn color_gradient(i: u32, g: Projected, painted: vec3<f32>) -> vec3<f32> {
     return (turned - dot(turned, d) * d) / distance;
 }
 
-// All formulas take R (mean - eye), so the eye's gradient is minus that of the mean. A clamped x/z is a bound of the image,
-// (constant - cx) / fx.
-fn camera_gradient(thread: u32, g: Projected, to: Through) {
-    let f = view.focal / g.p.z;
-    let along = vec2<f32>(dot(to.d0, view.R2.xyz), dot(to.d1, view.R2.xyz)) / g.p.z;
-    let w = select(vec2<f32>(0.0), along, g.clamped);
-    let row0 = to.p.x * g.offset + f.x * to.d0;
-    let row1 = to.p.y * g.offset + f.y * to.d1;
-    let row2 = to.p.z * g.offset - f.x * g.ratio.x * to.d0 - f.y * g.ratio.y * to.d1;
-    let focal = to.uv * g.p.xy / g.p.z + vec2<f32>(dot(to.d0, g.t0), dot(to.d1, g.t1)) / view.focal + w * g.ratio;
-    let middle = to.uv + w;
-    let at = thread * CAMERA;
-    for (var k = 0u; k < 3u; k++) {
-        camera_parts[at + k] = row0[k];
-        camera_parts[at + 3u + k] = row1[k];
-        camera_parts[at + 6u + k] = row2[k];
-        camera_parts[at + 9u + k] = -to.mean[k];
-    }
-    for (var k = 0u; k < 2u; k++) {
-        camera_parts[at + 12u + k] = focal[k];
-        camera_parts[at + 14u + k] = middle[k];
-    }
-}
-
 fn clear(i: u32) {
     for (var k = 0u; k < OUT; k++) {
         core_grads[i * OUT + k] = 0.0;
@@ -197,12 +177,16 @@ fn differentiate(i: u32, thread: u32) {
     var to: Through;
     to.uv = vec2<f32>(m.L.x * m.m.x, m.L.y * m.m.x + m.L.z * m.m.y);
     var lit = 0.0;
+    var lit_dilation = 0.0;
+    if (view.antialiased == 0u && g.blurred) {
+        lit = sums.h / g.still;
+        lit_dilation = view.dilation;
+    }
     if (view.antialiased != 0u && g.det0 > DET_FLOOR) {
         lit = sums.h / g.det0;
     }
-    shape_gradient(i, g, m, lit, &to);
-    mean_gradient(g, sums.depth, &to);
-    to.mean = to.p.x * view.R0.xyz + to.p.y * view.R1.xyz + to.p.z * view.R2.xyz + color_gradient(i, g, sums.color);
+    shape_gradient(i, g, m, lit, lit_dilation, &to);
+    through_camera(i, thread, g, sums.depth, color_gradient(i, g, sums.color), &to);
     for (var k = 0u; k < 3u; k++) {
         core_grads[i * OUT + k] = to.mean[k];
     }
@@ -210,7 +194,6 @@ fn differentiate(i: u32, thread: u32) {
     let screen = to.uv * 0.5 * vec2<f32>(view.size);
     core_grads[i * OUT + 14u] = sqrt(dot(screen, screen));
     core_grads[i * OUT + 15u] = 0.0;
-    camera_gradient(thread, g, to);
 }
 
 @compute @workgroup_size(64)

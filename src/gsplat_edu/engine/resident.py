@@ -128,6 +128,7 @@ class Resident:
         self.count = 0
         self._memory: Memory | None = None
         self._pixels, self._tiles, self._pairs = 1, 1, 0
+        self._optics = "pinhole"
         self._most_pairs_each = PAIRS_AT_FIRST
         self._waiting: deque[_Step] = deque()
         self._photos: dict[int, tuple[object, _KeptPhoto]] = {}
@@ -258,7 +259,8 @@ class Resident:
     def _submit(self, one: _Step) -> None:
         self._make_room_for(one.view)
         memory, pixels = self._here, one.view.camera.H * one.view.camera.W
-        block = one.view.packed(self.harmonics) + one.numbers.packed(pixels, self.count, one.photo.floats)
+        numbers = one.numbers.packed(pixels, self.count, one.photo.floats)
+        block = one.view.packed(self.harmonics, numbers)
         one.ticket = memory.submit("step", block, "live", one.photo.kept, "photo")
         self._last = one.view
         self._waiting.append(one)
@@ -289,17 +291,19 @@ class Resident:
         return sent
 
     def _make_room_for(self, view: DeviceView) -> None:
-        """Enlarge the buffers if a view is larger than all before."""
+        """Enlarge the buffers if a view is larger than all before, and take the passes of its lens."""
         pixels = view.camera.H * view.camera.W
-        if pixels > self._pixels or view.tiles > self._tiles:
+        if pixels > self._pixels or view.tiles > self._tiles or view.optics != self._optics:
             self.settle()
+            self._optics = view.optics
             self._pixels, self._tiles = max(pixels, self._pixels), max(view.tiles, self._tiles)
             self._memory = self._allocate(self._here)
 
     def _allocate(self, like: Memory | None) -> Memory:
         """Return buffers, those of another size new, and all others with what is in them."""
         counts = render_counts(self.count, self.harmonics, self._pixels, self._tiles, self._pairs, LIVE)
-        memory = self.device.allocate(step_program(sort_bits(self._tiles.bit_length())), counts, like=like)
+        wanted = step_program(sort_bits(self._tiles.bit_length()), self._optics)
+        memory = self.device.allocate(wanted, counts, like=like)
         memory.write("live", np.zeros(LIVE, dtype=np.uint32))
         return memory
 

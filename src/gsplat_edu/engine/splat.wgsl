@@ -16,6 +16,14 @@ fn power_at(a: vec4<f32>, b: vec4<f32>, d: vec2<f32>) -> f32 {
     return b.w - s * s - t * t;
 }
 
+// The first row of a record, moved to where the tile of a column sees it.
+fn placed(a: vec4<f32>, column: u32) -> vec4<f32> {
+    if (COPIES == 1) {
+        return a;
+    }
+    return vec4<f32>(a.x + seam_shift(column, a.x), a.yzw);
+}
+
 // Of a splat that is drawn, power >= LOG2_ALPHA_MIN.
 fn alpha_of(power: f32) -> f32 {
     return min(exp2(min(power, 0.0)), view.alpha_max);

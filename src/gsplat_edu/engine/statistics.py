@@ -32,8 +32,8 @@ class Asked:
 
 
 @functools.cache
-def _program(buffers: tuple[Buffer, ...], records: str, image: str) -> Program:
-    """Return the program that reads these buffers of a frame."""
+def _program(buffers: tuple[Buffer, ...], records: str, image: str, seam: str) -> Program:
+    """Return the program that reads these buffers of a frame; `seam` is "_seam" for a panorama's."""
     own = (
         *(Buffer("errors", Size("pixels")), Buffer("weighed", Size("pixels", WEIGHED))),
         *(
@@ -45,7 +45,7 @@ def _program(buffers: tuple[Buffer, ...], records: str, image: str) -> Program:
     sums = ("spans", "statistic_slots")
     passes = (
         Pass("statistics", "weigh", (image, "grads", "errors"), ("weighed",), Size("pixels"), 256),
-        Pass("statistics", "collect", lists, ("statistic_slots",), Size("edges"), 1),
+        Pass(f"statistics{seam}", "collect", lists, ("statistic_slots",), Size("edges"), 1),
         Pass("statistics", "sum_statistics", sums, ("collected",), Size("gaussians"), 64),
     )
     used = {name for one in passes for name in (*one.reads, *one.writes)}
@@ -59,7 +59,9 @@ def statistics_program(frame: Program, of_features: bool) -> Program:
         frame: The frame's program, whose buffers it reads.
         of_features: Whether of the features that were composited last, instead of the colours.
     """
-    return _program(frame.buffers, *(("painted", "feature_image") if of_features else ("records", "image")))
+    wraps = any(one.module == "composite_seam" for one in frame.passes())
+    drawn = ("painted", "feature_image") if of_features else ("records", "image")
+    return _program(frame.buffers, *drawn, "_seam" if wraps else "")
 
 
 def collect(memory: Memory, asked: Asked, of_features: bool = False) -> np.ndarray:

@@ -56,22 +56,26 @@ NO_SHELL = (0.0, 0.0, 0.0, -1.0)
 
 
 @functools.cache
-def step_program(tile_bits: int) -> Program:
-    """Return the program of a step, whose pairs are sorted by so many bits.
+def step_program(tile_bits: int, optics: str = "pinhole") -> Program:
+    """Return the program of a step.
 
     Its counts are those of a render; "pixels" and "edges" may be those of the largest view.
+
+    Args:
+        tile_bits: Bits of the number of tiles, by which pairs are sorted.
+        optics: One of `gsplat_edu.engine.view.OPTICS`.
     """
     core, rest = Size("gaussians", CORE), Size("rest")
     buffers = (
-        *render_buffers(),
+        *render_buffers(optics),
         *(Buffer(f"core_{moment}", core) for moment in ("first", "second")),
         *(Buffer(f"rest_{moment}", rest) for moment in ("first", "second")),
         Buffer("statistics", Size("gaussians", STATISTICS)),
         *(Buffer("photo", Size("pixels", PHOTO_WORDS)), Buffer("maps", Size("pixels", MAPS))),
         *(Buffer("loss_sums", Size("edges", 2)), Buffer("penalty_sums", Size("gaussians", 2, BLOCK))),
     )
-    parts = {"step": (*render_passes(tile_bits), *_loss(), *gradient_passes(), *_adam()), "noise": _noise()}
-    return Program(buffers, parts)
+    drawing, gradients = render_passes(tile_bits, optics), gradient_passes(optics)
+    return Program(buffers, {"step": (*drawing, *_loss(), *gradients, *_adam()), "noise": _noise()})
 
 
 def pairs_room(gaussians: int, pairs_each: float) -> int:

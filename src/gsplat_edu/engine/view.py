@@ -10,12 +10,20 @@ import numpy as np
 
 from gsplat_edu.base.constants import T_STOP, TILE
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.projection import COEFFICIENTS, PROJECTIONS
+from gsplat_edu.scene.shutter import readout_axis, readout_pace
 
 FARTHEST = 3e38
 """Stands for infinity, which WGSL lets a compiler assume away."""
 
 NO_STOP = -1.0
 """Transmittance that no pixel reaches."""
+
+LENS_PLACE = 496
+"""Bytes of the uniform block before the lens."""
+
+OPTICS = ("pinhole", "lens", "panorama")
+"""What a program is for: a pinhole at rest; any other camera; one whose image's left and right edges meet."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +62,26 @@ class DeviceView:
         """Tiles of the image."""
         return self.tiles_x * -(-self.camera.H // TILE)
 
-    def packed(self, rest: int) -> bytes:
+    @property
+    def optics(self) -> str:
+        """Which of the `OPTICS` the camera needs."""
+        if self.camera.pinhole:
+            return "pinhole"
+        return "panorama" if self.camera.projection.kind == "equirectangular" else "lens"
+
+    def packed(self, rest: int, numbers: bytes = b"") -> bytes:
         """Return the uniform block.
 
         Args:
             rest: Harmonics per Gaussian in the scene, besides the first.
+            numbers: Of a step of training; they follow the view.
         """
         camera = self.camera
         eye = np.asarray(camera.eye, dtype=np.float64)
         high = eye.astype(np.float32)
         rows = [(*row, 0.0) for row in camera.R]
         bounds = np.clip(camera.jacobian_bounds(self.jacobian_limit), -FARTHEST, FARTHEST)
-        numbers = (
+        floats = (
             *(value for row in rows for value in row),
             *(*high, 0.0),
             *(*(eye - high), 0.0),
@@ -75,4 +91,30 @@ class DeviceView:
             *(self.z_near, self.dilation, self.alpha_max, math.log2(self.alpha_max)),
         )
         whole = (camera.W, camera.H, self.tiles_x, self.tiles, self.sh_degree, rest, int(self.antialiased), 0)
-        return struct.pack(f"<{len(numbers)}f8I", *numbers, *whole)
+        block = struct.pack(f"<{len(floats)}f8I", *floats, *whole) + numbers
+        if self.optics == "pinhole":
+            return block
+        return block.ljust(LENS_PLACE, b"\0") + packed_lens(camera, self.jacobian_limit is not None)
+
+
+def packed_lens(camera: Camera, limited: bool) -> bytes:
+    """Return lens and rolling shutter of a camera, as `lens.wgsl` reads them.
+
+    Args:
+        camera: The camera.
+        limited: Whether there is a `jacobian_limit`.
+    """
+    kind, widest = camera.projection.kind, camera.widest
+    bound = {"perspective": math.tan(widest) ** 2, "fisheye": math.cos(widest)}.get(kind, 0.0)
+    coefficients, axis = camera.coefficients or (0.0,) * len(COEFFICIENTS), readout_axis(camera.readout)
+    motion = camera.motion or (0.0,) * 6
+    numbers = (
+        *(*coefficients, bound),
+        *(*motion[:3], readout_pace(camera.readout, camera.H, camera.W)),
+        *(*motion[3:], 0.5 * ((camera.W, camera.H)[axis] - 1)),
+    )
+    flags = (camera.coefficients is not None, camera.projection.radial_first, camera.motion is not None)
+    bounded = limited and kind == "perspective"
+    whole = (PROJECTIONS.index(kind), *flags, axis, camera.projection.along_ray, bounded)
+    spread = camera.exposure / math.sqrt(12.0)
+    return struct.pack(f"<{len(numbers)}f7If", *numbers, *map(int, whole), spread)

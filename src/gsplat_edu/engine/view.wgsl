@@ -24,6 +24,7 @@ struct View {
     antialiased: u32,
     zero: u32,               // 0, but the compiler does not know
     numbers: array<vec4<u32>, 20>,   // of a step of training: see step.wgsl
+    lens: array<vec4<u32>, 8>,       // of any camera but a pinhole at rest: see lens.wgsl
 }
 
 @group(0) @binding(1) var<uniform> view: View;

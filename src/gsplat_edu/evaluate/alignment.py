@@ -4,12 +4,15 @@ A training that refines its cameras shifts the scene against held-out photos, wh
 a held-out photo is therefore aligned on half of the photo, with the scene fixed, and scored on the other half. If the
 training corrected exposures too, the colours are fitted with the pose.
 
+A photo of a rolling shutter has a motion of its own, too. It can be aligned with the pose (`moving`).
+
 The halves are the light and the dark squares of a chessboard. The left half alone determines some moves of the camera
 poorly. On a clean capture, alignment on it cost 0.4 dB on the right half (benchmarks/archive/RESULTS-2026-11.md).
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -39,6 +42,9 @@ RATE, FINAL_RATE = 2e-3, 1e-4
 
 BETAS, EPS = (0.9, 0.99), 1e-15
 
+MOTION_UNIT = 4.0
+"""Unit of a motion during the readout, in those of a pose: a motion moves the mean pixel by a quarter of itself."""
+
 
 @runtime_checkable
 class TensorRenderer(Protocol):
@@ -57,6 +63,7 @@ def aligned_psnr(
     extent: float,
     *,
     colors: bool = False,
+    moving: bool = False,
 ) -> float | None:
     """Return the PSNR of the dark squares of a view after `STEPS` steps of its pose on the light ones.
 
@@ -67,16 +74,17 @@ def aligned_psnr(
         background: (3,) colour behind photos that are not opaque.
         extent: Size of the scene, world units.
         colors: Fit the exposure and white balance on the light squares too, at every step and for the score.
+        moving: Align the motion during the readout with the pose, from the view's own motion or from rest.
 
     Returns:
         dB; None if no pixel counts in one of the halves.
     """
     photo = view.read()
-    truth, light = np.ascontiguousarray(photo.over(background)), light_squares(view.camera.H, view.camera.W)
-    counts = np.ones_like(light) if photo.mask is None else photo.mask
-    fitted, scored = counts & light, counts & ~light
-    if not fitted.any() or not scored.any():
+    truth = np.ascontiguousarray(photo.over(background))
+    halves = scored_halves(photo.mask, view.camera.H, view.camera.W)
+    if halves is None:
         return None
+    fitted, scored = halves
     fixed = gaussians.map(lambda tensor: tensor.detach())
     target, mask = torch.from_numpy(truth), torch.from_numpy(fitted)
 
@@ -87,16 +95,43 @@ def aligned_psnr(
         return at_exposure_of(truth, output.image, fitted, transparency_of(photo, output, background))
 
     start = CameraTensors.of(view.camera)
-    twist = torch.zeros(6, dtype=torch.float64)
     units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
-    first, second = torch.zeros_like(twist), torch.zeros_like(twist)
+    changes = torch.zeros(12 if moving else 6, dtype=torch.float64)
+    first, second = torch.zeros_like(changes), torch.zeros_like(changes)
     for step in range(STEPS):
-        leaf = twist.clone().requires_grad_()
-        image = shown(start.moved(leaf * units)).cpu()  # the native loss compares the renders of any backend
+        leaf = changes.clone().requires_grad_()
+        image = shown(
+            _changed(start, leaf, units)
+        ).cpu()  # the native loss compares the renders of any backend
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
-        adam_in_torch(twist, first, second, gradient, _numbers(step))
+        adam_in_torch(changes, first, second, gradient, _numbers(step))
     with torch.no_grad():
-        return psnr(shown(start.moved(twist * units).value()), truth, scored)
+        return psnr(shown(_changed(start, changes, units).value()), truth, scored)
+
+
+def _changed(camera: CameraTensors, changes: Tensor, units: Tensor) -> CameraTensors:
+    """Return a camera after a twist, and after a change of its motion if there are twelve numbers."""
+    moved = camera.moved(changes[:6] * units)
+    if len(changes) == 6:
+        return moved
+    start = torch.zeros(6, dtype=torch.float64) if camera.motion is None else camera.motion
+    return dataclasses.replace(moved, motion=start + changes[6:] * (MOTION_UNIT * units))
+
+
+def scored_halves(
+    mask: Bool[np.ndarray, "H W"] | None, H: int, W: int
+) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]] | None:
+    """Return the pixels on which a photo is aligned and those on which it is scored; None if either are none.
+
+    Args:
+        mask: (H, W) true for pixels that count; None if all do.
+        H: Height, px.
+        W: Width, px.
+    """
+    light = light_squares(H, W)
+    counts = np.ones_like(light) if mask is None else mask
+    fitted, scored = counts & light, counts & ~light
+    return (fitted, scored) if fitted.any() and scored.any() else None
 
 
 def light_squares(H: int, W: int) -> Bool[np.ndarray, "H W"]:

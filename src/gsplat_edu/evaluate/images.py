@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import remove_leftovers, written_aside
 from gsplat_edu.base.validation import ArrayLike, check_shape, in_range
 from gsplat_edu.evaluate.comparison import SEPARATOR_GREY, SEPARATOR_WIDTH
 from gsplat_edu.evaluate.metrics import to_bytes
+from gsplat_edu.evaluate.spherical import XMP_KEY, photo_sphere
 from gsplat_edu.evaluate.video import encode_video
 
 PICTURE_SIDE = 640
@@ -55,12 +57,14 @@ NOT_WRITTEN = frozenset(
 RgbBytes = UInt8[np.ndarray, "H W 3"]
 
 
-def save_png(path: Path, image: ArrayLike) -> None:
+def save_png(path: Path, image: ArrayLike, sphere: bool = False) -> None:
     """Write an image as 8-bit PNG.
 
     Args:
         path: Output file; parent folders are created.
         image: (H, W, 3) uint8, or float from 0 to 1, clamped and rounded.
+        sphere: Whether it is equirectangular and shows the whole sphere; the file then says so
+            (`gsplat_edu.evaluate.spherical`).
 
     Raises:
         ShapeError: not (H, W, 3).
@@ -68,8 +72,11 @@ def save_png(path: Path, image: ArrayLike) -> None:
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     picture = Image.fromarray(to_bytes(image))
+    facts = PngInfo()
+    if sphere:
+        facts.add_itxt(XMP_KEY, photo_sphere(*picture.size))
     with written_aside(path) as aside:
-        picture.save(aside, format="PNG")
+        picture.save(aside, format="PNG", pnginfo=facts)
 
 
 def small_jpeg(image: RgbBytes) -> bytes:
@@ -130,7 +137,11 @@ def check_output(out: Path) -> None:
 
 
 def write_frames(
-    out: Path, frames: Iterable[ArrayLike], fps: float = 30.0, names: Sequence[str] | None = None
+    out: Path,
+    frames: Iterable[ArrayLike],
+    fps: float = 30.0,
+    names: Sequence[str] | None = None,
+    sphere: bool = False,
 ) -> list[Path]:
     """Write frames as a video, or as PNGs in a folder.
 
@@ -142,6 +153,7 @@ def write_frames(
             an odd width or height is padded with a copy of the last column or row.
         fps: Frames per second of a video.
         names: File names in a folder, one per frame; None means frame_0000.png and so on.
+        sphere: Whether the frames are equirectangular and show the whole sphere; the files then say so.
 
     Returns:
         The written files.
@@ -155,13 +167,13 @@ def write_frames(
     if out.suffix.lower() == VIDEO_SUFFIX:
         remove_leftovers(out.parent, below=False)
         with written_aside(out) as aside:
-            encode_video(aside, out, frames, in_range("fps", fps, 0.0, open_low=True))
+            encode_video(aside, out, frames, in_range("fps", fps, 0.0, open_low=True), sphere)
         return [out]
     remove_leftovers(out, below=False)
     written = []
     for index, frame in enumerate(frames):
         written.append(out / (f"frame_{index:04d}.png" if names is None else names[index]))
-        save_png(written[-1], frame)
+        save_png(written[-1], frame, sphere)
     if not written:
         raise ArgumentError("frames: is empty; give at least one")
     return written

@@ -3,6 +3,8 @@
     {"format": "gsplat_edu path", "version": 1, "loop": false, "duration": 8.0,
      "keyframes": [{"position": [x, y, z], "rotation": [[...], [...], [...]], "fov": 50.0, "time": 0.0}, ...]}
 
+A keyframe with a time may have a "hold", seconds that the camera rests there, and the path an "ease".
+
 `position` and `rotation` are those of a run's cameras.json: the camera's centre in the coordinates of the scene's file,
 and the rotation from camera to world. `docs/FORMATS.md` describes every key. The page's script `keyframes.js` writes
 the same file.
@@ -10,7 +12,6 @@ the same file.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -23,7 +24,14 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.json_fields import as_json, check_keys, checked_number, checked_numbers
+from gsplat_edu.base.json_fields import (
+    as_json,
+    check_keys,
+    checked_choice,
+    checked_number,
+    checked_numbers,
+    number_within,
+)
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.scene.camera import ROTATION_TOLERANCE, Camera
@@ -46,6 +54,9 @@ LEAST_STEP = 1e-3
 LONGEST = 1e6
 """Seconds: limit of times and durations, 11 days."""
 
+EASES = ENDS, VIEWS = ("ends", "views")
+"""Where the camera slows down to a stop: at both ends of the path, or at every keyframe."""
+
 SEGMENT_SECONDS = 2.0
 """Seconds from one keyframe to the next, on average, if a path states neither times nor a duration."""
 
@@ -61,12 +72,14 @@ class Keyframe:
         R: (3, 3) world-to-camera rotation, rows (right, down, forward).
         fov: Vertical field of view, degrees.
         time: When the path is here, seconds; None if the path chooses.
+        hold: How long the camera then rests here, seconds; 0 for no rest. Needs a time.
     """
 
     eye: Float64[np.ndarray, "3"]
     R: Float64[np.ndarray, "3 3"]
     fov: float
     time: float | None = None
+    hold: float = 0.0
 
     @classmethod
     def of_camera(cls, camera: Camera) -> Keyframe:
@@ -83,6 +96,7 @@ class KeyframePath:
         loop: Whether the path returns from the last keyframe to the first.
         duration: Seconds from the first keyframe to the end; None takes the last keyframe's time, or
             `SEGMENT_SECONDS` per segment without times.
+        ease: One of `EASES`, or None for a camera that slows down nowhere.
 
     Raises:
         ArgumentError: a value is out of range; times and duration contradict each other.
@@ -91,6 +105,7 @@ class KeyframePath:
     keyframes: tuple[Keyframe, ...]
     loop: bool
     duration: float | None = None
+    ease: str | None = None
 
     def __post_init__(self) -> None:
         """Check all values."""
@@ -103,6 +118,8 @@ class KeyframePath:
                 check_keyframe(keyframe)
             except ArgumentError as error:
                 raise type(error)(f"keyframes[{index}].{error}") from None
+        if self.ease is not None and self.ease not in EASES:
+            raise ArgumentError(f'ease: is {as_json(self.ease)}, but has to be "{ENDS}" or "{VIEWS}"')
         self._check_times()
 
     @property
@@ -117,7 +134,7 @@ class KeyframePath:
             return self.duration
         first, last = self.keyframes[0].time, self.keyframes[-1].time
         if first is not None and last is not None:
-            return last - first
+            return last + self.keyframes[-1].hold - first
         return SEGMENT_SECONDS * (len(self.keyframes) - (0 if self.loop else 1))
 
     def placed(self, R: ArrayLike, scale: float, shift: ArrayLike) -> KeyframePath:
@@ -140,8 +157,10 @@ class KeyframePath:
     def document(self) -> dict[str, Any]:
         """Return the content of the path's file."""
         duration = {} if self.duration is None else {"duration": self.duration}
+        ease = {} if self.ease is None else {"ease": self.ease}
         entries = [_entry(keyframe) for keyframe in self.keyframes]
-        return {"format": FORMAT, "version": VERSION, "loop": self.loop, **duration, "keyframes": entries}
+        head = {"format": FORMAT, "version": VERSION, "loop": self.loop}
+        return {**head, **ease, **duration, "keyframes": entries}
 
     def _check_times(self) -> None:
         if self.duration is not None and not LEAST_STEP <= self.duration <= LONGEST:
@@ -153,18 +172,20 @@ class KeyframePath:
             return
         if len(times) < len(self.keyframes):
             raise ArgumentError("keyframes: some have a time and some have none; give it for all or for none")
-        for index, (before, after) in enumerate(itertools.pairwise(times), 1):
-            if after - before < LEAST_STEP:
+        ends = [time + keyframe.hold for time, keyframe in zip(times, self.keyframes, strict=True)]
+        for index, (before, end, after) in enumerate(zip(times, ends, times[1:], strict=False), 1):
+            if after - end < LEAST_STEP:
+                until = f", which holds until {end}" if end > before else ""
                 raise ArgumentError(
                     f"keyframes[{index}].time: is {after}, but has to be at least {LEAST_STEP} s after the"
-                    f" keyframe before, at {before}"
+                    f" keyframe before, at {before}{until}"
                 )
         if not self.loop and self.duration is not None:
             raise ArgumentError("duration: follows from the keyframes' times; remove it, or the times")
-        if self.loop and (self.duration is None or self.duration - (times[-1] - times[0]) < LEAST_STEP):
+        if self.loop and (self.duration is None or self.duration - (ends[-1] - times[0]) < LEAST_STEP):
             raise ArgumentError(
                 f"duration: is {self.duration}, but a loop with times needs one that is longer than its keyframes,"
-                f" {times[-1] - times[0]} s, for the way back to the first"
+                f" {ends[-1] - times[0]} s, for the way back to the first"
             )
 
 
@@ -239,15 +260,23 @@ def check_keyframe(keyframe: Keyframe) -> None:
         )
     if keyframe.time is not None and not abs(keyframe.time) <= LONGEST:
         raise ArgumentError(f"time: is {keyframe.time}, but has to be within {LONGEST:g} seconds of 0")
+    if keyframe.hold and keyframe.time is None:
+        raise ArgumentError("hold: needs a time of the keyframe")
+    if keyframe.hold and not LEAST_STEP <= keyframe.hold <= LONGEST:
+        raise ArgumentError(
+            f"hold: is {keyframe.hold}, but has to be between {LEAST_STEP} and {LONGEST:g} seconds"
+        )
 
 
 def _entry(keyframe: Keyframe) -> dict[str, Any]:
     time = {} if keyframe.time is None else {"time": keyframe.time}
+    hold = {"hold": keyframe.hold} if keyframe.hold else {}
     return {
         "position": keyframe.eye.tolist(),
         "rotation": keyframe.R.T.tolist(),
         "fov": keyframe.fov,
         **time,
+        **hold,
     }
 
 
@@ -265,7 +294,7 @@ def parsed_path(found: object) -> KeyframePath:
     version = found.get("version")
     if type(version) is not int or version != VERSION:
         raise ArgumentError(f"version: is {version!r}, but {VERSION} is supported")
-    check_keys("", found, ("format", "version", "loop", "keyframes"), ("duration",))
+    check_keys("", found, ("format", "version", "loop", "keyframes"), ("ease", "duration"))
     loop, entries = found["loop"], found["keyframes"]
     if not isinstance(loop, bool):
         raise ArgumentError(f"loop: is {as_json(loop)}, but has to be true or false")
@@ -273,7 +302,8 @@ def parsed_path(found: object) -> KeyframePath:
         raise ArgumentError(f"keyframes: is {as_json(entries)}, but has to be a list")
     keyframes = tuple(parsed_keyframe(f"keyframes[{index}]", entry) for index, entry in enumerate(entries))
     duration = checked_number("duration", found["duration"]) if "duration" in found else None
-    return KeyframePath(keyframes, loop, duration)
+    ease = checked_choice("ease", found["ease"], EASES) if "ease" in found else None
+    return KeyframePath(keyframes, loop, duration, ease)
 
 
 def parsed_keyframe(where: str, entry: object) -> Keyframe:
@@ -288,7 +318,7 @@ def parsed_keyframe(where: str, entry: object) -> Keyframe:
     """
     if not isinstance(entry, dict):
         raise ArgumentError(f"{where}: is {as_json(entry)}, but has to be an object")
-    check_keys(f"{where}: ", entry, ("position", "rotation", "fov"), ("time",))
+    check_keys(f"{where}: ", entry, ("position", "rotation", "fov"), ("time", "hold"))
     eye = checked_numbers(f"{where}.position", entry["position"], 3)
     rows = entry["rotation"]
     if not isinstance(rows, list) or len(rows) != 3:
@@ -297,7 +327,11 @@ def parsed_keyframe(where: str, entry: object) -> Keyframe:
         )
     rotation = [checked_numbers(f"{where}.rotation[{i}]", row, 3) for i, row in enumerate(rows)]
     time = checked_number(f"{where}.time", entry["time"]) if "time" in entry else None
-    return Keyframe(np.array(eye), np.array(rotation).T, checked_number(f"{where}.fov", entry["fov"]), time)
+    hold = 0.0
+    if "hold" in entry:
+        hold = number_within(f"{where}.hold", entry["hold"], LEAST_STEP, LONGEST)
+    fov = checked_number(f"{where}.fov", entry["fov"])
+    return Keyframe(np.array(eye), np.array(rotation).T, fov, time, hold)
 
 
 def _refuse(name: str) -> NoReturn:

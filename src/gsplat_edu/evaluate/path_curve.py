@@ -7,7 +7,9 @@ continuous velocity, for any spacing of the knots: at keyframe 1, the blend and 
 through 0, 1, 2, on both sides. (The angular velocity of squad is continuous only if the knots are evenly spaced.)
 
 The camera moves at constant speed along the curve, or meets the keyframes at their times. Speed combines translation,
-rotation and zoom; see `Travel`. The times change only the speed along the curve, which is never negative.
+rotation and zoom; see `Travel`. The times change only the speed along the curve, which is never negative. A camera that
+rests at a keyframe for its `hold` is at the same distance at two times. A path with an `ease` has zero speed at both
+ends, or at every keyframe; without times, it meets the keyframes when a camera of constant speed would.
 
 `viewer/web/path.js` contains the same formulas.
 
@@ -25,7 +27,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.validation import ArrayLike, float64_array, whole_number
-from gsplat_edu.evaluate.keyframes import KeyframePath
+from gsplat_edu.evaluate.keyframes import ENDS, VIEWS, KeyframePath
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussian_math import quat_to_R_batch
 
@@ -88,7 +90,7 @@ class PathCurve:
     """
 
     def __init__(self, path: KeyframePath) -> None:
-        self.seconds, self.loop = path.seconds, path.loop
+        self.seconds, self.loop, self._ease = path.seconds, path.loop, path.ease
         states = _states(path)
         self.travel = Travel.along(states)
         steps = self.travel.between(states)
@@ -104,6 +106,10 @@ class PathCurve:
             times += [times[0] + path.seconds] if path.loop else []
             self._times = np.array(times) - times[0]
             self._places = self._lengths[STEPS * node_of]
+            self._hold([k.hold for k in path.keyframes])
+        elif path.ease is not None and self.length > 0.0:
+            self._places = self._lengths[::STEPS]
+            self._times = self.seconds * (self._places / self.length)
 
     def cameras(self, frames: int, W: int, H: int) -> list[Camera]:
         """Return the cameras of a video.
@@ -144,10 +150,17 @@ class PathCurve:
         rotations = np.swapaxes(quat_to_R_batch(states[:, QUAT]), 1, 2)
         return states[:, EYE], rotations, np.degrees(2.0 * np.arctan(np.exp(states[:, ZOOM][:, 0])))
 
+    def _hold(self, holds: list[float]) -> None:
+        """Add the end of each rest to the times, at the place where it began."""
+        held = np.flatnonzero(holds)
+        ends = self._times[held] + np.array(holds)[held]
+        self._times = np.insert(self._times, held + 1, ends)
+        self._places = np.insert(self._places, held + 1, self._places[held])
+
     def _place(self, at: Values) -> Values:
         """Return the distance covered at given times."""
         if len(self._times):
-            return _monotone(self._times, self._places, at, self.loop)
+            return _monotone(self._times, self._places, at, self.loop, self._ease)
         places: Values = self.length * at / self.seconds
         return places
 
@@ -266,7 +279,13 @@ def _mixed(a: States, b: States, share: Values) -> States:
     return mixed
 
 
-def _monotone(x: Float64[np.ndarray, " k"], y: Float64[np.ndarray, " k"], at: Values, loop: bool) -> Values:
+def _monotone(
+    x: Float64[np.ndarray, " k"],
+    y: Float64[np.ndarray, " k"],
+    at: Values,
+    loop: bool,
+    ease: str | None = None,
+) -> Values:
     """Interpolate a non-decreasing table by cubics that do not decrease either and whose slope is continuous.
 
     Args:
@@ -274,12 +293,17 @@ def _monotone(x: Float64[np.ndarray, " k"], y: Float64[np.ndarray, " k"], at: Va
         y: Not decreasing.
         at: Within the range of x.
         loop: Whether the slope at the end continues at the start.
+        ease: Makes the slope zero at both ends of the table (`ENDS`), or at each of its rows (`VIEWS`).
     """
     h = np.diff(x)
     secants = np.diff(y) / h
     slopes = np.r_[secants[0], _harmonic(h[:-1], h[1:], secants[:-1], secants[1:]), secants[-1]]
     if loop:
         slopes[0] = slopes[-1] = _harmonic(h[-1:], h[:1], secants[-1:], secants[:1])[0]
+    if ease == VIEWS:
+        slopes[:] = 0.0
+    elif ease == ENDS:
+        slopes[[0, -1]] = 0.0
     i = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(h) - 1)
     s = (at - x[i]) / h[i]
     left, right = h[i] * slopes[i], h[i] * slopes[i + 1]

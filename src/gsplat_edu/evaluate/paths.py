@@ -67,9 +67,9 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike =
     means = gaussians.means.double().numpy(force=True)
     near = ~far_shell(means)
     means, weights = means[near], gaussians.opacities.double().numpy(force=True)[near]
-    centre = np.array([sum(_weighted_quantile(column, weights, q) for q in BOX) / 2 for column in means.T])
+    centre = np.array([sum(weighted_quantile(column, weights, q) for q in BOX) / 2 for column in means.T])
     distances = np.linalg.norm(means - centre, axis=1)
-    outer, middle = (_weighted_quantile(distances, weights, q) for q in (EXTENT_QUANTILE, 0.5))
+    outer, middle = (weighted_quantile(distances, weights, q) for q in (EXTENT_QUANTILE, 0.5))
     extent = min(outer, MOST_EXTENT * middle) or outer
     if extent == 0.0:  # one Gaussian: three standard deviations of it
         extent = 3.0 * float(gaussians.scales.detach().max())
@@ -94,7 +94,7 @@ def resized(camera: Camera, longest: int) -> Camera:
     camera, longest = as_camera("camera", camera), whole_number("longest", longest, 1)
     share = longest / max(camera.W, camera.H)
     W, H = (max(1, round(side * share)) for side in (camera.W, camera.H))
-    return Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(W, H))
+    return camera.scaled(W, H)
 
 
 def common_up(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
@@ -145,9 +145,16 @@ def _unit(vector: Vector, otherwise: Vector) -> Vector:
     return np.asarray(chosen, dtype=np.float64)
 
 
-def _weighted_quantile(
+def weighted_quantile(
     values: Float64[np.ndarray, " N"], weights: Float64[np.ndarray, " N"], share: float
 ) -> float:
+    """Return the smallest value at or below which a share of the weight lies.
+
+    Args:
+        values: (N,) at least one.
+        weights: (N,) of them, at least 0.
+        share: 0 to 1.
+    """
     order = np.argsort(values, kind="stable")
     mass = np.cumsum(weights[order])
     index = int(np.searchsorted(mass, share * mass[-1]))

@@ -67,15 +67,23 @@ NAMES = {
 """Labels for the keys of metrics.json that are not plain English."""
 
 STYLE = """
-:root { color-scheme: light; }
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 1080px; margin: 2rem auto;
-  padding: 0 1rem; overflow-wrap: anywhere; }
+:root { color-scheme: light dark; --text: #222; --ground: #fff; --code: #f2f2f2; --line: #bbb; --faint: #eee;
+  --quiet: #666; --link: #06c; }
+@media (prefers-color-scheme: dark) {
+  :root { --text: #e6e8ea; --ground: #15181b; --code: #262b30; --line: #666; --faint: #2c3136; --quiet: #a5adb5;
+    --link: #8ab4f8; }
+  svg { filter: invert(.92) hue-rotate(180deg); } /* black lines on white become light ones on the ground */
+}
+a { color: var(--link); }
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--text); background: var(--ground); max-width: 1080px;
+  margin: 2rem auto; padding: 0 1rem; overflow-wrap: anywhere; }
 h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
-.verdict { font-size: 1.1rem; max-width: 46rem; } code { background: #f2f2f2; padding: .1rem .3rem; }
+.verdict { font-size: 1.1rem; max-width: 46rem; } code { background: var(--code); padding: .1rem .3rem; }
 .table { overflow-x: auto; }
 table { border-collapse: collapse; } th, td { text-align: left; padding: .2rem 1rem .2rem 0; vertical-align: top; }
-th { font-weight: 600; overflow-wrap: normal; } thead th { border-bottom: 1px solid #bbb; vertical-align: bottom; }
-td { border-bottom: 1px solid #eee; font-variant-numeric: tabular-nums; min-width: 4rem; }
+th { font-weight: 600; overflow-wrap: normal; }
+thead th { border-bottom: 1px solid var(--line); vertical-align: bottom; }
+td { border-bottom: 1px solid var(--faint); font-variant-numeric: tabular-nums; min-width: 4rem; }
 td.n, th.n { text-align: right; } td.n { white-space: nowrap; overflow-wrap: normal; min-width: 0; }
 summary { cursor: pointer; margin: .5rem 0; }
 figure { margin: 1.5rem 0; } figure > div { display: flex; flex-wrap: wrap; gap: 4px; }
@@ -89,10 +97,10 @@ figure .pair, figure .difference { flex: 1 1 320px; min-width: 0; } figure img {
 .pair .left { left: 6px; } .pair .right { right: 6px; }
 .pair input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0; cursor: ew-resize;
   touch-action: pan-y; }
-.pair:focus-within { outline: 3px solid #06c; outline-offset: 2px; }
+.pair:focus-within { outline: 3px solid var(--link); outline-offset: 2px; }
 .curves { display: grid; gap: 8px; grid-template-columns: repeat(auto-fill, minmax(min(100%, 400px), 1fr)); }
 .curves svg { width: 100%; height: auto; }
-figcaption { font-size: .9rem; } .quiet { color: #666; }
+figcaption { font-size: .9rem; } .quiet { color: var(--quiet); }
 @media (max-width: 600px) { th, td { padding-right: .6rem; } }
 """
 

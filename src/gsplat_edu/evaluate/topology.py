@@ -77,10 +77,10 @@ class _HalfEdges(NamedTuple):
         start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
         corner = np.arange(len(start))
         following = np.roll(corner.reshape(-1, 3), -1, axis=1).ravel()
-        low, high = np.minimum(start, end), np.maximum(start, end)
-        order = np.lexsort((high, low))
+        key = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
+        order = np.argsort(key)
         new = np.ones(len(order), dtype=bool)
-        new[1:] = (np.diff(low[order]) != 0) | (np.diff(high[order]) != 0)
+        new[1:] = np.diff(key[order]) != 0
         return cls(start[order], end[order], corner[order], following[order], np.cumsum(new) - 1)
 
 
@@ -93,11 +93,13 @@ def topology(mesh: Mesh) -> Topology:
     faces = mesh.faces.astype(np.int64)
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    used, compact = np.unique(faces, return_inverse=True)
-    faces = compact.reshape(-1, 3).astype(np.int64)
+    named = np.zeros(int(faces.max(initial=-1)) + 1, dtype=bool)
+    named[faces.ravel()] = True
+    used = np.flatnonzero(named)
+    faces = (np.cumsum(named) - 1)[faces]
     half = _HalfEdges.of(faces)
     uses = np.bincount(half.edge, minlength=0)
-    first = np.searchsorted(half.edge, np.arange(len(uses)))
+    first = np.cumsum(uses) - uses
     pairs = first[uses == 2]
     flipped = int((half.start[pairs] == half.start[pairs + 1]).sum())
     lone = first[uses == 1]

@@ -16,6 +16,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import named_in_utf8
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.evaluate.metrics import to_bytes
+from gsplat_edu.evaluate.spherical import as_sphere
 
 FOURCC = "vp09"
 
@@ -44,7 +45,9 @@ VISUAL_ENTRY = 8 + 8 + 78
 fields common to all visual entries."""
 
 
-def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float) -> None:
+def encode_video(
+    path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float, sphere: bool = False
+) -> None:
     """Write frames as VP9, yuv420p, in an MP4 file. Equal frames give equal bytes.
 
     An odd width or height is padded with a copy of the last column or row because chroma has half the resolution.
@@ -54,6 +57,7 @@ def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: floa
         shown: Its name in messages.
         frames: (H, W, 3) each, of equal size, uint8 or float from 0 to 1; taken one at a time.
         fps: Frames per second.
+        sphere: Whether the frames are equirectangular and show the whole sphere; the file then says so.
 
     Raises:
         ArgumentError: there are no frames, their sizes differ, or OpenCV cannot encode VP9 here.
@@ -61,7 +65,7 @@ def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: floa
     """
     with named_in_utf8(path) as plain:
         _encode(plain, shown, frames, fps)
-    path.write_bytes(streamable(path.read_bytes(), fps))
+    path.write_bytes(streamable(path.read_bytes(), fps, sphere))
 
 
 def _encode(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float) -> None:
@@ -100,7 +104,7 @@ def _writer(path: Path, shown: Path, size: tuple[int, int], fps: float) -> cv2.V
     return writer
 
 
-def streamable(data: bytes, fps: float | None = None) -> bytes:
+def streamable(data: bytes, fps: float | None = None, sphere: bool = False) -> bytes:
     """Move an MP4 file's index before its frames, and set the colour codes of its VP9 track and its frame rate.
 
     With the index at the end, a player has to fetch the whole file first. Without colour codes, browsers assume the
@@ -109,9 +113,10 @@ def streamable(data: bytes, fps: float | None = None) -> bytes:
     Args:
         data: The file.
         fps: Frames per second; None keeps those of the file.
+        sphere: Whether to add the boxes of a 360-degree video (`gsplat_edu.evaluate.spherical`).
 
     Returns:
-        The file, with its length unchanged.
+        The file; without added boxes, its length is unchanged.
 
     Raises:
         ArgumentError: it is not an MP4 file with an index, or too large for the index's 32-bit offsets.
@@ -126,8 +131,11 @@ def streamable(data: bytes, fps: float | None = None) -> bytes:
     _name_colours(index)
     if fps is not None:
         _set_rate(index, fps)
-    if start > boxes[b"mdat"][0]:
-        _shift_offsets(index, end - start)
+    if sphere:
+        index = as_sphere(index)
+    # the frames lie behind the index: it comes before them, or grows
+    if shift := len(index) - (end - start if start < boxes[b"mdat"][0] else 0):
+        _shift_offsets(index, shift)
     return data[:front] + index + data[front:start] + data[end:]
 
 

@@ -19,6 +19,7 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, as_camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.sh import num_coefficients, sh_rotation
+from gsplat_edu.scene.shutter import RollingShutter
 
 SHEAR = 1e-5
 """Largest entry of A A' / s² - I accepted for a similarity, to allow matrices typed with six digits."""
@@ -71,8 +72,11 @@ class Similarity:
 
     def camera(self, camera: Camera) -> Camera:
         """Return the camera that has the same view of the transformed scene as `camera` has of the original."""
-        eye = self.s * self.R @ camera.eye + self.t
-        return Camera.posed(camera.R @ self.R.T, eye, as_camera("camera", camera).intrinsics)
+        eye, own, shutter = self.s * self.R @ camera.eye + self.t, as_camera("camera", camera), None
+        if own.shutter is not None:
+            shift = self.s * self.R @ own.shutter.shift
+            shutter = RollingShutter(own.shutter.turn, shift, own.shutter.readout, own.shutter.exposure)
+        return Camera.posed(camera.R @ self.R.T, eye, own.intrinsics, shutter)
 
     def scene(self, scene: Scene) -> Scene:
         """Transform a scene: means, rotations, scales, SH coefficients and the up direction; scaling drops its unit.

@@ -83,6 +83,7 @@ class Found:
         advice: What to do about it.
         images: Names of the affected photos.
         values: A measured value for each of these photos, as text; empty if there is none.
+        options: Options of a training that the advice proposes, with their values.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Found:
     advice: str
     images: tuple[str, ...] = ()
     values: tuple[str, ...] = ()
+    options: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,10 @@ def events_after(path: Path, number: int = 0) -> list[tuple[int, float, Event]]:
         The number of each line, counted from 1, its time and its event.
     """
     follower, found = Follower(path), []
-    size = min(path.stat().st_size, MOST_READ) if path.is_file() else 0
+    try:
+        size = min(path.stat().st_size, MOST_READ) if path.is_file() else 0
+    except FileNotFoundError:  # its job has just been removed
+        size = 0
     while follower.offset < size:
         before = follower.offset
         found += [entry for entry in follower.read() if entry[0] > number]
@@ -88,15 +91,36 @@ def events_after(path: Path, number: int = 0) -> list[tuple[int, float, Event]]:
     return found
 
 
-def last_word(path: Path) -> Failed | Interrupted | Finished | None:
-    """Return how the last process that wrote a file of events ended; None if the file does not tell."""
+def has_started(path: Path, begin: int = 0) -> bool:
+    """Return whether a process has reported its start.
+
+    Args:
+        path: The file.
+        begin: Its size in bytes when the process was started; a start is the first event of every process.
+    """
+    try:
+        with open_file(path) as file:
+            file.seek(begin)
+            first, end, _ = file.read(LAST).partition(b"\n")
+        return bool(end) and isinstance(parse_line(first)[1], Started)
+    except (OSError, ValueError):
+        return False
+
+
+def last_word(path: Path, begin: int = 0) -> Failed | Interrupted | Finished | None:
+    """Return how the last process that wrote a file of events ended; None if the file does not tell.
+
+    Args:
+        path: The file.
+        begin: Its size in bytes when that process was started, which may have ended before it wrote anything.
+    """
     try:
         with open_file(path) as file:
             size = os.fstat(file.fileno()).st_size
-            file.seek(max(size - LAST, 0))
+            file.seek(max(size - LAST, begin))
             data = file.read()
             if size > LAST and data.count(b"\n") < 2:
-                file.seek(max(size - PIECE, 0))
+                file.seek(max(size - PIECE, begin))
                 data = file.read()
     except OSError:
         return None

@@ -27,7 +27,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import described, remove_leftovers
 from gsplat_edu.base.locks import POLL
 from gsplat_edu.jobs.events import EVENTS, Failed, Finished, Interrupted
-from gsplat_edu.jobs.following import LAST, last_start, last_word
+from gsplat_edu.jobs.following import LAST, has_started, last_start, last_word
 from gsplat_edu.jobs.process import SIGNALS, carries, identity, is_running, send
 from gsplat_edu.jobs.record import (
     ACTIVE,
@@ -93,6 +93,7 @@ class JobQueue:
         self._jobs: dict[str, Job] = {}
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._endings: dict[str, tuple[str, float]] = {}  # the last signal of each cancellation, and when
+        self._heard: dict[str, int] = {}  # size of each job's events when its process was started
         self._turns: dict[str, int] = {}  # when each job was queued, counted from 1
         self._settled: object = None  # the states that `_start_waiting` saw last
         self._closed = threading.Event()
@@ -122,11 +123,13 @@ class JobQueue:
         """Return the folder of a job; errors as for `get`."""
         return JobFolder(self.folder / self.get(name).id)
 
-    def submit(self, work: Work) -> Job:
+    def submit(self, work: Work, begun_by: str = "", begun_at: str = "") -> Job:
         """Add a job to the end of the queue.
 
         Args:
             work: What it does.
+            begun_by: See `Job`.
+            begun_at: See `Job`.
 
         Raises:
             ArgumentError: it is not allowed, or too many jobs are waiting.
@@ -139,7 +142,8 @@ class JobQueue:
             known = [int(name) for name in os.listdir(self.folder) if ID.fullmatch(name)]  # noqa: PTH208
             name = f"{max(known, default=0) + 1:06d}"
             rendered = self._render(work, Purpose.BEGIN)
-            job = Job(name, rendered.work, rendered.argv, State.QUEUED, time.time())
+            facts = (name, rendered.work, rendered.argv, State.QUEUED, time.time())
+            job = Job(*facts, begun_by=begun_by, begun_at=begun_at)
             folder = JobFolder(self.folder / name)
             folder.path.mkdir()
             try:
@@ -205,6 +209,16 @@ class JobQueue:
             job = replace(job, ended=None, line="", cancelled=False, pid=None, identity="")
             return self._put(job, state=State.QUEUED)
 
+    def keep(self, name: str) -> Job:
+        """Note that the result of a job is kept; nothing offers to undo it any more.
+
+        Raises:
+            ArgumentError: there is none of this id.
+            OSError: its record cannot be written.
+        """
+        with self._lock:
+            return self._put(self.get(name), begun_by="", begun_at="")
+
     def remove(self, name: str) -> None:
         """Forget a job that waits or has ended or is damaged, and delete its record; what it wrote elsewhere stays.
 
@@ -238,8 +252,10 @@ class JobQueue:
         with self._lock:
             move()
             for job in self.jobs():
-                if (work := job.work.renamed(old, new)) != job.work:
-                    self._put(job, work=work, argv=self._render(work, Purpose.SHOW).argv)
+                work = job.work.renamed(old, new)
+                begun_at = new if job.begun_at == old else job.begun_at
+                if work != job.work or begun_at != job.begun_at:
+                    self._put(job, work=work, argv=self._render(work, Purpose.SHOW).argv, begun_at=begun_at)
 
     def close(self, interrupt: bool = True) -> None:
         """End the queue; waiting jobs stay waiting for the next queue.
@@ -321,6 +337,7 @@ class JobQueue:
             self._put(job, state=State.FAILED, ended=time.time(), line=one_line(str(error)))
             return
         job = self._put(job, state=State.RUNNING, started=time.time(), attempts=job.attempts + 1, pid=None)
+        self._heard[job.id] = folder.events.stat().st_size if folder.events.exists() else 0
         try:
             with folder.output.open("ab") as output:
                 child = subprocess.Popen(
@@ -357,7 +374,10 @@ class JobQueue:
     def _signal(self, job: Job, name: str) -> None:
         self._endings[job.id] = name, time.monotonic()
         if job.pid is not None:
-            send(job.pid, job.identity, SIGNALS[name], group=name == "kill")
+            # until its start, a process may ignore SIGINT, or answer it with a traceback; it has nothing to save yet
+            events, begin = JobFolder(self.folder / job.id).events, self._heard.get(job.id, 0)
+            early = name == "interrupt" and not has_started(events, begin)
+            send(job.pid, job.identity, SIGNALS["terminate" if early else name], group=name == "kill")
             send(job.pid, job.identity, signal.SIGCONT, group=True)  # a stopped process would not see it
 
     def _ended(self, job: Job, code: int | None) -> None:
@@ -366,7 +386,7 @@ class JobQueue:
         stopped = self._endings.pop(job.id, None)
         if job.state is State.PAUSED:
             self.hold(job, False)
-        said = last_word(JobFolder(self.folder / job.id).events)
+        said = last_word(JobFolder(self.folder / job.id).events, self._heard.get(job.id, 0))
         changes: dict[str, Any] = {"state": State.INTERRUPTED, "line": "", "pid": None, "identity": ""}
         if isinstance(said, Finished):
             changes["state"] = State.DONE

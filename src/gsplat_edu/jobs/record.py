@@ -179,6 +179,8 @@ class Job:
         identity: `gsplat_edu.jobs.process.identity` of that process.
         line: Why it failed or was interrupted, in one line.
         cancelled: Whether the user asked for its end.
+        begun_by: Words of the proposal that began it and can be undone; empty for others, and once its result is kept.
+        begun_at: Place for which that proposal was made.
         waits_for: Jobs that have to end before this one may start, and a place that both use; not in the record.
     """
 
@@ -194,6 +196,8 @@ class Job:
     identity: str = ""
     line: str = ""
     cancelled: bool = False
+    begun_by: str = ""
+    begun_at: str = ""
     waits_for: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -208,7 +212,7 @@ class Job:
 
     def document(self) -> dict[str, Any]:
         """Return the record as JSON has it: the work, and no command line."""
-        facts = {name: getattr(self, name) for name in RECORD_FIELDS}
+        facts = {name: getattr(self, name) for name in (*RECORD_FIELDS, *LATER_FIELDS)}
         return {"version": VERSION, "id": self.id, "work": self.work.document(), **facts}
 
 
@@ -244,6 +248,9 @@ RECORD_FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "cancelled": lambda value: isinstance(value, bool),
 }
 """Checks of the other fields of a record."""
+
+LATER_FIELDS: Mapping[str, Callable[[Any], bool]] = {"begun_by": _text, "begun_at": _text}
+"""Checks of the fields that earlier records lack; they are empty there."""
 
 
 WORK_FIELDS: Mapping[str, Callable[[Any], bool]] = {
@@ -307,14 +314,16 @@ class JobFolder:
             self._check_files()
             with open_file(self.record) as file:
                 data = file.read(MOST_BYTES + 1)
-            entry = parse_json(data) if len(data) <= MOST_BYTES else None
+            entry: Any = parse_json(data) if len(data) <= MOST_BYTES else None
             if not isinstance(entry, dict) or entry.get("version") != VERSION:
                 raise ValueError("it is no record of this version")
-            if set(entry) != {"version", "id", "work", *RECORD_FIELDS}:
+            entry = dict.fromkeys(LATER_FIELDS, "") | entry
+            if set(entry) != {"version", "id", "work", *RECORD_FIELDS, *LATER_FIELDS}:
                 raise ValueError("it has other fields")
             if entry["id"] != self.path.name:
                 raise ValueError("it belongs to another job")
             _check_fields(entry, RECORD_FIELDS)
+            _check_fields(entry, LATER_FIELDS)
             work = entry["work"]
             if not isinstance(work, dict) or set(work) != set(WORK_FIELDS):
                 raise ValueError("it has no work")
@@ -326,7 +335,7 @@ class JobFolder:
         except ValueError as error:
             why = shortened(printable(str(error)))
             raise ArgumentError(f"job {self.path.name}: is damaged ({why}); remove it") from None
-        facts = {name: entry[name] for name in RECORD_FIELDS}
+        facts = {name: entry[name] for name in (*RECORD_FIELDS, *LATER_FIELDS)}
         facts["state"] = State(entry["state"])
         return Job(self.path.name, shown.work, shown.argv, **facts)
 

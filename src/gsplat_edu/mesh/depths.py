@@ -6,6 +6,9 @@ opaque, where the surface is seen edge-on, where it is too far for the voxels, a
 through it.
 
 Weight of a pixel: cos(angle between ray and normal) / z², at most 1 at the nearest depth of the scene.
+
+All maps are in memory at once, 10 bytes a pixel: the checks say which pixels they keep instead of making a second
+set of maps, and weights are computed from a byte, the cosine.
 """
 
 from __future__ import annotations
@@ -19,9 +22,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from gsplat_edu.mesh.faces import faces_of, in_view
 from gsplat_edu.ops.surface import normals_of_depth
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.field import within_field
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
@@ -45,6 +50,9 @@ CONTRADICTIONS = 2
 NEIGHBOURS = 6
 """Neighbouring views that check a depth map."""
 
+BAND = 32
+"""Rows of a depth map that are checked at a time."""
+
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how much of it is done, and how much there is."""
 
@@ -55,21 +63,43 @@ class DepthView:
 
     Args:
         name: Name of the view.
-        camera: Its camera.
-        depth: (H, W) camera depth, world units; 0 where there is no surface.
-        weight: (H, W) weight of each pixel, 0 to 1.
+        camera: Its camera, a pinhole.
+        rendered: (H, W) camera depth before the checks, world units; 0 where there is no surface.
+        facing: (H, W) cosine of the angle between ray and normal, 255 for 1.
         image: (H, W, 3) the rendered colours.
         clear: (H, W) pixels in the middle of an area that is less opaque than `CLEAR`: nothing is there.
         transparent: Number of pixels that are less opaque than `LEAST_ALPHA`.
+        kept: (H, W) pixels that the checks keep; None for all.
+        scale: Divisor of the weights.
+        lens: The camera of which this is a face; None for a view of a pinhole.
     """
 
     name: str
     camera: Camera
-    depth: Float32[np.ndarray, "H W"]
-    weight: Float32[np.ndarray, "H W"]
+    rendered: Float32[np.ndarray, "H W"]
+    facing: UInt8[np.ndarray, "H W"]
     image: UInt8[np.ndarray, "H W 3"]
     clear: Bool[np.ndarray, "H W"]
     transparent: int
+    kept: Bool[np.ndarray, "H W"] | None = None
+    scale: float = 1.0
+    lens: Camera | None = None
+
+    @property
+    def depth(self) -> Float32[np.ndarray, "H W"]:
+        """(H, W) camera depth, world units; 0 where there is no surface, or the checks dropped it."""
+        return self.rendered if self.kept is None else self.rendered * self.kept
+
+    @property
+    def weight(self) -> Float32[np.ndarray, "H W"]:
+        """(H, W) weight of each pixel; 0 where there is no depth."""
+        depth, weight = self.depth, np.zeros(self.rendered.shape)
+        np.divide(self.facing / 255.0, depth.astype(np.float64) ** 2, out=weight, where=depth > 0)
+        return weight.astype(np.float32) / np.float32(self.scale)
+
+    def only(self, chosen: Bool[np.ndarray, "H W"]) -> DepthView:
+        """Return the view with the depths of some pixels only."""
+        return replace(self, kept=chosen if self.kept is None else chosen & self.kept)
 
 
 @dataclass(frozen=True)
@@ -104,7 +134,7 @@ def render_depths(
 
     Args:
         gaussians: The scene.
-        cameras: Names and cameras.
+        cameras: Names and cameras. One that is no pinhole gives a view for each of its `faces_of`, with its own name.
         settings: The scene's render settings; without its Jacobian limit, splats beside a camera would veil its image.
         backend: What renders.
         progress: Called after every view.
@@ -112,21 +142,28 @@ def render_depths(
     sky = torch.from_numpy(far_shell(gaussians.means.numpy(force=True)))
     views, device = [], gaussians[~sky].to(backend.device)
     wanted = replace(settings, depth=False, median_depth=True)
-    for done, (name, camera) in enumerate(cameras, 1):
+    faces = [(name, camera, face) for name, camera in cameras for face in faces_of(camera)]
+    for done, (name, lens, camera) in enumerate(faces, 1):
         with torch.no_grad():
-            output = render(device, camera, settings=wanted, backend=backend)
+            shown = device if lens is camera else within_field(device, camera)
+            output = render(shown, camera, settings=wanted, backend=backend)
         assert output.median_depth is not None, "the settings ask for it"
         alpha, median, image = (t.cpu() for t in (output.alpha, output.median_depth, output.image))
-        depth = torch.where(alpha >= LEAST_ALPHA, median, 0.0).double()
+        seen = torch.ones_like(alpha, dtype=torch.bool)
+        if lens is not camera:
+            seen = torch.from_numpy(in_view(lens.through(lens.projection), camera))
+        depth = torch.where(seen & (alpha >= LEAST_ALPHA), median, 0.0).double()
         transparent = int((depth == 0).sum())
         cosines = facing_cosines(depth, camera)
         found = torch.where(cosines >= LEAST_COSINE, depth, 0.0).numpy().astype(np.float32)
-        weight = np.divide(cosines.numpy(), found**2, out=np.zeros(found.shape), where=found > 0)
+        facing = np.rint(255.0 * cosines.numpy()).astype(np.uint8)
         pixels = np.round(255.0 * image.clamp(0, 1).numpy()).astype(np.uint8)
         # A pixel at the rim of a surface may be clear by rounding.
-        clear = cv2.erode((alpha.numpy() < CLEAR).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        views.append(DepthView(name, camera, found, weight.astype(np.float32), pixels, clear, transparent))
-        progress("depth maps", done, len(cameras))
+        see_through = (seen & (alpha < CLEAR)).numpy().astype(np.uint8)
+        clear = cv2.erode(see_through, np.ones((3, 3), np.uint8)) > 0
+        own = None if lens is camera else lens
+        views.append(DepthView(name, camera, found, facing, pixels, clear, transparent, lens=own))
+        progress("depth maps", done, len(faces))
     return views
 
 
@@ -201,9 +238,7 @@ def checked(
         far_pixels, contradicted_pixels = far_pixels + int(far.sum()), contradicted_pixels + int(wrong.sum())
         if len(differences):
             errors.append(float(np.median(differences)))
-        good = ~(far | wrong)
-        weight = (view.weight * good / scale).astype(np.float32)
-        kept.append(replace(view, depth=view.depth * good, weight=weight))
+        kept.append(replace(view.only(~(far | wrong)), scale=scale))
         progress("checks", index + 1, len(views))
     pixels = sum(view.depth.size for view in views)
     transparent = sum(view.transparent for view in views)
@@ -215,28 +250,44 @@ def checked(
 def _contradictions(
     view: DepthView, others: Sequence[DepthView]
 ) -> tuple[Bool[np.ndarray, "H W"], Float64[np.ndarray, " n"]]:
-    """Return which pixels enough neighbours see through, and relative differences to the neighbours that agree."""
-    count = np.zeros(view.depth.shape, dtype=np.int16)
-    rows, columns = np.nonzero(view.depth)
-    z = view.depth[rows, columns].astype(np.float64)
-    points = view.camera.eye + z[:, None] * view.camera.rays()[rows, columns]
-    differences = []
-    for other in others:
-        u, v, depth = other.camera.project(camera_points(points, other.camera))
-        with np.errstate(invalid="ignore"):
-            inside = (
-                (depth > 0)
-                & (u > -0.5)
-                & (v > -0.5)
-                & (u < other.camera.W - 0.5)
-                & (v < other.camera.H - 0.5)
+    """Return which pixels enough neighbours see through, and relative differences to the neighbours that agree.
+
+    A band of rows goes through all neighbours before the next one, so that its numbers stay in the processor's cache.
+    """
+    against = np.zeros(view.rendered.shape, dtype=bool)
+    maps = [(other, other.depth, *_between(view.camera, other.camera)) for other in others]
+    depth, differences = view.depth, []
+    for first in range(0, len(depth), BAND):
+        rows, columns = np.nonzero(depth[first : first + BAND])
+        rows += first
+        z = depth[rows, columns].astype(np.float64)
+        count = np.zeros(len(z), dtype=np.int16)
+        for other, seen_by_other, turn, step in maps:
+            x, y, far = (
+                z * (turn[k, 0] * columns + turn[k, 1] * rows + turn[k, 2]) + step[k] for k in range(3)
             )
-        at = np.flatnonzero(inside)
-        place = np.rint(v[at]).astype(int), np.rint(u[at]).astype(int)
-        seen = other.depth[place].astype(np.float64)
-        relative = np.where(seen > 0, seen / depth[at] - 1.0, 0.0)
-        count[rows[at], columns[at]] += (relative > SEEN_THROUGH) | other.clear[place]
-        near = (seen > 0) & (np.abs(relative) <= SEEN_THROUGH)
-        differences.append(np.abs(relative[near][::7]))
+            H, W = seen_by_other.shape
+            # x / far > -1/2 without the division, which may be one by zero
+            inside = (far > 0) & (x > -0.5 * far) & (y > -0.5 * far)
+            inside &= (x < (W - 0.5) * far) & (y < (H - 0.5) * far)
+            at = np.flatnonzero(inside)
+            away = far[at]
+            row, column = (
+                np.minimum(np.rint(p[at] / away).astype(np.int64), n - 1) for p, n in ((y, H), (x, W))
+            )
+            place = row * W + column
+            seen = seen_by_other.ravel()[place].astype(np.float64)
+            relative = np.where(seen > 0, seen / away - 1.0, 0.0)
+            count[at] += (relative > SEEN_THROUGH) | other.clear.ravel()[place]
+            near = (seen > 0) & (np.abs(relative) <= SEEN_THROUGH)
+            differences.append(np.abs(relative[near][::7]))
+        against[rows, columns] = count >= CONTRADICTIONS
     found = np.concatenate(differences) if differences else np.zeros(0)
-    return count >= CONTRADICTIONS, found
+    return against, found
+
+
+def _between(one: Camera, other: Camera) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    """Return M and t, from a pixel of one camera to the other's image: (u' z', v' z', z') = z M (u, v, 1) + t."""
+    K, inverse = (np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]]) for c in (other, one))
+    turn = K @ other.R @ one.R.T @ np.linalg.inv(inverse)
+    return turn, K @ (other.R @ (one.eye - other.eye))

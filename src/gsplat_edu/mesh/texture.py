@@ -2,8 +2,8 @@
 
 Every texel inside a face has a place on the mesh. Each photo that sees this place, by its depth map, gives a colour.
 Its score is cos(angle) (f / z)^2, the number of the photo's pixels on a unit of the surface. The colours with the best
-scores are averaged by score, or their median is taken, which ignores what moved through single photos. Texels that no
-photo sees get the vertices' colours, or those of the nearest place that was seen.
+scores are averaged by score. Texels that no photo sees get the vertices' colours, or those of the nearest place that
+was seen.
 
 The layout is made by xatlas, which takes long for many faces: decimate first.
 """
@@ -60,14 +60,12 @@ class TextureSettings:
     Args:
         size: Sides of the image that the layout aims at, px; it exceeds them somewhat.
         best: Photos that are blended at each texel.
-        median: Take the median of the best photos instead of their average; needs three or more to ignore one.
         tolerance: A place is seen if it lies no further behind the depth map than this share of its depth.
         steepest: Photos do not paint faces that they see at a larger angle from the normal, degrees.
     """
 
     size: int = 2048
     best: int = 3
-    median: bool = False
     tolerance: float = 0.01
     steepest: float = 80.0
 
@@ -115,7 +113,7 @@ def textured(mesh: Mesh, views: Iterable[TextureView], settings: TextureSettings
             rows = texels[start : start + ROWS]
             seen, scores, colors = _looked_up(view, points[rows], normals[rows], facing[face[rows]], settings)
             found.add(rows[seen], scores, colors)
-    painted, seen_by_any = found.colors(settings.median)
+    painted, seen_by_any = found.colors()
     if not seen_by_any.all():
         _fill(mesh, painted, seen_by_any, points, weights, face)
     image = np.zeros((height * width, 3), dtype=np.uint8)
@@ -272,15 +270,12 @@ class _Best:
                 np.where(better[:, None], shade, colors),
             )
 
-    def colors(self, median: bool) -> tuple[Float32[np.ndarray, "T 3"], Bool[np.ndarray, " T"]]:
+    def colors(self) -> tuple[Float32[np.ndarray, "T 3"], Bool[np.ndarray, " T"]]:
         """Return the colours, 0 to 255, and which texels have one."""
         counts = (self._scores > 0.0).sum(axis=0)
         total = self._scores.sum(axis=0)
         mixed = np.einsum("kt,ktc->tc", self._scores, self._colors)
         mixed = mixed / np.where(total > 0.0, total, 1.0)[:, None]
-        for count in range(3, len(self._scores) + 1) if median else ():
-            chosen = counts == count
-            mixed[chosen] = np.median(self._colors[:count, chosen], axis=0)
         return mixed.astype(np.float32), counts > 0
 
 

@@ -17,7 +17,7 @@ import threading
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt64
 from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import ArgumentError
@@ -115,16 +115,28 @@ def without_spoiled_faces(mesh: Mesh) -> Mesh:
     Args:
         mesh: The mesh.
     """
-    order = np.lexsort(mesh.vertices.T[::-1])
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (mesh.vertices[order][1:] != mesh.vertices[order][:-1]).any(axis=1)
-    first = np.minimum.reduceat(order, np.flatnonzero(new)) if len(order) else order
-    representative = np.empty(len(order), dtype=np.int64)
-    representative[order] = first[np.cumsum(new) - 1]
-    faces = representative[mesh.faces]
+    faces = _representatives(mesh.vertices)[mesh.faces]
     kept = _distinct_faces(faces)
     cleaned = _with_faces(mesh, faces[kept], kept)
     return _without_needles(cleaned).used()
+
+
+def _representatives(vertices: Float64[np.ndarray, "V 3"]) -> Int64[np.ndarray, " V"]:
+    """Return for each vertex the first one at the same position."""
+    along = np.argsort(vertices[:, 0], kind="stable")
+    same = vertices[along[1:], 0] == vertices[along[:-1], 0]
+    shared = np.zeros(len(vertices), dtype=bool)
+    shared[along[1:][same]] = shared[along[:-1][same]] = True
+    some = np.flatnonzero(shared)  # only these can be at the same position as another
+    representative = np.arange(len(vertices))
+    if not len(some):
+        return representative
+    order = some[np.lexsort(vertices[some].T[::-1])]
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (vertices[order][1:] != vertices[order][:-1]).any(axis=1)
+    first = np.minimum.reduceat(order, np.flatnonzero(new))
+    representative[order] = first[np.cumsum(new) - 1]
+    return representative
 
 
 def _with_faces(mesh: Mesh, faces: Int64[np.ndarray, "F 3"], kept: Int64[np.ndarray, " F"]) -> Mesh:
@@ -138,19 +150,40 @@ def _with_faces(mesh: Mesh, faces: Int64[np.ndarray, "F 3"], kept: Int64[np.ndar
 def _distinct_faces(faces: Int64[np.ndarray, "F 3"]) -> Int64[np.ndarray, " K"]:
     """Return the faces with three different vertices, without duplicates and without pairs that cancel."""
     a, b, c = faces.T
-    ordered = np.sort(faces, axis=1)
-    even = ((a < b).astype(int) + (b < c) + (c < a)) == 2  # an even permutation of the ordered vertices
     usable = np.flatnonzero((a != b) & (b != c) & (c != a))
-    order = usable[np.lexsort((usable, *ordered[usable].T[::-1]))]
-    if not len(order):
-        return order
+    alone = np.ones(len(usable), dtype=bool)
+    sums = (_scattered(a) + _scattered(b) + _scattered(c))[usable]  # equal for faces with the same vertices
+    by_sum = np.argsort(sums)
+    twin = np.flatnonzero(sums[by_sum[1:]] == sums[by_sum[:-1]])
+    alone[by_sum[twin]] = alone[by_sum[twin + 1]] = False
+    return np.sort(np.concatenate([usable[alone], _without_twins(faces, usable[~alone])]))
+
+
+def _scattered(numbers: Int64[np.ndarray, " N"]) -> UInt64[np.ndarray, " N"]:
+    """Return numbers of 64 bits that look random, equal for equal numbers (the mixer of SplitMix64)."""
+    mixed = numbers.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return np.asarray(mixed ^ (mixed >> np.uint64(31)))
+
+
+def _without_twins(
+    faces: Int64[np.ndarray, "F 3"], usable: Int64[np.ndarray, " U"]
+) -> Int64[np.ndarray, " K"]:
+    """Return some of the usable faces, without duplicates and without pairs that cancel."""
+    if not len(usable):
+        return usable
+    corners, ordered = faces[usable], np.sort(faces[usable], axis=1)
+    a, b, c = corners.T
+    even = ((a < b).astype(int) + (b < c) + (c < a)) == 2  # an even permutation of the ordered vertices
+    order = np.lexsort((usable, *ordered.T[::-1]))
     new = np.ones(len(order), dtype=bool)
     new[1:] = (ordered[order][1:] != ordered[order][:-1]).any(axis=1)
     group = np.cumsum(new) - 1
     surplus = np.bincount(group, np.where(even[order], 1, -1))  # of those that face one way
     candidate = (surplus[group] != 0) & (even[order] == (surplus[group] > 0))
     _, first = np.unique(group[candidate], return_index=True)
-    return np.sort(order[candidate][first])
+    return np.asarray(usable[order[candidate][first]])
 
 
 def _without_needles(mesh: Mesh) -> Mesh:
@@ -237,9 +270,10 @@ def with_filled_holes(
         return mesh
     diagonal = float(np.linalg.norm(np.ptp(mesh.vertices[mesh.faces.ravel()], axis=0)))
     normals = mesh.face_normals()
-    patch = _Patch(mesh)
     start, _ = edge_ends(mesh.faces)
-    for loop in boundary_loops(mesh):
+    loops = boundary_loops(mesh)
+    patch = _Patch(mesh, np.concatenate([start[loop] for loop in loops]) if loops else start[:0])
+    for loop in loops:
         around = start[loop[::-1]]  # new faces lie on the other side of the loop
         ring = mesh.vertices[around]
         length = float(np.linalg.norm(ring - np.roll(ring, -1, axis=0), axis=1).sum())
@@ -256,11 +290,16 @@ class _Patch:
 
     Args:
         mesh: The mesh.
+        rim: The vertices of its boundary, which are those between which edges are added.
     """
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, rim: Int64[np.ndarray, " N"]) -> None:
         self._mesh = mesh
         start, end = edge_ends(mesh.faces)
+        on_rim = np.zeros(len(mesh.vertices), dtype=bool)
+        on_rim[rim] = True
+        between = on_rim[start] & on_rim[end]
+        start, end = start[between], end[between]
         low, high = np.minimum(start, end).tolist(), np.maximum(start, end).tolist()
         self._edges = set(zip(low, high, strict=True))
         self._vertices: list[Float64[np.ndarray, "1 3"]] = [mesh.vertices]

@@ -6,7 +6,7 @@ Half-edge 3 f + k is the edge of face f from its corner k to its corner k + 1; t
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64, Integer
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -16,6 +16,26 @@ from gsplat_edu.scene.mesh import Mesh, Texture
 def edge_ends(faces: Int64[np.ndarray, "F 3"]) -> tuple[Int64[np.ndarray, " H"], Int64[np.ndarray, " H"]]:
     """Return the start and the end of every half-edge, (3 F,) vertices each."""
     return faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+
+
+def by_edge(
+    low: Int64[np.ndarray, " H"], high: Int64[np.ndarray, " H"]
+) -> tuple[Int64[np.ndarray, " H"], Bool[np.ndarray, " H"]]:
+    """Sort half-edges by their edges. Those of one edge follow one another, in no particular order.
+
+    Args:
+        low: (H,) the lower of the two vertices of each, below 2^31.
+        high: (H,) the higher one.
+
+    Returns:
+        The order, and which of the sorted half-edges is the first of its edge.
+    """
+    key = low * (int(high.max(initial=0)) + 1) + high
+    order = np.argsort(key)
+    key = key[order]
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = key[1:] != key[:-1]
+    return order, new
 
 
 def following(half_edges: Int64[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
@@ -37,9 +57,7 @@ def opposite_half_edges(mesh: Mesh) -> Int64[np.ndarray, " H"]:
     """
     start, end = edge_ends(mesh.faces)
     low, high = np.minimum(start, end), np.maximum(start, end)
-    order = np.lexsort((start > end, high, low))
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
+    order, new = by_edge(low, high)
     first = np.flatnonzero(new)
     sizes = np.diff(np.append(first, len(order)))
     opposite = np.full(len(order), -1, dtype=np.int64)
@@ -48,6 +66,7 @@ def opposite_half_edges(mesh: Mesh) -> Int64[np.ndarray, " H"]:
     opposite[one[usable]], opposite[other[usable]] = other[usable], one[usable]
     for group in np.flatnonzero(sizes > 2):
         members = order[first[group] : first[group] + sizes[group]]
+        members = members[np.lexsort((members, start[members] > end[members]))]
         for one_edge, other_edge in _pairs(mesh, members):
             opposite[one_edge], opposite[other_edge] = other_edge, one_edge
     return opposite
@@ -94,9 +113,8 @@ def component_labels(mesh: Mesh) -> Int64[np.ndarray, " F"]:
     """
     start, end = edge_ends(mesh.faces)
     low, high = np.minimum(start, end), np.maximum(start, end)
-    order = np.lexsort((high, low))
-    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
-    a, b = order[:-1][same] // 3, order[1:][same] // 3
+    order, new = by_edge(low, high)
+    a, b = order[:-1][~new[1:]] // 3, order[1:][~new[1:]] // 3
     return _joined(len(mesh.faces), a, b)
 
 
@@ -104,10 +122,17 @@ def _joined(count: int, a: Int64[np.ndarray, " N"], b: Int64[np.ndarray, " N"]) 
     """Return the component of each of `count` things, of which a[i] is joined with b[i]; in order of appearance."""
     links = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(count, count))
     _, labels = connected_components(links, directed=False)
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    first = _first_places(labels)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse]
+    return np.asarray(rank[labels])
+
+
+def _first_places(labels: Integer[np.ndarray, " N"]) -> Int64[np.ndarray, " M"]:
+    """Return where each of the labels 0 to M - 1 appears first."""
+    first = np.empty(int(labels.max(initial=-1)) + 1, dtype=np.int64)
+    first[labels[::-1]] = np.arange(len(labels))[::-1]  # of equal indices, the last assignment holds
+    return first
 
 
 def separated(mesh: Mesh) -> Mesh:
@@ -133,9 +158,9 @@ def _repeated(mesh: Mesh) -> Mesh:
     opposite = opposite_half_edges(mesh)
     edges = np.flatnonzero(opposite >= 0)
     labels = _joined(mesh.faces.size, edges, following(opposite[edges]))
-    corner = np.unique(labels, return_index=True)[1]  # the first corner of each new vertex
+    corner = _first_places(labels)
     owner = mesh.faces.ravel()[corner]
-    order = np.argsort(owner, kind="stable")
+    order = np.argsort(owner * len(owner) + np.arange(len(owner)))  # no two are equal
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     origin = owner[order]
@@ -147,13 +172,12 @@ def _halved(mesh: Mesh) -> Mesh:
     """Halve edges with more than two faces, all but one sheet of each; at most one edge of a face."""
     start, end = edge_ends(mesh.faces)
     low, high = np.minimum(start, end), np.maximum(start, end)
-    order = np.lexsort((high, low))
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
+    order, new = by_edge(low, high)
     sizes = np.diff(np.append(np.flatnonzero(new), len(order)))
     crowded = order[np.repeat(sizes > 2, sizes)]
     if not len(crowded):
         return mesh
+    crowded = crowded[np.lexsort((crowded, high[crowded], low[crowded]))]
     opposite = opposite_half_edges(mesh)
     seen: set[tuple[int, int]] = set()
     touched: set[int] = set()

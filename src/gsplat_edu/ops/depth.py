@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape
+from gsplat_edu.ops.lenses import within_width
 
 LEAST_ALPHA = 0.5
 """Accumulated alpha from which a render has a depth; below it, the mean belongs to what little is there."""
@@ -40,6 +41,7 @@ def depth_error(
     given: Float[Tensor, " M"],
     weights: Float[Tensor, " M"],
     rule: DepthRule,
+    wraps: bool = False,
 ) -> Float[Tensor, ""]:
     """Return the mean difference of rendered and given depth: weight sum_m w_m rho_m / sum_m w_m.
 
@@ -54,6 +56,8 @@ def depth_error(
         given: (M,) its depth z*, above 0, world units.
         weights: (M,) at least 0.
         rule: How they are compared.
+        wraps: Whether the first and the last column are neighbours (`Projection.wraps`); columns of samples then count
+            up to whole widths.
 
     Returns:
         () scalar, differentiable in depth and alpha; the same bits for any number of threads.
@@ -75,7 +79,9 @@ def depth_error(
             )
     if min(depth.shape) < 2:
         raise ArgumentError(f"depth: is {depth.shape[1]}x{depth.shape[0]} px, but has to be at least 2x2")
-    value: Tensor = _DepthError.apply(depth, alpha, pixels, given, weights, rule)  # type: ignore[no-untyped-call]
+    value: Tensor = _DepthError.apply(  # type: ignore[no-untyped-call]
+        depth, alpha, pixels, given, weights, rule, wraps
+    )
     return value
 
 
@@ -91,16 +97,19 @@ class _DepthError(torch.autograd.Function):
         given: Tensor,
         weights: Tensor,
         rule: DepthRule,
+        wraps: bool,
     ) -> Tensor:
         with one_thread():
             H, W = depth.shape
             u, v = pixels.unbind(dim=1)
-            inside = (u >= 0) & (u <= W - 1) & (v >= 0) & (v <= H - 1) & (weights > 0)
+            if wraps:
+                u = within_width(u, W)
+            inside = (u >= 0) & ((u <= W - 1) | wraps) & (v >= 0) & (v <= H - 1) & (weights > 0)
             u, v, z, w = (tensor[inside] for tensor in (u, v, given, weights))
-            left, top = u.floor().clamp_(max=W - 2), v.floor().clamp_(max=H - 2)
+            left, top = u.floor().clamp_(max=W - 1 if wraps else W - 2), v.floor().clamp_(max=H - 2)
             a, b = u - left, v - top
-            corner = (top * W + left).long()
-            rows = torch.stack([corner, corner + 1, corner + W, corner + W + 1])
+            corner, beside = (top * W + left).long(), torch.where(left < W - 1, 1, 1 - W)
+            rows = torch.stack([corner, corner + beside, corner + W, corner + W + beside])
             shares = torch.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
             A = (shares * alpha.detach().reshape(-1)[rows]).sum(dim=0)
             D = (shares * depth.detach().reshape(-1)[rows]).sum(dim=0)
@@ -125,7 +134,7 @@ class _DepthError(torch.autograd.Function):
         (gradients,) = ctx.saved_tensors
         if grad.device.type != "cpu" or float(grad) != 1.0:
             gradients = gradients * grad
-        return gradients[0], gradients[1], None, None, None, None
+        return gradients[0], gradients[1], None, None, None, None, None
 
 
 def _compared(found: Tensor, given: Tensor, rule: DepthRule) -> tuple[Tensor, Tensor]:

@@ -15,11 +15,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, whole_number
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.ops.lenses import native_camera, native_rays, within_width
 from gsplat_edu.ops.surface import check_maps
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.projection_formulas import POLE, Operations
+from gsplat_edu.scene.sight import Optics, sight
 from gsplat_edu.scene.views import Photo
 
 RADIUS = 3
@@ -119,20 +123,21 @@ def patch_error(
     leads every pixel of the patch to a point of the other photo; ncc is the correlation of the values there, by
     bilinear interpolation, with the patch's own: 1 if they differ by brightness and contrast only. The mean is over all
     pixels of the grid. Those add 0 that have no surface, see it edge-on, whose patch leaves a photo, has pixels that do
-    not count, or shows no texture.
+    not count or have no ray, or shows no texture. Each camera has its lens and shutter. The edges of a panorama meet
+    behind it, so patches and interpolation go on across them; no patch is seen within a degree of its poles.
 
     Args:
         normals: (H, W, 3) composited `gsplat_edu.render.planes.facing_normals`.
         depth: (H, W) sum of w z, world units.
         alpha: (H, W) accumulated alpha.
-        photo: The photo of this camera.
+        photo: The photo of this camera, which is not orthographic.
         other: The neighbouring photo.
         grid: The patches' centres.
         weight: Factor of the value.
 
     Raises:
         ShapeError: the sizes differ.
-        ArgumentError: dtypes or devices differ, or the grid is impossible.
+        ArgumentError: dtypes or devices differ, the grid is impossible, or the camera is orthographic.
 
     Source: Chen et al. 2024 (PGSR), eq. 13.
     """
@@ -140,6 +145,8 @@ def patch_error(
     whole_number("stride", grid.stride, 1)
     whole_number("first_u", grid.first_u, 0)
     whole_number("first_v", grid.first_v, 0)
+    if photo.camera.projection.kind == "orthographic":
+        raise ArgumentError("photo: is orthographic, but patches need rays that meet; give photos of a lens")
     if normals.device.type != "cpu" or normals.dtype not in SUFFIXES:
         return patch_error_in_torch(normals, depth, alpha, photo, other, grid, weight)
     learning: list[int] = []
@@ -170,19 +177,28 @@ def patch_error_in_torch(
     v, u = (seat.reshape(-1).to(alpha.device) for seat in torch.meshgrid(*seats, indexing="ij"))
     away = torch.arange(-RADIUS, RADIUS + 1, device=alpha.device)
     down, right = (offsets.reshape(-1) for offsets in torch.meshgrid(away, away, indexing="ij"))
-    held = (u >= RADIUS) & (v >= RADIUS) & (u < W - RADIUS) & (v < H - RADIUS)
+    wraps, other_wraps = photo.camera.projection.wraps, other.camera.projection.wraps
+    held = (v >= RADIUS) & (v < H - RADIUS) & (W > 2 * RADIUS)
+    if not wraps:
+        held = held & (u >= RADIUS) & (u < W - RADIUS)
     held = held & (alpha[v, u] >= LEAST_ALPHA) & (normals[v, u] != 0).any(dim=-1) & (depth[v, u] > 0)
     u, v = u[held], v[held]
-    of_u, of_v = u[:, None] + right, v[:, None] + down
+    of_u, of_v = (u[:, None] + right) % W, v[:, None] + down  # the modulus changes columns of a panorama only
     own, counts = _values(photo, normals, of_u, of_v)
-    x, y, held = _seen(normals, depth, alpha, (photo.camera, other.camera), (u, v), (of_u, of_v))
+    cameras = photo.camera, other.camera
+    find = _seen if photo.camera.pinhole and other.camera.pinhole else _seen_through_lenses
+    x, y, held = find(normals, depth, alpha, cameras, (u, v), (of_u, of_v))
     last_u, last_v = other.camera.W - 1, other.camera.H - 1
+    if other_wraps:
+        x = within_width(x, other.camera.W)
+        last_u = other.camera.W
     held = held & ((x >= 0) & (y >= 0) & (x <= last_u) & (y <= last_v)).all(dim=1) & counts
     left, top = (at.detach().floor().clamp(0, max(last - 1, 0)) for at, last in ((x, last_u), (y, last_v)))
     corners, weights = [], ((1 - (x - left), x - left), (1 - (y - top), y - top))
     for below in (0, 1):
         for beside in (0, 1):
             at_u, at_v = (left + beside).clamp(max=last_u).long(), (top + below).clamp(max=last_v).long()
+            at_u = at_u % other.camera.W
             values, counts = _values(other, normals, at_u, at_v)
             held = held & counts
             corners.append(values * weights[0][beside] * weights[1][below])
@@ -236,6 +252,56 @@ def _seen(
     return other.fx * points[..., 0] / ahead + other.cx, other.fy * points[..., 1] / ahead + other.cy, held
 
 
+def _seen_through_lenses(
+    normals: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    cameras: tuple[Camera, Camera],
+    centre: tuple[Tensor, Tensor],
+    pixels: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the same as `_seen` for cameras with any lens and shutter, of which at least one is no pinhole."""
+    camera, other = cameras
+    found = camera.rays()
+    rayless = ~np.isfinite(found).all(axis=-1, keepdims=True)
+    all_rays = torch.from_numpy(np.where(rayless, 0.0, found)).to(normals)
+    start = torch.from_numpy(camera.origins() - other.eye).to(normals)
+    u, v = centre
+    z = depth[v, u] / alpha[v, u]
+    n = torch.nn.functional.normalize(normals[v, u], dim=-1)
+    rays, origins = all_rays[pixels[1], pixels[0]], start[pixels[1], pixels[0]]
+    place = start[v, u] + z[:, None] * all_rays[v, u]
+    of_pixels = (n[:, None] * rays).sum(dim=-1)
+    held = (of_pixels < -LEAST_COSINE * rays.norm(dim=-1)).all(dim=1)
+    s = (n[:, None] * (place[:, None] - origins)).sum(dim=-1) / of_pixels.where(held[:, None], -1.0)
+    held = held & (s > 0).all(dim=1)
+    points = (origins + s[..., None] * rays)[held]
+    x, y = torch.zeros_like(s), torch.zeros_like(s)
+    if not len(points):
+        return x, y, held
+    optics = Optics(other.projection, other.coefficients, other.widest, other.motion, other.readout)
+    lens, size = (other.fx, other.fy, other.cx, other.cy), (other.H, other.W)
+    seen = sight(
+        (points[..., 0], points[..., 1], points[..., 2]),
+        other.R.tolist(),
+        (0.0, 0.0, 0.0),
+        lens,
+        optics,
+        size,
+        0.0,
+        _TORCH,
+    )
+    valid = seen.valid
+    if other.projection.kind == "equirectangular":
+        own = (points.detach() @ torch.from_numpy(np.array(other.R)).to(points).T).square()
+        valid = valid & (own[..., 0] + own[..., 2] > POLE**2 * own.sum(dim=-1))
+    x, y = x.index_put((held,), seen.u), y.index_put((held,), seen.v)
+    return x, y, held.index_put((held.clone(),), valid.all(dim=1))
+
+
+_TORCH = Operations(torch.sqrt, torch.atan2, torch.where, torch.maximum)
+
+
 class _PatchError(torch.autograd.Function):
     """Compute value and gradients in one native call; backward only scales."""
 
@@ -253,15 +319,12 @@ class _PatchError(torch.autograd.Function):
         given = [tensor.detach().contiguous() for tensor in (normals, depth, alpha)]
         gradients = [reusable_tensor(tensor.shape, tensor) for tensor in given]
         names, (grid, weight) = ("normals", "depth", "alpha"), placed
-        turn, shift = relative_pose(photo.camera, other.camera)
         value, count = kernel("patches_f", normals.dtype)(
             **{name: native_array(tensor) for name, tensor in zip(names, given, strict=True)},
             **{f"grad_{name}": native_array(tensor) for name, tensor in zip(names, gradients, strict=True)},
             **_named("photo", photo),
             **_named("other", other),
-            R=photo.camera.R.ravel().tolist(),
-            turn=turn.ravel().tolist(),
-            shift=shift.tolist(),
+            **_pair(photo.camera, other.camera, normals.dtype),
             radius=RADIUS,
             **grid._asdict(),
             scale=grid.each(weight, photo.camera.H, photo.camera.W),
@@ -289,4 +352,19 @@ def _named(name: str, photo: GreyPhoto) -> dict[str, Any]:
         name: np.ascontiguousarray(photo.pixels),
         f"{name}_counts": None if counts is None else np.ascontiguousarray(counts).view(np.uint8),
         f"{name}_intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+    }
+
+
+def _pair(camera: Camera, other: Camera, dtype: torch.dtype) -> dict[str, Any]:
+    """Return the arguments of both cameras for the native call."""
+    if camera.pinhole and other.pinhole:
+        turn, shift = relative_pose(camera, other)
+        return {"R": camera.R.ravel().tolist(), "turn": turn.ravel().tolist(), "shift": shift.tolist()}
+    same, endless = np.eye(3).ravel().tolist(), (-np.inf, np.inf)
+    return {
+        "R": same,
+        "turn": same,
+        "shift": (camera.eye - other.eye).tolist(),
+        "other_camera": native_camera(other, (endless, endless), True),
+        **native_rays(camera, dtype),
     }

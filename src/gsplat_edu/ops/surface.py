@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -17,6 +18,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, in_range
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.ops.lenses import native_rays
 from gsplat_edu.scene.camera import Camera
 
 GRAZE = 0.02
@@ -49,14 +51,21 @@ def planar_depth(planes: Float[Tensor, "H W 4"], rays: Float[Tensor, "H W 3"]) -
     return torch.where(held, distance / torch.where(held, slope, 1.0), 0.0)
 
 
-def normals_of_depth(depth: Float[Tensor, "H W"], rays: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+def normals_of_depth(
+    depth: Float[Tensor, "H W"],
+    rays: Float[Tensor, "H W 3"],
+    origins: Float[Tensor, "H W 3"] | None = None,
+    wraps: bool = False,
+) -> Float[Tensor, "H W 3"]:
     """Return the normals of a depth map by central differences, towards the camera.
 
-    m = ty x tx,  tx = P(u + 1) - P(u - 1),  ty = P(v + 1) - P(v - 1),  P = z r
+    m = ty x tx,  tx = P(u + 1) - P(u - 1),  ty = P(v + 1) - P(v - 1),  P = o + z r
 
     Args:
         depth: (H, W) camera depth, world units; 0 where there is none.
         rays: (H, W, 3) world rays of camera depth 1, of the depth's dtype.
+        origins: (H, W, 3) where rays begin, world units, less any constant; None if all begin at one point.
+        wraps: Whether the first and the last column are neighbours (`Projection.wraps`), so that they are no border.
 
     Returns:
         (H, W, 3) unit vectors in world axes; 0 on the border, where one of the four neighbours has no depth, and where
@@ -64,7 +73,9 @@ def normals_of_depth(depth: Float[Tensor, "H W"], rays: Float[Tensor, "H W 3"]) 
 
     Differentiable in: depth.
     """
-    points = depth[..., None] * rays
+    points = depth[..., None] * rays if origins is None else origins + depth[..., None] * rays
+    if wraps:
+        points, depth = (torch.cat([t[:, -1:], t, t[:, :1]], dim=1) for t in (points, depth))
     along_u, along_v = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     normals = torch.linalg.cross(along_v, along_u)
     around = torch.stack([depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]])
@@ -73,7 +84,8 @@ def normals_of_depth(depth: Float[Tensor, "H W"], rays: Float[Tensor, "H W 3"]) 
     held = (nearest > 0) & (farthest < (1 + JUMP) * nearest) & (squared > 0)
     length = torch.where(held, squared, 1.0).sqrt()
     inner = torch.where(held[..., None], normals / length[..., None], 0.0)
-    return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1))
+    beside = 0 if wraps else 1
+    return torch.nn.functional.pad(inner, (0, 0, beside, beside, 1, 1))
 
 
 def check_maps(normals: Tensor, depth: Tensor, alpha: Tensor, camera: Camera) -> None:
@@ -102,13 +114,15 @@ def normal_error(
 
     m is the normal of `normals_of_depth` of the mean depth, sum w z / a; pixels without one add 0. The factors a are
     constants. The value is 0 where the splats of an opaque surface lie in it; splats of a pixel that disagree shorten N
-    and raise it.
+    and raise it. Through a lens, depth is that of its projection (`Projection.along_ray`), and a pixel without a ray
+    has none. Behind a rolling shutter, rays begin where the camera is when their pixel is read. The first and the last
+    column of a panorama are neighbours.
 
     Args:
         normals: (H, W, 3) composited `gsplat_edu.render.planes.facing_normals`.
         depth: (H, W) sum of w z, world units.
         alpha: (H, W) accumulated alpha.
-        camera: The camera.
+        camera: The camera. Of an orthographic one, torch's operations compute the value.
         weight: Factor of the value.
 
     Returns:
@@ -122,10 +136,15 @@ def normal_error(
     """
     check_maps(normals, depth, alpha, camera)
     in_range("weight", weight, 0.0)
-    if normals.device.type != "cpu" or normals.dtype not in SUFFIXES:
+    if normals.device.type != "cpu" or normals.dtype not in SUFFIXES or _parallel(camera):
         return normal_error_in_torch(normals, depth, alpha, camera, weight)
     value: Tensor = _NormalError.apply(normals, depth, alpha, camera, weight)  # type: ignore[no-untyped-call]
     return value
+
+
+def _parallel(camera: Camera) -> bool:
+    """Whether a camera's rays begin on a plane, which the native kernels do not know."""
+    return camera.projection.kind == "orthographic"
 
 
 @one_thread()  # the rounding of torch's sum depends on the number of threads
@@ -137,10 +156,13 @@ def normal_error_in_torch(
     weight: float = 1.0,
 ) -> Float[Tensor, ""]:
     """Return `normal_error` from its definition, by torch's operations, on any device."""
-    rays = torch.from_numpy(camera.rays()).to(normals)
+    own = camera.rays()
+    seen = np.isfinite(own).all(axis=-1)
+    rays = torch.from_numpy(np.where(seen[..., None], own, 0.0)).to(normals)
+    away = None if camera.pinhole else torch.from_numpy(camera.origins() - camera.eye).to(normals)
     drawn = alpha > 0
-    mean_depth = (depth / alpha.where(drawn, 1.0)).where(drawn, 0.0)
-    given = normals_of_depth(mean_depth, rays)
+    mean_depth = (depth / alpha.where(drawn, 1.0)).where(drawn & torch.from_numpy(seen).to(drawn.device), 0.0)
+    given = normals_of_depth(mean_depth, rays, away, camera.projection.wraps)
     a = alpha.detach() * (given.detach() != 0).any(dim=-1)
     agreement = (normals * given).sum(dim=-1)
     return weight * (a * (a - agreement)).sum() / (camera.H * camera.W)
@@ -164,11 +186,7 @@ class _NormalError(torch.autograd.Function):
         value = kernel("surface_f", normals.dtype)(
             **{name: native_array(tensor) for name, tensor in zip(names, given, strict=True)},
             **{f"grad_{name}": native_array(tensor) for name, tensor in zip(names, gradients, strict=True)},
-            R=camera.R.ravel().tolist(),
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
+            **(_pinhole(camera) if camera.pinhole else native_rays(camera, normals.dtype)),
             scale=weight / (camera.H * camera.W),
             jump=JUMP,
             threads=torch.get_num_threads(),
@@ -182,3 +200,9 @@ class _NormalError(torch.autograd.Function):
         # grad is almost always 1: needless passes over the images would wake torch's threads.
         scaled = [g if float(grad) == 1.0 else g * grad for g in ctx.saved_tensors]
         return (*scaled, None, None)
+
+
+def _pinhole(camera: Camera) -> dict[str, Any]:
+    """Return the arguments of a pinhole for the native call."""
+    intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return {"R": camera.R.ravel().tolist(), **intrinsics}

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.headroom import require_memory
-from gsplat_edu.base.validation import ArrayLike, Shape, float64_array, of_type
+from gsplat_edu.base.validation import ArrayLike, Shape, check_shape, float64_array, of_type
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
@@ -36,6 +36,7 @@ def render(
     settings: RenderSettings | None = None,
     background: Tensor | ArrayLike | None = None,
     features: Tensor | ArrayLike | None = None,
+    needed: Tensor | None = None,
     backend: str | Backend = "auto",
 ) -> RenderOutput: ...
 
@@ -59,6 +60,7 @@ def render(
     settings: RenderSettings | None = None,
     background: Tensor | ArrayLike | None = None,
     features: Tensor | ArrayLike | None = None,
+    needed: Tensor | None = None,
     backend: str | Backend = "auto",
 ) -> RenderOutput | RenderStack:
     """Render Gaussians from one camera, or from several of equal image size.
@@ -66,12 +68,14 @@ def render(
     Args:
         gaussians: N Gaussians, raw parameters, float32 or float64 (cuda: float32).
         camera: A `Camera` or any object with its members (`gsplat_edu.CameraLike`); `CameraTensors` for gradients of
-            its pose and intrinsics; or a sequence of cameras of equal image size.
+            its pose, lens and shutter; or a sequence of cameras of equal image size.
         settings: Background, SH degree, antialiasing, depths; None uses the defaults.
         background: (3,) background, as a tensor for differentiation; None uses the settings' background.
         features: (N, C) numbers to composite beside the colours, as a tensor of the Gaussians' dtype and device for
             differentiation; None for none.
             The backend cpu composites 32 at a time: every further 32 take another projection, sort and two passes.
+        needed: (H, W) bool, true for the pixels of one camera that are used, which saves the time of the others; None
+            for all. The others are undefined, but finite, and their gradients have to be 0.
         backend: "auto" for the fastest one on the Gaussians' device, or a backend by name (see
             `gsplat_edu.render.backends`), or a backend that is loaded already.
 
@@ -80,7 +84,8 @@ def render(
 
     Raises:
         BackendUnavailableError: the backend cannot run here.
-        ShapeError: the background is not of shape (3,), features have another shape, or cameras have different sizes.
+        ShapeError: the background is not of shape (3,), features or needed have another shape, or cameras have
+            different sizes.
         NotEnoughMemoryError: the image alone needs more memory than is free.
         ArgumentError: an argument has another type, or a feature is NaN or infinite; or on torch, a parameter is, or a
             quaternion has zero length. The kernels skip such a Gaussian; it has zero gradient and no effect on others.
@@ -91,18 +96,13 @@ def render(
     settings = RenderSettings() if settings is None else settings
     of_type("settings", settings, RenderSettings)
     chosen = backend if isinstance(backend, Backend) else load_backend(backend, gaussians.means.device)
-    if background is None:
-        background = _background(settings.background, gaussians.means.dtype, gaussians.means.device)
-    else:
-        background = _as_tensor("background", background, (3,), gaussians.means)
-        check_tensor("background", background, (3,), {})
-        background = background.to(gaussians.means)
-    if features is not None:
-        features = _as_tensor("features", features, ("N", "C"), gaussians.means)
-        check_features(features, gaussians.means)
-    extra = Extra(background, features)
+    extra = _extra(gaussians.means, settings, background, features)
     if not isinstance(camera, Sequence):
-        return _render_one(chosen, gaussians, _checked("camera", camera), settings, extra)
+        one = _checked("camera", camera)
+        extra = extra._replace(needed=_checked_needed(needed, one, gaussians.means))
+        return _render_one(chosen, gaussians, one, settings, extra)
+    if needed is not None:
+        raise ArgumentError("needed: describes the pixels of one camera; render the cameras one by one")
     cameras = [_checked(f"camera[{k}]", one) for k, one in enumerate(camera)]
     if len({(c.H, c.W) for c in cameras}) != 1:
         raise ArgumentError(
@@ -111,11 +111,43 @@ def render(
     return _stack(tuple(_render_one(chosen, gaussians, c, settings, extra) for c in cameras))
 
 
+def _extra(
+    means: Tensor,
+    settings: RenderSettings,
+    background: Tensor | ArrayLike | None,
+    features: Tensor | ArrayLike | None,
+) -> Extra:
+    """Check background and features, and return them as tensors of the Gaussians' dtype and device."""
+    if background is None:
+        background = _background(settings.background, means.dtype, means.device)
+    else:
+        background = _as_tensor("background", background, (3,), means)
+        check_tensor("background", background, (3,), {})
+        background = background.to(means)
+    if features is not None:
+        features = _as_tensor("features", features, ("N", "C"), means)
+        check_features(features, means)
+    return Extra(background, features)
+
+
 def _as_tensor(name: str, value: Tensor | ArrayLike, shape: Shape, like: Tensor) -> Tensor:
     """Return a tensor as it is, and an array or numbers as a tensor of this one's dtype and device."""
     if isinstance(value, Tensor):
         return value
     return torch.from_numpy(float64_array(name, value, shape).copy()).to(like)
+
+
+def _checked_needed(needed: Tensor | None, camera: Camera | CameraTensors, means: Tensor) -> Tensor | None:
+    """Check that `needed` marks the pixels of a camera, on the device of the Gaussians."""
+    if needed is None:
+        return None
+    of_type("needed", needed, Tensor)
+    check_shape("needed", needed.shape, (camera.H, camera.W), {})
+    if needed.dtype != torch.bool or needed.device != means.device:
+        raise ArgumentError(
+            f"needed: is {needed.dtype} on {needed.device}, but has to be torch.bool on {means.device}"
+        )
+    return needed
 
 
 def _stack(views: tuple[RenderOutput, ...]) -> RenderStack:
@@ -165,6 +197,8 @@ def _render_one(
             (BYTES_PER_PIXEL + BYTES_PER_CHANNEL * channels) * int(camera.W) * int(camera.H),
             "close other programs, or render fewer pixels (--size)",
         )
+    if not camera.pinhole:
+        backend.require("lens", "camera: its projection or rolling shutter")
     if settings.stop != "tile":
         backend.require("stop", f"stop: {settings.stop!r}")
     return backend.rasterize(gaussians, camera, settings, extra)

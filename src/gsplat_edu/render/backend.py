@@ -25,6 +25,7 @@ Rasterize = Callable[[Gaussians, "Camera | CameraTensors", RenderSettings, Extra
 """Renders validated arguments; `gsplat_edu.render.api.render` validates them."""
 
 FEATURES = {
+    "lens": "renders other lenses than the pinhole, and rolling shutters",
     "stop": "stops compositing pixel by pixel (RenderSettings.stop)",
     "processes": "shares a step among processes",
     "statistics": "collects statistics of each Gaussian (RenderOutput.collect)",

@@ -7,27 +7,42 @@ Chapter: 12_the_backward_pass.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.scene.camera import Camera, CameraLike, as_camera, jacobian_bound
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import check_tensor
+from gsplat_edu.scene.projection import COEFFICIENTS, PINHOLE, Distortion, Projection, jacobian_bound
+from gsplat_edu.scene.shutter import MOTION_NUMBERS, RollingShutter
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 """The entries of `CameraTensors.intrinsics`, px."""
 
 GRADIENT_NUMBERS = 16
-"""Numbers of a camera's gradient, as kernels return them: R row by row, the eye, fx, fy, cx, cy."""
+"""Numbers of a pinhole's gradient, as kernels return them: R row by row, the eye, fx, fy, cx, cy."""
+
+LENS_GRADIENT_NUMBERS = GRADIENT_NUMBERS + len(COEFFICIENTS) + MOTION_NUMBERS
+"""The same of any camera: a pinhole's, the coefficients of the distortion, turn and shift."""
+
+
+Pose = tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]
+"""R, eye, intrinsics, coefficients and motion, or their gradients."""
+
+POSE = 5
+"""Number of tensors of a `Pose`."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraTensors:
-    """A pinhole camera as float64 tensors on the CPU.
+    """A camera as float64 tensors on the CPU.
 
     The gradient in R has nine entries, those of the formulas with any 3 x 3 matrix. Optimise a `twist` instead, since R
     has to stay a rotation: `CameraTensors.moved`.
@@ -38,6 +53,11 @@ class CameraTensors:
         intrinsics: (4,) fx, fy, cx, cy, px.
         H: Image height, px.
         W: Image width, px.
+        projection: The kind of projection; its distortion is replaced by `coefficients`.
+        coefficients: (15,) of the distortion, as `gsplat_edu.scene.projection.COEFFICIENTS`; None for no distortion.
+        motion: (6,) turn and shift of a rolling shutter (`RollingShutter`); None for a global shutter.
+        readout: Direction of the rolling shutter.
+        exposure: Time for which a row is exposed, by that of the readout; a constant for the gradients.
 
     Raises:
         ShapeError: a tensor has another shape.
@@ -49,11 +69,19 @@ class CameraTensors:
     intrinsics: Float[Tensor, "4"]
     H: int
     W: int
+    projection: Projection = PINHOLE
+    coefficients: Float[Tensor, "15"] | None = None
+    motion: Float[Tensor, "6"] | None = None
+    readout: str = "down"
+    exposure: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the tensors and their values."""
         for name, shape in (("R", (3, 3)), ("eye", (3,)), ("intrinsics", (4,))):
             _check(name, getattr(self, name), shape)
+        for name, shape in (("coefficients", (len(COEFFICIENTS),)), ("motion", (MOTION_NUMBERS,))):
+            if getattr(self, name) is not None:
+                _check(name, getattr(self, name), shape)
         for name in ("H", "W"):
             object.__setattr__(self, name, whole_number(name, getattr(self, name), 1))
         self.value()
@@ -63,7 +91,18 @@ class CameraTensors:
         """Return a camera's numbers as tensors, which do not require a gradient."""
         one = as_camera("camera", camera)
         intrinsics = torch.tensor([getattr(one, name) for name in INTRINSICS], dtype=torch.float64)
-        return cls(torch.tensor(one.R), torch.tensor(one.eye), intrinsics, one.H, one.W)
+        coefficients = None
+        if one.coefficients is not None:
+            coefficients = torch.tensor(one.coefficients, dtype=torch.float64)
+        motion, readout = None, "down"
+        if one.shutter is not None:
+            motion, readout = (
+                torch.tensor(np.concatenate([one.shutter.turn, one.shutter.shift])),
+                one.shutter.readout,
+            )
+        R, eye = torch.tensor(one.R), torch.tensor(one.eye)
+        lens = one.projection, coefficients
+        return cls(R, eye, intrinsics, one.H, one.W, *lens, motion, readout, one.exposure)
 
     def moved(self, twist: Float[Tensor, "6"]) -> CameraTensors:
         """Turn and move the camera, differentiably: R' = exp([w]x) R,  eye' = eye + t.
@@ -82,22 +121,42 @@ class CameraTensors:
         x, y, z = twist[:3].unbind()
         zero = torch.zeros_like(x)
         cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-        return CameraTensors(
-            torch.linalg.matrix_exp(cross) @ self.R, self.eye + twist[3:], self.intrinsics, self.H, self.W
-        )
+        return replace(self, R=torch.linalg.matrix_exp(cross) @ self.R, eye=self.eye + twist[3:])
 
     def with_intrinsics(self, intrinsics: Float[Tensor, "4"]) -> CameraTensors:
         """Return the camera with other intrinsics: (4,) fx, fy, cx, cy, px."""
-        return CameraTensors(self.R, self.eye, intrinsics, self.H, self.W)
+        return replace(self, intrinsics=intrinsics)
 
     def value(self) -> Camera:
         """Return the camera as numbers."""
-        R, eye, (fx, fy, cx, cy) = (tensor.numpy(force=True) for tensor in self.tensors())
-        return Camera(R, eye, fx, fy, cx, cy, self.H, self.W)
+        R, eye, (fx, fy, cx, cy) = (t.numpy(force=True) for t in (self.R, self.eye, self.intrinsics))
+        projection, shutter = replace(self.projection, distortion=None), None
+        if self.coefficients is not None:
+            values = tuple(self.coefficients.tolist())
+            projection = replace(projection, distortion=Distortion(values, self.projection.radial_first))
+        if self.motion is not None:
+            numbers = self.motion.numpy(force=True)
+            shutter = RollingShutter(numbers[:3], numbers[3:], self.readout, self.exposure)
+        return Camera(R, eye, fx, fy, cx, cy, self.H, self.W).through(projection, shutter)
 
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return R, eye and intrinsics."""
-        return self.R, self.eye, self.intrinsics
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Return R, eye, intrinsics, and those of coefficients and motion that exist."""
+        return tuple(tensor for tensor in self.pose() if tensor is not None)
+
+    def pose(self) -> Pose:
+        """Return R, eye, intrinsics, coefficients and motion."""
+        return self.R, self.eye, self.intrinsics, self.coefficients, self.motion
+
+    @cached_property
+    def widest(self) -> float:
+        """Largest angle to the optical axis, radians: a constant for the gradients; see `Camera.widest`."""
+        return self.value().widest
+
+    @property
+    def pinhole(self) -> bool:
+        """Whether this is a pinhole at rest. A lens with coefficients is none, not even with zeros."""
+        undistorted = self.projection.kind == "perspective" and self.coefficients is None
+        return undistorted and self.motion is None
 
     @property
     def fx(self) -> Float[Tensor, ""]:
@@ -139,19 +198,31 @@ def _check(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
         )
 
 
-Pose = tuple[Tensor | None, Tensor | None, Tensor | None]
-"""R, eye and intrinsics, or their gradients."""
-
-
 def split_camera(camera: Camera | CameraTensors) -> tuple[Camera, Pose]:
     """Return a camera's numbers, and the tensors that its gradient belongs to: none for a `Camera`."""
     if isinstance(camera, CameraTensors):
-        return camera.value(), camera.tensors()
-    return camera, (None, None, None)
+        return camera.value(), camera.pose()
+    return camera, (None, None, None, None, None)
 
 
-def camera_gradients(numbers: Float[Tensor, "16"] | None) -> Pose:
-    """Split the `GRADIENT_NUMBERS` of a kernel into the gradients of R, eye and intrinsics; None if there are none."""
+def gradient_numbers(camera: Camera) -> int:
+    """Return how many numbers a kernel's gradient of this camera has."""
+    return GRADIENT_NUMBERS if camera.pinhole else LENS_GRADIENT_NUMBERS
+
+
+def camera_gradients(numbers: Float[Tensor, " numbers"] | None, wanted: Sequence[bool]) -> Pose:
+    """Split a kernel's numbers into the gradients of `CameraTensors.pose`.
+
+    Args:
+        numbers: `gradient_numbers` of them; None for no gradients.
+        wanted: Which of the five are wanted; the others are None.
+    """
     if numbers is None:
-        return None, None, None
-    return numbers[:9].view(3, 3), numbers[9:12], numbers[12:]
+        return None, None, None, None, None
+    found: list[Tensor | None] = [numbers[:9].view(3, 3), numbers[9:12], numbers[12:16], None, None]
+    if len(numbers) == LENS_GRADIENT_NUMBERS:
+        found[3:] = [numbers[16:-MOTION_NUMBERS], numbers[-MOTION_NUMBERS:]]
+    R, eye, intrinsics, coefficients, motion = (
+        g if needed else None for g, needed in zip(found, wanted, strict=True)
+    )
+    return R, eye, intrinsics, coefficients, motion

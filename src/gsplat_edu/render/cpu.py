@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -24,12 +23,14 @@ from torch.autograd.function import once_differentiable
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native, native_array
+from gsplat_edu.ops.lenses import native_camera
 from gsplat_edu.ops.moments import AdamInBackward, Moments
 from gsplat_edu.render.camera_tensors import (
-    GRADIENT_NUMBERS,
+    POSE,
     CameraTensors,
     Pose,
     camera_gradients,
+    gradient_numbers,
     split_camera,
 )
 from gsplat_edu.render.output import MOST_CHANNELS, STATISTICS, Extra, RenderOutput, check_features
@@ -55,6 +56,7 @@ class _Call:
     settings: RenderSettings
     sh_degree: int
     direct: bool
+    needed: Tensor | None = None
     visible: Tensor = field(init=False)
     radii: Tensor = field(init=False)
     num_pairs: int = field(init=False)
@@ -68,7 +70,7 @@ class _Call:
     def for_features(self) -> _Call:
         """Return a call that composites further features of the same view."""
         settings = dataclasses.replace(self.settings, depth=False, median_depth=False)
-        return _Call(self.camera, settings, self.sh_degree, self.direct)
+        return _Call(self.camera, settings, self.sh_degree, self.direct, self.needed)
 
 
 def render_cpu(
@@ -80,13 +82,15 @@ def render_cpu(
         gaussians: N Gaussians, float32 or float64, on the CPU.
         camera: The camera.
         settings: The settings.
-        extra: Background and features, of the Gaussians' dtype.
+        extra: Background and features, of the Gaussians' dtype, and the pixels that are needed.
 
     Returns:
         The view. Differentiable in every raw parameter, background, features and a camera of tensors.
     """
     value, pose = split_camera(camera)
-    call = _Call(value, settings, min(settings.sh_degree, gaussians.sh_degree), direct=False)
+    degree, needed = min(settings.sh_degree, gaussians.sh_degree), extra.needed
+    needed = None if needed is None else needed.contiguous().view(torch.uint8)
+    call = _Call(value, settings, degree, direct=False, needed=needed)
     tensors = gaussians.tensors()
     return _output(call, extra, pose, *(tensors[name] for name in RAW))
 
@@ -160,11 +164,11 @@ def _output(call: _Call, extra: Extra, pose: Pose, *parameters: Tensor) -> Rende
         [features] if features is None else list(torch.split(features, MOST_CHANNELS, dim=1)),
     )
     image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        call, extra.background, *pose, groups[0], *parameters
+        call, extra.background, groups[0], *pose, *parameters
     )
     for group in groups[1:]:
         calls.append(call.for_features())
-        further = _Rasterize.apply(calls[-1], extra.background, *pose, group, *parameters)  # type: ignore[no-untyped-call]
+        further = _Rasterize.apply(calls[-1], extra.background, group, *pose, *parameters)  # type: ignore[no-untyped-call]
         mixed = torch.cat([mixed, further[3]], dim=-1)
 
     def norms() -> Tensor:
@@ -272,12 +276,10 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         call: _Call,
         background: Tensor,
-        R: Tensor | None,
-        eye: Tensor | None,
-        intrinsics: Tensor | None,
         features: Tensor | None,
-        *parameters: Tensor,
+        *tensors: Tensor | None,  # the camera's, then the parameters
     ) -> tuple[Tensor, ...]:
+        parameters = [tensor for tensor in tensors[POSE:] if tensor is not None]
         camera, means, settings = call.camera, parameters[0], call.settings
         kept = [p.detach().contiguous() for p in parameters]
         given = None if features is None else features.detach().contiguous()
@@ -293,6 +295,7 @@ class _Rasterize(torch.autograd.Function):
                 alpha_max=settings.alpha_max,
                 pixel_stop=settings.stop == "pixel",
             ),
+            needed=_array(call.needed),
             threads=torch.get_num_threads(),
         )
         size: tuple[int, ...] = (camera.H, camera.W)
@@ -333,14 +336,14 @@ class _Rasterize(torch.autograd.Function):
             if call.waiting is not None or call.norms is not None:
                 raise ArgumentError("backward: passes a deferred image twice; defer works for one pass")
             call.waiting = _Waiting(ctx.frame, kept, images, incoming)
-            return (None,) * (6 + len(kept))
+            return (None,) * (3 + POSE + len(kept))
         outgoing = [reusable_tensor(p.shape, p) for p in kept]
         to_features = None if asked[3] is None else reusable_tensor(features.shape, features)
         norms = reusable_tensor((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
-        camera = (
-            torch.empty(GRADIENT_NUMBERS, dtype=torch.float64) if any(ctx.needs_input_grad[2:5]) else None
-        )
+        camera = None
+        if any(ctx.needs_input_grad[3 : 3 + POSE]):
+            camera = torch.empty(gradient_numbers(call.camera), dtype=torch.float64)
         # Saved tensors may have moved since the forward pass, so they are passed again.
         ctx.frame.backward(
             scene=_scene(kept, call.direct),
@@ -357,7 +360,8 @@ class _Rasterize(torch.autograd.Function):
             collected=_collected(call, kept[0]),
         )
         call.norms = norms if call.norms is None else call.norms + norms
-        return None, background, *camera_gradients(camera), to_features, *outgoing
+        pose = camera_gradients(camera, ctx.needs_input_grad[3 : 3 + POSE])
+        return None, background, to_features, *pose, *outgoing
 
 
 def _wanted(image: Tensor) -> Tensor | None:
@@ -384,16 +388,4 @@ def _images(*tensors: Tensor | None) -> Any:  # noqa: ANN401
 
 
 def _camera(camera: Camera, settings: RenderSettings) -> Any:  # noqa: ANN401
-    x_bounds, y_bounds = camera.jacobian_bounds(settings.jacobian_limit)
-    return native().Camera(
-        R=np.ascontiguousarray(camera.R, dtype=np.float64),
-        eye=np.ascontiguousarray(camera.eye, dtype=np.float64),
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        x_bounds=x_bounds,
-        y_bounds=y_bounds,
-        H=camera.H,
-        W=camera.W,
-    )
+    return native_camera(camera, camera.jacobian_bounds(settings.jacobian_limit), not camera.pinhole)

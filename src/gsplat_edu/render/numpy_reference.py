@@ -27,6 +27,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, first_index, float64_array, in_range, one_of
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussian_math import project_cov3d
+from gsplat_edu.scene.sight import seam_shift
 
 Extent = Literal["box3sigma", "exact"]
 Stop = Literal["box", "tile", "none"]
@@ -40,12 +41,13 @@ COV_TOLERANCE = 1e-6
 """Largest deviation of a covariance from symmetric and positive, as a fraction of its trace; allows float32 input."""
 
 
-class Projection(NamedTuple):
+class ScreenSplats(NamedTuple):
     """The visible splats in the image, near to far; ties keep the input order."""
 
     order: Int64[np.ndarray, " M"]  # indices of the Gaussians
     means2d: Float64[np.ndarray, "M 2"]  # px
-    cov2d: Float64[np.ndarray, "M 2 2"]  # px², dilated
+    cov2d: Float64[np.ndarray, "M 2 2"]  # px², dilated and blurred
+    factor: Float64[np.ndarray, " M"]  # of the opacities, in (0, 1]: 1 without motion blur
 
 
 def render_gaussians(
@@ -72,7 +74,7 @@ def render_gaussians(
         means: (N, 3) centres, world units.
         cov3ds: (N, 3, 3) covariances, world units squared, symmetric and positive semi-definite.
         colors: (N, 3) any range.
-        opacities: (N,) 0 to 1.
+        opacities: (N,) 0 to 1; a camera with an exposure lowers them, see `screen_splats`.
         bg: (3,) background colour.
         z_near: Means at this camera depth or nearer are culled, world units, >= 0.
         extent: "box3sigma": in a box of radius ceil(3 sqrt(lambda_max)). "exact": wherever alpha >= 1/255.
@@ -86,8 +88,7 @@ def render_gaussians(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: NaN, infinity, an opacity outside 0 to 1, an invalid covariance, camera or option; or a Gaussian,
-            by index, whose ellipse is too large or too thin for float64.
+        ArgumentError: an invalid number, covariance, camera or option; or, by index, an ellipse not fit for float64.
 
     Source: Kerbl et al. 2023, eq. 2-5; Zwicker et al. 2001 for the projection.
     """
@@ -98,11 +99,12 @@ def render_gaussians(
     # Tiles are whole; pixels outside the image have no transmittance and do not keep a tile alive.
     padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
     transmittance = padded[: cam.H, : cam.W]
-    for i, mean2d, cov2d in zip(*project(cam, means, cov3ds, z_near, jacobian_limit, dilation), strict=True):
-        T = transmittance[box := _box(mean2d, cov2d, opacities[i], cam, extent)]
+    screen = screen_splats(cam, means, cov3ds, z_near, jacobian_limit, dilation)
+    for i, mean2d, cov2d, factor in zip(*screen, strict=True):
+        T = transmittance[box := _box(mean2d, cov2d, opacity := factor * opacities[i], cam, extent)]
         if T.size == 0 or (stop == "box" and T.max() < T_STOP):
             continue
-        alpha = _alpha(mean2d, _resolved(i, cov2d), opacities[i], box)
+        alpha = _alpha(mean2d, _resolved(i, cov2d), opacity, box, cam)
         if stop == "tile":
             alpha = np.where(_in_live_tile(padded, box), alpha, 0.0)
         image[box] += (T * alpha)[..., None] * colors[i]
@@ -144,28 +146,105 @@ def project(
     z_near: float,
     jacobian_limit: float | None,
     dilation: float = DILATION,
-) -> Projection:
-    """Project Gaussians in front of the camera to screen-space ellipses, sorted near to far.
+) -> tuple[Int64[np.ndarray, " M"], Float64[np.ndarray, "M 2"], Float64[np.ndarray, "M 2 2"]]:
+    """Return indices, means and covariances of `screen_splats`: all of them that a camera at rest needs."""
+    return screen_splats(cam, means, cov3ds, z_near, jacobian_limit, dilation)[:3]
+
+
+def screen_splats(
+    cam: Camera,
+    means: Float64[np.ndarray, "N 3"],
+    cov3ds: Float64[np.ndarray, "N 3 3"],
+    z_near: float,
+    jacobian_limit: float | None,
+    dilation: float = DILATION,
+) -> ScreenSplats:
+    """Project Gaussians that the camera sees to screen-space ellipses, sorted near to far by depth.
 
     Sigma2d = J W Sigma W' J' + d I, with the dilation d
+
+    J is the Jacobian of the camera's projection and shutter (`Camera.sight`). Perspective lenses have bounds of J.
+
+    With an exposure, the ellipse gets g g' (`Sight.blur` is g). So that the splat keeps its light, its opacity gets the
+    factor sqrt(det Sigma2d / det(Sigma2d + g g')): each moment of the exposure draws the dilated ellipse, and a splat's
+    light goes with the root of its determinant. With antialiasing, each moment has its factor, too, see
+    `opacity_compensation`; the product is sqrt(det(J W Sigma W' J') / det(Sigma2d + g g')).
     """
     with np.errstate(over="ignore", invalid="ignore"):  # overflows are reported below
-        means_cam = cam.world_to_cam(means)
-        fits = np.isfinite(means_cam).all(axis=1)
-        if not fits.all():
-            raise ArgumentError(f"means{first_index(~fits)}: is too far from the camera for float64")
-        index = np.flatnonzero(means_cam[:, 2] > z_near)
-        index = index[np.argsort(means_cam[index, 2], kind="stable")]
-        u, v, _ = cam.project(means_cam[index])
-        flat = project_cov3d(cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit)
-        cov2d = flat + dilation * np.eye(2)
+        if cam.pinhole:
+            index, u, v, flat = _through_pinhole(cam, means, cov3ds, z_near, jacobian_limit)
+            blur = None
+        else:
+            index, u, v, flat, blur = _through_lens(cam, means, cov3ds, z_near, jacobian_limit)
+        cov2d, factor = flat + dilation * np.eye(2), np.ones(len(index))
+        if blur is not None:
+            flat, cov2d, factor = _blurred(flat, blur, dilation)
         # As used by _box and _alpha: the determinant, and squared distances.
         fits = np.isfinite(u * u + v * v + np.trace(cov2d, axis1=1, axis2=2) ** 2)
     if not fits.all():
         i = index[np.argmin(fits)]
         raise ArgumentError(f"means[{i}], cov3ds[{i}]: are too large on the screen for float64")
     drawn = _thick(flat, dilation)
-    return Projection(index[drawn], np.stack([u, v], axis=-1)[drawn], cov2d[drawn])
+    return ScreenSplats(index[drawn], np.stack([u, v], axis=-1)[drawn], cov2d[drawn], factor[drawn])
+
+
+def _blurred(
+    flat: Float64[np.ndarray, "M 2 2"], g: Float64[np.ndarray, "M 2"], dilation: float
+) -> tuple[Float64[np.ndarray, "M 2 2"], Float64[np.ndarray, "M 2 2"], Float64[np.ndarray, " M"]]:
+    """Return Sigma2d + g g' before and after the dilation, and the factor of the opacities."""
+    a, b, c, (x, y) = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1], g.T
+    det = np.maximum(a * c - b * b, 0.0) + dilation * (a + c) + dilation**2
+    more = np.maximum(x * x * c - 2 * x * y * b + y * y * a, 0.0) + dilation * (x * x + y * y)
+    moved = flat + g[:, :, None] * g[:, None, :]
+    # 1 / (1 + more / det), but for a point or a needle without dilation, which has no light of its own
+    factor = np.sqrt(det / np.maximum(det + more, np.finfo(np.float64).tiny))
+    return moved, moved + dilation * np.eye(2), factor
+
+
+def _through_pinhole(
+    cam: Camera,
+    means: Float64[np.ndarray, "N 3"],
+    cov3ds: Float64[np.ndarray, "N 3 3"],
+    z_near: float,
+    jacobian_limit: float | None,
+) -> tuple[
+    Int64[np.ndarray, " M"],
+    Float64[np.ndarray, " M"],
+    Float64[np.ndarray, " M"],
+    Float64[np.ndarray, "M 2 2"],
+]:
+    """Return the visible Gaussians, near to far, their positions, and their covariances before the dilation."""
+    means_cam = cam.world_to_cam(means)
+    fits = np.isfinite(means_cam).all(axis=1)
+    if not fits.all():
+        raise ArgumentError(f"means{first_index(~fits)}: is too far from the camera for float64")
+    index = np.flatnonzero(means_cam[:, 2] > z_near)
+    index = index[np.argsort(means_cam[index, 2], kind="stable")]
+    u, v, _ = cam.project(means_cam[index])
+    return index, u, v, project_cov3d(cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit)
+
+
+def _through_lens(
+    cam: Camera,
+    means: Float64[np.ndarray, "N 3"],
+    cov3ds: Float64[np.ndarray, "N 3 3"],
+    z_near: float,
+    jacobian_limit: float | None,
+) -> tuple[
+    Int64[np.ndarray, " M"],
+    Float64[np.ndarray, " M"],
+    Float64[np.ndarray, " M"],
+    Float64[np.ndarray, "M 2 2"],
+    Float64[np.ndarray, "M 2"] | None,
+]:
+    """Return the same for any projection and shutter, and the motion blur, px; None for none."""
+    seen = cam.sight(means, z_near, jacobian_limit)
+    index = np.flatnonzero(seen.valid)
+    index = index[np.argsort(seen.depth[index], kind="stable")]
+    JW = np.stack([np.stack(row, axis=-1) for row in seen.jacobian], axis=-2)[index]
+    flat = JW @ cov3ds[index] @ np.swapaxes(JW, -1, -2)
+    blur = None if seen.blur is None else np.stack(seen.blur, axis=-1)[index]
+    return index, seen.u[index], seen.v[index], flat, blur
 
 
 def _thick(flat: Float64[np.ndarray, "M 2 2"], dilation: float) -> Bool[np.ndarray, " M"]:
@@ -191,6 +270,9 @@ def _box(
     else:  # alpha = ALPHA_MIN on the ellipse d' Sigma^-1 d = 2 ln(o / ALPHA_MIN)
         level = 2.0 * np.log(max(opacity, ALPHA_MIN) / ALPHA_MIN)
         reach = np.sqrt(level * np.diag(cov2d))
+    if cam.projection.kind == "equirectangular":  # a splat may reach across the seam: all columns
+        top, bottom = (np.floor(mean2d) - np.ceil(reach))[1], (np.ceil(mean2d) + np.ceil(reach) + 1)[1]
+        return slice(*np.clip((top, bottom), 0, cam.H).astype(int)), slice(0, cam.W)
     low = np.clip(np.floor(mean2d) - np.ceil(reach), 0, (cam.W, cam.H)).astype(int)
     high = np.clip(np.ceil(mean2d) + np.ceil(reach) + 1, 0, (cam.W, cam.H)).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
@@ -213,11 +295,18 @@ def _resolved(i: np.int64, cov2d: Float64[np.ndarray, "2 2"]) -> Float64[np.ndar
 
 
 def _alpha(
-    mean2d: Float64[np.ndarray, "2"], cov2d: Float64[np.ndarray, "2 2"], opacity: float, box: Box
+    mean2d: Float64[np.ndarray, "2"],
+    cov2d: Float64[np.ndarray, "2 2"],
+    opacity: float,
+    box: Box,
+    cam: Camera,
 ) -> Float64[np.ndarray, "h w"]:
     """Evaluate alpha at every pixel of a box."""
     (A, B), (_, C) = np.linalg.inv(cov2d)
-    dx = np.arange(box[1].start, box[1].stop) - mean2d[0]
+    columns = np.arange(box[1].start, box[1].stop)
+    dx = columns - mean2d[0]
+    if cam.projection.kind == "equirectangular":
+        dx = dx - seam_shift(columns, mean2d[0], cam.W)
     dy = np.arange(box[0].start, box[0].stop)[:, None] - mean2d[1]
     power = -0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy
     alpha = np.minimum(ALPHA_MAX, opacity * np.exp(power))

@@ -35,10 +35,13 @@ class Extra(NamedTuple):
     Args:
         background: (3,) colour behind everything, of the Gaussians' dtype.
         features: (N, C) features to composite, or None.
+        needed: (H, W) bool, true for the pixels that the caller uses; None for all. The others are undefined, but
+            finite, and their gradients have to be 0. The backend cpu draws no tile without a needed pixel.
     """
 
     background: Tensor
     features: Tensor | None = None
+    needed: Tensor | None = None
 
 
 def check_features(features: Tensor, means: Tensor) -> int:

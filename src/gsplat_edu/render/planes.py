@@ -31,6 +31,9 @@ from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
 PLANE_CHANNELS = 4
 """Channels of `plane_features`."""
 
+FAR_BEHIND = 1e6
+"""World units behind an orthographic camera from where its parallel rays come, for the side of a normal."""
+
 
 def facing_normals(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 3"]:
     """Return each Gaussian's shortest axis, turned towards the camera. For a sphere it is one of three arbitrary ones.
@@ -47,12 +50,19 @@ def facing_normals(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N
 
     Differentiable in: quats. Which axis is the shortest, and its sign, are constants.
     """
-    eye = as_camera("camera", camera).eye
+    eye = _seen_from(as_camera("camera", camera))
     means, quats, log_scales = gaussians.means, gaussians.quats, gaussians.log_scales
     if means.device.type != "cpu" or means.dtype not in SUFFIXES:
         return facing_normals_in_torch(gaussians, eye)
     found: Tensor = _Normals.apply(means, quats, log_scales, eye)  # type: ignore[no-untyped-call]
     return found
+
+
+def _seen_from(camera: Camera) -> Float64[np.ndarray, "3"]:
+    """Return where the camera sees from: its centre, or a place far behind that of an orthographic one."""
+    if camera.projection.kind == "orthographic":
+        return np.asarray(camera.eye - FAR_BEHIND * camera.R[2])
+    return camera.eye
 
 
 def facing_normals_in_torch(gaussians: Gaussians, eye: Float64[np.ndarray, "3"]) -> Float[Tensor, "N 3"]:
@@ -91,7 +101,9 @@ def plane_features(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N
 
 
 def distortion_features(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 2"]:
-    """Return (z - m, (z - m)²) with the camera depths z of the means and the median m of those in front of the camera.
+    """Return (z - m, (z - m)²) with the depths z of the means and the median m of those in front of the camera.
+
+    Depths are distances for a projection that is `along_ray`.
 
     The distortion does not depend on m. Subtracting m keeps digits in float32, because A M2 - M1² cancels.
 
@@ -113,6 +125,9 @@ def distortion_features(gaussians: Gaussians, camera: CameraLike) -> Float[Tenso
 
 def _camera_depths(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, " N"]:
     eye, forward = (torch.tensor(v).to(means) for v in (camera.eye, camera.R[2]))
+    if camera.projection.along_ray:
+        distances: Tensor = torch.linalg.vector_norm(means - eye, dim=-1)
+        return distances
     return ((means - eye) * forward).sum(dim=-1)
 
 

@@ -29,6 +29,8 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.step_check import step_error
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.projection import Distortion, Projection
+from gsplat_edu.scene.shutter import RollingShutter
 
 IMAGE_BOUND = 1.1 * ALPHA_MIN
 """Largest error of a pixel, relative to the brightest or 1. If float32 rounds an alpha across 1/255, a pixel loses or
@@ -118,7 +120,10 @@ def kernel_error(device: torch.device) -> str | None:
     """
     from gsplat_edu.render.triton.rasterize import render_triton
 
-    return _error(render_triton, device)
+    for camera in (CHECK_CAMERA, *CHECK_LENSES):
+        if failure := _error(render_triton, device, camera):
+            return failure
+    return None
 
 
 def shader_error() -> str | None:
@@ -127,17 +132,20 @@ def shader_error() -> str | None:
     from gsplat_edu.render.webgpu_resident import WebgpuRun
 
     scene = check_scene(torch.float32)
-    return _error(render_webgpu, torch.device("cpu")) or step_error(
+    for camera in (CHECK_CAMERA, *CHECK_LENSES):
+        if failure := _error(render_webgpu, torch.device("cpu"), camera):
+            return failure
+    return step_error(
         WebgpuRun(scene.sh_rest.shape[1]), scene, CHECK_CAMERA, SETTINGS, _exact, GRADIENT_BOUND
     )
 
 
-def _error(render: Render, device: torch.device) -> str | None:
+def _error(render: Render, device: torch.device, camera: Camera) -> str | None:
     image, gradients = _differentiated(
         check_scene(torch.float32).to(device),
-        lambda g, bg: render(g, CHECK_CAMERA, SETTINGS, Extra(bg)),
+        lambda g, bg: render(g, camera, SETTINGS, Extra(bg)),
     )
-    truth, expected = _differentiated(check_scene(torch.float64), _exact)
+    truth, expected = _differentiated(check_scene(torch.float64), lambda g, bg: _exact(g, bg, camera))
     bright = max(1.0, float(truth.abs().max()))
     error = (image - truth).abs()
     worst, mean = float(error.max()) / bright, float(error.mean()) / bright
@@ -152,6 +160,16 @@ def _error(render: Render, device: torch.device) -> str | None:
 
 CHECK_CAMERA = Camera(np.eye(3), (0.0, 0.0, -3.0), fx=44.0, fy=47.0, cx=23.1, cy=18.4, H=37, W=46)
 """The image size is not a multiple of the tile size, and the principal point is off-centre."""
+
+
+CHECK_LENSES = (
+    Camera(np.eye(3), (0.0, 0.0, -1.2), fx=12.0, fy=13.0, cx=23.1, cy=18.4, H=37, W=46).through(
+        Projection("fisheye", Distortion((0.05, -0.01))),
+        RollingShutter((0.06, -0.05, 0.04), (0.05, 0.03, -0.04)),
+    ),
+    Camera.panorama(np.eye(3), (0.0, 0.0, 1.2), 23, 46),
+)
+"""A distorted fisheye with a rolling shutter; and a panorama with the scene behind it, on both sides of its seam."""
 
 
 def check_scene(dtype: torch.dtype) -> Gaussians:
@@ -180,14 +198,14 @@ def check_scene(dtype: torch.dtype) -> Gaussians:
     ).map(lambda tensor: tensor.to(dtype))
 
 
-def _exact(gaussians: Gaussians, background: Tensor) -> RenderOutput:
+def _exact(gaussians: Gaussians, background: Tensor, camera: Camera = CHECK_CAMERA) -> RenderOutput:
     if kernels.REASON is None:
         from gsplat_edu.render.cpu import render_cpu
 
-        return render_cpu(gaussians, CHECK_CAMERA, SETTINGS, Extra(background))
+        return render_cpu(gaussians, camera, SETTINGS, Extra(background))
     from gsplat_edu.render.torch_reference import render_dense
 
-    return render_dense(gaussians, CHECK_CAMERA, SETTINGS, Extra(background))
+    return render_dense(gaussians, camera, SETTINGS, Extra(background))
 
 
 def _differentiated(

@@ -22,9 +22,11 @@ from gsplat_edu.base.validation import first_index, in_range, whole_number
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.render.torch_sight import Through, directions_through_lens, like, through_lens
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import Gaussians, check_tensor, quat_to_R_t
 from gsplat_edu.scene.sh import basis_terms, num_coefficients
+from gsplat_edu.scene.sight import seam_shift
 
 CHUNK = 16
 """Number of splats that are evaluated at once. It affects speed and rounding only; with 16, a chunk fits a core's cache
@@ -55,7 +57,7 @@ class _Screen(NamedTuple):
     visible: Int64[Tensor, " M"]
     depths: Float[Tensor, " M"]
     variances: Float[Tensor, "M 2"]  # xx and yy of the dilated 2D covariance, px^2
-    compensation: Float[Tensor, " M"]  # opacity factor of antialiasing
+    factor: Float[Tensor, " M"] | None  # of the opacity, of antialiasing and motion blur; None for 1
 
 
 def eval_sh_t(degree: int, sh: Float[Tensor, "N K 3"], dirs: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -134,7 +136,7 @@ def render_t(
     screen = _project(means, cov3ds, cam)
     if track_means2d and screen.means2d.requires_grad:
         screen.means2d.retain_grad()
-    colors, opacities = colors[screen.visible], opacities[screen.visible]
+    colors, opacities = colors[screen.visible], _dimmed(opacities, screen)
     image, T = _composite(screen, colors, opacities, cam, _Thresholds(alpha_min, ALPHA_MAX), chunk)
     return DenseRender(image, T, screen.means2d, screen.visible)
 
@@ -166,9 +168,7 @@ def render_dense(
     screen = _project(gaussians.means, R * scales[:, None, :], camera, settings, factors=(R, scales))
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
-    opacities = gaussians.opacities[screen.visible]
-    if settings.antialiased:
-        opacities = opacities * screen.compensation
+    opacities = _dimmed(gaussians.opacities, screen)
     channels = [colors[screen.visible]] + ([screen.depths[:, None]] if settings.depth else [])
     if extra.features is not None:
         channels.append(extra.features[screen.visible])
@@ -186,6 +186,12 @@ def render_dense(
         features=None if extra.features is None else mixed[..., 3 + settings.depth :],
         median_depth=median,
     )
+
+
+def _dimmed(opacities: Float[Tensor, " N"], screen: _Screen) -> Float[Tensor, " M"]:
+    """Return the opacities with which the visible splats are drawn."""
+    visible = opacities[screen.visible]
+    return visible if screen.factor is None else visible * screen.factor
 
 
 @torch.no_grad()
@@ -259,17 +265,12 @@ def _median(
 
 def _viewing_directions(means: Float[Tensor, "N 3"], camera: Camera | CameraTensors) -> Float[Tensor, "N 3"]:
     """Return directions from the camera to the means; a mean at the camera, which is culled, gets the zero vector."""
-    offset = means - _like(means, camera.eye)
+    if not camera.pinhole:
+        return directions_through_lens(means, camera)
+    offset = means - like(means, camera.eye)
     squared = (offset * offset).sum(dim=-1, keepdim=True)
     # where() twice keeps the square root's infinite slope at 0 out of the chain rule.
     return torch.where(squared > 0, offset / torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
-
-
-def _like(tensor: Tensor, values: Tensor | np.ndarray | float) -> Tensor:
-    """Return a camera's numbers with the dtype and on the device of a tensor."""
-    if isinstance(values, Tensor):
-        return values.to(tensor)
-    return torch.tensor(values, dtype=tensor.dtype, device=tensor.device)
 
 
 def _check(
@@ -297,18 +298,8 @@ def _project(
 ) -> _Screen:
     """Project; `shapes` are covariances, or M = R S if the factors are given, which keeps the digits of thin ones."""
     settings = settings or RenderSettings()
-    R = _like(means, cam.R)
-    means_cam = (means - _like(means, cam.eye)) @ R.T
-    visible = torch.nonzero(means_cam[:, 2] > settings.z_near)[:, 0]
-    visible = visible[torch.argsort(means_cam[visible, 2], stable=True)]
-    x, y, z = means_cam[visible].unbind(-1)
-    means2d = torch.stack([cam.fx * x / z + cam.cx, cam.fy * y / z + cam.cy], dim=-1)
-    zero = torch.zeros_like(z)
-    (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(settings.jacobian_limit)
-    x_z = (x / z).clamp(_like(z, x_low), _like(z, x_high))
-    y_z = (y / z).clamp(_like(z, y_low), _like(z, y_high))
-    rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
-    JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
+    through = _through_pinhole if cam.pinhole else through_lens
+    means2d, JW, z, visible, blur = through(means, cam, settings)
     if factors is not None:
         rows_of_M = JW @ shapes[visible]
         cov2d = rows_of_M @ rows_of_M.mT
@@ -324,13 +315,57 @@ def _project(
     a0, b, c0 = cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1]
     a, c = a0 + settings.dilation, c0 + settings.dilation
     det = det_before + settings.dilation * (a0 + c0) + settings.dilation * settings.dilation
+    # The light of a splat goes with the root of its determinant: that of what is kept, by that of what is drawn.
+    kept_det = det_before.clamp(min=DET_FLOOR) if settings.antialiased else det
+    if blur is not None:
+        det = det + _blur_of_det(
+            blur, rows_of_M if factors is not None else None, (a0, b, c0), settings.dilation
+        )
+        a, b, c = a + blur[:, 0] ** 2, b + blur[:, 0] * blur[:, 1], c + blur[:, 1] ** 2
     if bool((thin := det <= THINNEST * (a + c)).any()):  # before the divisions, whose gradients would be NaN
         kept = torch.nonzero(~thin)[:, 0]
-        rows_of = (each[kept] for each in (means2d, visible, z, a, b, c, det, det_before))
-        means2d, visible, z, a, b, c, det, det_before = rows_of
+        rows_of = (each[kept] for each in (means2d, visible, z, a, b, c, det, kept_det))
+        means2d, visible, z, a, b, c, det, kept_det = rows_of
     ellipses = torch.stack([c / det, b / c, 1 / c], dim=-1)
-    compensation = torch.sqrt(det_before.clamp(min=DET_FLOOR) / det)
-    return _Screen(means2d, ellipses, visible, z, torch.stack([a, c], dim=-1), compensation)
+    dims = settings.antialiased or blur is not None
+    factor = torch.sqrt(kept_det / det) if dims else None
+    return _Screen(means2d, ellipses, visible, z, torch.stack([a, c], dim=-1), factor)
+
+
+def _blur_of_det(
+    blur: Float[Tensor, "M 2"],
+    rows_of_M: Float[Tensor, "M 2 3"] | None,
+    flat: tuple[Tensor, Tensor, Tensor],
+    dilation: float,
+) -> Float[Tensor, " M"]:
+    """Return det(Sigma2d + d I + g g') - det(Sigma2d + d I) = g' adj(Sigma2d + d I) g, without cancellation."""
+    x, y = blur.unbind(-1)
+    if rows_of_M is not None:
+        across = x[:, None] * rows_of_M[:, 1] - y[:, None] * rows_of_M[:, 0]
+        own = (across * across).sum(dim=-1)
+    else:
+        a, b, c = flat
+        own = (x * x * c - 2 * x * y * b + y * y * a).clamp(min=0.0)
+    return own + dilation * (x * x + y * y)
+
+
+def _through_pinhole(
+    means: Float[Tensor, "N 3"], cam: Camera | CameraTensors, settings: RenderSettings
+) -> Through:
+    """Return what a pinhole at rest sees of the visible means."""
+    R = like(means, cam.R)
+    means_cam = (means - like(means, cam.eye)) @ R.T
+    visible = torch.nonzero(means_cam[:, 2] > settings.z_near)[:, 0]
+    visible = visible[torch.argsort(means_cam[visible, 2], stable=True)]
+    x, y, z = means_cam[visible].unbind(-1)
+    means2d = torch.stack([cam.fx * x / z + cam.cx, cam.fy * y / z + cam.cy], dim=-1)
+    zero = torch.zeros_like(z)
+    (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(settings.jacobian_limit)
+    x_z = (x / z).clamp(like(z, x_low), like(z, x_high))
+    y_z = (y / z).clamp(like(z, y_low), like(z, y_high))
+    rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
+    JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
+    return Through(means2d, JW, z, visible, None)
 
 
 def _alpha(
@@ -343,6 +378,11 @@ def _alpha(
     u, v = (axis[:, None, None] for axis in means2d.unbind(-1))
     A, m, C = (axis[:, None, None] for axis in ellipses.unbind(-1))
     dx = torch.arange(cam.W, dtype=means2d.dtype, device=means2d.device) - u
+    if cam.projection.kind == "equirectangular":
+        dx = (
+            dx
+            - like(u, seam_shift(np.arange(cam.W), u.double().numpy(force=True)[..., 0], cam.W))[:, None, :]
+        )
     dy = torch.arange(cam.H, dtype=means2d.dtype, device=means2d.device)[:, None] - v
     power = -0.5 * A * (dx - m * dy) ** 2 - 0.5 * C * dy * dy
     alpha = (opacities[:, None, None] * torch.exp(power)).clamp(max=thresholds.largest)

@@ -27,7 +27,7 @@ from gsplat_edu.engine.frame import GRADS, FrameGradients, Pool, Scene, differen
 from gsplat_edu.engine.host import Device
 from gsplat_edu.engine.statistics import Asked
 from gsplat_edu.engine.view import DeviceView
-from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
+from gsplat_edu.render.camera_tensors import POSE, CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
@@ -82,12 +82,11 @@ def render_webgpu(
     value, pose = split_camera(camera)
     background = tuple(extra.background.detach().tolist())
     degree = min(settings.sh_degree, gaussians.sh_degree)
-    view = engine_view(value, settings, background, degree)
-    call = _Call(view, settings.depth)
+    call = _Call(engine_view(value, settings, background, degree), settings.depth)
     tensors = gaussians.tensors()
     parameters = [tensors[name] for name in (*CORE, "sh_rest")]
     image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        call, extra.background, *pose, extra.features, *parameters
+        call, extra.background, extra.features, *pose, *parameters
     )
 
     def norms() -> Tensor:
@@ -151,12 +150,10 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         call: _Call,
         background: Tensor,
-        R: Tensor | None,
-        eye: Tensor | None,
-        intrinsics: Tensor | None,
         features: Tensor | None,
-        *parameters: Tensor,
+        *tensors: Tensor | None,  # the camera's, then the parameters
     ) -> tuple[Tensor, ...]:
+        parameters = [tensor for tensor in tensors[POSE:] if tensor is not None]
         scene = _scene(parameters, features)
         frame = surviving(lambda: draw_frame(_pool(), scene, call.view))
         call.visible, call.radii = torch.from_numpy(frame.visible), torch.from_numpy(frame.radii)
@@ -203,12 +200,14 @@ class _Rasterize(torch.autograd.Function):
             if ctx.needs_input_grad[1]
             else None
         )
-        with_camera = any(ctx.needs_input_grad[2:5])
-        pose = camera_gradients(torch.from_numpy(found.camera) if with_camera else None)
+        with_camera = any(ctx.needs_input_grad[3 : 3 + POSE])
+        pose = camera_gradients(
+            torch.from_numpy(found.camera) if with_camera else None, ctx.needs_input_grad[3 : 3 + POSE]
+        )
         to_features = None if found.features is None else torch.from_numpy(found.features)
         core = torch.split(torch.from_numpy(found.core), list(CORE.values()), dim=1)
         outgoing = [part.reshape(p.shape) for part, p in zip(core, parameters, strict=False)]
-        return None, behind, *pose, to_features, *outgoing, torch.from_numpy(found.rest)
+        return None, behind, to_features, *pose, *outgoing, torch.from_numpy(found.rest)
 
 
 @functools.cache

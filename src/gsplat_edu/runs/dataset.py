@@ -12,7 +12,17 @@ from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset, DataSettings
 from gsplat_edu.data.reader import CaptureReader
 
-KEYS = ("resolution", "test_every", "background", "image_memory", "train_views", "test_views")
+KEYS = (
+    "resolution",
+    "test_every",
+    "background",
+    "image_memory",
+    "train_views",
+    "test_views",
+    "lens",
+    "left_out",
+    "region",
+)
 """Keys of the section "data" that are data settings."""
 
 
@@ -39,7 +49,8 @@ def data_settings(config: dict[str, Any]) -> DataSettings:
     section = config.get("data")
     if not isinstance(section, dict):
         raise CheckpointError("config.json: the section data is missing; restore it or train again")
-    values = {key: section[key] for key in KEYS if key in section}
+    # a run without a region does not use one that its capture got later
+    values = {"region": ()} | {key: section[key] for key in KEYS if key in section}
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
     try:
         return as_trained(DataSettings(**values), appearance_of(config))

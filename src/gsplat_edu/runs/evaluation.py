@@ -19,6 +19,7 @@ from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.runs.meshes import mesh_entries
 from gsplat_edu.runs.transients import masked_pictures
+from gsplat_edu.runs.trials import RefineTrials
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
@@ -116,6 +117,8 @@ def evaluate_run(
     masked = masked_pictures(folder, metrics, judged.train, gaussians, render, judged.background)
     title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
     notes = [str(note) for note in judged.notes]
+    if trials := RefineTrials.of(config):
+        notes.append(trials.note(config.get("train")))
     report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, mesh_entries(folder))
     write_report(into.report, report)
     gallery.remove_others(before)

@@ -32,10 +32,11 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import as_file_name
-from gsplat_edu.base.validation import ArrayLike, float64_array
+from gsplat_edu.base.validation import ArrayLike, float64_array, quoted
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.fields import CONFIG, LOG, MESH, METRICS, checked
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.lens_record import lens_entry, with_lens
 from gsplat_edu.scene.views import View
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -270,7 +271,11 @@ def render_settings(config: dict[str, Any]) -> RenderSettings:
     section = config.get("render", {})
     known = {field.name for field in dataclasses.fields(RenderSettings)}
     if not isinstance(section, dict) or (unknown := sorted(set(section) - known)):
-        what = f"unknown settings {', '.join(unknown)}" if isinstance(section, dict) else "is not an object"
+        what = (
+            f"unknown settings {', '.join(map(quoted, unknown))}"
+            if isinstance(section, dict)
+            else "is not an object"
+        )
         raise CheckpointError(
             f"config.json: render: {what}; use the version of gsplat_edu that started the run"
         )
@@ -367,6 +372,7 @@ def _camera_entry(index: int, view: View, split: str, shift: np.ndarray) -> dict
         "cx": camera.cx,
         "cy": camera.cy,
         "split": split,
+        **lens_entry(camera),
     }
 
 
@@ -387,6 +393,7 @@ def _camera(where: str, entry: object, shift: np.ndarray) -> tuple[str, str, Cam
             height,
             width,
         )
+        camera = with_lens(camera, entry)
     except KeyError as error:
         raise CheckpointError(f"{where}: lacks {error}; write the file again or remove it") from None
     except (ValueError, TypeError, OverflowError) as error:

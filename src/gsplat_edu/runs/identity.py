@@ -156,7 +156,11 @@ def _comparable(config: dict[str, Any]) -> bool:
 
 def _alike(a: Camera, b: Camera) -> bool:
     one, other = (np.array([*c.R.ravel(), *c.eye, c.fx, c.fy, c.cx, c.cy, c.H, c.W]) for c in (a, b))
-    return bool(np.allclose(one, other, rtol=MOVED, atol=MOVED))
+    kinds = [(c.projection, c.readout, c.exposure, c.motion is None) for c in (a, b)]
+    if kinds[0] != kinds[1]:
+        return False
+    moving = a.motion is None or b.motion is None or np.allclose(a.motion, b.motion, rtol=MOVED, atol=MOVED)
+    return bool(moving and np.allclose(one, other, rtol=MOVED, atol=MOVED))
 
 
 def _section(folder: RunFolder, config: dict[str, Any], name: str) -> dict[str, Any]:

@@ -162,7 +162,7 @@ def _reduced(resolution: float | None, factor: float) -> float:
 
 def _posed(camera: Camera, known: Camera | None) -> Camera:
     """Return a camera with the pose that its run learned."""
-    return camera if known is None else Camera.posed(known.R, known.eye, camera.intrinsics)
+    return camera if known is None else Camera.posed(known.R, known.eye, camera.intrinsics, camera.shutter)
 
 
 def _spread(views: Sequence[View]) -> tuple[View, ...]:

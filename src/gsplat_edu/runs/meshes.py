@@ -28,6 +28,7 @@ from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.evaluate.paths import resized
 from gsplat_edu.mesh.depths import DepthView
 from gsplat_edu.mesh.extract import MeshResult
+from gsplat_edu.mesh.faces import drawn_in
 from gsplat_edu.mesh.raster import Raster, lit, picture, rasterized
 from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust
 from gsplat_edu.runs.folder import RunFolder
@@ -178,12 +179,22 @@ def _figures(made: MadeMesh, dataset: Callable[[], Dataset], background: ArrayLi
         camera = resized(view.camera, min(PICTURE_SIDE, max(view.camera.W, view.camera.H)))
         raster = rasterized(made.mesh, camera)
         images = {
-            "photo": photos.get(view.name, view.image),
+            "photo": _as_seen(view, photos.get(view.name)),
             "mesh": picture(made.mesh, raster, BEHIND),
             **_evidence(made, raster, camera),
         }
         panels = {name: small_jpeg(image) for name, image in images.items()}
         yield MeshFigure(view.name, panels, view.name not in photos)
+
+
+def _as_seen(view: DepthView, photo: UInt8[np.ndarray, "h w 3"] | None) -> UInt8[np.ndarray, "H W 3"]:
+    """Return a view's photo, drawn in the face if the view is one of a lens; without a photo, the rendered view."""
+    if photo is None:
+        return view.image
+    if view.lens is None:
+        return photo
+    h, w = photo.shape[:2]
+    return drawn_in(view.camera, view.rendered, view.lens.scaled(w, h), photo)[0]
 
 
 def _apart(views: Sequence[DepthView]) -> list[DepthView]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from gsplat_edu.base.validation import whole_number
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.trials import RefineTrials
 from gsplat_edu.train.config import TrainConfig
 
 
@@ -31,6 +32,7 @@ class RunOptions:
         eval_every: Iterations between evaluations on the test views; 0 evaluates only at the end.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
         resume: Continue from the last checkpoint of the folder.
+        trials: Scores by which `config.refine` was chosen, for config.json; None if no short trainings were judged.
 
     Raises:
         ArgumentError: a number is out of range.
@@ -47,11 +49,14 @@ class RunOptions:
     eval_every: int = 1_000
     save_every: int = 500
     resume: bool = False
+    trials: RefineTrials | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         for name in ("eval_every", "save_every"):
             whole_number(name, getattr(self, name), 0)
+        if self.config.region == "none":
+            object.__setattr__(self, "data_settings", replace(self.data_settings, region=()))
 
     @property
     def folder(self) -> RunFolder:

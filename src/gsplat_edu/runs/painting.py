@@ -10,45 +10,59 @@ from jaxtyping import UInt8
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.images import decode_mask
 from gsplat_edu.mesh.depths import DepthView
+from gsplat_edu.mesh.faces import drawn_in
 from gsplat_edu.mesh.texture import TextureSettings, TextureView, textured
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.transients import mask_path
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.views import Photo, View
+from gsplat_edu.train.transients import resized_mask
 
 HALF_OPAQUE = 128
 """Pixels of photos with a smaller alpha paint nothing."""
 
 
 def painted(
-    mesh: Mesh, dataset: Dataset, views: Sequence[DepthView], settings: TextureSettings | None = None
+    mesh: Mesh,
+    dataset: Dataset,
+    views: Sequence[DepthView],
+    run: RunFolder | None = None,
+    settings: TextureSettings | None = None,
 ) -> Mesh:
     """Give a mesh a texture from the training photos.
 
-    What masks exclude, and what photos with alpha show less than half opaque, paints nothing.
+    What masks exclude, what a training with `transients` found to have moved, and what photos with alpha show less than
+    half opaque, paints nothing.
 
     Args:
         mesh: The mesh, in the frame of the dataset's cameras.
         dataset: The capture; photos at the scene's exposure, as `gsplat_edu.runs.cleaning.open_subject` gives them.
         views: Depth maps of the scene, by the names of the photos; photos without one are not used.
+        run: The scene's run, whose masks of things that move count; None for none.
         settings: Size and blending; None for the defaults.
 
     Raises:
         ArgumentError: no photo has a depth map, or as for `textured`.
-        DatasetError: a photo cannot be read.
+        DatasetError: a photo or a mask cannot be read.
     """
     photos = {view.name: view for view in dataset.train}
     if not any(view.name in photos for view in views):
         raise ArgumentError("--texture: none of the depth maps is of a photo of the capture; check --dataset")
-    return textured(mesh, _views(views, photos), settings)
+    return textured(mesh, _views(views, photos, run), settings)
 
 
-def _views(views: Sequence[DepthView], photos: Mapping[str, View]) -> Iterator[TextureView]:
-    """Yield the photos one by one, at the size of their depth maps."""
+def _views(
+    views: Sequence[DepthView], photos: Mapping[str, View], run: RunFolder | None
+) -> Iterator[TextureView]:
+    """Yield the photos one by one, at the size of their depth maps, or drawn in the faces of their lens."""
     for view in views:
         if view.name not in photos:
             continue
         photo = photos[view.name].read()
-        H, W = view.depth.shape
+        camera = view.camera if view.lens is None else view.lens
+        H, W = camera.H, camera.W
         image = _bytes(photo)
         counts = np.ones(image.shape[:2], dtype=bool)
         if photo.mask is not None:
@@ -58,6 +72,12 @@ def _views(views: Sequence[DepthView], photos: Mapping[str, View]) -> Iterator[T
         if image.shape[:2] != (H, W):
             image = cv2.resize(image, (W, H), interpolation=cv2.INTER_AREA)
             counts = cv2.resize(counts.astype(np.uint8), (W, H), interpolation=cv2.INTER_NEAREST) > 0
+        if run is not None and (path := mask_path(run, view.name)).is_file():
+            counts &= resized_mask(decode_mask(path), H, W)
+        if view.lens is not None:
+            image, inside = drawn_in(view.camera, view.depth, camera, image)
+            shown, _ = drawn_in(view.camera, view.depth, camera, counts.astype(np.uint8), cv2.INTER_NEAREST)
+            counts = inside & (shown > 0)
         yield TextureView(view.camera, image, np.where(counts, view.depth, np.float32(0)))
 
 

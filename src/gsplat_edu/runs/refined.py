@@ -49,7 +49,7 @@ def write_refined(folder: RunFolder, dataset: Dataset) -> None:
 
 def in_capture_frame(camera: Camera, dataset: Dataset) -> Camera:
     """Return a camera of the dataset in the capture's own coordinates."""
-    return Camera.posed(camera.R, camera.eye + dataset.origin, camera.intrinsics)
+    return Camera.posed(camera.R, camera.eye + dataset.origin, camera.intrinsics, camera.shutter)
 
 
 def png_names(views: Sequence[View]) -> list[str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -141,11 +142,23 @@ def _of_run(folder: RunFolder, path: Path) -> Source:
         known = sorted(folder.read_cameras((x, y, z)), key=lambda entry: entry[0])
         cameras = tuple((name, camera) for name, _, camera in known)
         held_out = frozenset(name for name, split, _ in known if split == "test")
-    scale = config.get("scale") or {}
-    up = WORLD_UP if scale.get("level") is True else scene_up([camera for _, camera in cameras])
-    unit = scale.get("unit") if scale.get("unit") in UNITS else None
+    up, unit = up_and_unit(config, [camera for _, camera in cameras])
     scene = Scene(gaussians, settings.antialiased, up, unit)
     return Source(path, scene, cameras, settings, (x, y, z), held_out)
+
+
+def up_and_unit(
+    config: Mapping[str, Any], cameras: Sequence[Camera]
+) -> tuple[tuple[float, float, float], str | None]:
+    """Return the up direction of a run, and the unit of its coordinates, "m", "cm" or "mm"; None if it is unknown.
+
+    Args:
+        config: The content of config.json.
+        cameras: The run's cameras.
+    """
+    scale = config.get("scale") or {}
+    up = WORLD_UP if scale.get("level") is True else scene_up(cameras)
+    return up, scale.get("unit") if scale.get("unit") in UNITS else None
 
 
 def scene_up(cameras: Sequence[Camera]) -> tuple[float, float, float]:

@@ -70,7 +70,7 @@ def with_start_points(
         say("the time limit is too short to triangulate start points; the run starts from random ones")
         return options
     # At the size of the files, which `triangulate` reduces, and without keeping them in memory.
-    settings = dataclasses.replace(options.data_settings, resolution=None, image_memory=0)
+    settings = dataclasses.replace(options.data_settings, resolution=None, image_memory=0, lens="undistort")
     cloud = triangulate(Dataset.of(reader, settings).train, options.folder.path / "points", progress)
     if cloud is None:
         say("the photos match too little to triangulate start points from them")

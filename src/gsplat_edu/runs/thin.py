@@ -1,22 +1,30 @@
 """How long a training on few photos may be before it overfits: short trials on most photos, judged by the others.
 
-Many scenes fit a handful of photos, and a long training finds a wrong one, especially with inaccurate poses. The
-held-out test photos take no part.
+Many scenes fit a handful of photos, and a long training finds a wrong one, especially with inaccurate poses. PSNR tells
+that, but is a poor judge of the best length then: with poses that are wrong by some pixels it prefers a blur to details
+that are out of place. So `psnr_shifted` chooses the length. The held-out test photos take no part.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.evaluate.metrics import ImageScore, score_views
+from gsplat_edu.evaluate.metrics import ImageScore, at_exposure_of, score_views
+from gsplat_edu.evaluate.shifted import psnr_shifted
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.events import Event, StepEvent
@@ -31,12 +39,15 @@ HOLD_OUT = 4
 SIDE = 240
 """Longest side of the photos of a trial, px."""
 
+Picture = UInt8[np.ndarray, "H W 3"]
+"""A render or a photo."""
+
 LENGTHS = (100, 200, 400, 800)
 """Iterations of the trials, in this order."""
 
 OVERFIT_LOSS = 0.45
-"""Stop once a trial scores this much below the best shorter one, dB. If longer trainings are better, trials fluctuate
-by 0.3 dB."""
+"""A training is too long if its PSNR is this much below that of the best shorter one, dB. If longer trainings are
+better, trials fluctuate by 0.3 dB."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +70,13 @@ class ThinTrial:
         """Return why the training ends early; empty if it does not."""
         if self.longest is None:
             return ""
-        last = max(self.scores)
+        best = _best(self.scores)
+        worst = min(_longer(self.scores, best), key=lambda length: self.scores[length])
+        sharp = f"; {self.longest} show most detail, some pixels out of place" if self.longest != best else ""
         return (
             f"longer trainings make photos worse that they have not seen: {self.judges} training photos, held out for a"
-            f" trial, score {self.scores[self.longest]:.1f} dB after {self.longest} iterations and"
-            f" {self.scores[last]:.1f} dB after {last}; take more photos, or check the poses"
+            f" trial, score {self.scores[best]:.1f} dB after {best} iterations and"
+            f" {self.scores[worst]:.1f} dB after {worst}{sharp}; take more photos, or check the poses"
         )
 
 
@@ -78,7 +91,7 @@ def try_lengths(
     progress: Callable[[], None] = lambda: None,
     is_over: Callable[[], bool] = lambda: False,
 ) -> ThinTrial:
-    """Train on most of the training photos for increasing numbers of iterations, until the others get worse.
+    """Train on most of the training photos for increasing numbers of iterations, and score the others.
 
     Args:
         options: Options of the run.
@@ -98,6 +111,7 @@ def try_lengths(
     judges = dataset.train[HOLD_OUT // 2 :: HOLD_OUT]
     kept = tuple(view for i, view in enumerate(dataset.train) if i % HOLD_OUT != HOLD_OUT // 2)
     scores: dict[int, float] = {}
+    shifted: dict[int, float] = {}
     cut = False
     for length in LENGTHS:
         config = _config(options.config, length)
@@ -110,26 +124,54 @@ def try_lengths(
         trainer.run(is_over, [step])
         if cut := trainer.iteration < length:
             break
-        renderer = dataclasses.replace(options, config=config).renderer
-        found = score_views(trainer.gaussians, judges, renderer, config.background)
-        if not found:
+        found = _scored(trainer.gaussians, judges, dataclasses.replace(options, config=config))
+        if found is None:
             return ThinTrial(None, {}, 0)
-        scores[length] = _mean(found, config.appearance != "none")
-        if scores[length] < max(scores.values()) - OVERFIT_LOSS:
-            break
+        scores[length], shifted[length] = found
+    return ThinTrial(longest_of(scores, shifted), scores, len(judges), cut)
+
+
+def longest_of(scores: dict[int, float], shifted: dict[int, float]) -> int | None:
+    """Return the number of iterations after which a training gets worse; None if more are no worse.
+
+    Args:
+        scores: PSNR by iterations, dB: tells whether a training can be too long.
+        shifted: `psnr_shifted` by the same iterations, dB: best at the longest that is not.
+    """
     if not scores:
-        return ThinTrial(None, {}, len(judges), cut)
-    best = max(scores, key=lambda length: scores[length])
-    fell = scores[max(scores)] < scores[best] - OVERFIT_LOSS
-    return ThinTrial(best if fell else None, scores, len(judges), cut)
+        return None
+    best = _best(scores)
+    fell = any(scores[length] < scores[best] - OVERFIT_LOSS for length in _longer(scores, best))
+    return _best(shifted) if fell else None
 
 
-def _mean(scores: list[ImageScore], fitted: bool) -> float:
-    """Return the mean PSNR, dB, after a fit of the exposure if the run corrects exposures."""
+def _best(scores: dict[int, float]) -> int:
+    """Return the number of iterations with the highest score; the fewest of equal ones."""
+    return max(sorted(scores), key=lambda length: scores[length])
+
+
+def _longer(scores: dict[int, float], length: int) -> list[int]:
+    """Return the numbers of iterations above another."""
+    return [other for other in scores if other > length]
+
+
+def _scored(gaussians: Gaussians, judges: Sequence[View], options: RunOptions) -> tuple[float, float] | None:
+    """Return the mean PSNR and shifted PSNR, dB, with fitted exposures if the run has them; None without pixels."""
+    fitted = options.config.appearance != "none"
+    shifted = []
+
+    def compare(view: View, score: ImageScore, image: Picture, truth: Picture) -> None:
+        mask = view.read().mask
+        shown = torch.from_numpy(image / 255.0)
+        shifted.append(psnr_shifted(at_exposure_of(truth, shown, mask) if fitted else shown, truth, mask))
+
+    scores = score_views(gaussians, judges, options.renderer, options.config.background, compare)
+    if not scores:
+        return None
     values = [
         score.psnr if not fitted or score.psnr_fitted is None else score.psnr_fitted for score in scores
     ]
-    return math.fsum(values) / len(values)
+    return math.fsum(values) / len(values), math.fsum(shifted) / len(shifted)
 
 
 def _config(config: TrainConfig, iterations: int) -> TrainConfig:

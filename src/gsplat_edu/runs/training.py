@@ -19,12 +19,14 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.files import check_folder, remove_leftovers
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.region import read_region
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.runs.dataset import as_trained, reader_for
+from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for
 from gsplat_edu.runs.depth import check_depth, depth_digest, depth_name, with_run_depth
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
@@ -36,6 +38,7 @@ from gsplat_edu.runs.skies import shell_around, start_sky, with_room_for
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
 from gsplat_edu.runs.transients import write_masks
+from gsplat_edu.runs.trials import KEY as TRIALS
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.checkpoint import (
     list_checkpoints,
@@ -58,6 +61,8 @@ from gsplat_edu.train.transients import check_enough
 def document(options: RunOptions) -> dict[str, Any]:
     """Return the part of config.json that a run's options determine."""
     data = dataclasses.asdict(options.data_settings)
+    if not data["region"]:
+        del data["region"]  # as in the runs of older versions
     return {
         "version": version("gsplat-edu"),
         "data": {
@@ -71,6 +76,7 @@ def document(options: RunOptions) -> dict[str, Any]:
         "render": dataclasses.asdict(options.render_settings),
         "backend": options.backend,
         "machine": machine_facts(),
+        **({} if options.trials is None else {TRIALS: options.trials.json()}),
     }
 
 
@@ -81,8 +87,23 @@ Clean = Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]
 """Removes splats from a scene, and returns the others and a record of the removal."""
 
 
+def _with_own_files(options: RunOptions) -> RunOptions:
+    """Return the options with the left-out photos and the region of config.json, else of the capture's own files."""
+    settings, folder, changes = options.data_settings, options.folder, dict[str, Any]()
+    stored = data_settings(folder.read_config()) if folder.exists() else None
+    is_here = options.data.exists()
+    if settings.left_out is None and settings.train_views is None:
+        here = read_left_out(options.data) if stored is None and is_here else None
+        changes["left_out"] = here if stored is None else stored.left_out
+    if settings.region is None:
+        region = read_region(options.data) if stored is None and is_here else None
+        changes["region"] = (() if region is None else region.numbers) if stored is None else stored.region
+    return dataclasses.replace(options, data_settings=dataclasses.replace(settings, **changes))
+
+
 def _checked_folder(options: RunOptions) -> RunOptions:
-    """Check the folder against the options; return them with the start scene of a resumed run filled in."""
+    """Check the folder against the options; return them with what config.json adds of a resumed run filled in."""
+    options = _with_own_files(options)
     folder = options.folder
     if folder.exists():
         if not options.resume:
@@ -150,7 +171,8 @@ class CaptureRun:
         progress: Receives the number of photos read and their total.
         team: The processes that share the training; each makes this object and calls `train`. Only the first uses the
             folder, so the others may run on machines that do not have it.
-        check: Called with the capture before anything is written; it raises an error for one that must not be trained.
+        prepare: Called with the capture before anything is written; returns it with the views to train, perhaps with
+            other masks, and raises an error for a capture that must not be trained. Scores are those of the capture.
         reader: Has read the capture already; None to read it.
 
     Raises:
@@ -173,11 +195,11 @@ class CaptureRun:
         say: Callable[[str], None] = lambda sentence: None,
         progress: Callable[[int, int], None] | None = None,
         team: Member = ALONE,
-        check: Callable[[Dataset], None] = lambda dataset: None,
+        prepare: Callable[[Dataset], Dataset] = lambda dataset: dataset,
         reader: CaptureReader | None = None,
     ) -> None:
         self._team, self._leads = team, team.rank == 0
-        options = _checked_folder(options) if self._leads else options
+        options = _checked_folder(options) if self._leads else _with_own_files(options)
         scene = team.shared(None if options.scene is None else str(options.scene))
         self.options = dataclasses.replace(options, scene=None if scene is None else Path(scene))
         self.folder, self._say = options.folder, say
@@ -191,7 +213,7 @@ class CaptureRun:
         self.dataset = with_run_depth(with_points_of_first(dataset, team), reader, options, say)
         for note in self.dataset.notes:
             say(str(note))
-        check(self.dataset)
+        self._trained = prepare(self.dataset)
         self.dataset.preload(progress)
         if options.config.transients != "none":
             check_enough(len(self.dataset.train))
@@ -261,7 +283,7 @@ class CaptureRun:
         options = self.options
         return training(
             options.config,
-            self.dataset,
+            self._trained,
             dataclasses.replace(load_backend(options.backend), photo_room=options.data_settings.image_memory),
             Start(gaussians, self._shell),
             callbacks=[self._record],

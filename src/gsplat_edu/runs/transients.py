@@ -17,7 +17,6 @@ from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.capture import is_outside
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile, decode_mask
-from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.evaluate.masked import MaskedPicture
 from gsplat_edu.evaluate.metrics import Renderer, to_bytes
 from gsplat_edu.runs.folder import RunFolder, image_file_names
@@ -140,7 +139,7 @@ def _counting(view: View, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "H 
 
 
 def _write(path: Path, counts: Bool[np.ndarray, "H W"], source: PhotoFile | None) -> None:
-    if source is not None and not isinstance(source.lens, FaceLens) and not source.lens.distorts:
+    if source is not None and not source.resampled:
         counts = resized_mask(counts, source.lens.H, source.lens.W)
     with written_aside(path) as aside:
         Image.fromarray(np.where(counts, 255, 0).astype(np.uint8)).save(aside, format="PNG")

@@ -1,4 +1,4 @@
-"""The pinhole camera: position, orientation and projection.
+"""The camera: position, orientation, projection and shutter.
 
 Axes are OpenCV's, for the world and the camera alike: +x right, +y down, +z forward. The world's up is
 (0, -1, 0). Pixels are sampled at integer coordinates.
@@ -8,9 +8,10 @@ Chapters: 01_points, 03_gaussians_in_3d.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, SupportsFloat, SupportsIndex, runtime_checkable
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol, SupportsFloat, SupportsIndex, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,6 +19,10 @@ from jaxtyping import Float64
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, float64_array, in_range, whole_number
 from gsplat_edu.scene.intrinsics import Intrinsics
+from gsplat_edu.scene.projection import PINHOLE, Projection, jacobian_bound
+from gsplat_edu.scene.projection_formulas import NUMPY
+from gsplat_edu.scene.shutter import RollingShutter
+from gsplat_edu.scene.sight import Optics, Sight, sight
 
 WORLD_UP = (0.0, -1.0, 0.0)
 """The world's up direction: +y points down."""
@@ -25,12 +30,8 @@ WORLD_UP = (0.0, -1.0, 0.0)
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of R R' - I accepted for a rotation, to allow rotations stored as float32 text."""
 
-PARALLEL = 1e-3
-"""Smallest eigenvalue of mean(I - d d') at which the intersection of the optical axes d is well defined. Below it
-(about 1.8 degrees between axes) the intersection is noise."""
-
-EXTENT_MARGIN = 1.1
-"""Factor between the cameras' spread and the extent (the code of Kerbl et al. 2023)."""
+WHOLE_SPHERE = 1e-6
+"""Largest relative deviation of the angles that an equirectangular image covers from 360 and 180 degrees."""
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Float64[np.ndarray, "3 3"]:
@@ -67,21 +68,9 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Floa
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def jacobian_bound(size: int, middle: Any, focal: Any, limit: float) -> Any:  # noqa: ANN401
-    """Return one bound of x/z for the projection's Jacobian; see `Camera.jacobian_bounds`.
-
-    Args:
-        size: Width of the image, px.
-        middle: cx, px, a number or a tensor without axes.
-        focal: fx, px, of the same kind.
-        limit: Signed factor on the distance between the image's centre and its edge.
-    """
-    return (0.5 * (size - 1) + 0.5 * limit * size - middle) / focal
-
-
 @dataclass(frozen=True, eq=False, init=False)
 class Camera:
-    """A pinhole camera in OpenCV axes.
+    """A camera in OpenCV axes: a pinhole, unless it has another projection.
 
     x_cam = R (x - eye);  u = fx x/z + cx,  v = fy y/z + cy
 
@@ -94,6 +83,8 @@ class Camera:
         cy: Row of the principal point, px.
         H: Image height, px.
         W: Image width, px.
+
+    `projection` and `shutter` are a pinhole's and None; `through` returns a camera with others.
 
     Raises:
         ShapeError: R is not (3, 3) or eye not (3,).
@@ -109,6 +100,8 @@ class Camera:
     cy: float
     H: int
     W: int
+    projection: Projection = field(default=PINHOLE, init=False)
+    shutter: RollingShutter | None = field(default=None, init=False)
 
     def __init__(
         self, R: ArrayLike, eye: ArrayLike, fx: float, fy: float, cx: float, cy: float, H: int, W: int
@@ -134,6 +127,52 @@ class Camera:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
+    def through(self, projection: Projection = PINHOLE, shutter: RollingShutter | None = None) -> Camera:
+        """Return this camera with another lens and shutter.
+
+        Args:
+            projection: How the lens projects. The focal lengths of an equirectangular one have to be W / 2 pi and
+                H / pi px per radian: `Camera.panorama`.
+            shutter: How the camera moves while the image is read; None if it does not. R and eye are those at half
+                time.
+
+        Raises:
+            ArgumentError: the focal lengths or the shutter do not fit an equirectangular image.
+        """
+        if projection.kind == "equirectangular":
+            angles = 2 * np.pi * self.fx / self.W - 1, np.pi * self.fy / self.H - 1
+            if np.abs(angles).max() > WHOLE_SPHERE:
+                raise ArgumentError(
+                    "fx, fy: of an equirectangular image have to be W / 2 pi and H / pi px per radian; "
+                    "Camera.panorama makes one"
+                )
+            if shutter is not None and shutter.axis == 0:
+                raise ArgumentError("shutter: an equirectangular image is read by rows, down or up")
+        found = copy(self)
+        found.__dict__.pop("widest", None)
+        object.__setattr__(found, "projection", projection)
+        object.__setattr__(found, "shutter", shutter)
+        return found
+
+    @classmethod
+    def panorama(cls, R: ArrayLike, eye: ArrayLike, H: int, W: int) -> Camera:
+        """Make a camera of an equirectangular image: the whole sphere, with the forward direction in the middle.
+
+        Args:
+            R: (3, 3) world-to-camera rotation.
+            eye: (3,) camera centre, world units.
+            H: Image height, px.
+            W: Image width, px; twice the height for square pixels at the horizon.
+
+        Raises:
+            ShapeError: R is not (3, 3) or eye not (3,).
+            ArgumentError: as for the constructor.
+        """
+        H, W = whole_number("H", H, 1), whole_number("W", W, 1)
+        focal = W / (2 * np.pi), H / np.pi
+        plain = cls(R, eye, *focal, (W - 1) / 2, (H - 1) / 2, H, W)
+        return plain.through(Projection("equirectangular"))
+
     @classmethod
     def looking_at(
         cls, eye: ArrayLike, target: ArrayLike, fx: float, fy: float, H: int, W: int, up: ArrayLike = WORLD_UP
@@ -157,20 +196,23 @@ class Camera:
         return cls(look_at(eye, target, up), eye, fx, fy, W / 2, H / 2, H, W)
 
     @classmethod
-    def posed(cls, R: ArrayLike, eye: ArrayLike, intrinsics: Intrinsics) -> Camera:
+    def posed(
+        cls, R: ArrayLike, eye: ArrayLike, intrinsics: Intrinsics, shutter: RollingShutter | None = None
+    ) -> Camera:
         """Make a camera from a pose and intrinsics.
 
         Args:
             R: (3, 3) world-to-camera rotation.
             eye: (3,) camera centre, world units.
-            intrinsics: Of a pinhole; `Intrinsics.undistorted` gives that of a lens.
+            intrinsics: Focal lengths, principal point, size and projection.
+            shutter: How the camera moves while the image is read.
 
         Raises:
             ShapeError: R is not (3, 3) or eye not (3,).
             ArgumentError: as for the constructor.
         """
         i = intrinsics
-        return cls(R, eye, i.fx, i.fy, i.cx, i.cy, i.H, i.W)
+        return cls(R, eye, i.fx, i.fy, i.cx, i.cy, i.H, i.W).through(i.projection, shutter)
 
     @classmethod
     def from_viewmat(
@@ -213,14 +255,72 @@ class Camera:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Focal lengths, principal point and image size as one value."""
-        return Intrinsics(self.W, self.H, self.fx, self.fy, self.cx, self.cy)
+        """Focal lengths, principal point, image size and projection as one value."""
+        return Intrinsics(self.W, self.H, self.fx, self.fy, self.cx, self.cy, projection=self.projection)
+
+    @property
+    def pinhole(self) -> bool:
+        """Whether this is a pinhole at rest: undistorted perspective, and no rolling shutter."""
+        return self.projection.plain and self.shutter is None
+
+    @cached_property
+    def widest(self) -> float:
+        """Largest angle to the optical axis at which the lens projects means, radians; see `Projection.widest`."""
+        x = np.array([-0.5, self.W - 0.5]) - self.cx
+        y = np.array([-0.5, self.H - 0.5]) - self.cy
+        return self.projection.widest(float(np.hypot(np.abs(x).max() / self.fx, np.abs(y).max() / self.fy)))
+
+    @property
+    def coefficients(self) -> tuple[float, ...] | None:
+        """The coefficients of the distortion, as `gsplat_edu.scene.projection.COEFFICIENTS`; None if there is none."""
+        return None if self.projection.distortion is None else self.projection.distortion.coefficients
+
+    @property
+    def readout(self) -> str:
+        """The direction of a rolling shutter; of a global one, it means nothing."""
+        return "down" if self.shutter is None else self.shutter.readout
+
+    @property
+    def motion(self) -> tuple[float, ...] | None:
+        """Turn and shift during the readout, six numbers; None for a global shutter."""
+        return None if self.shutter is None else (*self.shutter.turn.tolist(), *self.shutter.shift.tolist())
+
+    @property
+    def exposure(self) -> float:
+        """Time for which a row is exposed, by that of the readout; 0 for no motion blur."""
+        return 0.0 if self.shutter is None else self.shutter.exposure
+
+    def scaled(self, W: int, H: int) -> Camera:
+        """Return the camera of the same photo at another size, see `Intrinsics.scaled`."""
+        return Camera.posed(self.R, self.eye, self.intrinsics.scaled(W, H), self.shutter)
+
+    def sight(self, points: ArrayLike, z_near: float = 0.0, jacobian_limit: float | None = None) -> Sight:
+        """See points of the world: image position, depth, Jacobian and direction, by projection and shutter.
+
+        Args:
+            points: (N, 3) world units.
+            z_near: Smallest depth, world units.
+            jacobian_limit: As for `jacobian_bounds`.
+
+        Raises:
+            ShapeError: not of shape (N, 3).
+            ArgumentError: a coordinate is NaN or infinite.
+        """
+        x, y, z = float64_array("points", points, ("N", 3)).T
+        lens, size = (self.fx, self.fy, self.cx, self.cy), (self.H, self.W)
+        rows, eye = [tuple(row) for row in self.R.tolist()], tuple(self.eye.tolist())
+        bounds = None if jacobian_limit is None else self.jacobian_bounds(jacobian_limit)
+        lens_of = self.projection, self.coefficients, self.widest
+        optics = Optics(*lens_of, self.motion, self.readout, bounds, self.exposure)
+        with np.errstate(all="ignore"):  # the numbers of points that are not seen mean nothing
+            return sight((x, y, z), rows, eye, lens, optics, size, z_near, NUMPY)
 
     def jacobian_bounds(self, limit: float | None) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the bounds of x/z and y/z for evaluating the projection's Jacobian.
 
         Far outside the image, a Gaussian's first-order ellipse grows without bound and would cover the image. The
-        bounds are the viewing directions of the image rectangle, enlarged by `limit` about its centre.
+        bounds are the viewing directions of the image rectangle, enlarged by `limit` about its centre; through a
+        distorted lens, those of its edges (`Projection.extent`). Only perspective projections have bounds.
 
         Args:
             limit: Factor, 1.3 in Kerbl et al.'s code; None for no bounds.
@@ -228,8 +328,14 @@ class Camera:
         Returns:
             (low, high) of x/z and of y/z.
         """
-        if limit is None:
+        if limit is None or self.projection.kind != "perspective":
             return (-np.inf, np.inf), (-np.inf, np.inf)
+        if self.projection.distortion is not None:
+            x, y = (
+                ((-0.5 - middle) / focal, (size - 0.5 - middle) / focal)
+                for size, middle, focal in ((self.W, self.cx, self.fx), (self.H, self.cy, self.fy))
+            )
+            return self.projection.extent(x, y, self.widest, limit)
         edges = [
             [jacobian_bound(size, middle, focal, side * limit) for side in (-1, 1)]
             for size, middle, focal in ((self.W, self.cx, self.fx), (self.H, self.cy, self.fy))
@@ -258,33 +364,70 @@ class Camera:
     def project(
         self, points_cam: ArrayLike
     ) -> tuple[Float64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch"]]:
-        """Project points in camera coordinates to the image: u = fx x/z + cx, v = fy y/z + cy.
+        """Project points in camera coordinates to the image: u = fx x/z + cx, v = fy y/z + cy for a pinhole.
+
+        A rolling shutter is not considered: the camera coordinates are those at the time of the point (`sight`).
 
         Args:
             points_cam: (..., 3) camera coordinates, world units.
 
         Returns:
-            u, v: (...) column and row, px; NaN where z <= 0, because a point beside or behind the camera has no image.
-            z: (...) depth, world units.
+            u, v: (...) column and row, px; NaN where the projection does not see the point, a pinhole where z <= 0.
+            depth: (...) z, or the distance from the camera if the projection is `along_ray`; world units.
 
         Raises:
             ShapeError: the last axis is not 3.
             ArgumentError: a coordinate is NaN or infinite.
         """
-        x, y, z = np.moveaxis(float64_array("points_cam", points_cam, ("...", 3)), -1, 0)
+        points = float64_array("points_cam", points_cam, ("...", 3))
+        x, y, z = np.moveaxis(points, -1, 0)
+        if not self.projection.plain:
+            still = Camera.posed(np.eye(3), np.zeros(3), self.intrinsics).sight(points.reshape(-1, 3))
+            u, v = (np.where(still.valid, each, np.nan).reshape(x.shape) for each in (still.u, still.v))
+            return u, v, np.reshape(still.depth, x.shape)
         depth = np.where(z > 0, z, np.nan)
         u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
         return np.asarray(u), np.asarray(v), np.array(z)  # for a single point: 0-d arrays, not scalars
 
     def rays(self) -> Float64[np.ndarray, "H W 3"]:
-        """Return the ray of every pixel, in world axes and of camera depth 1.
+        """Return the ray of every pixel, in world axes and of depth 1.
 
-        r = R' ((u - cx) / fx, (v - cy) / fy, 1),  so that eye + z r lies at the camera depth z
+        r = R' ((u - cx) / fx, (v - cy) / fy, 1) for a pinhole,  so that eye + z r lies at the camera depth z
+
+        Rays of another projection have the length 1 if its depth is the distance from the camera (`along_ray`), and are
+        NaN where a pixel has no ray. `origins` gives where they begin.
         """
         u, v = np.arange(self.W), np.arange(self.H)[:, None]
         x, y = np.broadcast_arrays((u - self.cx) / self.fx, (v - self.cy) / self.fy)
-        rays: Float64[np.ndarray, "H W 3"] = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.R
-        return rays
+        if self.projection.plain:
+            rays: Float64[np.ndarray, "H W 3"] = np.stack([x, y, np.ones_like(x)], axis=-1)
+        else:
+            rays = self.projection.directions(x, y, self.widest)
+        return np.asarray(self._when_read(rays) @ self.R)
+
+    def _when_read(self, vectors: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "H W 3"]:
+        """Turn vectors from the camera's axes when their pixel is read to those at half time."""
+        if self.shutter is None:
+            return vectors
+        h = 0.5 * self.shutter.times(self.H, self.W)[..., None] * self.shutter.turn
+        once = np.cross(vectors, h)  # -h x r: the inverse of Cayley's map
+        return np.asarray(
+            vectors + 2 / (1 + (h * h).sum(axis=-1, keepdims=True)) * (once + np.cross(once, h))
+        )
+
+    def origins(self) -> Float64[np.ndarray, "H W 3"]:
+        """Return where the ray of every pixel begins, world axes: the camera's centre when the pixel is read.
+
+        Rays of an orthographic projection begin on the plane through the centre.
+        """
+        eyes = np.broadcast_to(self.eye, (self.H, self.W, 3))
+        if self.projection.kind == "orthographic":
+            u, v = np.arange(self.W), np.arange(self.H)[:, None]
+            x, y = np.broadcast_arrays((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+            eyes = eyes + self._when_read(np.stack([x, y, np.zeros_like(x)], axis=-1)) @ self.R
+        if self.shutter is None:
+            return np.asarray(eyes)
+        return np.asarray(eyes + self.shutter.times(self.H, self.W)[..., None] * self.shutter.shift)
 
 
 @runtime_checkable
@@ -355,72 +498,3 @@ def as_camera(name: str, camera: CameraLike) -> Camera:
         return Camera(*(getattr(camera, member) for member in members))
     except ArgumentError as error:
         raise type(error)(f"{name}.{error}") from None
-
-
-def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius: float = 3.0) -> Camera:
-    """Make a square camera on a sphere around the origin, looking at the origin.
-
-    eye = radius (cos e sin a, sin e, -cos e cos a)
-
-    Args:
-        azimuth: Angle around the vertical axis, radians; 0 looks along +z.
-        elevation: Angle from the horizon, radians; positive is +y, which is down.
-        size: Height and width of the image, px.
-        fx: Focal length of both axes, px.
-        radius: Distance of the camera from the origin, world units.
-
-    Raises:
-        ArgumentError: the radius or focal length is not positive, the size is below 1, or the camera is straight above
-            or below the origin, where up is undefined.
-    """
-    radius = in_range("radius", radius, 0.0, open_low=True)
-    azimuth, elevation = (
-        float(float64_array(n, a, ())) for n, a in (("azimuth", azimuth), ("elevation", elevation))
-    )
-    direction = (np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth))
-    return Camera.looking_at(radius * np.array(direction), (0.0, 0.0, 0.0), fx, fx, size, size)
-
-
-def point_nearest_axes(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"] | None:
-    """Find the point nearest to all optical axes in the least-squares sense.
-
-    p minimises sum_i |(I - d_i d_i') (p - e_i)|²,  e_i: centre of camera i,  d_i: its viewing direction
-
-    Args:
-        cameras: At least one.
-
-    Returns:
-        (3,) world units; None if the axes are so nearly parallel that their intersection is noise.
-    """
-    eyes = np.stack([camera.eye for camera in cameras])
-    axes = np.stack([camera.R[2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    A, mean = across.mean(axis=0), eyes.mean(axis=0)
-    if np.linalg.eigvalsh(A)[0] < PARALLEL:
-        return None
-    b = (across @ (eyes - mean)[:, :, None]).mean(axis=0)[:, 0]
-    return np.asarray(mean + np.linalg.solve(A, b))
-
-
-def scene_extent(cameras: Sequence[Camera]) -> float:
-    """Measure the scale of a scene by the spread of its cameras.
-
-    1.1 max_i |e_i - mean e|,  e_i: centre of camera i
-
-    Args:
-        cameras: At least one.
-
-    Returns:
-        World units; 1 if all cameras are at the same place, which does not determine the size.
-
-    Raises:
-        ArgumentError: there is no camera.
-
-    Source: the code of Kerbl et al. 2023.
-    """
-    if not cameras:
-        raise ArgumentError("cameras: is empty; the extent of a scene needs at least one camera")
-    eyes = np.stack([camera.eye for camera in cameras])
-    spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
-    # Differences within rounding count as the same place.
-    return EXTENT_MARGIN * spread if spread > 1e-9 * max(1.0, float(np.abs(eyes).max())) else 1.0

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from gsplat_edu.base.constants import DET_FLOOR, DILATION, DILATION_MAX
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, check_shape, first_index, float64_array, in_range
-from gsplat_edu.scene.camera import CameraLike, as_camera
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 
 
 def quat_to_R(quat: ArrayLike) -> Float64[np.ndarray, "3 3"]:
@@ -108,22 +108,23 @@ def project_cov3d(
 
     Sigma2d = J W Sigma W' J',  W = cam.R,  J = [[fx/z, 0, -fx x/z²], [0, fy/z, -fy y/z²]]
 
-    (J: Jacobian of the pinhole at the mean, whose camera coordinates are x y z.) The dilation is not included.
+    (J: Jacobian of the pinhole at the mean, whose camera coordinates are x y z; other projections have their own.) The
+    dilation is not included.
 
     Args:
         cov3d: (..., 3, 3) covariances in world axes, world units squared.
         mean_cam: (..., 3) means in camera coordinates, world units; the same leading axes.
         cam: The camera: a `Camera` or any object with its members (`CameraLike`).
-        jacobian_limit: Clamp x/z and y/z inside J to this multiple of half the field of view, see
-            `Camera.jacobian_bounds`; None disables clamping.
+        jacobian_limit: Clamp x/z and y/z inside J of a perspective lens to this multiple of half the field of view,
+            see `Camera.jacobian_bounds`; None disables clamping.
 
     Returns:
         (..., 2, 2) screen-space covariances, px².
 
     Raises:
         ShapeError: a shape differs.
-        ArgumentError: a mean is not in front of the camera (z <= 0), anything is NaN or infinite, or `cam` is not a
-            camera.
+        ArgumentError: a mean is not in front of the camera (z <= 0) or not seen by its lens, anything is NaN or
+            infinite, or `cam` is not a camera or has a rolling shutter (`Camera.sight` has its Jacobian).
 
     Source: Zwicker et al. 2002, "EWA Splatting", eq. 31; Kerbl et al. 2023, eq. 5.
     """
@@ -131,6 +132,10 @@ def project_cov3d(
     cov3d = float64_array("cov3d", cov3d, ("...", 3, 3))
     mean_cam = float64_array("mean_cam", mean_cam, ("...", 3))
     check_shape("mean_cam", mean_cam.shape, (*cov3d.shape[:-2], 3), {})
+    if not cam.pinhole:
+        JW = _lens_jacobian(mean_cam, cam, jacobian_limit) @ cam.R
+        through_lens: Float64[np.ndarray, "*batch 2 2"] = JW @ cov3d @ np.swapaxes(JW, -1, -2)
+        return through_lens
     x, y, z = np.moveaxis(mean_cam, -1, 0)
     if not np.all(z > 0):
         raise ArgumentError(
@@ -143,6 +148,24 @@ def project_cov3d(
     JW = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) @ cam.R
     cov2d: Float64[np.ndarray, "*batch 2 2"] = JW @ cov3d @ np.swapaxes(JW, -1, -2)
     return cov2d
+
+
+def _lens_jacobian(
+    mean_cam: Float64[np.ndarray, "*batch 3"], cam: Camera, limit: float | None
+) -> Float64[np.ndarray, "*batch 2 3"]:
+    """Return the Jacobian of a projection that is not a pinhole, by camera axes, px per world unit."""
+    if cam.shutter is not None:
+        raise ArgumentError(
+            "cam: has a rolling shutter; Camera.sight has its Jacobian at points of the world"
+        )
+    seen = Camera.posed(np.eye(3), np.zeros(3), cam.intrinsics).sight(
+        mean_cam.reshape(-1, 3), jacobian_limit=limit
+    )
+    if not np.all(seen.valid):
+        hidden = np.asarray(~seen.valid.reshape(mean_cam.shape[:-1]))
+        raise ArgumentError(f"mean_cam{first_index(hidden)}: is not seen by the lens; cull it first")
+    rows = np.stack([np.stack(row, axis=-1) for row in seen.jacobian], axis=-2)
+    return np.asarray(rows.reshape(*mean_cam.shape[:-1], 2, 3))
 
 
 def opacity_compensation(cov2d: ArrayLike, dilation: float = DILATION) -> Float64[np.ndarray, "*batch"]:

@@ -19,8 +19,10 @@ class GivenDepth:
     """Depth along some rays of a camera. Rays have no pixels, so they fit a photo of any size.
 
     Args:
-        rays: (M, 2) x / z and y / z of each ray in camera axes, without units.
-        depths: (M,) camera depth z, above 0, world units.
+        rays: (M, 2) place of each ray on the plane of the camera's projection, (u - cx) / fx and (v - cy) / fy, without
+            units: x / z and y / z of the ray in the axes of a pinhole.
+        depths: (M,) depth of that projection, above 0, world units: z, or the distance from the camera's centre if the
+            projection is `along_ray`.
         weights: (M,) at least 0; how much each depth counts. None for 1 each.
         sparse: Whether these are the points of a capture instead of the pixels of a map.
 

@@ -1,15 +1,16 @@
-"""Pinhole intrinsics as a value: focal lengths, principal point and image size."""
+"""Intrinsics as a value: focal lengths, principal point, image size and projection."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.scene.projection import PINHOLE, Projection
 
 _Kind = TypeVar("_Kind", bound="Intrinsics")
 
@@ -20,7 +21,7 @@ find the ratio within 1 %."""
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics of a pinhole camera.
+    """Intrinsics of a camera.
 
     Args:
         W: Image width, px.
@@ -29,6 +30,7 @@ class Intrinsics:
         fy: Focal length along y, px.
         cx: Column of the principal point, px; pixel centres have integer coordinates.
         cy: Row of the principal point, px.
+        projection: How the lens projects; a pinhole by default.
 
     Raises:
         ArgumentError: a size is below 1, a focal length is not positive, or a number is NaN or infinite.
@@ -40,6 +42,7 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
+    projection: Projection = field(default=PINHOLE, kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ("W", "H"):
@@ -75,14 +78,18 @@ class Intrinsics:
         return replace(self, W=W, H=H, fx=self.fx * sx, fy=self.fy * sy, cx=cx, cy=cy)
 
     def turned(self, turns: int) -> Intrinsics:
-        """Return the pinhole of the photo turned clockwise: (u, v) becomes (H - 1 - v, u).
+        """Return the intrinsics of the photo turned clockwise: (u, v) becomes (H - 1 - v, u).
 
         Args:
             turns: Quarter turns.
+
+        Raises:
+            ArgumentError: of an equirectangular image.
         """
-        found = Intrinsics(self.W, self.H, self.fx, self.fy, self.cx, self.cy)
+        found = Intrinsics(self.W, self.H, self.fx, self.fy, self.cx, self.cy, projection=self.projection)
         for _ in range(turns % 4):
-            found = Intrinsics(found.H, found.W, found.fy, found.fx, found.H - 1 - found.cy, found.cx)
+            cx, cy, projection = found.H - 1 - found.cy, found.cx, found.projection.turned()
+            found = Intrinsics(found.H, found.W, found.fy, found.fx, cx, cy, projection=projection)
         return found
 
     def undistorted(self) -> Intrinsics:

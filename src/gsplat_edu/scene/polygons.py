@@ -73,17 +73,22 @@ def least_area_triangles(
     cost = np.zeros((count, count))  # of the part between corners i and j
     middle = np.zeros((count, count), dtype=np.int64)
     for gap in range(2, count):
-        for i in range(count - gap):
-            j = i + gap
-            if gap < count - 1 and not allowed(i, j):
-                cost[i, j] = np.inf
-                continue
-            between = np.arange(i + 1, j)
-            areas = np.linalg.norm(np.cross(ring[between] - ring[i], ring[j] - ring[i]), axis=1)
-            total = cost[i, between] + cost[between, j] + 0.5 * areas
-            best = int(total.argmin())
-            cost[i, j] = total[best] + LONG_EDGE * float(((ring[j] - ring[i]) ** 2).sum())
-            middle[i, j] = between[best]
+        starts = np.arange(count - gap)
+        if gap < count - 1:
+            closed = np.array([not allowed(first, first + gap) for first in range(count - gap)])
+            cost[starts[closed], starts[closed] + gap] = np.inf
+            starts = starts[~closed]
+        if not len(starts):
+            continue
+        ends, between = starts + gap, starts[:, None] + np.arange(1, gap)
+        chord = ring[ends] - ring[starts]
+        (x, y, z), (u, v, w) = np.moveaxis(ring[between] - ring[starts, None], -1, 0), chord.T[..., None]
+        areas = np.sqrt((y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2)
+        total = cost[starts[:, None], between] + cost[between, ends[:, None]] + 0.5 * areas
+        best = total.argmin(axis=1)
+        rows = np.arange(len(starts))
+        cost[starts, ends] = total[rows, best] + LONG_EDGE * (chord**2).sum(axis=1)
+        middle[starts, ends] = between[rows, best]
     if not np.isfinite(cost[0, count - 1]):
         return None
     triangles, parts = [], [(0, count - 1)]

@@ -92,6 +92,16 @@ class Photo:
         """Where the photo is opaque but for a twentieth, (H, W); None if it has no alpha."""
         return None if self.alpha is None else self.alpha >= OPAQUE
 
+    def counting(self, counts: Bool[np.ndarray, "H W"]) -> Photo:
+        """Return the photo with fewer pixels that count; what the capture's mask excludes stays the same.
+
+        Args:
+            counts: (H, W) true for pixels that still count, if the photo's own mask lets them.
+        """
+        outside = np.zeros(counts.shape, dtype=bool) if self.excluded is None else self.excluded
+        mask = counts if self.mask is None else counts & self.mask
+        return Photo(self.image, self.alpha, mask, outside, self.lens_only)
+
     def over(self, background: ArrayLike) -> Pixels:
         """Composite the photo over a background: rgb alpha + background (1 - alpha).
 
@@ -210,10 +220,10 @@ class View:
         """
         if factor == 1.0:
             return self
-        intrinsics = self.camera.intrinsics
-        W, H = (max(1, round(side / factor)) for side in (intrinsics.W, intrinsics.H))
-        camera = Camera.posed(self.camera.R, self.camera.eye, intrinsics.scaled(W, H))
-        return View.stored(camera, lambda: self.read().scaled(W, H), self.name).with_depth(self.depth)
+        W, H = (max(1, round(side / factor)) for side in (self.camera.W, self.camera.H))
+        return View.stored(self.camera.scaled(W, H), lambda: self.read().scaled(W, H), self.name).with_depth(
+            self.depth
+        )
 
     def _set(
         self,

@@ -10,7 +10,8 @@ from jaxtyping import Float64
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.io.edit import Similarity
-from gsplat_edu.scene.camera import Camera, point_nearest_axes
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.rig import point_nearest_axes
 
 DISTANCE = 5.0
 """Median distance of the cameras from their target, in units of the result. It is similar to COLMAP's own normalisation

@@ -9,10 +9,8 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +19,8 @@ import numpy as np
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import install_command
 
-PROGRESS_EVERY = 0.25
-"""Seconds between two queries of a job's progress."""
-
 BEAT = 10.0
 """Seconds after which the progress of a job that reports nothing is repeated, so that its time can be shown."""
-
-COUNTS = {
-    "features": "SELECT COUNT(*) FROM descriptors",
-    "matches": "SELECT COUNT(*) FROM two_view_geometries",
-}
-"""Queries that measure the progress of jobs without progress reports."""
 
 COLMAP_SEED = 0
 """Seed for all random numbers of COLMAP and of this package during structure from motion."""
@@ -70,18 +59,15 @@ def call(
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
     answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     listener = threading.Thread(target=_listen, args=(process, answers), daemon=True)
-    count = COUNTS.get(job)
     result: dict[str, Any] | None = None
     assert process.stdin is not None and process.stdout is not None
     try:
-        with suppress(BrokenPipeError), process.stdin as stdin:  # broken if the process failed at once
-            stdin.write(json.dumps({"job": job, **arguments}).encode())
+        with suppress(BrokenPipeError):  # the process failed at once
+            process.stdin.write(json.dumps({"job": job, **arguments}).encode() + b"\n")
+            process.stdin.flush()  # it stays open: its end tells the process that this one has ended
         listener.start()
-        rows = None if count is None else partial(_rows, Path(str(arguments["database"])), count)
-        result = _await_result(answers, progress, rows)
+        result = _await_result(answers, progress)
         code = process.wait()
-        if result is not None and rows is not None:
-            progress(rows())
     finally:
         if process.poll() is None:
             process.kill()
@@ -89,6 +75,8 @@ def call(
         if listener.ident is not None:
             listener.join()
         process.stdout.close()
+        with suppress(BrokenPipeError):  # what the process did not read
+            process.stdin.close()
     if result is None:
         how = f"was ended by signal {-code}" if code < 0 else f"failed with code {code}"
         raise DatasetError(
@@ -99,31 +87,24 @@ def call(
 
 
 def _await_result(
-    answers: queue.SimpleQueue[dict[str, Any]],
-    progress: Callable[[int], None],
-    rows: Callable[[], int] | None,
+    answers: queue.SimpleQueue[dict[str, Any]], progress: Callable[[int], None]
 ) -> dict[str, Any] | None:
     """Forward a job's progress until it ends; return its result, or None if it has none.
 
     Args:
         answers: The job's messages.
         progress: Called with the amount done; also, now and then, while the job reports nothing.
-        rows: Measures the amount done of a job that does not report it.
     """
-    done, told = 0, time.monotonic()
+    done = 0
     while True:
         try:
-            answer = answers.get(timeout=PROGRESS_EVERY)
+            answer = answers.get(timeout=BEAT)
         except queue.Empty:
-            if rows is not None:
-                progress(rows())
-            elif time.monotonic() - told >= BEAT:
-                told = time.monotonic()
-                progress(done)
+            progress(done)
             continue
         if "done" not in answer:
             return answer.get("result")
-        done, told = answer["done"], time.monotonic()
+        done = answer["done"]
         progress(done)
 
 
@@ -186,22 +167,11 @@ def _unchangeable(database: Path, error: sqlite3.Error) -> DatasetError:
 
 
 def _listen(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[str, Any]]) -> None:
-    """Forward a process's messages, and report its end."""
+    """Forward a process's messages, and report its end; the last line of one that was killed may be incomplete."""
     assert process.stdout is not None
-    for line in process.stdout:
-        answers.put(json.loads(line))
-    answers.put({"ended": True})
-
-
-def _rows(database: Path, query: str) -> int:
-    """Count the rows that a job has written; zero if there are none yet."""
     try:
-        reader = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=1.0)
-    except sqlite3.Error:  # the file does not exist yet
-        return 0
-    try:
-        return int(reader.execute(query).fetchone()[0])
-    except sqlite3.Error:  # its tables do not exist yet, or it is being written
-        return 0
+        for line in process.stdout:
+            if line.endswith(b"\n"):
+                answers.put(json.loads(line))
     finally:
-        reader.close()
+        answers.put({"ended": True})

@@ -127,7 +127,8 @@ def shared_cameras(groups: Sequence[Mapping[str, Any]]) -> dict[int, int]:
     were cropped to different aspect ratios still get one camera each.
 
     Args:
-        groups: Groups of photos of one size: "names", "width" and "height", px, and their "kind" by EXIF.
+        groups: Groups of photos of one size: "names", "width" and "height", px, their "kind" by EXIF, and "lens", not
+            None for a fisheye, which has a camera of its own.
 
     Returns:
         For each replaced camera, the number of its replacement; numbers count from 1 in the order of the groups. Empty
@@ -136,7 +137,11 @@ def shared_cameras(groups: Sequence[Mapping[str, Any]]) -> dict[int, int]:
     total = sum(len(group["names"]) for group in groups)
     if max((len(group["names"]) for group in groups), default=0) >= MAIN * total:
         return {}
-    few = [number for number, group in enumerate(groups, 1) if len(group["names"]) < OWN]
+    few = [
+        number
+        for number, group in enumerate(groups, 1)
+        if len(group["names"]) < OWN and group.get("lens") is None
+    ]
     few.sort(key=lambda number: (-groups[number - 1]["width"], number))  # scaled to the largest
     shared, leaders = dict[int, int](), list[int]()
     for number in few:

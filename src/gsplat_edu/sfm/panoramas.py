@@ -6,12 +6,14 @@ intrinsics and rotations stay fixed: a panorama has six unknowns, as a photo doe
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -34,6 +36,24 @@ from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts, taken_
 EQUIRECTANGULAR = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular", re.IGNORECASE)
 """XMP entry of a panorama, as attribute or as element (Google's Photo Sphere XMP)."""
 
+EXAMINED = 12
+"""Most photos whose edges are compared."""
+
+MOST = 0.8
+"""Photos are panoramas if at least this fraction of those examined are."""
+
+SEAM_WIDTH = 512
+"""Largest width at which the edges of a picture are compared, px."""
+
+SEAM = 2.0
+"""Largest difference of the left and right edge, in those of neighbouring columns."""
+
+CONTRAST = 6.0
+"""Smallest mean difference of columns a quarter turn apart, 0 to 255. Without it, a picture's edges always fit."""
+
+POLE = 0.5
+"""Largest standard deviation of the first and last row, in that of the rows between them."""
+
 FACE_QUALITY = 95
 """JPEG quality of the faces of lossy panoramas; faces of other panoramas are PNG."""
 
@@ -54,26 +74,26 @@ class Panorama:
 
 
 def are_panoramas(files: Sequence[Path], choice: str, say: Callable[[str], None]) -> bool:
-    """Decide whether photos are panoramas, by the user's choice or by the XMP of all photos.
+    """Decide whether photos are panoramas: by the user's choice, by XMP, or by their pictures.
 
-    The shape alone is not enough, because a plain photo may be cropped to 2:1; a note then names the option.
+    The shape alone is not enough, because a plain photo may be cropped to 2:1. A picture of the whole sphere continues
+    from its right edge at its left edge, and its first and last rows show one direction each.
 
     Args:
         files: The photos, or some frames of a video; files that cannot be read do not count.
         choice: "yes", "no", or "auto".
-        say: Receives a note if "auto" leaves doubt.
+        say: Receives what the photos were taken for, and why, unless the choice decides or they are not 2:1.
 
     Raises:
-        DatasetError: the choice is "yes", and a photo is not 2:1.
+        DatasetError: the choice is "yes", and a photo is not 2:1; or it is "auto", and there are panoramas among other
+            photos.
     """
     if choice == "no":
         return False
-    sizes, marked = dict[Path, tuple[int, int]](), list[Path]()
+    sizes = dict[Path, tuple[int, int]]()
     for path in files:
         try:
             sizes[path] = upright_size(image_size(path), image_orientation(path))
-            if is_panorama_size(*sizes[path]) and _has_panorama_xmp(path):
-                marked.append(path)
         except DatasetError:
             continue
     others = [path for path, size in sizes.items() if not is_panorama_size(*size)]
@@ -85,19 +105,50 @@ def are_panoramas(files: Sequence[Path], choice: str, say: Callable[[str], None]
                 "32,759 px); export it so, or give --panorama no"
             )
         return bool(sizes)
+    wide = [path for path in sizes if path not in others]
+    marked = [path for path in wide if _has_panorama_xmp(path)]
     if marked and len(marked) == len(sizes):
-        return True
-    if marked:
         say(
-            f"{len(marked)} of {len(sizes)} photos are 360-degree panoramas according to their XMP, first "
-            f"{marked[0].name}: used as plain photos; put them into a folder of their own"
+            f"{len(sizes)} photos taken for 360-degree panoramas: their XMP says so; otherwise give --panorama no"
         )
-    elif sizes and not others:
+        return True
+    some = wide[:: max(1, math.ceil(len(wide) / EXAMINED))]
+    closed = [path for path in some if path in marked or _shows_sphere(path)]
+    if others and closed:
+        raise DatasetError(
+            f"{len(marked) or len(wide)} of {len(sizes)} photos are 360-degree panoramas, first {closed[0].name}, and "
+            f"others are not, first {others[0].name}; put the panoramas into a folder of their own, or give "
+            "--panorama no"
+        )
+    if some and not others and len(closed) >= MOST * len(some):
         say(
-            "all photos are twice as wide as high: used as plain photos; if they are 360-degree panoramas, give "
-            "--panorama yes"
+            f"{len(sizes)} photos taken for 360-degree panoramas: they are 2:1, their left and right edges fit, and "
+            "their first and last rows show one point each; otherwise give --panorama no"
+        )
+        return True
+    if sizes and not others:
+        say(
+            f"{len(sizes)} photos taken for plain photos, although they are twice as wide as high: their left and "
+            "right edges do not fit; if they are 360-degree panoramas, give --panorama yes"
         )
     return False
+
+
+def _shows_sphere(path: Path) -> bool:
+    """Return whether a picture that is 2:1 shows a whole sphere, by its edges; False if it cannot be decoded."""
+    try:
+        image, _ = decode(path, image_orientation(path))
+    except DatasetError:
+        return False
+    width = min(SEAM_WIDTH, image.shape[1])
+    small = cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+    band = small[width // 16 : width // 2 - width // 16]  # without the poles, where all columns are alike
+    columns = [float(np.abs(band - np.roll(band, shift, axis=1)).mean()) for shift in (1, width // 4)]
+    seam = float(np.abs(band[:, 0] - band[:, -1]).mean())
+    if columns[1] < CONTRAST or seam > SEAM * columns[0] + 1.0 or seam > 0.5 * columns[1]:
+        return False
+    middle = float(band.std(axis=1).mean())
+    return all(float(row.std(axis=0).mean()) < POLE * middle for row in (small[0], small[-1]))
 
 
 def cut_panoramas(
@@ -157,7 +208,7 @@ def color_problems(files: Sequence[Path]) -> list[tuple[str, str]]:
 
 
 def face_facts(photos: Sequence[PhotoFacts], panoramas: Sequence[Panorama]) -> list[PhotoFacts]:
-    """Complete the facts of the faces: where they were taken, and that their pixels are final.
+    """Complete the facts of the faces: where they were taken.
 
     Args:
         photos: The faces, as found by `copy_photos`.
@@ -173,7 +224,7 @@ def face_facts(photos: Sequence[PhotoFacts], panoramas: Sequence[Panorama]) -> l
                 f"{missing[0]}: a face of {panorama.name} is damaged; remove the work folder sfm/"
             )
     return [
-        PhotoFacts(**asdict(by_name[name]) | {"place": panorama.place, "final": True})
+        PhotoFacts(**asdict(by_name[name]) | {"place": panorama.place})
         for panorama in panoramas
         for name in panorama.faces
     ]

@@ -54,6 +54,12 @@ JPEG_ENDINGS = (".jpg", ".jpeg")
 HEIC_ENDINGS = (".heic", ".heif", ".hif")
 """Endings of lossy photos that become .jpg; photos of all other formats are written as PNG."""
 
+FISHEYE_NAME = re.compile("fish.?eye", re.IGNORECASE)
+"""Name of a lens or camera in EXIF that makes its photos fisheyes."""
+
+SHORTEST, SHORTEST_FISHEYE = 0.3, 0.1
+"""Shortest plausible focal length in EXIF, of the longer side."""
+
 GRAY = (0.5, 0.5, 0.5)
 """Background of transparent photos in the working copies."""
 
@@ -76,7 +82,7 @@ class PhotoFacts:
             HEIC, which is decoded upright, the one that turns it back. Photos of one camera then share a lens.
         problem: `gsplat_edu.data.images.ImageHeader.problem`.
         taken: When it was taken, from EXIF, as a text that sorts by time; empty if unknown.
-        final: Whether the file is an upright pinhole image made here, which the capture takes as it is.
+        fisheye: Whether EXIF names the lens or camera a fisheye.
     """
 
     name: str
@@ -91,7 +97,7 @@ class PhotoFacts:
     sensor: int = UPRIGHT
     problem: str = ""
     taken: str = ""
-    final: bool = False
+    fisheye: bool = False
 
     def copy_size(self, longest: int) -> tuple[int, int]:
         """Return width and height of the working copy, px.
@@ -361,13 +367,14 @@ def _facts(path: Path, name: str, copy: str) -> tuple[PhotoFacts, tuple[int, int
     sensor = COUNTER[turns] if heif else 2 if orientation in MIRRORED else UPRIGHT
     if heif and turns % 2:
         W, H = H, W
-    focal = _focal(details, W, H)
     said = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)]
     said += [details.get(tag) for tag in (ExifTags.Base.LensModel, ExifTags.Base.FocalLength)]
     said += [details.get(ExifTags.Base.FocalLengthIn35mmFilm), details.get(ExifTags.Base.DigitalZoomRatio)]
     camera = " ".join([f"{W}x{H}", *(str(value).strip("\0 ") for value in said if value is not None)])
+    fisheye = FISHEYE_NAME.search(camera) is not None
+    focal = _focal(details, W, H, SHORTEST_FISHEYE if fisheye else SHORTEST)
     photo = PhotoFacts(name, copy, W, H, turns, focal, camera, place, sensor=sensor, problem=problem)
-    return replace(photo, taken=_taken(details)), decoded
+    return replace(photo, taken=_taken(details), fisheye=fisheye), decoded
 
 
 def _taken(details: dict[int, object]) -> str:
@@ -389,10 +396,10 @@ def _number(value: object) -> float:
         return math.nan
 
 
-def _focal(details: dict[int, object], W: int, H: int) -> float | None:
+def _focal(details: dict[int, object], W: int, H: int, shortest: float) -> float | None:
     """Compute the focal length in px from the 35 mm equivalent, f / 43.27 mm = f_px / diagonal, or the sensor's pitch.
 
-    Reject a focal length outside 0.3 to 20 times the longer side.
+    Reject a focal length outside `shortest` to 20 times the longer side.
     """
     equivalent = _number(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
     focal = equivalent / FULL_FRAME * math.hypot(W, H)
@@ -402,7 +409,7 @@ def _focal(details: dict[int, object], W: int, H: int) -> float | None:
         stored = _number(details.get(ExifTags.Base.ExifImageWidth))
         shrunk = W / stored if stored > 0 else 1.0
         focal = _number(details.get(ExifTags.Base.FocalLength)) * per_mm * shrunk
-    return float(focal) if 0.3 * max(W, H) < focal < 20.0 * max(W, H) else None
+    return float(focal) if shortest * max(W, H) < focal < 20.0 * max(W, H) else None
 
 
 def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:

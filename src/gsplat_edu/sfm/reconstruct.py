@@ -19,6 +19,7 @@ from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import remove_leftovers
 from gsplat_edu.data.images import UPRIGHT
+from gsplat_edu.data.masks import MASKS
 from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.sfm import pairs
@@ -26,7 +27,7 @@ from gsplat_edu.sfm.candidates import Candidates
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
 from gsplat_edu.sfm.mapping import Cameras, attempts, map_photos, no_overlap, rig_attempts, shared_cameras
 from gsplat_edu.sfm.masks import check_some_used, find_masks, unused_folders
-from gsplat_edu.sfm.options import SfmOptions as SfmOptions
+from gsplat_edu.sfm.options import SfmOptions as SfmOptions, lens_choice
 from gsplat_edu.sfm.panoramas import (
     Panorama,
     are_panoramas,
@@ -50,6 +51,8 @@ from gsplat_edu.sfm.result import build_capture, note_published, publish, publis
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
+from gsplat_edu.sfm.whole_photos import WholePhotos
+from gsplat_edu.sfm.wide_lenses import CameraGroup, camera_groups, circles_of, lens_lines, write_lens_masks
 
 INLIERS = 15
 """Smallest number of matches with one geometry that connects two photos: COLMAP's own bound."""
@@ -62,6 +65,10 @@ version 4 also if every photo has its own size."""
 
 FACES = 1
 """Version of the method that cuts panoramas."""
+
+LEAST_MOVING = 0.2
+"""Panoramas are warned of if a smaller fraction of their matches moves by more than a turn. Of a garden under a sky,
+whose positions came out wrong, 0.1 does, of a room 0.85."""
 
 PHOTOS = 2
 """Version of the method that copies photos. Version 2 reads the facts of the photos from their headers."""
@@ -76,7 +83,7 @@ def reconstruct(
     say: Say = lambda sentence: None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Path:
-    """Find the poses of photos, and write a capture in COLMAP's layout: undistorted photos and a model of pinholes.
+    """Find the poses of photos, and write a capture in COLMAP's layout: undistorted photos, fisheyes, panoramas.
 
     Features, matches and the order of all random draws are the same in every run. The mappers' order of summation
     depends on their threads, so poses of different runs agree to a fraction of a pixel but not to the bit. With one
@@ -127,6 +134,8 @@ class _Run:
         self.stages = Stages(self.folder / "stages.json", say)
         self.video = is_video(options.source)
         self.panoramas: list[Panorama] | None = None
+        self.cameras: list[CameraGroup] = []
+        """The photos by camera; empty for panoramas, whose faces have known cameras."""
         self.unit = 1
         """Photos with one pose: a panorama's faces."""
         self.threads = options.threads or -1
@@ -140,6 +149,7 @@ class _Run:
             source = self.folder / "frames"
             files = photo_files(source)
         check_some_used(files)
+        self.whole = WholePhotos()
         if are_panoramas(files, options.panorama, self._say):
             files = self._faces(files)
         self.source = source = files[0].parent
@@ -155,7 +165,7 @@ class _Run:
         known = set(facts["names"])
         self.photos = [photo for photo in photo_facts(files, source, copies) if photo.name in known]
         if self.panoramas is None:
-            self.groups = _groups(self.photos, options.max_image_size)
+            self._group(copies)
         else:
             self.photos = face_facts(self.photos, self.panoramas)
             self.groups = face_groups(self.photos, options.max_image_size)
@@ -165,16 +175,33 @@ class _Run:
             "pycolmap": version("pycolmap"),
             "method": FEATURES,
         }
+        if lenses := [group["lens"] for group in self.groups if group.get("lens")]:
+            wanted |= {"fisheyes": lenses}
         self._stage("features", wanted, self._features, database)
         facts = self._stage("matches", {"matcher": options.matcher}, self._match, [], self._forget_matches)
         wanted = {"mapper": options.mapper, "camera_model": options.camera_model, "method": MAPPING}
         connected = facts["connected"]
         self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
+        if self.model.get("moving", 1.0) < LEAST_MOVING:
+            self._say(
+                f"only {100 * self.model['moving']:.0f} % of the matches move between the panoramas by more than a"
+                " turn; the rest is far away, as sky is, and says little of where they stood: check the poses, mask"
+                f" the sky ({MASKS}/), or take more panoramas near things"
+            )
         if not all((options.out / part).is_dir() for part in ("images", "sparse/0")):
             self.stages.forget("capture")
         wanted = {} if options.scale == AUTO else {"scale": options.scale}
         self._stage("capture", wanted, self._finish, [])
         return options.out
+
+    def _group(self, copies: Path) -> None:
+        """Group the photos by camera, and say which are fisheyes."""
+        options = self.options
+        self.cameras = camera_groups(self.photos, copies, options.max_image_size, options.camera_model)
+        for line in lens_lines(self.cameras):
+            self._say(line)
+        self.groups = [group.json() for group in self.cameras]
+        self.whole = WholePhotos(circles_of(self.cameras))
 
     def _stage(
         self,
@@ -236,6 +263,8 @@ class _Run:
             Panorama(one["name"], tuple(one["faces"]), _place(one["place"])) for one in facts["panoramas"]
         ]
         self.unit = len(self.panoramas[0].faces)
+        named = {path.name: mask for path, mask in masks.items()}
+        self.whole = WholePhotos({}, self.panoramas, files[0].parent, named)
         return [folder / name for panorama in self.panoramas for name in panorama.faces]
 
     def _cut(self, files: Sequence[Path], folder: Path) -> dict[str, Any]:
@@ -276,7 +305,8 @@ class _Run:
     def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
         """Report the masks that are not used, and those whose orientation is ambiguous."""
         for folder in unused_folders(files, find_masks(files)):
-            self._say(f"{folder}: not used, because none of its images is named like a photo")
+            if not folder.is_relative_to(self.folder):  # beside the faces of panoramas lie the copies' masks
+                self._say(f"{folder}: not used, because none of its images is named like a photo")
         stored = stored_mask(self.folder / "photos", "").parent
         unknown = [
             photo.name
@@ -293,7 +323,9 @@ class _Run:
 
     def _features(self) -> dict[str, Any]:
         total, most = len(self.photos), self.options.max_features
-        masks = mask_folder(self.folder / "photos")
+        masks = write_lens_masks(
+            self.cameras, mask_folder(self.folder / "photos"), self.folder / "lens_masks"
+        )
         found = self._call(
             "features",
             lambda done: self._progress("features", min(done, total), total),
@@ -368,7 +400,10 @@ class _Run:
             shared = shared_cameras(self.groups)
             cameras = Cameras(shared)
             used = len(self.groups) - len(shared)
-            ways = attempts(options.mapper, options.camera_model, total, used, self.video)
+            lens, _ = lens_choice(options.camera_model)
+            ways = attempts(options.mapper, lens, total, used, self.video)
+            if all(group.lens is not None for group in self.cameras):
+                ways = [way for way in ways if not way.free]  # a freer lens than a fisheye is none
         else:
             cameras, ways = Cameras({}, rig_of(self.photos)), rig_attempts(options.mapper)
         model = map_photos(
@@ -386,7 +421,14 @@ class _Run:
 
     def _finish(self) -> dict[str, Any]:
         facts = build_capture(
-            self.model, self.photos, self.source, self.folder, self._progress, self.options.scale, self._say
+            self.model,
+            self.photos,
+            self.source,
+            self.folder,
+            self._progress,
+            self.options.scale,
+            self._say,
+            self.whole,
         )
         publish(self.folder, self.options.out)
         if scale := Scale.of_json(facts["scale"]):
@@ -408,7 +450,16 @@ class _Run:
                 f"{listed(facts['doubtful'])}"
             )
         figures = f"{facts['points']:,} points, mean reprojection error {facts['error']:.2f} px"
-        return facts | {"summary": f"{len(self.model['names'])} photos undistorted, {figures}"}
+        return facts | {"summary": f"{self._kept()}, {figures}"}
+
+    def _kept(self) -> str:
+        """Say how many photos were undistorted, and how many keep their lens."""
+        placed = set(self.model["names"])
+        if self.panoramas is not None:
+            return f"{len(placed) // self.unit} panoramas, whole (train --lens native uses them so)"
+        wide = {photo.copy for group in self.cameras if group.lens is not None for photo in group.photos}
+        counts = ((len(placed - wide), "undistorted"), (len(placed & wide), "with their own lens"))
+        return ", ".join(f"{count} photos {how}" for count, how in counts if count)
 
     def _call(self, job: str, progress: Callable[[int], None], **arguments: object) -> dict[str, Any]:
         database = str(self.folder / "database.db")
@@ -421,24 +472,6 @@ class _Run:
             seed=COLMAP_SEED,
             **arguments,
         )
-
-
-def _groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
-    """Group photos by camera, with the focal length from EXIF at the size of the working copies."""
-    groups: dict[str, dict[str, Any]] = {}
-    for photo in photos:
-        if photo.camera not in groups:
-            width, height = photo.copy_size(longest)
-            focal = None if photo.focal is None else photo.focal * width / photo.W
-            groups[photo.camera] = {
-                "names": [],
-                "kind": photo.camera.partition(" ")[2],
-                "focal": focal,
-                "width": width,
-                "height": height,
-            }
-        groups[photo.camera]["names"].append(photo.copy)
-    return list(groups.values())
 
 
 def _place(value: Sequence[float] | None) -> tuple[float, float, float] | None:

@@ -1,4 +1,8 @@
-"""Turn a model of the working copies into a capture: upright, undistorted photos and a matching model."""
+"""Turn a model of the working copies into a capture: upright photos and a matching model.
+
+Photos are undistorted, so that every program can read the capture. Fisheyes and panoramas stay whole, because no
+pinhole shows all of them.
+"""
 
 from __future__ import annotations
 
@@ -6,33 +10,48 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
+from jaxtyping import Float64
 
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
-from gsplat_edu.data.images import AT_ONCE, UPRIGHT, PhotoFile, load_photo
-from gsplat_edu.data.lens import Lens
+from gsplat_edu.data.images import (
+    AT_ONCE,
+    PhotoFile,
+    decode_mask,
+    image_orientation,
+    image_size,
+    load_photo,
+    upright_size,
+)
+from gsplat_edu.data.lens import FISHEYE, Lens
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.scale import SCALE_FILE, write_scale
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussian_math import quat_to_R
 from gsplat_edu.scene.intrinsics import Intrinsics
+from gsplat_edu.sfm.circle import Circle
 from gsplat_edu.sfm.colmap import call
-from gsplat_edu.sfm.masks import turn_mask
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts
 from gsplat_edu.sfm.scale import Sight, placed as placed_world
-
-QUALITY = 95
-"""JPEG quality of undistorted photos."""
+from gsplat_edu.sfm.whole_photos import (
+    DIM,
+    WholePhotos,
+    copy_or_encode,
+    save,
+    write_counting,
+    write_panorama,
+)
+from gsplat_edu.sfm.wide_lenses import rim_line
 
 PARTS = ("images", "masks", SCALE_FILE, "sparse")
 """Parts of a capture. The model comes last: its presence means that the capture is complete."""
@@ -45,26 +64,38 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
-class Undistorted:
+class NewPhoto:
     """A photo of the capture.
 
     Args:
-        photo: The original photo.
-        name: Its name in images/.
+        photo: The original photo, or a face of a panorama.
+        name: Its name in images/; faces have the name of their panorama.
         lens: Its lens, at the size of the file.
         pinhole: Intrinsics of the undistorted, upright photo.
+        rotation: From the axes of the original camera to those of the new photo's.
+        circle: The round image of a fisheye at the size of the file; None if it has none.
     """
 
     photo: PhotoFacts
     name: str
     lens: Lens
     pinhole: Intrinsics
+    rotation: Float64[np.ndarray, "3 3"]
+    circle: Circle | None = None
 
     def entry(self) -> dict[str, Any]:
         """Return the photo's entry for `gsplat_edu.sfm.engine.jobs.finish`."""
-        p = self.pinhole  # formats put the first pixel's centre at (0.5, 0.5)
-        sizes = {"name": self.name, "W": p.W, "H": p.H, "turns": self.photo.turns}
-        return sizes | {"fx": p.fx, "fy": p.fy, "cx": p.cx + 0.5, "cy": p.cy + 0.5}
+        p, turns = self.pinhole, self.photo.turns
+        params = [p.fx, p.fy, p.cx + 0.5, p.cy + 0.5]  # formats put the first pixel's centre at (0.5, 0.5)
+        model = "PINHOLE"
+        if isinstance(self.lens, FaceLens):
+            model, p, params = "EQUIRECTANGULAR", self.lens, [self.lens.W, self.lens.H]
+        elif self.lens.model == FISHEYE:
+            missing = 4 - len(self.lens.coefficients)
+            model, p = "OPENCV_FISHEYE", self.lens.turned(turns)
+            params = [p.fx, p.fy, p.cx + 0.5, p.cy + 0.5, *self.lens.coefficients, *[0.0] * missing]
+        sizes = {"name": self.name, "W": p.W, "H": p.H, "rotation": self.rotation.tolist()}
+        return sizes | {"model": model, "params": params}
 
 
 def build_capture(
@@ -75,6 +106,7 @@ def build_capture(
     progress: Callable[[str, int, int], None],
     scale: str = AUTO,
     say: Callable[[str], None] = lambda sentence: None,
+    whole: WholePhotos = WholePhotos(),  # noqa: B008
 ) -> dict[str, Any]:
     """Write images/, masks/ (if a photo has a mask), scale.json (if it is known) and sparse/0 into folder/result.
 
@@ -83,12 +115,13 @@ def build_capture(
         photos: All photos.
         source: Their folder.
         folder: Work folder; result/ in it is recreated.
-        progress: Called with the number of undistorted photos.
+        progress: Called with the number of photos written.
         scale: As for `gsplat_edu.sfm.scale.placed`.
-        say: As for `gsplat_edu.sfm.scale.placed`.
+        say: As for `gsplat_edu.sfm.scale.placed`; it also receives how far a fisheye sees.
+        whole: What is known of photos that keep their lens.
 
     Returns:
-        "points", their number; "error" in px of the undistorted photos; "left_out", the names of photos without a pose;
+        "points", their number; "error" in px of the photos written; "left_out", the names of photos without a pose;
         "unclear", photos of another size with an ambiguous focal length; and "doubtful", other photos whose pose did
         not count. "scale" is the scale as JSON, or None.
 
@@ -99,12 +132,14 @@ def build_capture(
     result = folder / "result"
     shutil.rmtree(result, ignore_errors=True)
     found, placed = folder / model["folder"], set(model["names"])
-    entries, cameras, sights = _views(found, [photo for photo in photos if photo.copy in placed])
+    entries, cameras, sights = _views(found, [photo for photo in photos if photo.copy in placed], whole)
     cloud = read_points(found)
     if cloud is None:
         raise DatasetError(f"{found}: contains no points; the photos show too little in common")
     move, known = placed_world(cameras, cloud.points, sights, scale, say)
-    _write_photos(entries, source, result, progress)
+    for line in _rims(entries):
+        say(line)
+    _write_photos(entries, source, result, whole, progress)
     if known is not None:
         write_scale(result, known)
     facts = call(
@@ -117,32 +152,80 @@ def build_capture(
         scale=move.s,
         photos={entry.photo.copy: entry.entry() for entry in entries},
     )
+    return facts | {"scale": None if known is None else known.json()} | _without_pose(model, photos)
+
+
+def _without_pose(model: Mapping[str, Any], photos: Sequence[PhotoFacts]) -> dict[str, list[str]]:
+    """Return the names of the photos without a pose that counts, by the reason."""
+    placed = set(model["names"])
     unclear = set(model["unclear"]) - placed
     doubtful = set(model["doubtful"]) - placed - unclear
     others = {photo.copy for photo in photos} - placed - unclear - doubtful
     kinds = {"left_out": others, "unclear": unclear, "doubtful": doubtful}
-    return (
-        facts
-        | {"scale": None if known is None else known.json()}
-        | {kind: [photo.name for photo in photos if photo.copy in copies] for kind, copies in kinds.items()}
-    )
+    return {kind: [photo.name for photo in photos if photo.copy in copies] for kind, copies in kinds.items()}
 
 
-def _views(model: Path, photos: Sequence[PhotoFacts]) -> tuple[list[Undistorted], list[Camera], list[Sight]]:
-    """Return the photos of the capture, their cameras in the model's world, and the photos before undistortion."""
+def _views(
+    model: Path, photos: Sequence[PhotoFacts], whole: WholePhotos
+) -> tuple[list[NewPhoto], list[Camera], list[Sight]]:
+    """Return the photos of the capture, pinholes in the model's world, and the photos with their own lenses."""
     poses = {pose.name: pose for pose in read_images(model / "images.bin")}
     lenses = read_cameras(model / "cameras.bin")
-    entries, cameras, sights = list[Undistorted](), list[Camera](), list[Sight]()
-    for photo, name in zip(photos, output_names(photos), strict=True):
+    entries, cameras, sights = list[NewPhoto](), list[Camera](), list[Sight]()
+    faces = {} if not whole.panoramas else _panorama_faces(whole)
+    names = [faces[photo.name].name for photo in photos] if faces else output_names(photos)
+    for photo, name in zip(photos, names, strict=True):
         pose = poses[photo.copy]
+        R = quat_to_R(pose.quat)
+        eye = -R.T @ np.array(pose.shift)
+        if faces:
+            face = faces[photo.name]
+            entries.append(NewPhoto(photo, name, face.lens, face.lens.undistorted(), face.lens.R.T))
+            cameras.append(Camera.posed(R, eye, lenses[pose.camera]))
+            if face.lens.number == 0:
+                sights.append(Sight(face.panorama, face.lens, face.lens.R.T @ R, eye))
+            continue
         lens = lenses[pose.camera].scaled(photo.W, photo.H)
         pinhole = lens.undistorted().turned(photo.turns)
-        entries.append(Undistorted(photo, name, lens, pinhole))
-        R, turn = quat_to_R(pose.quat), np.linalg.matrix_power(QUARTER, photo.turns)
-        eye = -R.T @ np.array(pose.shift)
+        turn = np.linalg.matrix_power(QUARTER, photo.turns)
+        circle = whole.circles.get(photo.copy)
+        if circle is not None:
+            circle = circle.scaled(photo.W / lenses[pose.camera].W)
+        entries.append(NewPhoto(photo, name, lens, pinhole, turn, circle))
         cameras.append(Camera.posed(turn @ R, eye, pinhole))
         sights.append(Sight(photo, lens, R, eye))
     return entries, cameras, sights
+
+
+class _Face(NamedTuple):
+    """A face of a panorama."""
+
+    panorama: PhotoFacts
+    name: str  # of the panorama in images/
+    lens: FaceLens
+
+
+def _panorama_faces(whole: WholePhotos) -> dict[str, _Face]:
+    """Return the panorama of each face, by the face's name."""
+    facts = []
+    for one in whole.panoramas:
+        path = whole.folder / one.name
+        W, H = upright_size(image_size(path), image_orientation(path))
+        facts.append(PhotoFacts(one.name, one.name, W, H, place=one.place))
+    return {
+        face: _Face(panorama, name, FaceLens.of(panorama.W, panorama.H, number))
+        for panorama, name, one in zip(facts, output_names(facts), whole.panoramas, strict=True)
+        for number, face in enumerate(one.faces)
+    }
+
+
+def _rims(entries: Sequence[NewPhoto]) -> Iterator[str]:
+    """Say how far each fisheye sees."""
+    seen = set[tuple[Lens, Circle | None]]()
+    for entry in entries:
+        if entry.lens.model == FISHEYE and (entry.lens, entry.circle) not in seen:
+            seen.add((entry.lens, entry.circle))
+            yield rim_line(entry.lens, entry.circle)
 
 
 def published(folder: Path) -> tuple[str, ...]:
@@ -243,34 +326,48 @@ def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
 
 
 def _write_photos(
-    entries: Sequence[Undistorted], source: Path, result: Path, progress: Callable[[str, int, int], None]
+    entries: Sequence[NewPhoto],
+    source: Path,
+    result: Path,
+    whole: WholePhotos,
+    progress: Callable[[str, int, int], None],
 ) -> None:
-    """Undistort and turn photos in parallel."""
+    """Write the photos in parallel, each panorama once."""
+    entries = list({entry.name: entry for entry in entries}.values())
     largest = max(entry.lens.W * entry.lens.H for entry in entries)
     pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
-    futures = [pool.submit(_write_photo, entry, source, result) for entry in entries]
+    panoramas = {face: one.name for one in whole.panoramas for face in one.faces}
+    futures = []
+    for entry in entries:
+        target, mask = result / "images" / entry.name, result / "masks" / f"{entry.name}.png"
+        if entry.photo.name in panoramas and isinstance(entry.lens, FaceLens):
+            futures.append(pool.submit(write_panorama, whole, panoramas[entry.photo.name], target, mask))
+        elif entry.lens.model == FISHEYE:
+            futures.append(pool.submit(_write_fisheye, entry, source, target, mask))
+        else:
+            futures.append(pool.submit(_write_undistorted, entry, source, target, mask))
     try:
         for done, future in enumerate(futures, 1):
             future.result()
-            progress("undistorting", done, len(entries))
+            progress("writing photos", done, len(entries))
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
-    lens, target = entry.lens, result / "images" / entry.name
+def _write_fisheye(entry: NewPhoto, source: Path, target: Path, mask: Path) -> None:
+    photo, lens = entry.photo, entry.lens
+    copy_or_encode(source / photo.name, target, photo.sensor, photo.turns)
+    counts = None if entry.circle is None else entry.circle.inside(lens.W, lens.H, DIM)
+    if photo.mask:
+        own = decode_mask(Path(photo.mask))
+        counts = own if counts is None else own & counts
+    if counts is not None:
+        write_counting(np.rot90(counts, -photo.turns), mask)
+
+
+def _write_undistorted(entry: NewPhoto, source: Path, target: Path, mask: Path) -> None:
+    lens = entry.lens
     target.parent.mkdir(parents=True, exist_ok=True)
-    if entry.photo.final:
-        shutil.copyfile(source / entry.photo.name, target)
-        if entry.photo.mask:
-            mask = result / "masks" / f"{entry.name}.png"
-            mask.parent.mkdir(parents=True, exist_ok=True)
-            given = Path(entry.photo.mask)
-            if given.suffix.lower() == ".png":
-                shutil.copyfile(given, mask)
-            else:
-                turn_mask(given, UPRIGHT, mask)
-        return
     counts = Path(entry.photo.mask) if entry.photo.mask else None
     photo = load_photo(
         PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None, entry.photo.sensor)
@@ -278,12 +375,6 @@ def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     pixels = np.asarray(photo.image)
     if photo.alpha is not None:
         pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)
-    jpeg = target.suffix.lower() in JPEG_ENDINGS and pixels.shape[2] == 3
-    options: dict[str, Any] = {"quality": QUALITY, "subsampling": 0} if jpeg else {"compress_level": 3}
-    upright_pixels = np.ascontiguousarray(np.rot90(pixels, -entry.photo.turns))
-    Image.fromarray(upright_pixels).save(target, format="JPEG" if jpeg else "PNG", **options)
+    save(np.rot90(pixels, -entry.photo.turns), target)
     if photo.mask is not None:
-        mask = result / "masks" / f"{entry.name}.png"
-        mask.parent.mkdir(parents=True, exist_ok=True)
-        upright_mask = np.where(np.rot90(photo.mask, -entry.photo.turns), 255, 0).astype(np.uint8)
-        Image.fromarray(upright_mask).save(mask)
+        write_counting(np.rot90(photo.mask, -entry.photo.turns), mask)

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.lens import Lens
+from gsplat_edu.data.native_lens import native_intrinsics
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.io.edit import Similarity
 from gsplat_edu.scene.camera import Camera
@@ -55,7 +56,7 @@ class Sight:
         """Return the unit direction of a marked pixel, in the world.
 
         Raises:
-            ArgumentError: the mark lies outside the photo.
+            ArgumentError: the mark lies outside the photo, or the lens has no ray for it.
         """
         W, H = (self.photo.W, self.photo.H)[:: -1 if self.photo.turns % 2 else 1]
         if not (0.0 <= mark.x <= W and 0.0 <= mark.y <= H):
@@ -65,8 +66,9 @@ class Sight:
         u, v, width, height = mark.x, mark.y, W, H
         for _ in range(self.photo.turns % 4):  # a clockwise quarter turn maps (u, v) to (height - v, u)
             u, v, width, height = v, width - u, height, width
-        x, y = self.lens.rays(np.array([u - 0.5]), np.array([v - 0.5]))[:, 0]
-        ray = self.R.T @ np.array([x, y, 1.0])
+        ray = self.R.T @ _own_ray(self.lens, u - 0.5, v - 0.5)
+        if not np.isfinite(ray).all():
+            raise ArgumentError(f"--scale: {_spelled(mark)} lies outside of what the lens shows")
         return np.asarray(ray / np.linalg.norm(ray))
 
 
@@ -214,6 +216,17 @@ def _check_near(cameras: Sequence[Camera], s: float, unit: str, say: Callable[[s
             f"the cameras are {spread:.2g} {unit} from their mean, and renderers clip splats nearer than 0.2 "
             f"units; give the distance in {smaller}, so that a unit is 1 {smaller}"
         )
+
+
+def _own_ray(lens: Lens, u: float, v: float) -> Float64[np.ndarray, "3"]:
+    """Return the ray of a pixel in camera axes, of any length; NaN if there is none."""
+    own = native_intrinsics(lens) if lens.wide else None
+    if own is not None:
+        camera = Camera.posed(np.eye(3), np.zeros(3), own)
+        place = np.array([(u - own.cx) / own.fx]), np.array([(v - own.cy) / own.fy])
+        return np.asarray(camera.projection.directions(*place, camera.widest)[0])
+    x, y = lens.rays(np.array([u]), np.array([v]))[:, 0]
+    return np.array([x, y, 1.0])
 
 
 def _spelled(mark: Mark) -> str:

@@ -94,11 +94,22 @@ def too_few(source: Path, count: int, unreadable: Sequence[str]) -> str:
         besides = f" that can be decoded (not {listed(unreadable)})" if unreadable else ""
         return f"{source}: holds {held}{besides}; poses need at least {FEWEST}, from different places"
     if unreadable:
-        return f"{source}: holds no photo that can be decoded: {listed(unreadable)}; export them as JPEG"
+        return f"{source}: holds no photo that can be decoded: {listed(unreadable)}; {remedy(unreadable)}"
     video = next((path.name for path in sorted(source.iterdir()) if is_video(path)), None)
     return f"{source}: holds no photos; " + (
         f"it holds a video; give that: {source / video}" if video else WANTED
     )
+
+
+def remedy(names: Sequence[str]) -> str:
+    """Say what to do with photos that cannot be decoded: a JPEG is damaged, another format may be unknown.
+
+    Args:
+        names: Their names, at least one.
+    """
+    if all(Path(name).suffix.lower() in (".jpg", ".jpeg") for name in names):
+        return "they are damaged, or no JPEG in spite of their name; copy them from the camera again"
+    return "export them as JPEG"
 
 
 def listed(names: Sequence[str]) -> str:

@@ -134,7 +134,7 @@ class Stages:
                     " again"
                 )
             return facts  # type: ignore[no-any-return]
-        changed = [key for key in options if known["options"].get(key) != options[key]]
+        changed = [key for key in known["options"] | options if known["options"].get(key) != options.get(key)]
         self._say(
             f"{name}: {', '.join(changed) or 'options'} changed; repeating this stage and the later ones"
         )

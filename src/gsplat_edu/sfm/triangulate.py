@@ -15,7 +15,7 @@ from PIL import Image
 
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import read_points_ply
-from gsplat_edu.scene.camera import scene_extent
+from gsplat_edu.scene.rig import scene_extent
 from gsplat_edu.scene.views import View
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call

@@ -199,6 +199,9 @@ def _smooth(camera: Camera, image: Pixels, points: Float64[np.ndarray, "N 3"]) -
 
 def _directions(camera: Camera) -> Float64[np.ndarray, "h w 3"]:
     """Return the unit direction of every pixel."""
+    if not camera.pinhole:
+        rays = camera.rays()
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
     u, v = np.meshgrid(np.arange(camera.W), np.arange(camera.H))
     across, down = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     # term by term: the rounding of a product of matrices may depend on the number of threads

@@ -16,7 +16,15 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute
 
 from gsplat_edu.base.constants import LOOPBACK
-from gsplat_edu.studio import job_routes, library_routes, live_routes, run_routes, scene_routes
+from gsplat_edu.studio import (
+    capture_routes,
+    floater_routes,
+    job_routes,
+    library_routes,
+    live_routes,
+    run_routes,
+    scene_routes,
+)
 from gsplat_edu.studio.guard import Guard
 from gsplat_edu.studio.patience import Patience
 from gsplat_edu.studio.refusal import not_found
@@ -62,7 +70,9 @@ def application(
         *job_routes.routes(),
         *live_routes.routes(),
         *run_routes.routes(),
+        *capture_routes.routes(),
         *scene_routes.routes(),
+        *floater_routes.routes(),
         *library_routes.routes(),
     ]
     guard = Middleware(Guard, token=token, host=host, cookie=cookie)

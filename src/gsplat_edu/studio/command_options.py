@@ -7,6 +7,7 @@ from typing import Any
 
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import option_flag, shortened
+from gsplat_edu.data.settings import LENS_MODES
 from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.studio.refusal import RefusedError
@@ -124,6 +125,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "sky": _choice("auto", *SKIES),
     "transients": _choice("auto", *TRANSIENTS),
     "refine": _choice("auto", *REFINEMENTS),
+    "lens": _choice(*LENS_MODES),
     "outside_masks": _choice("auto", *OUTSIDE_MASKS),
     "panorama": _choice(*PANORAMA),
     "scale": _text,
@@ -157,6 +159,7 @@ MESH_OPTIONS: Mapping[str, Option] = {
 CONVERT_OPTIONS: Mapping[str, Option] = {
     "sh_degree": _whole(0, 3),
     "min_opacity": _number(0.0, 1.0),
+    "verify": _choice("photos"),
 }
 
 RENDER_OPTIONS: Mapping[str, Option] = {

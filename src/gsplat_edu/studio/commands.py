@@ -25,6 +25,7 @@ from gsplat_edu.studio.command_options import (
     Words,
 )
 from gsplat_edu.studio.library import Library, files_within, scene_file
+from gsplat_edu.studio.listing import is_unfinished
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
 
@@ -77,6 +78,8 @@ class _Asked:
         entry = self.library.entry(kind, place.name)
         if kind == "photos" and not any(True for _ in files_within(entry)):
             raise conflict(f"{inputs[0]}: is empty; add photos first")
+        if kind == "captures" and is_unfinished(entry):
+            raise conflict(f"{inputs[0]}: has no poses yet; find the poses of its photos first")
         return kind, entry
 
     def _along(self) -> dict[str, str]:
@@ -239,14 +242,12 @@ def _doctor(asked: _Asked) -> Line:
 def _clean(asked: _Asked) -> Line:
     _, entry = asked.source()
     out = asked.made()
-    return [entry, "--out", out / f"{out.name}.ply", *asked.options()]
+    return [entry, "--out", out / f"{out.name}.ply", *asked.edits(), *asked.options()]
 
 
 def _convert(asked: _Asked) -> Line:
-    return [
-        *(asked.scene(), asked.exported(), *asked.options(), *asked.edits(), *asked.meshes()),
-        "--verify",
-    ]
+    line = [asked.scene(), asked.exported(), *asked.options(), *asked.edits(), *asked.meshes()]
+    return line if "verify" in asked.work.options else [*line, "--verify"]
 
 
 def _render(asked: _Asked) -> Line:
@@ -270,6 +271,7 @@ class _Command:
         reads: Kinds of the entries that it works on.
         makes: Kind of the entry that it makes; empty if it makes none.
         suffix: Added to the name of what it reads, for the default name of the entry that it makes.
+        word: Goes before the number of a further one of that name.
         forms: Endings of the file that it writes among the exports of what it reads; none if it writes none.
         edits: Whether it can apply edits.
         without_options: Kinds of entries with which it accepts no options.
@@ -281,6 +283,7 @@ class _Command:
     reads: tuple[str, ...]
     makes: str = ""
     suffix: str = ""
+    word: str = ""
     forms: tuple[str, ...] = ()
     edits: bool = False
     without_options: tuple[str, ...] = ()
@@ -293,12 +296,14 @@ class _Command:
 
 
 COMMANDS: Mapping[str, _Command] = {
-    "sfm": _Command(_sfm, "poses of INPUT", SFM_OPTIONS, ("photos",), "captures"),
-    "train": _Command(_train, "training of OUTPUT", TRAIN_OPTIONS, ("captures", "photos"), "runs"),
+    "sfm": _Command(_sfm, "poses of INPUT", SFM_OPTIONS, ("photos",), "captures", word="poses"),
+    "train": _Command(
+        _train, "training of OUTPUT", TRAIN_OPTIONS, ("captures", "photos"), "runs", word="run"
+    ),
     "doctor": _Command(
         _doctor, "doctor of INPUT", DOCTOR_OPTIONS, ("captures", "runs"), without_options=("runs",)
     ),
-    "clean": _Command(_clean, "cleaning of INPUT", CLEAN_OPTIONS, ("runs",), "scenes", "-clean"),
+    "clean": _Command(_clean, "cleaning of INPUT", CLEAN_OPTIONS, ("runs",), "scenes", "-clean", edits=True),
     "convert": _Command(
         _convert, "export of OUTPUT", CONVERT_OPTIONS, ("runs", "scenes"), forms=FORMATS, edits=True
     ),
@@ -336,7 +341,7 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
         options["resume"] = True
     outputs: tuple[str, ...] = ()
     if command.makes:
-        free = to or library.free_name(command.makes, f"{entry}{command.suffix}")
+        free = to or library.free_name(command.makes, f"{entry}{command.suffix}", command.word)
         outputs = (f"{command.makes}/{legible(checked_name('to', free))}",)
     elif command.forms:
         form = request.get("format") if len(command.forms) > 1 else command.forms[0]

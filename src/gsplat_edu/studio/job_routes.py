@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from numbers import Real
 from typing import Any
 
 from starlette.requests import Request
@@ -14,9 +16,10 @@ from gsplat_edu.base.text import shortened, whole_of
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
-from gsplat_edu.studio.replies import act
+from gsplat_edu.studio.replies import act, fields
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.stream import event_document, job_document
+from gsplat_edu.studio.undoing import beginning, undo
 
 MOST_EVENTS = 2_000
 """Events of a job in one answer: the latest ones."""
@@ -34,6 +37,7 @@ def routes() -> list[BaseRoute]:
         act("/api/jobs/{id}", "DELETE", _remove),
         act("/api/jobs/{id}/events", "GET", _events),
         act("/api/jobs/{id}/output", "GET", _output),
+        act("/api/jobs/{id}/undo", "POST", _undo),
         act("/api/jobs/{id}/{action}", "POST", _change),
         Route("/api/events", _stream, methods=["GET"]),
     ]
@@ -50,7 +54,9 @@ def _jobs(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noq
 def _start(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     if not isinstance(body, dict):
         raise RefusedError("body: has to be an object")
-    return job_document(studio.start(body))
+    begun = beginning(studio, body["begun"]) if "begun" in body else ("", "")
+    asked = {name: value for name, value in body.items() if name != "begun"}
+    return job_document(studio.start(asked, *begun))
 
 
 def _job(studio: Studio, request: Request) -> Job:
@@ -63,13 +69,19 @@ def _job(studio: Studio, request: Request) -> Job:
 
 def _change(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     job, action = _job(studio, request), request.path_params["action"]
-    actions = {"cancel": studio.queue.cancel, "pause": studio.queue.pause, "resume": studio.resume}
+    queue = studio.queue
+    actions = {"cancel": queue.cancel, "pause": queue.pause, "resume": studio.resume, "keep": queue.keep}
     if action not in actions:
         raise not_found(f"jobs/{job.id}/{shortened(action)}")
     try:
         return job_document(actions[action](job.id))
     except ArgumentError as error:
         raise conflict(str(error)) from None
+
+
+def _undo(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    job = undo(studio, request.path_params["id"], fields(body, created=Real)["created"])
+    return {"undone": job is None}
 
 
 def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -99,7 +111,7 @@ def _output(studio: Studio, request: Request, body: Any) -> Response:  # noqa: A
     text = ""
     if path.is_file():
         with open_file(path) as file:
-            file.seek(max(path.stat().st_size - MOST_OUTPUT, 0))
+            file.seek(max(os.fstat(file.fileno()).st_size - MOST_OUTPUT, 0))
             text = file.read().decode("utf-8", errors="replace")
     return PlainTextResponse(text)
 

@@ -13,6 +13,7 @@ Removing it removes the link. A link that was not adopted by this user on this c
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import shutil
@@ -29,7 +30,7 @@ from gsplat_edu.base.text import as_file_name, legible, shortened, whole_of
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.adopted import adopted, note_adopted
-from gsplat_edu.studio.names import checked_name
+from gsplat_edu.studio.names import checked_name, name_after
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 
 KINDS = ("photos", "captures", "runs", "scenes")
@@ -71,14 +72,21 @@ class Library:
     Args:
         root: The folder; its parts are created if missing.
         in_use: Called with an absolute path; returns the reason why it may not be moved, or None.
+        changed: Called after an entry was made, renamed, removed or restored.
 
     Raises:
         RefusedError: one of the library's own folders is a link or a file.
     """
 
-    def __init__(self, root: Path, in_use: Callable[[Path], str | None] = lambda path: None) -> None:
+    def __init__(
+        self,
+        root: Path,
+        in_use: Callable[[Path], str | None] = lambda path: None,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
         self.root = root.resolve()
-        self.in_use = in_use
+        self.in_use, self.changed = in_use, changed
+        self._promised: set[Path] = set()
         self.lock = threading.RLock()
         check_own_folders(self.root)
         self._adopted = adopted(self.root)
@@ -197,12 +205,50 @@ class Library:
             raise conflict(f"{kind}/{path.name}: exists already; choose another name")
         return path
 
-    def free_name(self, kind: str, name: str) -> str:
-        """Return the name, or the name with a number appended if it is taken."""
+    def free_name(self, kind: str, name: str, word: str = "", others: tuple[str, ...] = ()) -> str:
+        """Return the name, or the name with a number appended if it is taken or a waiting job will take it.
+
+        Args:
+            kind: Kind of the new entry.
+            name: The name.
+            word: Goes before the number, so that "walk-run-2" is no second set of photos.
+            others: Further kinds in which the name must be free.
+        """
         chosen, copy = name, 2
-        while os.path.lexists(self.place(kind, chosen)):
-            chosen, copy = f"{name}-{copy}", copy + 1
+        with self.lock:
+            while any(self._is_taken(self.place(one, chosen)) for one in (kind, *others)):
+                chosen, copy = "-".join(filter(None, (name, word, str(copy)))), copy + 1
         return chosen
+
+    def promise(self, kind: str, wish: str) -> str:
+        """Return a free name for a new entry, which nobody else gets until `release`.
+
+        No entry of any kind has it: entries of one name belong together.
+
+        Args:
+            kind: Its kind.
+            wish: The name of a file or folder to name it after; characters that a name may not have are replaced.
+        """
+        with self.lock:
+            name = self.free_name(kind, name_after(wish, kind), others=KINDS)
+            self._promised.add(self.place(kind, name))
+        return name
+
+    def release(self, kind: str, name: str) -> None:
+        """Give up a promised name."""
+        with self.lock:
+            self._promised.discard(self.place(kind, name))
+
+    def _name_of(self, kind: str, source: Path) -> str:
+        """Return a free name after a source, or that of the link to it that was not adopted here."""
+        name = name_after(source.stem if source.is_file() else source.name, kind)
+        link = self.place(kind, name)
+        link = link / source.name if source.is_file() else link
+        strange = link.is_symlink() and not self.is_within(link) and link.resolve() == source
+        return name if strange else self.free_name(kind, name, others=KINDS)
+
+    def _is_taken(self, path: Path) -> bool:
+        return os.path.lexists(path) or path in self._promised or self.in_use(path) is not None
 
     def part(self, suffix: str = "") -> Path:
         """Return a new path for a file or folder that is not complete yet."""
@@ -217,10 +263,16 @@ class Library:
         with self.lock:
             path = self.fresh(kind, name)
             part.rename(path)
+        self.changed()
         return path
 
-    def adopt(self, kind: str, source: Path, name: str) -> Path:
+    def adopt(self, kind: str, source: Path, name: str | None = None) -> Path:
         """Make an entry of a folder or file elsewhere on this computer, without copying it.
+
+        Args:
+            kind: Its kind.
+            source: The folder or file.
+            name: Its name; None for a free one after the source.
 
         Raises:
             RefusedError: the source does not exist, is not of that kind, or lies in the library; or the name is taken.
@@ -241,6 +293,7 @@ class Library:
             wanted = f"a folder, or a file ending in {', '.join(endings)}" if endings else "a folder"
             raise RefusedError(f"path: {source} is a file; give {wanted}")
         with self.lock:
+            name = self._name_of(kind, source) if name is None else name
             path = self.place(kind, name)
             link = path / source.name if source.is_file() else path
             if (
@@ -251,6 +304,7 @@ class Library:
                 link.symlink_to(source, target_is_directory=source.is_dir())
             note_adopted(self.root, source)
             self._adopted.append(source)
+        self.changed()
         return path
 
     def rename(self, kind: str, name: str, to: object) -> Path:
@@ -264,6 +318,7 @@ class Library:
             self._check_free(path)
             target = self.fresh(kind, to)
             path.rename(target)
+        self.changed()
         return target
 
     def remove(self, kind: str, name: str) -> str:
@@ -281,6 +336,7 @@ class Library:
             with written_aside(folder / "from.txt") as aside:
                 aside.write_text(kind, encoding="utf-8")
             path.rename(folder / path.name)
+        self.changed()
         return number
 
     def trash(self) -> list[dict[str, Any]]:
@@ -311,13 +367,18 @@ class Library:
                     folder = self.hidden("trash") / number
                     (folder / entry["name"]).rename(target)
                     _delete(folder)
+                    self.changed()
                     return target
         raise not_found(f"trash/{shortened(number)}")
 
     def empty_trash(self) -> None:
         """Delete what is in the trash; adopted entries lose only their link."""
-        for entry in self.trash():
-            _delete(self.hidden("trash") / entry["id"])
+        with self.lock:  # out of reach first, so that nothing is restored while it is deleted
+            numbers = {entry["id"] for entry in self.trash()}
+            doomed = [(self.hidden("trash") / number).rename(self.part()) for number in numbers]
+        for folder in doomed:
+            _delete(folder)
+        self.changed()
 
     def _check_free(self, path: Path) -> None:
         if (why := self.in_use(path)) is not None:
@@ -361,11 +422,12 @@ def extent_of(folder: Path) -> Extent:
     """Count what a folder holds, without following links inside."""
     files = num_bytes = photos = videos = 0
     for _, entry, is_photo in files_within(folder):
-        files += 1
-        num_bytes += entry.stat().st_size
-        ending = os.path.splitext(entry.name)[1].lower()  # noqa: PTH122 - a name, thousands of times
-        photos += is_photo and ending in PHOTO_ENDINGS
-        videos += ending in VIDEO_ENDINGS
+        with contextlib.suppress(OSError):  # it has just been removed
+            num_bytes += entry.stat().st_size
+            files += 1
+            ending = os.path.splitext(entry.name)[1].lower()  # noqa: PTH122 - a name, thousands of times
+            photos += is_photo and ending in PHOTO_ENDINGS
+            videos += ending in VIDEO_ENDINGS
     return Extent(files, num_bytes, photos, videos)
 
 
@@ -396,9 +458,35 @@ def files_within(folder: Path) -> Iterator[tuple[str, os.DirEntry[str], bool]]:
                 yield f"{prefix}{entry.name}", entry, photos
 
 
+def size_of(folder: Path, without: Path | None = None) -> int:
+    """Return the bytes of all files below a folder, hidden ones too; links are not followed.
+
+    Args:
+        folder: The folder.
+        without: A folder below it that does not count.
+    """
+    size, waiting = 0, [str(folder)]
+    while waiting:
+        try:
+            with os.scandir(waiting.pop()) as found:
+                entries = list(found)
+        except OSError:
+            continue
+        for entry in entries:
+            with contextlib.suppress(OSError):  # it has just been removed
+                if not entry.is_dir(follow_symlinks=False):
+                    size += entry.stat(follow_symlinks=False).st_size if not entry.is_symlink() else 0
+                elif without is None or entry.path != str(without):
+                    waiting.append(entry.path)
+    return size
+
+
 def scene_file(folder: Path) -> Path | None:
     """Return the scene of an entry of scenes: its only file with a scene's ending, or meta.json of an unpacked SOG."""
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SCENE_ENDINGS)
+    try:
+        found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SCENE_ENDINGS)
+    except FileNotFoundError:  # the entry has just been renamed or removed
+        return None
     found += [folder / name for name in ("lod-meta.json", "meta.json") if (folder / name).is_file()]
     return found[0] if found else None
 

@@ -10,10 +10,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
+from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.record import State
-from gsplat_edu.studio.library import KINDS
-from gsplat_edu.studio.listing import summary
-from gsplat_edu.studio.pictures import photo_list, thumbnail
+from gsplat_edu.studio.listing import summaries, summary
+from gsplat_edu.studio.origins import makers, origins
+from gsplat_edu.studio.pictures import leave_out, photo_list, thumbnail
+from gsplat_edu.studio.projects import projects
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import Json, act, answered, content_length, entry_of, fields, file_answer
 from gsplat_edu.studio.state import Studio
@@ -27,6 +29,8 @@ def routes() -> list[BaseRoute]:
     return [
         act("/api/library", "GET", _library),
         act("/api/adopt", "POST", _adopt),
+        act("/api/names", "POST", _promise),
+        act("/api/names/{kind}/{name}", "DELETE", _release),
         act("/api/trash", "GET", lambda studio, request, body: {"trash": studio.library.trash()}),
         act("/api/trash", "DELETE", _empty_trash),
         act("/api/trash/{id}/restore", "POST", _restore),
@@ -34,6 +38,7 @@ def routes() -> list[BaseRoute]:
         act("/api/{kind}/{name}", "DELETE", _remove),
         act("/api/{kind}/{name}/rename", "POST", _rename),
         act("/api/{kind}/{name}/photos", "GET", _photos),
+        act("/api/{kind}/{name}/left-out", "POST", _leave_out),
         act("/api/{kind}/{name}/thumbs/{path:path}", "GET", _thumb),
         Route("/api/{kind}/{name}/files/{path:path}", answered(_upload), methods=["PUT"]),
         Route("/api/{kind}/{name}/zip", answered(_upload_zip), methods=["PUT"]),
@@ -42,11 +47,13 @@ def routes() -> list[BaseRoute]:
 
 def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     library = studio.library
-    lists = {kind: [summary(kind, path) for path in library.entries(kind)] for kind in KINDS}
+    lists = summaries(library)
+    grouped = projects(library, lists, studio.queue.jobs(), studio.former)
     return {
         "folder": str(library.root),
         "free_bytes": shutil.disk_usage(library.root).free,
         "used_bytes": studio.uploads.used(),
+        "trash_bytes": studio.uploads.trash_size(),
         "limits": studio.uploads.limits.document(),
         "jobs_at_once": studio.queue.at_once,
         "waiting": sum(job.state is State.QUEUED for job in studio.queue.jobs()),
@@ -58,6 +65,7 @@ def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
             *_few(library.strange_links(), "entries are links that were not adopted here"),
             *([studio.queue.trouble] if studio.queue.trouble else []),
         ],
+        "projects": grouped,
         **lists,
     }
 
@@ -72,30 +80,48 @@ def _entry(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # no
 
 
 def _adopt(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    given = fields(body, kind=str, path=str, name=str)
-    path = studio.library.adopt(given["kind"], Path(given["path"]), given["name"])
+    given = fields(body, kind=str, path=str, **({"name": str} if body and "name" in body else {}))
+    path = studio.library.adopt(given["kind"], Path(given["path"]), given.get("name"))
     return summary(given["kind"], path)
+
+
+def _promise(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    given = fields(body, kind=str, wish=str)
+    name = legible(studio.library.promise(given["kind"], given["wish"]))
+    return {"kind": given["kind"], "name": name, "entry": f"{given['kind']}/{name}"}
+
+
+def _release(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    kind, name = request.path_params["kind"], request.path_params["name"]
+    studio.library.release(kind, name)
+    return {"released": f"{kind}/{name}"}
 
 
 def _rename(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     kind, name = request.path_params["kind"], request.path_params["name"]
-    return summary(kind, studio.rename(kind, name, fields(body, to=str)["to"]))
+    along = isinstance(body, dict) and "along" in body
+    given = fields(body, to=str, **({"along": bool} if along else {}))
+    if not given.get("along"):
+        return summary(kind, studio.rename(kind, name, given["to"]))
+    parents = origins(studio.library, summaries(studio.library), makers(studio.queue.jobs()), studio.former)
+    places = studio.rename_along(kind, name, given["to"], parents)
+    made = studio.library.entry(kind, given["to"])
+    return summary(kind, made) | {"renamed": places}
 
 
 def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     number = studio.library.remove(request.path_params["kind"], request.path_params["name"])
-    studio.uploads.recount()
     return {"trash": number}
 
 
 def _restore(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     path = studio.library.restore(request.path_params["id"])
-    studio.uploads.recount()
     return summary(path.parent.name, path)
 
 
 def _empty_trash(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     studio.library.empty_trash()
+    studio.uploads.recount()
     return {"trash": studio.library.trash()}
 
 
@@ -104,6 +130,17 @@ def _photos(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
     if kind not in ("photos", "captures"):
         raise RefusedError(f"{kind}: have no photos of their own; request the photos of a capture")
     return {"photos": photo_list(entry)}
+
+
+def _leave_out(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    kind, entry = entry_of(studio, request)
+    given = fields(body, photos=list, back=bool)
+    if kind != "captures" or not all(isinstance(photo, str) for photo in given["photos"]):
+        raise RefusedError("photos: has to be a list of photos of a capture")
+    with studio.library.lock:  # two tabs may change the list at the same time
+        left = leave_out(entry, given["photos"], given["back"])
+    studio.stream.library_changed()
+    return {"left_out": left}
 
 
 def _thumb(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401

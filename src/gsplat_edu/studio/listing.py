@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import math
 import os
 import re
 from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.studio.library import extent_of, scene_file
+from gsplat_edu.studio.library import KINDS, Library, extent_of, scene_file
+
+
+def summaries(library: Library) -> dict[str, list[dict[str, Any]]]:
+    """Return the facts of all entries, by kind; those that have just been renamed or removed are left out."""
+    found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
+    for kind, facts in found.items():
+        for path in library.entries(kind):
+            with contextlib.suppress(FileNotFoundError):
+                facts.append(summary(kind, path))
+    return found
 
 
 def summary(kind: str, path: Path) -> dict[str, Any]:
@@ -19,6 +33,9 @@ def summary(kind: str, path: Path) -> dict[str, Any]:
     Args:
         kind: Its kind.
         path: Its folder.
+
+    Raises:
+        FileNotFoundError: it has just been renamed or removed.
     """
     size = extent_of(path)
     facts: dict[str, Any] = {
@@ -35,6 +52,8 @@ def summary(kind: str, path: Path) -> dict[str, Any]:
         facts |= {"photos": size.photos, "videos": size.videos}
     if kind == "captures":
         facts["layout"] = layout(path)
+        facts["search"] = search_facts(path)
+        facts["unfinished"] = is_unfinished(path)
     if kind == "runs":
         facts |= run_facts(path)
     if kind == "scenes":
@@ -59,11 +78,51 @@ def layout(path: Path) -> str | None:
     return None
 
 
+def search_facts(path: Path) -> dict[str, Any] | None:
+    """Return what a finished search for poses found; None if the capture does not come from one.
+
+    Returns:
+        photos, the number that it was given; posed, those with a pose, both null for panoramas; and error, the mean
+        reprojection error, px.
+    """
+    file = path / "sfm" / "stages.json"
+    try:
+        facts = file.stat()
+    except OSError:
+        return None
+    return _search_facts(file, facts.st_mtime_ns, facts.st_size)
+
+
+@functools.lru_cache(maxsize=256)
+def _search_facts(file: Path, modified: int, size: int) -> dict[str, Any] | None:
+    """Read a file of stages once for each of its states; it lists every photo."""
+    try:
+        stages = parse_json(read_text(file))["stages"]
+        error = float(stages["capture"]["facts"]["error"])
+        given, posed = (len(stages[name]["facts"]["names"]) for name in ("photos", "mapping"))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if not math.isfinite(error):
+        return None
+    faces = "faces" in stages
+    return {"photos": None if faces else given, "posed": None if faces else posed, "error": error}
+
+
+def is_unfinished(path: Path) -> bool:
+    """Return whether a capture holds only what a search for poses needs to be resumed, and no poses."""
+    return layout(path) is None and (path / "sfm").is_dir()
+
+
 def scene_bytes(file: Path | None) -> int:
     """Return the size of a scene: its file, or the folder of an unpacked SOG."""
     if file is None:
         return 0
-    return extent_of(file.parent).num_bytes if file.suffix == ".json" else file.stat().st_size
+    if file.suffix == ".json":
+        return extent_of(file.parent).num_bytes
+    try:
+        return file.stat().st_size
+    except FileNotFoundError:  # it has just been renamed or removed
+        return 0
 
 
 def run_facts(path: Path) -> dict[str, Any]:

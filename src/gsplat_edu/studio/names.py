@@ -15,6 +15,9 @@ from gsplat_edu.studio.refusal import RefusedError
 LONGEST = 120
 """Bytes of the name of an entry in UTF-8; file systems have 255, and some names get an ending."""
 
+LONGEST_WISH = 100
+"""Bytes of a name that is made after a file; a number may be appended."""
+
 LONGEST_FILE = 200
 """Bytes of the name of a file in UTF-8."""
 
@@ -57,6 +60,19 @@ def checked_name(what: str, name: object, longest: int = LONGEST) -> str:
             f"{what}: the name {said!r} begins with a dot, a dash or a space, or ends with one; rename it"
         )
     return as_file_name(name)
+
+
+def name_after(wish: str, otherwise: str) -> str:
+    """Return a name that is allowed, like that of a file or folder.
+
+    Args:
+        wish: The name of the file or folder.
+        otherwise: Returned if nothing of it can be kept.
+    """
+    text = unicodedata.normalize("NFC", printable(as_file_name(wish)))
+    text = "".join("_" if letter in RESERVED else letter for letter in text)
+    text = text.encode("utf-8", "ignore")[:LONGEST_WISH].decode("utf-8", "ignore")
+    return text.lstrip(".- ").rstrip(". ") or otherwise
 
 
 def checked_path(what: str, path: object) -> Path:

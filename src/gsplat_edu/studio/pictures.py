@@ -13,29 +13,97 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.text import legible
 from gsplat_edu.studio.library import Library, photo_names
 from gsplat_edu.studio.names import below, checked_path
+from gsplat_edu.studio.photo_masks import masked
 from gsplat_edu.studio.refusal import RefusedError, not_found
 from gsplat_edu.studio.workers import Worker
 
 SIDES = (128, 256, 512, 1024)
 """Longest sides of thumbnails, px."""
 
-QUALITY = 85
-
 
 def photo_list(entry: Path) -> list[dict[str, Any]]:
-    """Return the photos of an entry: name, bytes, and upright width and height; a problem if it cannot be read."""
+    """Return the photos of an entry: name, bytes, upright width and height, and whether it is left out or drawn on.
+
+    A photo that cannot be read has a problem instead of a size.
+
+    Raises:
+        RefusedError: the list of photos to leave out, or the record of shapes, cannot be read.
+    """
     from gsplat_edu.data.images import image_orientation, image_size, upright_size
 
-    found = []
+    found, out, drawn = [], left_out(entry), masked(entry)
     for name in photo_names(entry):
         path = entry / name
-        facts: dict[str, Any] = {"name": legible(name), "bytes": path.stat().st_size, "problem": None}
+        try:
+            size = path.stat().st_size
+        except FileNotFoundError:  # it has just been removed
+            continue
+        facts: dict[str, Any] = {"name": legible(name), "bytes": size, "problem": None}
+        facts |= {"left_out": facts["name"] in out, "masked": facts["name"] in drawn}
         try:
             facts["W"], facts["H"] = upright_size(image_size(path), image_orientation(path))
         except DatasetError as error:
             facts |= {"W": None, "H": None, "problem": error.reason}
         found.append(facts)
     return found
+
+
+def leave_out(entry: Path, photos: list[str], back: bool) -> list[str]:
+    """Put photos of a capture on its list of those to leave out, or take them off; return all that it leaves out.
+
+    Args:
+        entry: The capture.
+        photos: Paths of photos below it, as `photo_list` names them.
+        back: Take them off.
+
+    Raises:
+        RefusedError: there is no such photo, none would be left, or the list cannot be read or changed now.
+    """
+    from gsplat_edu.data.changes import changing
+    from gsplat_edu.data.left_out import write_left_out
+
+    known = {legible(name): name for name in photo_names(entry)}
+    for photo in photos:
+        if photo not in known:
+            raise not_found(f"{entry.name}/{legible(photo)}")
+    chosen = {known[photo] for photo in photos}
+    try:
+        with changing(entry):
+            kept = [name for name in _listed(entry) if not any(name in _names_of(photo) for photo in chosen)]
+            listed = {*kept} if back else {*kept, *chosen}
+            out = [name for name in known.values() if not _names_of(name).isdisjoint(listed)]
+            if len(out) == len(known):
+                raise RefusedError(f"{entry.name}: none of its {len(known)} photos would be left; keep some")
+            write_left_out(entry, listed)
+    except DatasetError as error:
+        raise RefusedError(str(error), HTTPStatus.CONFLICT) from None
+    return [legible(name) for name in out]
+
+
+def left_out(entry: Path) -> set[str]:
+    """Return the photos that a capture's list leaves out, as `photo_list` names them.
+
+    Raises:
+        RefusedError: the list cannot be read.
+    """
+    listed = _listed(entry)
+    names = photo_names(entry) if listed else []
+    return {legible(name) for name in names if not _names_of(name).isdisjoint(listed)}
+
+
+def _listed(entry: Path) -> tuple[str, ...]:
+    from gsplat_edu.data.left_out import read_left_out
+
+    try:
+        return read_left_out(entry)
+    except DatasetError as error:
+        raise RefusedError(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
+
+
+def _names_of(path: str) -> set[str]:
+    """Return the names that a list may have for a photo: its path below the entry, and shorter ones."""
+    parts = path.split("/")
+    return {"/".join(parts[start:]) for start in range(len(parts))}
 
 
 def thumbnail(decoder: Worker, library: Library, entry: Path, name: str, side: str) -> Path:
@@ -88,22 +156,12 @@ def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
         DatasetError: the photo cannot be decoded.
         NotEnoughMemoryError: it needs more memory than is free.
     """
-    import cv2
-    from PIL import Image
+    from gsplat_edu.data.thumbnails import thumbnail_jpeg
 
-    from gsplat_edu.data.images import decode, image_orientation
-    from gsplat_edu.scene.views import Photo
-
-    path, target = Path(photo), Path(out)
+    target = Path(out)
     if target.is_file():
         return {}
-    pixels, alpha = decode(path, image_orientation(path), smaller=side)
-    if alpha is not None:
-        pixels = Photo(pixels, alpha).over((0.5, 0.5, 0.5))
-    factor = side / max(pixels.shape[:2])
-    if factor < 1.0:
-        size = (max(1, round(factor * pixels.shape[1])), max(1, round(factor * pixels.shape[0])))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    data = thumbnail_jpeg(Path(photo), side)
     with written_aside(target) as aside:
-        Image.fromarray(pixels).save(aside, format="JPEG", quality=QUALITY)
+        aside.write_bytes(data)
     return {}

@@ -62,6 +62,11 @@ def _finite(value: Any) -> Any:  # noqa: ANN401
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+QUIET = "quiet"
+"""Parameter of a GET: with the value 1, a refusal has the status 200, and its own one in the JSON. The page asks so for
+what may not be there yet, because browsers log every other status as an error."""
+
+
 def act(path: str, method: str, function: Act) -> Route:
     """Return a route whose function runs in a thread, after the JSON body was read."""
 
@@ -88,6 +93,8 @@ def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Re
         except OSError as error:
             line, status = described(error), HTTPStatus.INTERNAL_SERVER_ERROR
         await drain(request, status)
+        if request.method in ("GET", "HEAD") and request.query_params.get(QUIET) == "1":
+            return Json({"error": line, "status": int(status)})
         return refusal(line, status)
 
     return safe

@@ -17,6 +17,10 @@ from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.library import photo_names
+from gsplat_edu.studio.origins import renamed_capture
+from gsplat_edu.studio.photo_masks import masked
+from gsplat_edu.studio.pictures import left_out
+from gsplat_edu.studio.proposals import proposals, train_again
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer
 from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture
@@ -105,6 +109,7 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
             "fine": [],
             "advice": [],
             "stale": False,
+            "again": None,
         }
     return _diagnosis(studio, jobs[-1], kind, entry)
 
@@ -115,36 +120,64 @@ def _diagnosis(studio: Studio, job: Job, kind: str, entry: Path) -> dict[str, An
     events = [event for _, _, event in events_after(path)]
     starts = [index for index, event in enumerate(events) if isinstance(event, Started)]
     events = events[starts[-1] :] if starts else events
-    places = _photo_places(studio, kind, entry)
+    capture = entry if kind == "captures" else _capture_of(studio, entry)
+    places = {} if capture is None else _photo_places(capture)
+    out, drawn = set[str](), set[str]()
+    if capture is not None:
+        prefix = f"captures/{legible(capture.name)}/"
+        out, drawn = ({f"{prefix}{name}" for name in those(capture)} for those in (left_out, masked))
     findings = []
     for event in events:
         if isinstance(event, Found):
             photos = [places.get(name) for name in event.images]
-            findings.append({**dataclasses.asdict(event), "photos": photos})
+            offered = proposals(studio, kind, entry, event)
+            facts = {
+                "photos": photos,
+                "left_out": [photo in out for photo in photos],
+                "masked": [photo in drawn for photo in photos],
+                "proposals": offered,
+            }
+            findings.append({**dataclasses.asdict(event), **facts})
     rest = next((event for event in events if isinstance(event, Diagnosed)), Diagnosed((), (), ()))
     changing = entry / "metrics.json" if kind == "runs" else entry
-    stale = job.ended is not None and changing.exists() and changing.stat().st_mtime > job.ended
+    # a change while the doctor looked may have come after what it read
+    began = job.started if job.ended is not None else None
+    stale = began is not None and changing.exists() and changing.stat().st_mtime > began
     return {
         "job": job.id,
         "state": job.state.value,
         "line": job.line,
         "findings": findings,
         **dataclasses.asdict(rest),
+        "facts": [(name, _with_names(text, entry, capture)) for name, text in rest.facts],
         "stale": stale,
+        "again": train_again(studio, entry) if kind == "runs" else None,
     }
 
 
-def _photo_places(studio: Studio, kind: str, entry: Path) -> dict[str, str]:
-    """Return the photos of a capture, or of a run's capture, as "captures/NAME/thumbs" names them, by their names."""
-    if kind == "runs":
-        try:
-            capture = Path(str(RunFolder(entry).read_config()["data"]["path"]))
-        except (KeyError, TypeError):
-            return {}
-        parent = studio.library.root / "captures"
-        if capture.parent != parent or not capture.is_dir():
-            return {}
-        entry = capture
+def _with_names(text: str, *entries: Path | None) -> str:
+    """Return a text with the names of entries in place of their paths."""
+    places = {
+        str(path): legible(entry.name) for entry in entries if entry for path in (entry, entry.resolve())
+    }
+    for path in sorted(places, key=len, reverse=True):
+        text = text.replace(path, places[path])
+    return text
+
+
+def _capture_of(studio: Studio, run: Path) -> Path | None:
+    """Return the capture of a run; None if it is not in the library."""
+    try:
+        named = str(RunFolder(run).read_config()["data"]["path"])
+    except (KeyError, TypeError):
+        return None
+    capture = Path(renamed_capture(studio.library, run, named, studio.former) or named)
+    parent = studio.library.root / "captures"
+    return capture if capture.parent == parent and capture.is_dir() else None
+
+
+def _photo_places(entry: Path) -> dict[str, str]:
+    """Return the photos of a capture as "captures/NAME/thumbs" names them, by their names."""
     found: dict[str, str] = {}
     for name in photo_names(entry):
         parts = name.split("/")

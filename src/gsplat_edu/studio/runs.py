@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def curves(folder: RunFolder, after: str) -> dict[str, Any]:
     """
     try:
         with open_file(folder.log_file) as file:
-            facts = folder.log_file.stat()
+            facts = os.fstat(file.fileno())  # of this file: a resumed training puts another one in its place
             known, _, offset = after.partition(".")
             file_id = f"{facts.st_ino:x}"
             begin = (whole_of(offset) or 0) if known == file_id else 0

@@ -14,7 +14,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.base.errors import CheckpointError, SplatError
-from gsplat_edu.base.files import described, written_aside
+from gsplat_edu.base.files import described, newest_first, written_aside
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.base.text import bounded, legible
 from gsplat_edu.edits.stored import MOST_BYTES, version_of
@@ -46,6 +46,7 @@ def routes() -> list[BaseRoute]:
     return [
         act("/api/{kind}/{name}/page", "GET", _page),
         act("/api/{kind}/{name}/picture", "POST", _picture),
+        act("/api/{kind}/{name}/cover", "GET", _cover),
         act("/api/{kind}/{name}/scene", "GET", _download),
         act("/api/{kind}/{name}/exports", "GET", _exports),
         act("/api/{kind}/{name}/exports/{file}", "GET", _export),
@@ -74,18 +75,36 @@ def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN
     scene = current_scene(studio.library, entry, kind)
     facts = scene.stat()
     editing = request.query_params.get("edit") == "1"
+    applied = {} if editing else _applied(studio, entry, request)
     meshes = {name: path for name in MESHES if (path := _mesh_file(entry, request, name)) is not None}
     states = [(str(path), path.stat().st_mtime_ns, path.stat().st_size) for path in meshes.values()]
+    states += [(path, *_state(Path(path))) for path in applied.values()]
     key = f"{scene} {facts.st_mtime_ns} {facts.st_size} {entry.name} {editing} {states or ''}"
+    task = {"source": str(scene_of(entry, kind)), "title": legible(entry.name)}
+    if editing:
+        task |= {"edits": str(entry / EDITS), "url": EDITS}
+    task |= {name: str(path) for name, path in meshes.items()} | applied
+    return cached_page(studio, request, key, "page", task)
+
+
+def cached_page(studio: Studio, request: Request, key: str, name: str, task: dict[str, str]) -> Response:
+    """Return a page from the cache, made if it is not there.
+
+    Args:
+        studio: The studio.
+        request: The request.
+        key: What the page depends on.
+        name: Name of the worker's task that makes it and returns its policy.
+        task: The task's arguments, but for `out`, the file to write.
+
+    Raises:
+        RefusedError: the page cannot be made.
+    """
     digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
     target = studio.library.hidden("cache") / "pages" / f"{digest}.html"
     policy = target.with_suffix(".policy")
     if not (target.is_file() and policy.is_file()):
-        task = {"source": str(scene_of(entry, kind)), "title": legible(entry.name), "out": str(target)}
-        if editing:
-            task |= {"edits": str(entry / EDITS), "url": EDITS}
-        task |= {name: str(path) for name, path in meshes.items()}
-        made = studio.worker.ask("page", **task)
+        made = studio.worker.ask(name, **task, out=str(target))
         with written_aside(policy) as aside:
             aside.write_text(made["policy"], encoding="utf-8")
         _prune(target.parent)
@@ -107,9 +126,55 @@ def _mesh_file(entry: Path, request: Request, parameter: str) -> Path | None:
 def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
     kind, entry = entry_of(studio, request)
     current_scene(studio.library, entry, kind)
+    if body is None:
+        raise RefusedError("body: has to be a camera")
     source = str(scene_of(entry, kind))
-    data = studio.painter.paint(studio.is_training, source=source, camera=body, live=False)
+    applied = _applied(studio, entry, request)
+    data = studio.painter.paint(studio.is_training, source=source, camera=body, live=False, **applied)
     return Response(data, media_type="image/jpeg")
+
+
+def _cover(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    """Return a small picture of a scene from its start view, with its saved edits if they fit it."""
+    kind, entry = entry_of(studio, request)
+    scene = current_scene(studio.library, entry, kind)
+    task: dict[str, Any] = {"source": str(scene_of(entry, kind)), "camera": None, "live": False}
+    edits = _saved_edits(studio.library, entry)
+    key = f"{scene} {_state(scene)} {_state(edits) if edits else ''}"
+    digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
+    target = studio.library.hidden("cache") / "covers" / f"{digest}.jpg"
+    if not target.is_file():
+        try:
+            applied = {"applied": str(edits)} if edits else {}
+            data = studio.painter.paint(studio.is_training, **task, **applied)
+        except RefusedError as error:
+            if not edits or error.status is not HTTPStatus.BAD_REQUEST:
+                raise
+            data = studio.painter.paint(studio.is_training, **task)  # the edits are of an earlier scene
+        with written_aside(target) as aside:
+            aside.write_bytes(data)
+    return file_answer(request, target, "image/jpeg")
+
+
+def _saved_edits(library: Library, entry: Path) -> Path | None:
+    """Return the file of an entry's edits; None if there is none."""
+    path = entry / EDITS
+    if not path.is_file():
+        return None
+    library.check_within(path)
+    return path
+
+
+def _applied(studio: Studio, entry: Path, request: Request) -> dict[str, str]:
+    """Return the argument of a worker's task for the saved edits, if the address asks for them and there are some."""
+    wanted = request.query_params.get("edited") == "1"
+    edits = _saved_edits(studio.library, entry) if wanted else None
+    return {"applied": str(edits)} if edits else {}
+
+
+def _state(path: Path) -> tuple[int, int]:
+    facts = path.stat()
+    return facts.st_mtime_ns, facts.st_size
 
 
 def page_answer(request: Request, path: Path, policy: str) -> Response:
@@ -121,8 +186,7 @@ def page_answer(request: Request, path: Path, policy: str) -> Response:
 
 def _prune(folder: Path) -> None:
     """Remove the oldest pages of the cache."""
-    pages = sorted(folder.glob("*.html"), key=lambda path: path.stat().st_mtime, reverse=True)
-    for path in pages[KEPT_PAGES:]:
+    for path in newest_first(folder.glob("*.html"))[KEPT_PAGES:]:
         path.unlink(missing_ok=True)
         path.with_suffix(".policy").unlink(missing_ok=True)
 
@@ -145,7 +209,10 @@ def _exports(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
         if path.name[0] == "." or path.is_symlink() or not path.is_file():
             continue
         form = next((form for form in ENDINGS if path.name.endswith(f".{form}")), None)
-        facts = path.stat()
+        try:
+            facts = path.stat()
+        except FileNotFoundError:  # it has just been removed
+            continue
         found.append(
             {
                 "file": legible(path.name),
@@ -191,6 +258,7 @@ def _remove_export(studio: Studio, request: Request, body: Any) -> dict[str, Any
     if (why := studio.in_use(path)) is not None:
         raise conflict(f"{path.name}: {why}")
     path.unlink()
+    studio.stream.library_changed()
     return {"removed": legible(path.name)}
 
 
@@ -258,4 +326,5 @@ def _store(studio: Studio, kind: str, entry: Path, data: bytes, expected: str) -
             )
         with written_aside(entry / EDITS) as aside:
             aside.write_bytes(data)
+    studio.stream.library_changed()
     return version_of(data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ from gsplat_edu.jobs.following import last_stage
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job, State, Work
 from gsplat_edu.studio.commands import command_line, title_of, work_of
-from gsplat_edu.studio.library import Library
+from gsplat_edu.studio.floaters import Proposals
+from gsplat_edu.studio.library import HIDDEN, Library
 from gsplat_edu.studio.painter import Painter
 from gsplat_edu.studio.refusal import conflict
+from gsplat_edu.studio.renaming import FormerNames, names_along, rename_all
 from gsplat_edu.studio.stream import Stream
 from gsplat_edu.studio.uploads import Limits, Uploads
 from gsplat_edu.studio.workers import Worker
@@ -37,15 +40,17 @@ class Studio:
     """
 
     def __init__(self, folder: Path, at_once: int = 1, limits: Limits | None = None) -> None:
-        self.library = Library(folder, self.in_use)
-        self.uploads = Uploads(self.library, limits or Limits())
         self.stream = Stream()
+        self.library = Library(folder, self.in_use, self.stream.library_changed)
+        self.former = FormerNames(self.library.root / HIDDEN)
+        self.uploads = Uploads(self.library, limits or Limits())
         self.worker, self.prober = (
             Worker(),
             Worker(),
         )  # two, so that a measurement does not delay a page
         self.decoder = Worker(waiting=MOST_THUMBNAILS)
         self.painter = Painter()
+        self.proposals = Proposals()
         jobs = self.library.hidden("jobs")
         self.queue = JobQueue(
             jobs,
@@ -57,16 +62,26 @@ class Studio:
         )
         self._starting = threading.Lock()
 
-    def start(self, request: Mapping[str, Any]) -> Job:
+    def start(self, request: Mapping[str, Any], begun_by: str = "", begun_at: str = "") -> Job:
         """Queue the job that a request describes.
+
+        Args:
+            request: See `gsplat_edu.studio.commands.work_of`.
+            begun_by: See `Job`.
+            begun_at: See `Job`.
 
         Raises:
             RefusedError: it is not allowed, or a job that waits or runs does the same or writes to the same place.
         """
         with self._starting:
             work = work_of(self.library, request)
-            self._check_first(work, self._pending())
-            return self.queue.submit(work)
+            others = self._pending()
+            if request.get("to") is None:  # the name is ours, and no reason to do the same work twice
+                work = next(
+                    (job.work for job in others if replace(job.work, outputs=work.outputs) == work), work
+                )
+            self._check_first(work, others)
+            return self.queue.submit(work, begun_by, begun_at)
 
     def resume(self, name: str) -> Job:
         """Continue a paused job, or queue one again; see `JobQueue.resume`.
@@ -100,7 +115,38 @@ class Studio:
         with library.lock:
             old, new = library.entry(kind, name), library.fresh(kind, to)
             self.queue.rename(library.name(old), library.name(new), lambda: library.rename(kind, name, to))
+            self.former.note(library.name(old), library.name(new))
         return new
+
+    def rename_along(self, kind: str, name: str, to: str, parents: Mapping[str, str]) -> dict[str, str]:
+        """Give an entry another name, and likewise all that was made from it and named after it.
+
+        Args:
+            kind: Its kind.
+            name: Its name.
+            to: Its new name.
+            parents: What each entry was made from.
+
+        Returns:
+            The new places by the old ones.
+
+        Raises:
+            RefusedError: a job uses one of them, or a name is taken; all have their old names then.
+        """
+        library = self.library
+        with library.lock:
+            places = names_along(library.name(library.entry(kind, name)), to, parents)
+            for old, new in places.items():
+                path = library.entry(*old.split("/", 1))
+                if (used := self.in_use(path)) is not None:
+                    raise conflict(f"{old}: {used}; nothing is renamed")
+                library.fresh(*new.split("/", 1))
+            rename_all(places, self._rename_place)
+        return places
+
+    def _rename_place(self, old: str, new: str) -> None:
+        kind, _, name = old.partition("/")
+        self.rename(kind, name, new.partition("/")[2])
 
     def close(self) -> None:
         """End running jobs with a checkpoint; waiting ones are held by the next start."""
@@ -108,6 +154,7 @@ class Studio:
         self.prober.close()
         self.decoder.close()
         self.painter.close()
+        self.proposals.close()
         self.queue.close()
 
     def is_training(self) -> bool:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import json
+import math
 import secrets
 import threading
 from collections import deque
 from collections.abc import AsyncIterator
+from time import monotonic
 from typing import Any
 
 from gsplat_edu.base.locks import POLL
@@ -25,6 +28,9 @@ again."""
 
 HEARTBEAT = 15.0
 """Seconds of silence after which a comment is sent, to detect closed connections."""
+
+LIBRARY_EVERY = 1.0
+"""Least time between two events about changes of the library, s: uploads change it with every file."""
 
 MOST_WATCHING = 64
 """Streams at once."""
@@ -47,6 +53,8 @@ def job_document(job: Job) -> dict[str, Any]:
         "line": job.line,
         "waits_for": [{"job": name, "place": place} for name, place in job.waits_for],
         "resumable": job.resumable,
+        "begun_by": job.begun_by,
+        "begun_at": job.begun_at,
         "cancelling": job.cancelled and job.state in ACTIVE,
     }
 
@@ -76,7 +84,10 @@ class Stream:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._woken: set[asyncio.Event] = set()
         self._followers: dict[str, Follower] = {}
+        self._begun = set[str]()  # jobs that ran since the last look; one may end before the next
         self._over = threading.Event()
+        self._library_changed = threading.Event()
+        self._told = -math.inf  # when the stream last said so
 
     def close(self) -> None:
         """End all streams, for the end of the server; called in its event loop."""
@@ -88,7 +99,14 @@ class Stream:
         if job is None:
             self.publish("removed", {"id": name})
         else:
+            if job.state in ACTIVE:
+                with self._lock:
+                    self._begun.add(name)
             self.publish("job", job_document(job))
+
+    def library_changed(self) -> None:
+        """Note that entries of the library have changed. May be called from any thread, for each file of many."""
+        self._library_changed.set()
 
     def publish(self, kind: str, data: dict[str, Any]) -> None:
         """Add an event to the stream. May be called from any thread."""
@@ -97,8 +115,9 @@ class Stream:
             text = f"id: {self.boot}-{self._number}\nevent: {kind}\ndata: {json.dumps(data)}\n\n"
             self._kept.append((self._number, text))
             loop = self._loop
-        if loop is not None and not loop.is_closed():
-            loop.call_soon_threadsafe(self._wake)
+        if loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(self._wake)
 
     def _wake(self) -> None:
         for woken in self._woken:
@@ -112,19 +131,28 @@ class Stream:
             await asyncio.sleep(POLL)
 
     def look(self, queue: JobQueue) -> None:
-        """Publish what running jobs have written since the last look."""
+        """Publish what running jobs have written since the last look, and whether the library has changed."""
+        if self._library_changed.is_set() and monotonic() - self._told >= LIBRARY_EVERY:
+            self._library_changed.clear()
+            self._told = monotonic()
+            self.publish("library", {})
         jobs = {job.id: job for job in queue.jobs()}
+        with self._lock:
+            begun, self._begun = self._begun, set()
         for name in list(self._followers):
             if name not in jobs:
                 del self._followers[name]
         for name, job in jobs.items():
-            if job.state not in ACTIVE and name not in self._followers:
+            if job.state not in ACTIVE and name not in self._followers and name not in begun:
                 continue
             follower = self._followers.get(name)
             if follower is None:
                 follower = self._followers[name] = Follower(queue.folder / name / "events.jsonl")
-            for number, time, event in follower.read():
-                self.publish("event", {"job": name, **event_document(number, time, event)})
+            before = -1
+            while before < follower.offset:  # a read ends after `PIECE` bytes
+                before = follower.offset
+                for number, time, event in follower.read():
+                    self.publish("event", {"job": name, **event_document(number, time, event)})
             if job.state not in ACTIVE:
                 self._followers.pop(name, None)
 

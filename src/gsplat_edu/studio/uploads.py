@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from starlette.concurrency import run_in_threadpool
@@ -17,10 +18,13 @@ from starlette.concurrency import run_in_threadpool
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.photos.image_files import is_image
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
-from gsplat_edu.studio.library import SCENE_ENDINGS, Library, extent_of
+from gsplat_edu.studio.library import SCENE_ENDINGS, Library, size_of
 from gsplat_edu.studio.names import below, checked_path
 from gsplat_edu.studio.refusal import RefusedError, conflict, too_large
 from gsplat_edu.studio.unpack import ZipLimits, unpack
+
+COUNTED_FOR = 5.0
+"""Time for which a count of the library's bytes holds, s: jobs write to it too."""
 
 AT_ONCE = 16
 """Uploads that are received at the same time."""
@@ -32,7 +36,7 @@ class Limits:
 
     Args:
         file: Bytes of one file.
-        library: Bytes of the whole library, without adopted entries.
+        library: Bytes of the whole library with its trash, without adopted entries.
         spare: Bytes of the disk that stay free.
         entry_files: Files of one entry.
         zipped: What a zip file may hold.
@@ -72,12 +76,23 @@ class Uploads:
         self._expected = 0  # bytes of the uploads that are being received
         self._running = 0
         self._used: int | None = None
+        self._counted = 0.0  # when
 
-    def used(self) -> int:
-        """Return the bytes of the library's own files, counted once and then updated by uploads."""
-        if self._used is None:
-            self._used = extent_of(self.library.root).num_bytes
-        return self._used
+    def used(self, *, fresh: bool = True) -> int:
+        """Return the bytes of the library with its trash, records and cache, without adopted entries.
+
+        Args:
+            fresh: Whether to count now; else a count of the last `COUNTED_FOR` seconds will do, with later uploads.
+        """
+        used = self._used  # another thread may forget it meanwhile
+        if fresh or used is None or monotonic() - self._counted >= COUNTED_FOR:
+            self._counted = monotonic()
+            self._used = used = size_of(self.library.root, without=self.library.hidden("uploads"))
+        return used
+
+    def trash_size(self) -> int:
+        """Return the bytes of the trash."""
+        return size_of(self.library.hidden("trash"))
 
     def recount(self) -> None:
         """Count the library's files again at the next upload, after something else has written or removed some."""
@@ -210,7 +225,7 @@ class Uploads:
     def _room(self) -> int:
         """Return how many bytes more may be taken in."""
         disk = shutil.disk_usage(self.library.root).free - self.limits.spare
-        return min(disk, self.limits.library - self.used()) - self._expected
+        return min(disk, self.limits.library - self.used(fresh=False)) - self._expected
 
     def _reserve(self, size: int, *, begins: bool = False) -> None:
         """Reserve room for bytes of an upload.
@@ -227,8 +242,8 @@ class Uploads:
                 )
             if size > (room := self._room()):
                 raise RefusedError(
-                    f"file: has {size:,} bytes, but there is room for {max(room, 0):,}; remove something, or set"
-                    " --max-library",
+                    f"file: has {size:,} bytes, but there is room for {max(room, 0):,}; empty the trash,"
+                    " remove something first, or set --max-library",
                     HTTPStatus.INSUFFICIENT_STORAGE,
                 )
             self._expected += size
@@ -248,6 +263,7 @@ class Uploads:
                     f"file: {target.name!r} exists already; rename the new one or remove the old one"
                 )
             part.rename(target)
+        self.library.changed()
         with self._lock:
             if self._used is not None:
                 self._used += size

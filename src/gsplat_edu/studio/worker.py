@@ -22,6 +22,9 @@ from gsplat_edu.base.files import described, written_aside
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.base.text import legible
 
+COVER = 512
+"""Longest side of the picture of a scene's start view, px."""
+
 IDLE = 600.0
 """Seconds without a request after which the process ends."""
 
@@ -34,6 +37,7 @@ def make_page(
     url: str = "",
     surface: str = "",
     collider: str = "",
+    applied: str = "",
 ) -> dict[str, Any]:
     """Write the page that shows a scene (`gsplat_edu.viewer.page`).
 
@@ -45,6 +49,7 @@ def make_page(
         url: Where that page reads and stores edits, relative to itself.
         surface: File of the mesh that the page shows beside the splats; empty for none.
         collider: File of the collider over it; empty for none.
+        applied: File of edits that the page, one without the editor, shows applied; empty for none.
     """
     from gsplat_edu.runs.source import open_source
     from gsplat_edu.viewer import page, page_parts
@@ -53,15 +58,34 @@ def make_page(
 
     found = open_source(source)
     meshes = open_meshes(Path(surface) if surface else None, Path(collider) if collider else None, found)
-    tour = page.Tour(origin=found.origin, meshes=meshes)
+    pictures, tour = "picture", page.Tour(origin=found.origin, meshes=meshes)
+    if applied:
+        pictures = "picture?edited=1"
+        found, tour = _edited(found, applied, meshes)
     shown = (found.scene, found.cameras, found.settings, title, found.held_out, tour)
     if edits:
         editing = editing_of(found, Path(source), Path(edits), url)
         html, policy = page.html(*shown, editing), page_parts.policy(page_parts.EDITOR)
     else:
-        html, policy = page.html(*shown, pictures="picture"), page_parts.policy(page_parts.PICTURED)
+        html, policy = page.html(*shown, pictures=pictures), page_parts.policy(page_parts.PICTURED)
     _write(out, html)
     return {"policy": policy, "count": len(found.scene.gaussians)}
+
+
+def _edited(found: Any, applied: str, meshes: Any = None) -> tuple[Any, Any]:  # noqa: ANN401
+    """Apply edits to an opened scene and the meshes beside it; return it with the tour of its page."""
+    from dataclasses import replace
+
+    from gsplat_edu.edits.apply import views_after
+    from gsplat_edu.edits.document import read_edits
+    from gsplat_edu.viewer.edited import edited_meshes, edited_source, toured
+
+    path = Path(applied)
+    edits = read_edits(path)
+    views = views_after(edits.operations)
+    meshes = edited_meshes(meshes, found, edits)
+    found, tour = toured(edited_source(found, edits, path.name), views, views.move)
+    return found, replace(tour, meshes=meshes and meshes.moved(views.move))
 
 
 def make_live_page(facts: str, out: str) -> dict[str, Any]:
@@ -77,14 +101,37 @@ def make_live_page(facts: str, out: str) -> dict[str, Any]:
     return {"policy": page_parts.policy(page_parts.LIVE)}
 
 
-def make_picture(source: str, camera: Any, live: bool, threads: int = 0) -> dict[str, Any]:  # noqa: ANN401
+def make_capture_page(capture: str, title: str, out: str) -> dict[str, Any]:
+    """Write the page that shows a capture in 3D (`gsplat_edu.viewer.capture_page`).
+
+    Args:
+        capture: Folder of the capture.
+        title: Heading of the page.
+        out: File to write.
+    """
+    from gsplat_edu.data.reader import CaptureReader
+    from gsplat_edu.viewer import capture_page
+    from gsplat_edu.viewer.capture_data import capture_facts
+
+    _write(out, capture_page.html(capture_facts(CaptureReader(capture), title)))
+    return {"policy": capture_page.policy()}
+
+
+def make_picture(
+    source: str,
+    camera: Any,  # noqa: ANN401
+    live: bool,
+    threads: int = 0,
+    applied: str = "",
+) -> dict[str, Any]:
     """Render what a page's camera sees.
 
     Args:
         source: Scene file or run folder.
-        camera: As `gsplat_edu.viewer.live.picture_camera` takes it.
+        camera: As `gsplat_edu.viewer.live.picture_camera` takes it; None for the start view, at most `COVER` px.
         live: Whether to draw the newest snapshot of the run's training.
         threads: Threads to render with; 0 for all.
+        applied: File of edits to apply; empty for none.
 
     Returns:
         jpeg, in base64, and the seconds of processor time that it took.
@@ -95,11 +142,17 @@ def make_picture(source: str, camera: Any, live: bool, threads: int = 0) -> dict
     import torch
 
     from gsplat_edu.render.api import render
+    from gsplat_edu.render.field import within_field
     from gsplat_edu.viewer.live import jpeg_of, picture_camera
 
-    seen = picture_camera(camera)
     began = time.process_time()
-    gaussians, settings = _snapshot(Path(source)) if live else _opened(source)
+    if live:
+        gaussians, settings, lenses = _snapshot(Path(source))
+        seen = picture_camera(camera)
+    else:
+        gaussians, settings, start, lenses = _opened(source, applied)
+        seen = start if camera is None else picture_camera(camera)
+    gaussians = within_field(gaussians, seen) if lenses else gaussians
     before = torch.get_num_threads()
     torch.set_num_threads(threads or before)
     try:
@@ -110,8 +163,8 @@ def make_picture(source: str, camera: Any, live: bool, threads: int = 0) -> dict
     return {"jpeg": data, "seconds": time.process_time() - began}
 
 
-def _snapshot(run: Path) -> tuple[Any, Any]:
-    """Read the newest splats of a training, and the settings of its page."""
+def _snapshot(run: Path) -> tuple[Any, Any, bool]:
+    """Read the newest splats of a training, the settings of its page, and whether it trains through lenses."""
     from gsplat_edu.base.errors import SceneFormatError
     from gsplat_edu.render.settings import RenderSettings
     from gsplat_edu.viewer import page_data
@@ -124,21 +177,34 @@ def _snapshot(run: Path) -> tuple[Any, Any]:
     header, splats = split(folder.scene, read_bytes(folder.scene))
     gaussians = page_data.unpacked(folder.scene, splats, header["count"], header["sh_degree"])
     given = facts["settings"] | {"background": tuple(facts["settings"]["background"])}
-    return gaussians, RenderSettings(**given, depth=False)
+    lenses = given.pop("beyond", None) is not None
+    return gaussians, RenderSettings(**given, depth=False), lenses
 
 
-def _opened(source: str) -> tuple[Any, Any]:
-    """Open a finished scene; the last one is kept."""
+def _opened(source: str, applied: str) -> tuple[Any, Any, Any, bool]:
+    """Open a finished scene; return splats, settings, start view, and whether it was trained through lenses.
+
+    The last one is kept.
+    """
     from dataclasses import replace
 
+    from gsplat_edu.evaluate.paths import resized
     from gsplat_edu.runs.source import open_source
+    from gsplat_edu.scene.rig import through_lenses
+    from gsplat_edu.viewer.page_start import start_of
 
-    if (key := _state_of(source)) not in _scenes:
-        found = open_source(source)
+    if (key := f"{_state_of(source)} {_state_of(applied) if applied else ''}") not in _scenes:
+        found, start = open_source(source), None
+        if applied:
+            found, tour = _edited(found, applied)
+            start = tour.start
+        camera = (start or start_of(found.scene, [camera for _, camera in found.cameras])).camera
         _scenes.clear()
-        _scenes[key] = found.scene.gaussians, replace(found.settings, depth=False)
-    gaussians, settings = _scenes[key]
-    return gaussians, settings
+        lenses = through_lenses(own for _, own in found.cameras)
+        settings = replace(found.settings, depth=False)
+        _scenes[key] = found.scene.gaussians, settings, resized(camera, COVER), lenses
+    gaussians, settings, camera, lenses = _scenes[key]
+    return gaussians, settings, camera, lenses
 
 
 def _state_of(source: str) -> str:
@@ -192,7 +258,7 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     from dataclasses import replace
 
     from gsplat_edu.budget.choice import Prospect, choose_backend
-    from gsplat_edu.budget.costs import Facts, wanted_gaussians
+    from gsplat_edu.budget.costs import Facts
     from gsplat_edu.budget.forecast import predict
     from gsplat_edu.data.dataset import Dataset
     from gsplat_edu.data.reader import CaptureReader
@@ -213,7 +279,7 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     for name in sorted(QUALITIES, key=lambda name: -QUALITIES[name]):
         iterations = planned_iterations(name, facts.train, facts.measured)
         config = recipe(iterations, strategy=DEFAULT_STRATEGY)
-        cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+        cap = facts.wanted(config)
         config = replace(config, max_gaussians=cap)
         if measured is None:
             prospect = Prospect(dataset, whole, config)
@@ -239,6 +305,15 @@ def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
     return make_thumbnail(photo, side, out)
 
 
+def draw_mask(
+    capture: str, photo: str, shapes: list[Any] | None = None, version: str | None = None
+) -> dict[str, Any]:
+    """Draw on a photo's mask; see `gsplat_edu.studio.photo_masks.draw`."""
+    from gsplat_edu.studio.photo_masks import draw
+
+    return draw(capture, photo, shapes, version)
+
+
 def make_view_pictures(comparison: str, outs: dict[str, str], small: bool) -> dict[str, Any]:
     """Write pictures of a run's held-out view; see `gsplat_edu.studio.runs.make_view_pictures`."""
     from gsplat_edu.studio.runs import make_view_pictures
@@ -249,9 +324,11 @@ def make_view_pictures(comparison: str, outs: dict[str, str], small: bool) -> di
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "page": make_page,
     "live_page": make_live_page,
+    "capture_page": make_capture_page,
     "picture": make_picture,
     "check_edits": check_edits,
     "thumbnail": make_thumbnail,
+    "mask": draw_mask,
     "view_pictures": make_view_pictures,
     "forecast": forecast,
 }

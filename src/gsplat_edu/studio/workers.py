@@ -10,6 +10,7 @@ import threading
 from http import HTTPStatus
 from typing import Any
 
+from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.reading import parse_json
 from gsplat_edu.studio.refusal import RefusedError
 
@@ -68,11 +69,13 @@ class Worker:
     def close(self) -> None:
         """End the process and its task."""
         self._closed = True
-        process = self._process
-        if process is not None:
-            process.kill()
-            with self._lock:  # waiting requests get an error
-                self._drop()
+        while not self._lock.acquire(timeout=POLL):  # a request waits for an answer, or starts the process
+            if (process := self._process) is not None:
+                process.kill()
+        try:
+            self._drop()
+        finally:
+            self._lock.release()
 
     def _drop(self) -> None:
         """Forget the process."""

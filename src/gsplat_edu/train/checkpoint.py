@@ -65,7 +65,7 @@ def save_checkpoint(folder: Path, trainer: Trainer, seconds: float) -> Path:
             f"{path}: cannot be written ({reason}); earlier checkpoints are unharmed, make room and use --resume"
         ) from None
     for old in list_checkpoints(folder)[:-KEPT]:
-        old.unlink()
+        old.unlink(missing_ok=True)
     return path
 
 

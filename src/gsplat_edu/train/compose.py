@@ -16,8 +16,8 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import of_type, offers
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend, check_backend_value
-from gsplat_edu.scene.camera import scene_extent
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.rig import scene_extent
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.capacity import planned_gaussians
 from gsplat_edu.train.config import TrainConfig
@@ -25,7 +25,9 @@ from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
 from gsplat_edu.train.objective import make_objective
+from gsplat_edu.train.overlap import separate_views
 from gsplat_edu.train.patches import neighbourhood_for
+from gsplat_edu.train.poses import NEED_LENSES
 from gsplat_edu.train.stepper import StepParts
 from gsplat_edu.train.team import ALONE, Team
 from gsplat_edu.train.trainer import Callback, Trainer
@@ -114,6 +116,7 @@ def training(
     offers("dataset", dataset, TrainingData)
     config, start = _begin(config, dataset, start)
     cameras = [view.camera for view in dataset.train]
+    _check_lenses(config, dataset.train, backend)
     extent = scene_extent(cameras) if start.extent is None else start.extent
     gaussians, shell = start.gaussians.to(backend.device), start.shell
     features = functools.partial(render, backend=backend)
@@ -142,7 +145,7 @@ def _begin(config: TrainConfig, dataset: TrainingData, start: Start | None) -> t
     """Return the configuration with its cap, and where the training starts."""
     if not dataset.train:
         raise ArgumentError("dataset: has no training views; give at least one")
-    config = _with_cap(config, dataset.train, 0 if start is None else len(start.gaussians))
+    config = _with_cap(config, dataset, 0 if start is None else len(start.gaussians))
     if config.sky != "none" and (start is None or start.shell is None):
         raise ArgumentError(
             f"sky: is {config.sky!r}, but start has no shell of splats; gsplat_edu.runs.skies makes it, or set"
@@ -153,9 +156,33 @@ def _begin(config: TrainConfig, dataset: TrainingData, start: Start | None) -> t
     return config, start
 
 
-def _with_cap(config: TrainConfig, views: Sequence[View], start: int) -> TrainConfig:
+def _with_cap(config: TrainConfig, dataset: TrainingData, start: int) -> TrainConfig:
     """Return the configuration with the cap that fast plans for these views, unless it has one."""
     if config.strategy != "fast" or config.max_gaussians is not None:
         return config
-    pixels = float(np.mean([view.camera.W * view.camera.H for view in views]))
-    return dataclasses.replace(config, max_gaussians=max(planned_gaussians(pixels, len(views)), start))
+    cameras = [view.camera for view in dataset.train]
+    pixels = float(np.mean([camera.W * camera.H for camera in cameras]))
+    planned = planned_gaussians(pixels, len(cameras), separate_views(cameras, dataset.points))
+    return dataclasses.replace(config, max_gaussians=max(planned, start))
+
+
+def _check_lenses(config: TrainConfig, views: Sequence[View], backend: Backend) -> None:
+    """Check that everything the configuration asks for works with the views' lenses.
+
+    Raises:
+        ArgumentError: a view is no pinhole, and the backend knows pinholes only; or one is orthographic, and a surface
+            is to be learned.
+    """
+    if config.refine in NEED_LENSES:
+        backend.require("lens", f"refine: {config.refine}")
+    odd = next((view for view in views if not view.camera.pinhole), None)
+    if odd is None:
+        return
+    backend.require("lens", f"the lens of {odd.name or 'a photo'}")
+    if config.surface and (
+        flat := next((v for v in views if v.camera.projection.kind == "orthographic"), None)
+    ):
+        raise ArgumentError(
+            f"surface: needs rays that meet in the camera, and {flat.name or 'a photo'} is orthographic; "
+            "leave it out, or train without --surface"
+        )

@@ -29,7 +29,7 @@ from gsplat_edu.train.checks import (
     accept_positive as _positive,
     accept_whole as _whole,
 )
-from gsplat_edu.train.setting import DEPTH_KINDS, OUTSIDE_MASKS, TRANSIENTS, Setting as Setting
+from gsplat_edu.train.setting import DEPTH_KINDS, OUTSIDE_MASKS, REGIONS, TRANSIENTS, Setting as Setting
 from gsplat_edu.train.strategy_config import AdcConfig, FastConfig, McmcConfig, documented, number
 from gsplat_edu.train.tempo import Tempo, accept_tempo as _tempo
 
@@ -43,7 +43,10 @@ STRATEGIES = ("adc", "mcmc", "fast", "none")
 VIEW_ORDERS = ("shuffled", "random")
 APPEARANCES = ("none", "exposure", "vignetting")
 SKIES = ("none", "shell")
-REFINEMENTS = ("none", "poses", "intrinsics", "both")
+REFINEMENTS = (
+    *("none", "poses", "intrinsics", "both", "lens", "shutter"),
+    *("poses+lens", "poses+shutter", "both+shutter", "lens+shutter", "all"),
+)
 
 FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
 """Defaults of a run that starts from a trained scene. Its Gaussians are nearly in place, so the means' rate starts at
@@ -151,7 +154,9 @@ class TrainConfig:
     refine: str = number(
         "none",
         _one_of(REFINEMENTS),
-        "Which numbers of the cameras are learned with the scene: poses, intrinsics, both or none.",
+        "Which numbers of the cameras are learned with the scene: poses; intrinsics; both; the lens, which is the"
+        " intrinsics and the distortion; the motion during the readout of a rolling shutter; several of these, such as"
+        " poses+lens; all; or none.",
     )
     transients: str = number(
         "none",
@@ -171,6 +176,12 @@ class TrainConfig:
     )
     lens_rate: float = number(
         2e-4, _not_negative, "Initial learning rate of the intrinsics, relative; it falls to a hundredth."
+    )
+    region: str = number(
+        "capture",
+        _one_of(REGIONS),
+        'Which pixels count. "capture": those that may show the box of the capture\'s region.json, if it has one;'
+        ' "none": all.',
     )
     background: tuple[float, float, float] = number(
         (0.0, 0.0, 0.0), _color, "Background colour, RGB, 0 to 1.", "2023"

@@ -25,7 +25,9 @@ class DepthTerm:
     """Compares the rendered depth with `View.depth`: `gsplat_edu.ops.depth.depth_error`.
 
     Maps are compared by the relative difference, whose size is that of a sensor's error; points by 1 / z, whose error
-    is that of triangulation.
+    is that of triangulation. The depth of a lens is that of its projection (`Projection.along_ray`). Samples of
+    a photo that keeps its lens stay at the photo's pixels while the lens is learned; those of a pinhole follow its
+    focal lengths.
 
     Args:
         weight: Factor for maps, on the average of all steps.
@@ -56,11 +58,13 @@ class DepthTerm:
         if output.depth is None:
             raise ArgumentError("depth: needs the depth, which was not rendered")
         rays, depths, weights, sparse = self._samples(rendered, output.depth)
-        camera = rendered.camera or rendered.draw.view.camera
+        own = rendered.draw.view.camera
+        camera = rendered.camera if own.pinhole and rendered.camera is not None else own
         focal, middle = (rays.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
         weight = (self.points_weight if bool(sparse) else self.weight) * self.turns.every
         rule = DepthRule(weight, extent=self.extent if bool(sparse) else None)
-        return depth_error(output.depth, output.alpha, rays * focal + middle, depths, weights, rule)
+        pixels, wraps = rays * focal + middle, own.projection.wraps
+        return depth_error(output.depth, output.alpha, pixels, depths, weights, rule, wraps)
 
     def _samples(self, rendered: Rendered, like: Tensor) -> tuple[Tensor, ...]:
         """Return rays, depths, weights and sparseness of the view's samples, from memory if there is room."""

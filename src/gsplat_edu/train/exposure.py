@@ -73,6 +73,11 @@ class Exposure(Identity):
         self._begin = (VIGNETTING_START if vignetting else GAINS_START) * iterations
         self._recolor, self._vignetting = recolor, vignetting
 
+    @property
+    def counted_only(self) -> bool:
+        """Return true: the correction is pixel by pixel, and the measurement applies the mask."""
+        return True
+
     def parameters(self) -> Mapping[str, Tensor]:
         """Return the state, (views, 4) or (views, 5)."""
         return {NAME: self._state}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -44,6 +44,7 @@ class Term(Protocol):
     A term that uses `output.depth` has a true attribute `needs_depth`. One that in some steps uses the depth and the
     composited normals (`gsplat_edu.render.planes.facing_normals`), in `output.features`, has a method
     `needs_normals(iteration)`. One that in some steps uses the depth only has a method `needs_depth_in(iteration)`.
+    One that uses no pixel that the mask of the photo excludes has a true attribute `counted_only`.
     """
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
@@ -70,6 +71,12 @@ class Objective:
     def needs_depth(self) -> bool:
         """Whether a term uses the depth; only then is it rendered."""
         return any(getattr(term, "needs_depth", False) for term in self.terms.values())
+
+    @property
+    def counted_only(self) -> bool:
+        """Whether no term uses pixels that the mask of the photo excludes, so that they need not be drawn."""
+        plain = type(self) is Objective  # a subclass may use more than its terms
+        return plain and all(getattr(term, "counted_only", False) for term in self.terms.values())
 
     def needs_normals(self, iteration: int) -> bool:
         """Whether a term uses depth and normals in the step of this iteration; only then are they rendered."""
@@ -179,6 +186,7 @@ class PhotoTerm:
 
     ssim_weight: float
     loss: LossKernel | None = None
+    counted_only: ClassVar[bool] = True
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return (1 - k) L1 + k (1 - SSIM)."""
@@ -199,6 +207,7 @@ class MeanOpacity:
     weight: float
     until: int | None = None
     least_share: float = 0.0
+    counted_only: ClassVar[bool] = True
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(opacity)."""
@@ -240,6 +249,7 @@ class MeanScale:
 
     weight: float
     shell: Shell | None = None
+    counted_only: ClassVar[bool] = True
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(scale)."""

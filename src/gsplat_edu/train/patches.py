@@ -32,6 +32,12 @@ NEIGHBOURS = 8
 WIDEST = 30.0
 """Largest angle between the directions of view of neighbours, degrees, as in Chen et al. 2024 (PGSR)."""
 
+WIDEST_FISHEYE = 60.0
+"""The same of two fisheyes, which see much more than a photo."""
+
+AROUND = 2 * NEIGHBOURS
+"""A panorama's neighbours are spread over this many of the nearest panoramas, since the angle excludes none."""
+
 SHORTEST = 0.01
 """Smallest distance between neighbours, as a fraction of the scene's size: from nearer ones, depth can't be told."""
 
@@ -46,7 +52,8 @@ def neighbours_of(cameras: Sequence[Camera], extent: float) -> list[tuple[int, .
     """Return for each camera those that see its subject from elsewhere: at most `NEIGHBOURS`, from near to far.
 
     They are spread evenly over all cameras within `WIDEST` and beyond `SHORTEST`, ordered by distance; among cameras at
-    the same distance the lower index comes first.
+    the same distance the lower index comes first. Two fisheyes may differ by `WIDEST_FISHEYE`, and two panoramas by any
+    angle, of which the nearest `AROUND` count.
 
     Args:
         cameras: The cameras.
@@ -54,14 +61,24 @@ def neighbours_of(cameras: Sequence[Camera], extent: float) -> list[tuple[int, .
     """
     eyes = np.array([camera.eye for camera in cameras])
     directions = np.array([camera.R[2] for camera in cameras])
+    kinds = np.array([camera.projection.kind for camera in cameras])
     found = []
-    for eye, direction in zip(eyes, directions, strict=True):
+    for eye, direction, kind in zip(eyes, directions, kinds, strict=True):
         distances = np.linalg.norm(eyes - eye, axis=1)
-        near = (directions @ direction >= math.cos(math.radians(WIDEST))) & (distances >= SHORTEST * extent)
-        ordered = np.argsort(np.where(near, distances, np.inf), kind="stable")[: int(near.sum())]
+        least = np.where(kinds == kind, _least_cosine(kind), math.cos(math.radians(WIDEST)))
+        near = (directions @ direction >= least) & (distances >= SHORTEST * extent)
+        count = min(int(near.sum()), AROUND) if kind == "equirectangular" else int(near.sum())
+        ordered = np.argsort(np.where(near, distances, np.inf), kind="stable")[:count]
         places = np.linspace(0, len(ordered) - 1, min(NEIGHBOURS, len(ordered)))
         found.append(tuple(ordered[np.round(places).astype(int)].tolist()))
     return found
+
+
+def _least_cosine(kind: str) -> float:
+    """Return the smallest cosine between the directions of view of neighbours with this kind of projection."""
+    if kind == "equirectangular":
+        return -math.inf
+    return math.cos(math.radians(WIDEST_FISHEYE if kind == "fisheye" else WIDEST))
 
 
 class Neighbourhood:

@@ -1,8 +1,11 @@
-"""A step of one camera's pose towards its photo, measured from a render and its depth.
+"""A step of one camera's pose, or of its motion during the readout, towards its photo: from a render and its depth.
 
 A turn by w about the camera's own axes and a shift of the camera by t move what a pixel shows, at depth z, by
 
     x_cam' = x_cam + w x x_cam - R t,    δp = J_π (w x x_cam - R t)
+
+(J_π: Jacobian of the camera's projection.) A change of the motion of a rolling shutter does so in proportion to the
+time of the pixel, tau - 1/2.
 
 and change the render I by -∇I·δp. The step is the Gauss-Newton step of
 
@@ -21,6 +24,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
@@ -55,8 +59,9 @@ def pose_step(
     moved: Float64[Tensor, "6"],
     spread: Float64[Tensor, "6"],
     mask: Bool[Tensor, "H W"] | None = None,
+    times: Float64[np.ndarray, "H W"] | None = None,
 ) -> Float64[Tensor, "6"]:
-    """Return the twist that brings a camera closer to its photo; see `CameraTensors.moved`.
+    """Return the twist that brings a camera closer to its photo (`CameraTensors.moved`), or the change of its motion.
 
     Args:
         image: (H, W, 3) render of the camera.
@@ -66,6 +71,7 @@ def pose_step(
         moved: (6,) how far the camera is from its given pose, radians and world units.
         spread: (6,) standard deviation of the given pose from the true one, radians and world units.
         mask: (H, W) true for pixels that count; None if all do.
+        times: (H, W) tau - 1/2 of every pixel, for the change of turn and shift of a rolling shutter; None for a twist.
 
     Returns:
         (6,) w, radians, and t, world units, on the CPU; 0 if too few pixels count. The same bits for any number of
@@ -86,7 +92,11 @@ def pose_step(
         weights = (
             1.0 / (1.0 + (residual / (2.0 * sigma)).square()) / (PIXELS_PER_OBSERVATION * sigma.square())
         )
-        flow = -(_flow(camera, pixels, z) * spread)
+        flow = _flow(camera, pixels, z) if camera.projection.plain else _lens_flow(camera, pixels, z)
+        if times is not None:
+            columns, rows = pixels.long().unbind(dim=1)
+            flow = flow * torch.from_numpy(np.array(times))[rows, columns][:, None, None]
+        flow = -(flow * spread)
         normal, slope = _normal_equations(flow, slopes, light, residual, weights)
         normal += torch.diag(torch.tensor([1.0] * 6 + [GAIN_PRIOR] * 3, dtype=torch.float64))
         slope[:6] += moved / spread
@@ -173,3 +183,24 @@ def _flow(
         camera.R.copy()
     )
     return torch.cat([turn, shift / z[:, None, None]], dim=2) * focal[:, None]
+
+
+def _lens_flow(
+    camera: Camera, pixels: Float64[Tensor, "n 2"], depth: Float64[Tensor, " n"]
+) -> Float64[Tensor, "n 2 6"]:
+    """Return the same for any projection; 0 for pixels without a ray."""
+    u, v = pixels.numpy().T
+    a, b = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    rays = camera.projection.directions(a, b, camera.widest)
+    points = rays * depth.numpy()[:, None]
+    if camera.projection.kind == "orthographic":
+        points[:, :2] = np.stack([a, b], axis=1)
+    seen = np.isfinite(points).all(axis=1)
+    points[~seen] = (0.0, 0.0, 1.0)
+    own = Camera.posed(np.eye(3), np.zeros(3), camera.intrinsics).sight(points)
+    J = np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in own.jacobian], axis=1)
+    x, y, z = points.T
+    zero = np.zeros_like(x)
+    turn = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)  # w x p, by w
+    flow = np.concatenate([J @ turn, -(J @ camera.R)], axis=2)
+    return torch.from_numpy(np.where((seen & own.valid)[:, None, None], flow, 0.0))

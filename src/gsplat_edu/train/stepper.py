@@ -363,7 +363,15 @@ class TensorStepper:
             settings, normals = replace(settings, depth=True), facing_normals(self.gaussians, at)
         elif self.objective.needs_depth_in(iteration):
             settings = replace(settings, depth=True)
-        output = render(self.gaussians, camera, settings=settings, features=normals, backend=self._backend)
+        counted_only = self.objective.counted_only and getattr(model, "counted_only", False)
+        output = render(
+            self.gaussians,
+            camera,
+            settings=settings,
+            features=normals,
+            needed=target.mask if counted_only else None,
+            backend=self._backend,
+        )
         given = ViewRender(
             output.image, output.transmittance, view.settings.background, camera, output.median_depth
         )

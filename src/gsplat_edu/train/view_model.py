@@ -49,6 +49,9 @@ class ViewModel(Protocol):
     gradients, and the trainer's optimiser updates them in place. The others are measured: they have a row for each
     view, which the trainer replaces by what `measure` returns, once all views of a step are rendered. Names must differ
     from those of the Gaussians' parameters.
+
+    A model that uses no pixel of a render that the photo's mask excludes may have a true attribute `counted_only`. If
+    the objective has one too, such pixels are not drawn.
     """
 
     @property
@@ -100,6 +103,11 @@ class Identity:
     """Corrects nothing and learns nothing; a base class for models that correct only one of camera and image."""
 
     @property
+    def counted_only(self) -> bool:
+        """Return true for this class, and false for a subclass that does not say so itself."""
+        return type(self) is Identity
+
+    @property
     def needs_depth(self) -> bool:
         """Return false."""
         return False
@@ -134,6 +142,11 @@ class Chain:
 
     def __init__(self, models: Sequence[ViewModel]) -> None:
         self.models = tuple(models)
+
+    @property
+    def counted_only(self) -> bool:
+        """Return whether no model uses pixels that the photo's mask excludes."""
+        return all(getattr(model, "counted_only", False) for model in self.models)
 
     @property
     def needs_depth(self) -> bool:

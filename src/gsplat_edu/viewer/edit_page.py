@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from gsplat_edu.runs.source import Source
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.viewer.page import Editing, Tour
 from gsplat_edu.viewer.page_start import SIDE, Start
+from gsplat_edu.viewer.proposing import NAME as FLOATERS
 
 EXAMPLE_FORMAT = ".spz"
 """Format in the command that the page shows."""
@@ -43,6 +44,7 @@ def editing_of(source: Source, named: Path, file: Path, url: str | None = None) 
         "file": file.name,
         "commands": {"convert": convert, "render": render},
         "url": url,
+        "floaters": None if url is None else str(PurePosixPath(url).with_name(FLOATERS)),
     }
     return Editing(facts, _values(source))
 
@@ -64,7 +66,7 @@ def tour_of(source: Source, views: Views, move: Similarity, path: KeyframePath |
 
     Args:
         source: The edited scene, after its move.
-        views: Start view and named views of the edits.
+        views: Start view and named views of the edits; those with a text are the guided tour.
         move: The transform that the edits applied to the scene.
         path: The camera path, moved already.
     """
@@ -76,7 +78,8 @@ def tour_of(source: Source, views: Views, move: Similarity, path: KeyframePath |
         pivot = move.s * move.R @ np.array(views.start.pivot) + move.t
         camera = _camera(placed_view(views.start.view, move), W, H)
         start = Start(camera, pivot, up / np.linalg.norm(up), -1)
-    return Tour(path, source.origin, start, named)
+    texts = {view.name: view.text for view in views.named if view.text}
+    return Tour(path, source.origin, start, named, texts=texts)
 
 
 def _camera(view: Keyframe, W: int, H: int) -> Camera:

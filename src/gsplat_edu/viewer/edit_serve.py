@@ -7,8 +7,8 @@ because another tab or program may have written it.
 from __future__ import annotations
 
 import http
+import json
 import threading
-import urllib.parse
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, SplatError
@@ -17,14 +17,17 @@ from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.stored import MOST_BYTES, version_of
 from gsplat_edu.viewer.edit_page import read_content
-from gsplat_edu.viewer.guard import Guard
-from gsplat_edu.viewer.serve import PATIENCE, PageHandler, PageServer, _Request
+from gsplat_edu.viewer.guarded import GuardedHandler, GuardedServer
+from gsplat_edu.viewer.proposing import NAME, Proposing
 
 ADDRESS = "/edits.json"
 """Where the page reads and writes its edits."""
 
+FLOATERS = f"/{NAME}"
+"""Where the page asks for splats to delete."""
 
-class EditServer(PageServer):
+
+class EditServer(GuardedServer):
     """Serves one page with the editor, to browsers that have its token.
 
     Args:
@@ -38,27 +41,33 @@ class EditServer(PageServer):
     """
 
     def __init__(self, host: str, port: int, policy: str, file: Path) -> None:
-        super().__init__(b"", host, port, policy=policy)
+        super().__init__(host, port, policy)
         self.RequestHandlerClass = _Handler
         self.file = file
         self.scene: Identity | None = None
-        self.guard = Guard(host, self.server_port)
         self.writing = threading.Lock()
+        self.proposing: Proposing | None = None
 
-    @property
-    def url(self) -> str:
-        """The page's address, with the token."""
-        return f"{super().url}?token={self.guard.token}"
-
-    def prepare(self, scene: Identity) -> None:
+    def prepare(self, scene: Identity, source: Path | None = None) -> None:
         """Set the scene that is edited, and check the file if it exists.
+
+        Args:
+            scene: Its identity.
+            source: Scene file or run folder that proposals are made for; None for no proposals.
 
         Raises:
             ArgumentError: the file is damaged, or was made for another scene.
             OSError: it cannot be read.
         """
         self.scene = scene
+        self.proposing = None if source is None else Proposing(source)
         self.content()
+
+    def server_close(self) -> None:
+        """Close the server, and end the process that judges the scene."""
+        super().server_close()
+        if self.proposing is not None:
+            self.proposing.stop()
 
     def content(self) -> bytes | None:
         """Return the checked content of the file; None if there is none.
@@ -93,16 +102,16 @@ class EditServer(PageServer):
         return version_of(data)
 
 
-class _Handler(PageHandler):
+class _Handler(GuardedHandler):
     server: EditServer
-    _known = False  # whether the request brought the token
 
     def _answer(self) -> bytes:
+        if self.path.partition("?")[0] != ADDRESS:
+            return self._proposals() if self.path == FLOATERS else super()._answer()
         if (fault := self._fault()) is not None:
             self._refuse(http.HTTPStatus.FORBIDDEN, fault)
             return b""
-        self.path = urllib.parse.urlsplit(self.path).path
-        return self._edits() if self.path == ADDRESS else super()._answer()
+        return self._edits()
 
     def _edits(self) -> bytes:
         """Send the headers of the edits file and return its content, or refuse one that the page could not apply."""
@@ -118,11 +127,37 @@ class _Handler(PageHandler):
         self._headers("application/json", len(body))
         return body
 
-    def end_headers(self) -> None:
-        if self._known:
-            self.send_header("Set-Cookie", self.server.guard.cookie)
-        self.send_header("Referrer-Policy", "no-referrer")  # the URL is a secret
-        super().end_headers()
+    def _proposals(self) -> bytes:
+        """Send the headers of the state of the proposals and return it."""
+        if (fault := self._fault()) is not None:
+            self._refuse(http.HTTPStatus.FORBIDDEN, fault)
+            return b""
+        if (proposing := self.server.proposing) is None:
+            self._refuse(http.HTTPStatus.NOT_FOUND, "there are no proposals")
+            return b""
+        if self.command == "POST":
+            try:
+                proposing.start()
+            except OSError as error:
+                self._refuse(http.HTTPStatus.INTERNAL_SERVER_ERROR, described(error))
+                return b""
+        elif self.command == "DELETE":
+            proposing.stop()
+        body = json.dumps(proposing.state()).encode() + b"\n"
+        self.send_response(http.HTTPStatus.OK)
+        self._headers("application/json", len(body))
+        return body
+
+    def do_POST(self) -> None:
+        """Start to judge the scene."""
+        if self.path != FLOATERS:
+            return self._say(http.HTTPStatus.METHOD_NOT_ALLOWED)
+        self.wfile.write(self._proposals())
+        return None
+
+    def do_DELETE(self) -> None:
+        """Stop judging it."""
+        self.do_POST()
 
     def do_PUT(self) -> None:
         """Write the edits file."""
@@ -130,17 +165,9 @@ class _Handler(PageHandler):
             return self._refuse(http.HTTPStatus.FORBIDDEN, fault)
         if self.path != ADDRESS:
             return self._refuse(http.HTTPStatus.NOT_FOUND, "there is nothing to write")
-        length, expected = self.headers.get("Content-Length", ""), self.headers.get("If-Match", "").strip('"')
-        if not length.isascii() or not length.isdigit():
-            return self._refuse(http.HTTPStatus.LENGTH_REQUIRED, "the length is missing")
-        if int(length) > MOST_BYTES:
-            return self._refuse(http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES:,} bytes")
-        raw = self.rfile.raw  # type: ignore[attr-defined]
-        if isinstance(raw, _Request):
-            raw.allow(PATIENCE, int(length) + 1)
-        data = self.rfile.read(int(length))
-        if len(data) != int(length):
-            return self._refuse(http.HTTPStatus.BAD_REQUEST, "the request is incomplete")
+        expected = self.headers.get("If-Match", "").strip('"')
+        if (data := self._body(MOST_BYTES)) is None:
+            return None
         try:
             version = self.server.store(data, expected)
         except ArgumentError as error:
@@ -157,21 +184,3 @@ class _Handler(PageHandler):
         self.send_response(http.HTTPStatus.OK)
         self.send_header("ETag", f'"{version}"')
         return self._text("saved")
-
-    def _fault(self) -> str | None:
-        """Return why a request is refused; None if it is not."""
-        fault = self.server.guard.fault(
-            self.command, self.path, lambda name: self.headers.get_all(name) or []
-        )
-        self._known = fault is None
-        return fault
-
-    def _refuse(self, status: http.HTTPStatus, reason: str) -> None:
-        self.send_response(status)
-        self._text(reason)
-
-    def _text(self, text: str) -> None:
-        body = f"{text}\n".encode("utf-8", "replace")
-        self._headers("text/plain; charset=utf-8", len(body))
-        if self.command != "HEAD":
-            self.wfile.write(body)

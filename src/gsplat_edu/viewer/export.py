@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,15 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
 from gsplat_edu.runs.lod_refinement import LevelScore, refine_levels
 from gsplat_edu.runs.source import Source
+from gsplat_edu.scene.rig import through_lenses
 from gsplat_edu.viewer import page
+from gsplat_edu.viewer.page_proof import poster_jpeg
+
+VEIL = (
+    "the scene was trained through its photos' own lenses: viewers that draw pinholes may show splats far beside the"
+    " picture as a veil over it, which a page leaves out; for such viewers, train with --lens undistort"
+)
+"""What a scene file cannot tell other viewers."""
 
 PAGE = ".html"
 """Suffix of the HTML page that renders a scene in a browser."""
@@ -105,7 +113,7 @@ def has_levels(path: Path) -> bool:
 def write(
     path: Path, source: Source, tour: page.Tour | None = None, options: LodOptions | None = None
 ) -> None:
-    """Write a scene in the format given by the file's name; a page also gets the cameras and settings.
+    """Write a scene in the format given by the file's name; a page also gets the cameras, settings and a poster.
 
     Args:
         path: Output file.
@@ -119,6 +127,9 @@ def write(
     """
     if path.suffix.lower() == PAGE:
         tour = tour or page.Tour(origin=source.origin)
+        if len(source.scene.gaussians):
+            start = tour.start or page.usual_start(source.scene, source.cameras, source.held_out)
+            tour = replace(tour, poster=poster_jpeg(source, start.camera))
         page.write(path, source.scene, source.cameras, source.settings, source.held_out, tour)
     elif path.name.lower() == LOD_META:
         lod_codec.write(path, source.scene, options)
@@ -169,9 +180,12 @@ def levels_line(path: Path) -> str:
     return f"levels of {counts} splats; errors up to {lengths} units; {len(index.regions)} leaves, {size}"
 
 
-def losses(path: Path, scene: Scene) -> list[str]:
+def losses(path: Path, source: Source) -> list[str]:
     """List the parts of a scene that the format of a path cannot store, one sentence each."""
-    return [] if path.suffix.lower() == PAGE else formats.losses(path, scene)
+    if path.suffix.lower() == PAGE:
+        return []
+    veiled = through_lenses(camera for _, camera in source.cameras)
+    return [*formats.losses(path, source.scene), *([VEIL] if veiled else [])]
 
 
 def kept_degree(path: Path, scene: Scene) -> int:

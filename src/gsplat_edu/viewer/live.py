@@ -92,6 +92,7 @@ class LiveView:
         self._asked_at = self._seen_at = -math.inf
         self._hold_from: float = math.inf  # the training waits from this iteration on
         self._wanted: Camera | None = None
+        self._drawn: Camera | None = None  # the camera that the training thread draws
         self._picture: bytes | str = ""
         self._one_picture = threading.Lock()
 
@@ -146,14 +147,16 @@ class LiveView:
 
     def camera(self) -> Camera | None:
         """Return the camera of the picture that a page waits for."""
-        return self._wanted
+        self._drawn = self._wanted
+        return self._drawn
 
     def take_picture(self, output: RenderOutput | str) -> None:
         """Give the picture to the page that waits for it."""
         picture = output if isinstance(output, str) else jpeg_of(output)
         with self._news:
-            self._wanted, self._picture = None, picture
-            self._news.notify_all()
+            if self._wanted is self._drawn:  # else that request has given up, and another one waits
+                self._wanted, self._picture = None, picture
+                self._news.notify_all()
 
     def noticed(self) -> None:
         """Note that a browser is connected."""

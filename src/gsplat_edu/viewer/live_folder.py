@@ -28,6 +28,7 @@ A training that is killed leaves its files; `seconds_old` tells by state.json wh
 
 from __future__ import annotations
 
+import errno
 import json
 import struct
 import time
@@ -107,8 +108,7 @@ class LiveFolder:
         Raises:
             OSError: the file cannot be written.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
-        self.wanted.touch()
+        self._touch(self.wanted)
 
     def is_wanted(self) -> bool:
         """Return whether a watcher asked for the files within the last `FRESH` seconds."""
@@ -125,10 +125,21 @@ class LiveFolder:
             OSError: the file cannot be written or removed.
         """
         if paused:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self.pause.touch()
+            self._touch(self.pause)
         else:
             self.pause.unlink(missing_ok=True)
+
+    def _touch(self, path: Path) -> None:
+        """Touch a file of the watcher; again if the training has just removed the folder, which was empty."""
+        for last in (False, False, True):
+            self.path.mkdir(parents=True, exist_ok=True)
+            try:
+                path.touch()
+            except FileNotFoundError:
+                if last:
+                    raise
+            else:
+                return
 
     def seconds_old(self) -> float:
         """Return the age of state.json in seconds; infinite if there is none."""
@@ -178,8 +189,11 @@ class LiveFolder:
         """
         for path in (self.page, self.html, self.state, self.scene):
             path.unlink(missing_ok=True)
-        if self.path.is_dir() and not any(self.path.iterdir()):
+        try:
             self.path.rmdir()
+        except OSError as error:  # there is none, or a watcher has files in it
+            if error.errno not in (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST):
+                raise
 
 
 def framed(iteration: int, count: int, sh_degree: int, packed: bytes) -> bytes:

@@ -13,7 +13,7 @@ import gzip
 import math
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,21 +22,31 @@ import torch
 from jaxtyping import Float
 
 from gsplat_edu.base import constants
-from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.field import BEYOND, LEAST_BEYOND
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.rig import stand_in, through_lenses
 from gsplat_edu.viewer import page_data, page_mesh
 from gsplat_edu.viewer.page_mesh import Meshes
 from gsplat_edu.viewer.page_parts import filled, web
-from gsplat_edu.viewer.page_start import Start, first_camera, start_among, start_of, subjects_of
+from gsplat_edu.viewer.page_proof import Proof
+from gsplat_edu.viewer.page_start import (
+    Start,
+    contents_of,
+    first_camera,
+    start_among,
+    start_of,
+    subjects_of,
+)
 
 FORMAT = "gsplat-edu page"
 VERSION = 1
@@ -44,18 +54,20 @@ VERSION = 1
 PIECE = 12 << 20
 """Compressed bytes per element, a multiple of 3 so that the base64 of one element continues in the next."""
 
-FACTS_OPEN, SPLATS_OPEN, VALUES_OPEN, MESHES_OPEN, CLOSE = (
+FACTS_OPEN, SPLATS_OPEN, VALUES_OPEN, MESHES_OPEN, SEEN_OPEN, PHOTOS_OPEN, CLOSE = (
     b'<script type="application/json" id="facts">',
     b'<script type="application/octet-stream;base64" class="splats">',
     b'<script type="application/octet-stream;base64" class="values">',
     b'<script type="application/octet-stream;base64" class="meshes">',
+    b'<script type="application/octet-stream;base64" class="seen">',
+    b'<script type="application/octet-stream;base64" class="photos">',
     b"</script>",
 )
 
 
 @dataclass(frozen=True)
 class Tour:
-    """What a page offers to look at besides the splats: a camera path, views and meshes.
+    """What a page offers to look at besides the splats: a camera path, views, meshes, and evidence.
 
     Args:
         path: Keyframes that the page plays, in the coordinates of the page's scene; None for none.
@@ -63,6 +75,9 @@ class Tour:
         start: The view in which the page opens; None lets the page choose one.
         views: Named views, listed before those of the capture.
         meshes: Meshes in the coordinates of the page's scene; None for none.
+        texts: Texts of named views by their names. Views with a text are the steps of a guided tour.
+        proof: How many photos saw each splat, and photos to compare with the picture; None for none.
+        poster: A JPEG that is shown until the first picture is drawn; empty for none.
     """
 
     path: KeyframePath | None = None
@@ -70,6 +85,9 @@ class Tour:
     start: Start | None = None
     views: Sequence[NamedCamera] = ()
     meshes: Meshes | None = None
+    texts: Mapping[str, str] = field(default_factory=dict)
+    proof: Proof | None = None
+    poster: bytes = b""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +116,8 @@ def write(
     Args:
         path: Output file; parent folders are created.
         scene: The scene; it may be empty.
-        views: Name and camera of each viewpoint in the page's list; the page starts at the first one that was not held
-            out.
+        views: Name and camera of each viewpoint. The page numbers them, starts at the first one that was not held out,
+            and contains no names.
         settings: Render settings; None takes those of scene files (`gsplat_edu.runs.source.file_settings`).
         held_out: Names of the test views, which are marked in the list.
         tour: The camera path to play, the origin of the coordinates, and meshes; None for no path, no meshes, and no
@@ -109,7 +127,10 @@ def write(
         ArgumentError: a parameter is NaN or infinite.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
-    pieces = _pieces(path.stem, scene, views, settings, held_out, tour or Tour())
+    # the names of files tell a visitor nothing
+    shown = [(f"photo {i}", camera) for i, (_, camera) in enumerate(views, start=1)]
+    out = {f"photo {i}" for i, (name, _) in enumerate(views, start=1) if name in held_out}
+    pieces = _pieces(path.stem, scene, shown, settings, out, tour or Tour(), {"shared": True})
     with written_aside(path) as aside, aside.open("wb") as file:
         file.writelines(pieces)
 
@@ -235,19 +256,32 @@ def _pieces(
 ) -> Iterator[bytes]:
     """Yield the file in parts, so that they need not be in memory together."""
     scene.gaussians.check_finite()
-    facts = _facts(title, scene, views, settings or file_settings(scene), held_out, tour) | _toured(tour)
+    facts = _facts(title, scene, views, settings or file_settings(scene), held_out, tour) | _toured(
+        tour, scene
+    )
     facts["cameras"] = [*facts.pop("views"), *facts["cameras"]]
     facts |= more or {}
     mesh_data = b""
     if tour.meshes is not None:
         facts["meshes"], mesh_data = page_mesh.packed(tour.meshes)
+    proof = tour.proof or Proof()
+    facts |= proof.facts(len(tour.views))
     head, tail = web("index.html").split("{{splats}}\n")
-    yield filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
+    begin = filled(head, title, facts, tour.poster)
+    yield begin.encode("utf-8", errors="replace")  # a file name may not be valid text
     yield from _elements(SPLATS_OPEN, page_data.packed(scene.gaussians))
     if editing is not None:
         yield from _elements(VALUES_OPEN, editing.values)
     if mesh_data:
         yield from _elements(MESHES_OPEN, mesh_data)
+    if proof.seen is not None:
+        if len(proof.seen) != len(scene.gaussians):
+            raise ArgumentError(
+                f"seen: counts {len(proof.seen)} splats, but the scene has {len(scene.gaussians)}"
+            )
+        yield from _elements(SEEN_OPEN, proof.seen.tobytes())
+    if proof.photos:
+        yield from _elements(PHOTOS_OPEN, b"".join(photo.jpeg for photo in proof.photos))
     yield tail.encode("utf-8")
 
 
@@ -258,14 +292,26 @@ def _elements(opening: bytes, data: bytes) -> Iterator[bytes]:
         yield opening + base64.b64encode(compressed[begin : begin + PIECE]) + CLOSE + b"\n"
 
 
-def _toured(tour: Tour) -> dict[str, Any]:
+def _toured(tour: Tour, scene: Scene) -> dict[str, Any]:
     """Return the facts of a tour that replace those of the scene, and its views."""
+    cameras = [camera for _, camera in tour.views]
+    chosen = contents_of([*cameras, *([tour.start.camera] if tour.start else [])], _opaque(scene))
     views = [
-        {"name": name, "held_out": False, "saved": True, **_camera(camera)} for name, camera in tour.views
+        {
+            "name": name,
+            "held_out": False,
+            "saved": True,
+            **({"text": tour.texts[name]} if tour.texts.get(name) else {}),
+            **_camera(camera),
+            "subject": content,
+        }
+        for (name, camera), content in zip(tour.views, chosen, strict=False)
     ]
     if tour.start is None:
         return {"views": views}
-    return {"views": views, "start": _start(tour.start)}
+    start = _start(tour.start)
+    start["camera"]["subject"] = chosen[-1]
+    return {"views": views, "start": start}
 
 
 def _facts(
@@ -276,10 +322,10 @@ def _facts(
     held_out: Collection[str],
     tour: Tour,
 ) -> dict[str, Any]:
+    lenses = through_lenses(camera for _, camera in views)
+    views = [(name, stand_in(camera)) for name, camera in views]  # the page draws pinholes
     cameras = [camera for _, camera in views]
-    trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
-    first = first_camera(cameras, trained or range(len(views))) if views else 0
-    start = start_of(scene, cameras, first)
+    start = usual_start(scene, views, held_out)
     facts = {
         "format": FORMAT,
         "version": VERSION,
@@ -293,6 +339,7 @@ def _facts(
             "sh_degree": int(settings.sh_degree),
             "antialiased": bool(settings.antialiased),
             "jacobian_limit": None if settings.jacobian_limit is None else float(settings.jacobian_limit),
+            "beyond": [BEYOND, LEAST_BEYOND] if lenses else None,
         },
         "near": constants.Z_NEAR,
         "start": _start(start) | {"index": start.index + (len(tour.views) if start.index >= 0 else 0)},
@@ -302,9 +349,30 @@ def _facts(
             {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views
         ],
     }
-    opaque = scene.gaussians.logit_opacities > 0
-    _add_subjects(facts, cameras, start.camera, scene.gaussians.means[opaque].double().numpy(force=True))
+    _add_subjects(facts, cameras, start.camera, _opaque(scene))
     return facts
+
+
+def usual_start(scene: Scene, views: Sequence[NamedCamera], held_out: Collection[str]) -> Start:
+    """Return the view in which a page opens unless its tour has one.
+
+    Args:
+        scene: As for `write`.
+        views: As for `write`.
+        held_out: As for `write`.
+    """
+    cameras = [stand_in(camera) for _, camera in views]
+    trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
+    return start_of(scene, cameras, first_camera(cameras, trained or range(len(views))) if views else 0)
+
+
+def _opaque(scene: Scene) -> Float[np.ndarray, "N 3"]:
+    """Return the centres of the splats whose opacity exceeds a half."""
+    gaussians = scene.gaussians
+    means: Float[np.ndarray, "N 3"] = (
+        gaussians.means[gaussians.logit_opacities > 0].double().numpy(force=True)
+    )
+    return means
 
 
 def _add_subjects(

@@ -38,15 +38,17 @@ class Meshes:
     Args:
         surface: Drawn in place of the splats on one side of a line.
         collider: Drawn translucent over the surface and the splats; None for none.
+        stays: Some splats were moved without the others; the meshes show them where they were, and the page says so.
     """
 
     surface: Mesh
     collider: Mesh | None = None
+    stays: bool = False
 
     def moved(self, move: Similarity) -> Meshes:
         """Return the meshes after a transform of the scene."""
         collider = None if self.collider is None else _moved(self.collider, move)
-        return Meshes(_moved(self.surface, move), collider)
+        return Meshes(_moved(self.surface, move), collider, self.stays)
 
 
 def open_meshes(surface: Path | None, collider: Path | None, source: Source) -> Meshes | None:
@@ -80,7 +82,7 @@ def open_meshes(surface: Path | None, collider: Path | None, source: Source) -> 
                 " make a smaller one with gsplat-edu mesh --faces"
             )
         found.append(replace(mesh, vertices=mesh.vertices - np.array(source.origin)))
-    return Meshes(*found)
+    return Meshes(found[0], found[1] if len(found) > 1 else None)
 
 
 def packed(meshes: Meshes) -> tuple[list[dict[str, Any]], bytes]:
@@ -95,7 +97,7 @@ def packed(meshes: Meshes) -> tuple[list[dict[str, Any]], bytes]:
         if mesh is None:
             continue
         entry, data = _packed(mesh)
-        entries.append({"name": name, **entry})
+        entries.append({"name": name, **entry} | ({"stays": True} if meshes.stays else {}))
         parts += data
     return entries, b"".join(parts)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import html as html_text
 import json
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -13,6 +15,7 @@ from gsplat_edu.base import constants
 from gsplat_edu.base.content_policy import content_policy, policy_element
 
 SCRIPTS = (
+    "common.js",
     "scene.js",
     "region.js",
     "camera.js",
@@ -24,7 +27,13 @@ SCRIPTS = (
     "pace.js",
     "controls.js",
     "panel.js",
+    "timeline.js",
     "keyframes.js",
+    "flight.js",
+    "seen.js",
+    "compare.js",
+    "guide.js",
+    "frustums.js",
 )
 """Scripts of every page in loading order; they share one scope."""
 
@@ -61,7 +70,8 @@ class Kind:
         styles: Its style sheets, after the common one.
         workers: Its workers, in addition to the one that sorts.
         own_server: Whether it may load from its own server, and save there.
-        define: Macro that its shaders are compiled with; empty for none.
+        define: Macro whose parts its shaders have; empty for none.
+        shaders: Its shaders, in addition to those of every page.
     """
 
     fact: str = ""
@@ -70,6 +80,7 @@ class Kind:
     workers: tuple[str, ...] = ()
     own_server: bool = False
     define: str = ""
+    shaders: tuple[str, ...] = ()
 
 
 PLAIN = Kind()
@@ -81,11 +92,23 @@ EDITOR = Kind(
     (
         "edit_cells.js",
         "edit_member.js",
+        "edit_near.js",
+        "edit_front.js",
         "edit_state.js",
         "edit_shapes.js",
         "edit_pixel.js",
+        "edit_overlay.js",
         "edit_draw.js",
+        "edit_move.js",
+        "edit_gizmo.js",
+        "edit_gizmo_panel.js",
+        "edit_level.js",
+        "edit_look.js",
         "edit_tools.js",
+        "edit_polygon.js",
+        "edit_histogram.js",
+        "edit_tour.js",
+        "edit_floaters.js",
         "edit_panel.js",
         "edit.js",
         "edit_start.js",
@@ -93,6 +116,7 @@ EDITOR = Kind(
     ("edit.css",),
     own_server=True,
     define="EDITING",
+    shaders=("edit_dots.vert", "edit_dots.frag", "edit_edge.vert", "edit_edge.frag"),
 )
 
 
@@ -101,23 +125,28 @@ def policy(kind: Kind = PLAIN) -> str:
     return content_policy(_scripts(kind), [_style(kind)], workers=True, own_server=kind.own_server)
 
 
-def filled(template: str, title: str, facts: dict[str, Any]) -> str:
+def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b"") -> str:
     """Fill in the part of a page before the splats.
 
     Args:
         template: Text with placeholders, {{name}}.
         title: Heading of the page.
         facts: The page's metadata, which also decides its kind.
+        poster: A JPEG that is shown until the first picture is drawn; empty for none.
     """
     kind = next((kind for kind in (LEVELS, LIVE, EDITOR, PICTURED) if kind.fact in facts), PLAIN)
     workers = ("sort_worker", *kind.workers)
+    defined = {kind.define, "SEEN" if "seen" in facts else ""}
     texts = {
         "title": html_text.escape(title),
         "policy": policy_element(policy(kind)),
         "style": _style(kind),
+        "poster": _poster(poster),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-        "shaders": "\n".join(_text_element(name, _shader(name, kind.define)) for name in SHADERS),
+        "shaders": "\n".join(
+            _text_element(name, _shader(name, defined)) for name in (*SHADERS, *kind.shaders)
+        ),
         "worker": "\n".join(_text_element(name.replace("_", "-"), web(f"{name}.js")) for name in workers),
         "scripts": "\n".join(f"<script>{script}</script>" for script in _scripts(kind)),
     }
@@ -142,8 +171,15 @@ def _text_element(name: str, text: str) -> str:
     return f'<script type="text/plain" id="{name}">{text}</script>'
 
 
-def _shader(name: str, define: str) -> str:
-    """Return one of our shaders, preceded by the renderer's constants; the editor's part only if it is defined."""
+def _poster(jpeg: bytes) -> str:
+    if not jpeg:
+        return ""
+    data = base64.b64encode(jpeg).decode()
+    return f'<img id="poster" alt="the first view of the scene" src="data:image/jpeg;base64,{data}">'
+
+
+def _shader(name: str, defined: Collection[str]) -> str:
+    """Return one of our shaders, preceded by the renderer's constants, without the parts of macros not defined."""
     lines = ["#version 300 es", "precision highp float;", f"const float FINITE = {FINITE!r};"]
     for constant in SHADER_CONSTANTS:
         value = getattr(constants, constant)
@@ -152,7 +188,9 @@ def _shader(name: str, define: str) -> str:
             lines.append(f"const {array} {constant} = {array}({', '.join(map(repr, value))});")
         else:
             lines.append(f"const float {constant} = {value!r};")
-    text = web(f"{name}.glsl")
-    if not define:
-        text = re.sub(r"#ifdef EDITING\n.*?#endif\n", "", text, flags=re.DOTALL)
-    return "\n".join([*lines, *([f"#define {define}"] if define else []), text])
+
+    def part(found: re.Match[str]) -> str:
+        return found[2] if found[1] in defined else ""
+
+    text = re.sub(r"#ifdef (\w+)\n(.*?)#endif\n", part, web(f"{name}.glsl"), flags=re.DOTALL)
+    return "\n".join([*lines, text])

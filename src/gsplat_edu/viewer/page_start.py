@@ -39,8 +39,13 @@ SEEN_BY = 0.7
 """A point belongs to the subject if it is seen by at least this fraction of the number of cameras that see the best
 point. There is no subject unless at least this fraction of all cameras sees the best point."""
 
-OUTERMOST = 3.0
-"""Ignore this percentage of the subject's points at each side of an image."""
+OUTERMOST = (3.0, 0.1)
+"""Ignore this percentage of the subject's points at the left and right side, and at the top and bottom, of an image.
+A head is a small part of a person."""
+
+AT_EDGE = 0.1
+"""A subject that comes as near as this fraction of the height to the top or bottom of an image reaches it: what most
+cameras see ends at `SUBJECT_PART`, but a person does not."""
 
 LEAST_PART, LEAST_POINTS = 0.1, 16
 """A subject is at least this fraction of the image wide and high, and has at least this number of points."""
@@ -114,6 +119,24 @@ def subjects_of(
     return [_edges(camera, near) for camera in shown]
 
 
+def contents_of(shown: Sequence[Camera], points: Float[np.ndarray, "N 3"]) -> list[list[float]]:
+    """Find what views show that somebody has chosen: all points in view, whether or not they belong to the subject.
+
+    Args:
+        shown: The cameras of the views.
+        points: (N, 3) points of the scene; may be empty.
+
+    Returns:
+        For each view the left, top, right and bottom edge of its content, px; those of the image if it is nearly empty.
+    """
+    near = points[~far_shell(points)]
+    found = []
+    for camera in shown:
+        inside = near[_is_inside(camera, near, 1.0)]
+        found.append(_edges(camera, inside) or [0.0, 0.0, float(camera.W), float(camera.H)])
+    return found
+
+
 def _is_inside(camera: Camera, points: Float64[np.ndarray, "N 3"], part: float) -> Bool[np.ndarray, " N"]:
     """Return which points lie in the middle part of a camera's image."""
     x, y, z = camera.world_to_cam(points).T
@@ -129,15 +152,17 @@ def _edges(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> list[float] | 
     if front.sum() < LEAST_POINTS:
         return None
     edges = []
-    for ratio, focal, centre, side in (
-        (x, camera.fx, camera.cx, camera.W),
-        (y, camera.fy, camera.cy, camera.H),
+    for ratio, focal, centre, side, outermost in (
+        (x, camera.fx, camera.cx, camera.W, OUTERMOST[0]),
+        (y, camera.fy, camera.cy, camera.H, OUTERMOST[1]),
     ):
-        ends = np.percentile(focal * ratio[front] / z[front] + centre + 0.5, (OUTERMOST, 100 - OUTERMOST))
+        ends = np.percentile(focal * ratio[front] / z[front] + centre + 0.5, (outermost, 100 - outermost))
         edges.append(np.clip(ends, 0, side))
     (left, right), (top, bottom) = edges
     if right - left < LEAST_PART * camera.W or bottom - top < LEAST_PART * camera.H:
         return None
+    top = 0.0 if top < AT_EDGE * camera.H else top
+    bottom = camera.H if bottom > (1 - AT_EDGE) * camera.H else bottom
     return [round(float(edge), 1) for edge in (left, top, right, bottom)]
 
 

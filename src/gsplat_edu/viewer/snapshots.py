@@ -18,6 +18,7 @@ import torch
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.locks import POLL
+from gsplat_edu.base.text import Told
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.training import CaptureRun
@@ -153,7 +154,7 @@ class FolderWatcher:
         self._wanted = not self._failed and self._folder.is_wanted()
         before, self._paused = self._paused, self._folder.is_paused()
         if self._paused and not before:
-            self._say(f"paused; remove {self._folder.pause} to continue")
+            self._say(Told(f"paused; remove {self._folder.pause} to continue", ""))
 
     def _try(self, write: Callable[[], None]) -> None:
         try:

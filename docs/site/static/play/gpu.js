@@ -3,7 +3,7 @@
 "use strict";
 
 gsplatPlay.gpu = (() => {
-    const WORD = 4, JOB_BYTES = 32, SLICE = 256, VIEW_BYTES = 512, LEAST = 4; // as in engine/dispatch.py
+    const WORD = 4, JOB_BYTES = 32, SLICE = 256, VIEW_BYTES = 640, LEAST = 4; // as in engine/dispatch.py
     let opening = null;
 
     /** Resolve to the browser's device, or to null. All figures of a page share it. */

@@ -11,6 +11,7 @@ from gsplat_edu.cli.options.train import FOR_POINTS
 from gsplat_edu.data.settings import FACTOR_BELOW
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.strategy_config import FastConfig
 
 
 def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, argparse.Namespace | None]:
@@ -25,6 +26,10 @@ def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, 
     of_block.resume, of_block.scene = False, arguments.scene or arguments.out
     kept = {name: value for name, value in arguments.settings.items() if name not in FOR_POINTS}
     of_block.settings = {"means_rate": TrainConfig.means_rate, **kept}  # a coarse model is not in place yet
+    if (
+        arguments.scene is None and strategy_of(arguments) == "fast"
+    ):  # and has no detail that small photos would undo
+        of_block.settings = {"fast_start_factor": FastConfig.start_factor, **of_block.settings}
     of_block.sky = None
     coarse = argparse.Namespace(**vars(arguments))
     if arguments.scene is not None:

@@ -45,6 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.html",
         help="also write a page of the scene in grey, with the removed splats in a colour for each reason",
     )
+    parser.add_argument(
+        "--edits",
+        type=Path,
+        metavar="FILE",
+        help="carry the edits of the scene over to OUT, a PLY: they are written beside it, as edits.json",
+    )
     parser.add_argument("--dry-run", action="store_true", help="report what would be removed; write no scene")
 
 
@@ -55,6 +61,8 @@ def check(arguments: argparse.Namespace) -> None:
         ArgumentError: an option is out of range, or contradicts another.
         DatasetError: there is nothing under --dataset.
     """
+    if arguments.edits is not None and (arguments.out is None or arguments.out.suffix.lower() != ".ply"):
+        raise ArgumentError("--edits: fit only a PLY, whose splats stay exact; give one with --out")
     in_range("--max-loss", arguments.max_loss, 0.0)
     if arguments.dry_run and arguments.out is not None:
         raise ArgumentError("--dry-run: writes no scene; remove --out")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
-from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.cli.arguments import add_backend, add_meshes, numbers_text, whole_number_text
 from gsplat_edu.sfm.scale_text import POINTS
 
@@ -17,6 +17,32 @@ MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 1
 
 LOD_STEPS = 300
 """Iterations per level of `--lod-refine` without a number."""
+
+VERIFY_FILE, VERIFY_PHOTOS = "file", "photos"
+"""Values of `--verify`: of an option without a value, and of one that adds photos to a page."""
+
+PHOTOS, MOST_PHOTOS = 12, 200
+"""Number of photos in a page, and the largest."""
+
+
+def evidence_text(text: str) -> str:
+    """Parse the value of --verify: file, photos or photos=N."""
+    name, _, number = text.partition("=")
+    if name == VERIFY_PHOTOS and ((number.isascii() and number.isdigit()) or text == name):
+        if not number or 1 <= int(number) <= MOST_PHOTOS:
+            return text
+        raise argparse.ArgumentTypeError(f"{number} photos: has to be from 1 to {MOST_PHOTOS}")
+    if text == VERIFY_FILE:
+        return text
+    raise argparse.ArgumentTypeError(
+        f"{text!r} is not {VERIFY_PHOTOS} or {VERIFY_PHOTOS}=N; put --verify behind OUT"
+    )
+
+
+def photos_asked(arguments: argparse.Namespace) -> int | None:
+    """Return how many photos --verify puts into the page; None for no evidence in it."""
+    name, _, number = (arguments.verify or "").partition("=")
+    return None if name != VERIFY_PHOTOS else int(number or PHOTOS)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,8 +118,19 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--verify",
-        action="store_true",
-        help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
+        type=evidence_text,
+        nargs="?",
+        const=VERIFY_FILE,
+        metavar=f"{VERIFY_PHOTOS}[=N]",
+        help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR;"
+        f" --verify {VERIFY_PHOTOS} also lets visitors of a run's page verify it: a switch colours what fewer than two"
+        f" training photos saw, and N photos can be compared with the picture (default: {PHOTOS})",
+    )
+    parser.add_argument(
+        "--dataset",
+        type=Path,
+        metavar="PATH",
+        help=f"the run's capture if it has moved, for --verify {VERIFY_PHOTOS}",
     )
 
 
@@ -135,9 +172,23 @@ def check(arguments: argparse.Namespace) -> None:
 
     Raises:
         ArgumentError: one needs another, or excludes it.
+        DatasetError: there is nothing under --dataset.
     """
     if arguments.edits_anyway and arguments.edits is None:
         raise ArgumentError("--edits-anyway: has an effect only with --edits; add --edits FILE")
+    if photos_asked(arguments) is not None:
+        if arguments.out.suffix.lower() != ".html":
+            raise ArgumentError(
+                f"--verify {VERIFY_PHOTOS}: {arguments.out} is no page; give a name that ends in .html"
+            )
+        if len(arguments.sources) > 1:
+            raise ArgumentError(
+                f"--verify {VERIFY_PHOTOS}: is for the page of one run; convert one at a time"
+            )
+    elif arguments.dataset is not None:
+        raise ArgumentError(f"--dataset: has an effect only with --verify {VERIFY_PHOTOS}; add it")
+    if arguments.dataset is not None and not arguments.dataset.exists():
+        raise DatasetError(f"--dataset: {arguments.dataset} does not exist; give the folder of a capture")
     if arguments.edits is not None and len(arguments.sources) > 1:
         raise ArgumentError(
             "--edits: is for one scene; convert each scene with its edits, then merge the results"

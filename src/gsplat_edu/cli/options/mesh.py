@@ -71,8 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-memory",
         type=bytes_text,
         metavar="SIZE",
-        help="memory of the volume, for example 2GiB; without --voxel, larger voxels are chosen until it fits (default:"
-        " what is free)",
+        help="memory of the command, for example 2GiB; without --voxel, larger voxels are chosen until all fits"
+        " (default: what is free)",
     )
     _add_truth(parser)
     add_backend(parser)

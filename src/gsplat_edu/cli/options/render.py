@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.render.settings import MAPS
+from gsplat_edu.scene.projection import STEEPEST_FISHEYE
 
 EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
+
+LENSES = ("pinhole", "fisheye", "equirectangular", "orthographic")
+"""Names of the lenses of --camera-model."""
+
+FISHEYE_DEGREES = 180.0
+"""Field of view of a fisheye unless one is given."""
+
+WIDEST_FISHEYE = 2 * math.degrees(STEEPEST_FISHEYE)
+"""Largest field of view of a fisheye, degrees."""
 
 SCENE_SIZE = 512
 """px: size of the images of a scene file that comes without cameras."""
@@ -63,6 +75,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder for PNGs, or a video (VP9 in MP4) (default: renders/ in the run, out/ for a scene file)",
     )
     parser.add_argument(
+        "--camera-model",
+        metavar="NAME[:N]",
+        default="pinhole",
+        help=f"lens: fisheye[:DEGREES] (a circle with this field of view, {FISHEYE_DEGREES:g} if none is given),"
+        " equirectangular (the whole sphere, level, 2:1, marked for players of 360-degree images and videos), or"
+        " orthographic; without --orbit, --path and --dataset, orthographic[:HEIGHT] is a floor plan that leaves out"
+        " what is higher above the floor, world units (default: pinhole)",
+    )
+    parser.add_argument(
         "--maps",
         metavar="NAMES",
         help=f"also write maps, separated by commas: {', '.join(MAPS)}; each as float32 TIFF, 16-bit PNG (maps.json has"
@@ -103,6 +124,45 @@ def _add_path(parser: argparse.ArgumentParser) -> None:
     )
 
 
+@dataclass(frozen=True)
+class LensChoice:
+    """What --camera-model says.
+
+    Args:
+        kind: One of `LENSES`.
+        value: The number after it: degrees of a fisheye, or height of a plan, world units; None if there is none.
+    """
+
+    kind: str
+    value: float | None = None
+
+
+def lens_choice(text: str) -> LensChoice:
+    """Read the value of --camera-model.
+
+    Raises:
+        ArgumentError: the lens is unknown, or its number is none, out of range or not wanted.
+    """
+    kind, colon, number = text.partition(":")
+    if kind not in LENSES:
+        raise ArgumentError(f"--camera-model: does not know {kind!r}; use {', '.join(LENSES)}")
+    if not colon:
+        return LensChoice(kind)
+    if kind in ("pinhole", "equirectangular"):
+        raise ArgumentError(f"--camera-model: {kind} takes no number; leave out {text.removeprefix(kind)!r}")
+    what, most = ("degrees", WIDEST_FISHEYE) if kind == "fisheye" else ("height", float("inf"))
+    try:
+        value = float(number)
+    except ValueError:
+        value = float("nan")
+    if not 0.0 < value <= most or value == float("inf"):
+        limit = "" if kind == "orthographic" else f" of at most {most:g}"
+        raise ArgumentError(
+            f"--camera-model: {text!r} has no {what}; write {kind}:N with a positive N{limit}"
+        )
+    return LensChoice(kind, value)
+
+
 def check(arguments: argparse.Namespace) -> None:
     """Check the options that exclude each other.
 
@@ -125,6 +185,8 @@ def check(arguments: argparse.Namespace) -> None:
         )
     if arguments.save_path is not None and (given := _given(arguments, "out", "maps")):
         raise ArgumentError(f"--save-path: renders nothing; remove {given[0]}")
+    if arguments.save_path is not None and arguments.camera_model != "pinhole":
+        raise ArgumentError("--save-path: renders nothing; remove --camera-model")
     if arguments.save_path is None and arguments.keyframes is not None:
         raise ArgumentError("--keyframes: is only for --save-path; remove it")
 

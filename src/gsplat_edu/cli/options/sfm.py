@@ -48,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     choice("--mapper", "COLMAP mapper", MAPPERS)
     choice(
         "--camera-model",
-        "lens model (auto refines as many parameters as held-out photos support)",
+        "lens model (auto recognises fisheyes by black corners and EXIF, and refines as many parameters as held-out"
+        " photos support; a fisheye's field of view may follow, as in OPENCV_FISHEYE:200)",
         CAMERA_MODELS,
     )
     add_panorama(parser)
@@ -66,8 +67,8 @@ def add_panorama(group: argparse._ActionsContainer) -> None:
         "--panorama",
         metavar="NAME",
         default="auto",
-        help="whether the photos or frames are 360-degree panoramas, to be cut into pinhole images:"
-        f" {', '.join(PANORAMA)} (default: auto, if their XMP says so)",
+        help="whether the photos or frames are 360-degree panoramas:"
+        f" {', '.join(PANORAMA)} (default: auto, if their XMP or their edges say so)",
     )
 
 

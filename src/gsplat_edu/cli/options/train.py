@@ -21,7 +21,7 @@ from gsplat_edu.cli.options.settings import (
 )
 from gsplat_edu.cli.options.several import check_several
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
-from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.data.settings import LENS_MODES, DataSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.sfm.options import PANORAMA
@@ -253,6 +253,13 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         help="below 32: divide the photos' size by this; from 32 on: their longest side in px; auto: what the planned"
         " Gaussians resolve, if the photos are much larger (default: full size)",
     )
+    group.add_argument(
+        "--lens",
+        choices=LENS_MODES,
+        help="native: train through the photos' own lenses and rolling shutters, without resampling or cropping them;"
+        " auto: only fisheyes, panoramas, rolling shutters and photos that would lose a tenth; undistort: none"
+        " (default: undistort)",
+    )
     _add_number(
         group,
         "--test-every",
@@ -287,8 +294,8 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--refine",
         metavar="NAME",
-        help='"poses", "intrinsics" or "both" are learned with the scene; "none" are not; "auto" decides by short'
-        " trainings (default: none)",
+        help='"poses", "intrinsics", "both", "lens", "shutter" or "all" are learned with the scene; "none" are not;'
+        ' "auto" decides by short trainings (default: none)',
     )
     group.add_argument(
         "--sky",
@@ -384,6 +391,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         test_every=arguments.test_every,
         background=None if config.random_background else config.background,
         image_memory=DataSettings.image_memory if arguments.image_memory is None else arguments.image_memory,
+        lens=arguments.lens or DataSettings.lens,
     )
     return RunOptions(
         data=arguments.data,

@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         type=Path,
-        metavar="SCENE|RUN",
-        help="scene file, run folder, or folder with levels of detail",
+        metavar="SCENE|RUN|CAPTURE",
+        help="scene file, run folder, folder with levels of detail, or capture: its cameras, photos and points",
     )
     add_address(parser, PORT)
     parser.add_argument(

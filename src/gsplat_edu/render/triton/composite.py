@@ -18,6 +18,7 @@ import triton
 import triton.language as tl
 
 from gsplat_edu.base import constants
+from gsplat_edu.render.triton.intersect import seam_shift
 from gsplat_edu.render.triton.project import RECORD, SLOT
 
 TILE = tl.constexpr(constants.TILE)
@@ -40,10 +41,20 @@ def _pixels(tile, tiles_x, W, H):
 
 @triton.jit
 @no_type_check
-def _alphas(records, ids, mask, x, y, most):
+def _column_of_means(records, ids, mask, left, W, WRAPS: tl.constexpr):
+    """Return the columns of means, px; in a panorama, nearest to the tile whose first column is `left`."""
+    u = tl.load(records + ids.to(tl.int64) * RECORD, mask=mask, other=0.0)
+    if WRAPS:
+        u += seam_shift(left, u, W)
+    return u
+
+
+@triton.jit
+@no_type_check
+def _alphas(records, ids, mask, x, y, u, most):
     """Return p and alpha for every pair of pixel and Gaussian; `most` is the logarithm of alpha's clamp."""
     row = records + ids.to(tl.int64) * RECORD
-    dx = x[:, None].to(tl.float32) - tl.load(row, mask=mask, other=0.0)[None, :]
+    dx = x[:, None].to(tl.float32) - u[None, :]
     dy = y[:, None].to(tl.float32) - tl.load(row + 1, mask=mask, other=0.0)[None, :]
     sx, sy = tl.load(row + 2, mask=mask, other=0.0), tl.load(row + 3, mask=mask, other=0.0)
     ty, log2_o = tl.load(row + 4, mask=mask, other=0.0), tl.load(row + 5, mask=mask, other=-1000.0)
@@ -78,7 +89,8 @@ def _channels(records, ids, mask):
 @no_type_check
 def composite_kernel(
     records, gaussians, tile_begin, background, image, transmittance, depth, median, W, H, tiles_x, most,
-    WITH_DEPTH: tl.constexpr, WITH_MEDIAN: tl.constexpr, BATCH: tl.constexpr, PRECISION: tl.constexpr,
+    WITH_DEPTH: tl.constexpr, WITH_MEDIAN: tl.constexpr, WRAPS: tl.constexpr, BATCH: tl.constexpr,
+    PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Composite one tile."""
     tile = tl.program_id(0)
@@ -91,7 +103,8 @@ def composite_kernel(
         lane = k + tl.arange(0, BATCH)
         mask = lane < end
         ids = tl.load(gaussians + lane, mask=mask, other=0)
-        _, alpha = _alphas(records, ids, mask, x, y, most)
+        u = _column_of_means(records, ids, mask, tile % tiles_x * TILE, W, WRAPS)
+        _, alpha = _alphas(records, ids, mask, x, y, u, most)
         before, alpha, T = _weights(alpha, T)
         if WITH_MEDIAN:
             deep = tl.load(records + ids.to(tl.int64) * RECORD + 9, mask=mask, other=0.0)
@@ -146,7 +159,7 @@ def _gradients(
 def composite_backward_kernel(
     records, gaussians, perm, tile_begin, image, transmittance, depth,
     grad_image, grad_transmittance, grad_depth, slots, W, H, tiles_x, most,
-    WITH_T: tl.constexpr, WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr,
+    WITH_T: tl.constexpr, WITH_DEPTH: tl.constexpr, WRAPS: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     """Write every pair's sums over one tile to its own slot; slots of pairs that were not drawn stay unchanged.
 
@@ -180,7 +193,8 @@ def composite_backward_kernel(
         lane = k + tl.arange(0, BATCH)
         mask = lane < end
         ids = tl.load(gaussians + lane, mask=mask, other=0)
-        p, alpha = _alphas(records, ids, mask, x, y, most)
+        u = _column_of_means(records, ids, mask, tile % tiles_x * TILE, W, WRAPS)
+        p, alpha = _alphas(records, ids, mask, x, y, u, most)
         before, alpha, T = _weights(alpha, T)
         w = before * alpha
         row = records + ids.to(tl.int64) * RECORD
@@ -198,8 +212,8 @@ def composite_backward_kernel(
         tl.store(out + 2, tl.sum(w * g2[:, None], axis=0), mask=mask)
         if WITH_DEPTH:
             tl.store(out + 3, tl.sum(w * g3[:, None], axis=0), mask=mask)
-        u, v = tl.load(row, mask=mask, other=0.0) - x0, tl.load(row + 1, mask=mask, other=0.0) - y0
-        _store_moments(out, h, bx, by, u, v, mask)
+        v = tl.load(row + 1, mask=mask, other=0.0) - y0
+        _store_moments(out, h, bx, by, u - x0, v, mask)
         k += BATCH
 
 

@@ -2,6 +2,9 @@
 
 The ellipse's x interval over a band of rows is computed as in `native/intersect.cpp`. Gaussians arrive near to far, so
 pairs are written in depth order, and a stable sort by tile leaves every tile's list sorted by depth.
+
+The left and right edges of a panorama meet (WRAPS): an ellipse has three places there, 360 degrees apart, and each tile
+sees the nearest one.
 """
 
 from __future__ import annotations
@@ -70,26 +73,66 @@ def _columns(u, v, ex, ey, slant, tangent, half, ty, width):
 
 @triton.jit
 @no_type_check
-def count_kernel(records, pairs_of, n, width, height, BLOCK: tl.constexpr):
+def seam_shift(left, u, width):
+    """Return the whole turns, px, by which a mean at column u is nearest to the tile whose first column is `left`."""
+    turn = width * 1.0
+    return turn * tl.floor((left + 0.5 * (TILE - 1) - u) / turn + 0.5)
+
+
+@triton.jit
+@no_type_check
+def _nearest_tiles(u, copy, width):
+    """Return the first column of tiles to which a copy of the ellipse is the nearest, and the one after the last."""
+    tiles_x = (width + TILE - 1) // TILE
+    begin, end = 0 * u.to(tl.int32) + tiles_x, 0 * u.to(tl.int32)
+    tx = 0
+    while tx < tiles_x:
+        here = seam_shift(tx * TILE, u, width) == copy * width
+        begin, end = tl.where(here & (tx < begin), tx, begin), tl.where(here, tx + 1, end)
+        tx += 1
+    return begin, end
+
+
+@triton.jit
+@no_type_check
+def _columns_of(copy, u, v, ex, ey, slant, tangent, half, ty, width, nearest, WRAPS: tl.constexpr):
+    """Return the same as `_columns` for a copy of the ellipse."""
+    if WRAPS:
+        first, columns = _columns(u + copy * width, v, ex, ey, slant, tangent, half, ty, width)
+        begin, end = tl.maximum(first, nearest[0]), tl.minimum(first + columns, nearest[1])
+        first, columns = begin, tl.maximum(end - begin, 0)
+    else:
+        first, columns = _columns(u, v, ex, ey, slant, tangent, half, ty, width)
+    return first, columns
+
+
+@triton.jit
+@no_type_check
+def count_kernel(records, pairs_of, n, width, height, WRAPS: tl.constexpr, BLOCK: tl.constexpr):
     """Count the tiles of each Gaussian of a block."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     u, v, ex, ey, slant, tangent, half, seen = _ellipse(records, i, i < n)
     first, rows = _rows(v, ey, height, seen)
     ey = tl.where(seen, ey, 1.0)
     total = tl.zeros([BLOCK], tl.int32)
-    k, most = 0, tl.max(rows, 0)
-    while k < most:
-        _, columns = _columns(u, v, ex, ey, slant, tangent, half, first + k, width)
-        total += tl.where(k < rows, columns, 0)
-        k += 1
+    for copy in tl.static_range(-1 if WRAPS else 0, 2 if WRAPS else 1):
+        nearest = _nearest_tiles(u, copy, width) if WRAPS else (0, 0)
+        k, most = 0, tl.max(rows, 0)
+        while k < most:
+            _, columns = _columns_of(
+                copy, u, v, ex, ey, slant, tangent, half, first + k, width, nearest, WRAPS
+            )
+            total += tl.where(k < rows, columns, 0)
+            k += 1
     tl.store(pairs_of + i, total, mask=i < n)
 
 
 @triton.jit
 @no_type_check
 def emit_kernel(
-    records, order, begin, pairs_of, tiles, gaussians, n, width, height, tiles_x, BLOCK: tl.constexpr
-):
+    records, order, begin, pairs_of, tiles, gaussians, n, width, height, tiles_x,
+    WRAPS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Write tile and Gaussian of every pair, by Gaussian in the given order; never more than were counted."""
     k = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = k < n
@@ -99,15 +142,19 @@ def emit_kernel(
     ey = tl.where(seen, ey, 1.0)
     place = tl.load(begin + i, mask=mask, other=0)
     end = place + tl.load(pairs_of + i, mask=mask, other=0)
-    row, most_rows = 0, tl.max(rows, 0)
-    while row < most_rows:
-        tx, columns = _columns(u, v, ex, ey, slant, tangent, half, first + row, width)
-        columns = tl.where(row < rows, columns, 0)
-        column, most_columns = 0, tl.max(columns, 0)
-        while column < most_columns:
-            here = mask & (column < columns) & (place + column < end)
-            tl.store(tiles + place + column, (first + row) * tiles_x + tx + column, mask=here)
-            tl.store(gaussians + place + column, i.to(tl.int32), mask=here)
-            column += 1
-        place += columns
-        row += 1
+    for copy in tl.static_range(-1 if WRAPS else 0, 2 if WRAPS else 1):
+        nearest = _nearest_tiles(u, copy, width) if WRAPS else (0, 0)
+        row, most_rows = 0, tl.max(rows, 0)
+        while row < most_rows:
+            tx, columns = _columns_of(
+                copy, u, v, ex, ey, slant, tangent, half, first + row, width, nearest, WRAPS
+            )
+            columns = tl.where(row < rows, columns, 0)
+            column, most_columns = 0, tl.max(columns, 0)
+            while column < most_columns:
+                here = mask & (column < columns) & (place + column < end)
+                tl.store(tiles + place + column, (first + row) * tiles_x + tx + column, mask=here)
+                tl.store(gaussians + place + column, i.to(tl.int32), mask=here)
+                column += 1
+            place += columns
+            row += 1

@@ -1,10 +1,15 @@
 """project: from raw parameters to screen-space ellipses, one packed record per Gaussian; and the backward pass.
 
-    Sigma2d = J W Sigma W' J' + d I, d: dilation,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
+    Sigma2d = J W Sigma W' J' + d I + g g', d: dilation, g: motion blur
+    u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
 
 A record holds u, v, sx, sy, ty, log2 o, red, green, blue, depth, half width, half height. Then alpha = 2^(log2 o - (sx
 dx + sy dy)² - (ty dy)²), whose squares cannot cancel for long, thin ellipses. A half width of 0 marks an invisible
 Gaussian.
+
+Where a lens or a rolling shutter (LENS: 1, or 2 with an exposure) sees the Gaussians, and g, the kernels of
+`gsplat_edu.render.triton.sight` have worked out before; project_backward returns the gradient of that, in rows of
+`SEEN`, in place of the means'.
 """
 
 from __future__ import annotations
@@ -17,6 +22,7 @@ import triton.language as tl
 
 from gsplat_edu.base import constants
 from gsplat_edu.render.camera_tensors import GRADIENT_NUMBERS
+from gsplat_edu.render.triton.blur import blurred, still_gradient, store_blur_gradient
 from gsplat_edu.render.triton.gaussian import (
     C0,
     DET_FLOOR,
@@ -38,6 +44,7 @@ from gsplat_edu.render.triton.gaussian import (
     store3,
     unit_quaternion,
 )
+from gsplat_edu.render.triton.sight import SEEN
 
 RECORD = tl.constexpr(16)
 """Values per record; twelve are used, sixteen fill a cache line."""
@@ -46,7 +53,7 @@ SLOT = tl.constexpr(16)
 """Values per slot: sums of w g (3), of w times the depth's gradient, and six moments of h."""
 
 CAMERA_NUMBERS = tl.constexpr(GRADIENT_NUMBERS)
-"""Numbers of a camera's gradient, at the offsets of the camera's row."""
+"""Numbers of a pinhole's gradient, at the offsets of the camera's row."""
 
 ALPHA_MIN = tl.constexpr(constants.ALPHA_MIN)
 COLOR_LIMIT = tl.constexpr(constants.COLOR_LIMIT)
@@ -75,27 +82,65 @@ def _is_finite(x):
 
 @triton.jit
 @no_type_check
+def _through_lens(seen, i, mask):
+    """Load direction, image position, depth, and the rows of J W."""
+    row = seen + i * SEEN
+    u, v = tl.load(row, mask=mask, other=0.0), tl.load(row + 1, mask=mask, other=0.0)
+    t = (
+        tl.load(row + 2, mask=mask, other=0.0),
+        tl.load(row + 3, mask=mask, other=0.0),
+        tl.load(row + 4, mask=mask, other=0.0),
+    )
+    p = (
+        tl.load(row + 5, mask=mask, other=0.0),
+        tl.load(row + 6, mask=mask, other=0.0),
+        tl.load(row + 7, mask=mask, other=0.0),
+    )
+    depth = tl.load(row + 8, mask=mask, other=1.0)
+    direction = (
+        tl.load(row + 9, mask=mask, other=0.0),
+        tl.load(row + 10, mask=mask, other=0.0),
+        tl.load(row + 11, mask=mask, other=1.0),
+    )
+    return direction, u, v, depth, t, p
+
+
+@triton.jit
+@no_type_check
 def project_kernel(
-    means, quats, log_scales, sh0, sh_rest, logits, camera, records, n,
-    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, DILATION: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, log_scales, sh0, sh_rest, logits, camera, seen_by_lens, records, n,
+    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, DILATION: tl.constexpr,
+    LENS: tl.constexpr, WRAPS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the records of a block of Gaussians."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
-    o0, o1, o2, x, y, z = into_camera(means, camera, i, mask)
-    front = z > tl.load(camera + NEAR_AT)
-    z = tl.where(front, z, 1.0)
+    if LENS:
+        (o0, o1, o2), x, y, z, (t0, t1, t2), (p0, p1, p2) = _through_lens(seen_by_lens, i, mask)
+        front = tl.load(seen_by_lens + i * SEEN + 12, mask=mask, other=0.0) > 0
+        u, v = x, y
+    else:
+        o0, o1, o2, x, y, z = into_camera(means, camera, i, mask)
+        front = z > tl.load(camera + NEAR_AT)
+        z = tl.where(front, z, 1.0)
+        t0, t1, t2, _ = jacobian_row(camera, 0, x, z)
+        p0, p1, p2, _ = jacobian_row(camera, 1, y, z)
+        u = tl.load(camera + FOCAL_AT) * x / z + tl.load(camera + MIDDLE_AT)
+        v = tl.load(camera + FOCAL_AT + 1) * y / z + tl.load(camera + MIDDLE_AT + 1)
     qw, qx, qy, qz, length = unit_quaternion(quats, i, mask)
     R = rotation(qw, qx, qy, qz)
     l0, l1, l2 = load3(log_scales, i, mask)
     s0, s1, s2 = tl.exp(l0), tl.exp(l1), tl.exp(l2)
-    t0, t1, t2, _ = jacobian_row(camera, 0, x, z)
     r = onto_axes(t0, t1, t2, R, s0, s1, s2)
-    t0, t1, t2, _ = jacobian_row(camera, 1, y, z)
-    q = onto_axes(t0, t1, t2, R, s0, s1, s2)
+    q = onto_axes(p0, p1, p2, R, s0, s1, s2)
     a, b, c, det0, det = shape_on_screen(r, q, DILATION)
     a, c = a + DILATION, c + DILATION
     opacity = 1 / (1 + tl.exp(-tl.load(logits + i, mask=mask, other=0.0)))
+    if LENS == 2:
+        before = det
+        _, _, a, b, c, det = blurred(seen_by_lens, i, mask, r, q, (a, b, c, det), DILATION)
+        if not ANTIALIASED:
+            opacity = opacity * tl.sqrt(before / det)
     if ANTIALIASED:
         opacity = opacity * tl.sqrt(tl.maximum(det0, DET_FLOOR) / det)
 
@@ -109,11 +154,10 @@ def project_kernel(
     )
     seen = mask & front & fine & (det > THINNEST * (a + c)) & (opacity >= ALPHA_MIN)
     level = 2 * tl.log(tl.where(seen, opacity / ALPHA_MIN, 1.0))
-    u = tl.load(camera + FOCAL_AT) * x / z + tl.load(camera + MIDDLE_AT)
-    v = tl.load(camera + FOCAL_AT + 1) * y / z + tl.load(camera + MIDDLE_AT + 1)
     ex, ey = tl.sqrt(level * a), tl.sqrt(level * c)
     W, H = tl.load(camera + SIZE_AT), tl.load(camera + SIZE_AT + 1)
-    seen &= (tl.ceil(u - ex) <= W - 1) & (tl.floor(u + ex) >= 0)
+    if not WRAPS:
+        seen &= (tl.ceil(u - ex) <= W - 1) & (tl.floor(u + ex) >= 0)
     seen &= (tl.ceil(v - ey) <= H - 1) & (tl.floor(v + ey) >= 0)
     # d' Sigma2d^-1 d = (c / det) (dx - b/c dy)² + dy² / c
     sx = tl.sqrt(c / det * (LOG2E / 2))
@@ -164,13 +208,13 @@ def _sums(slots, slot_begin, pairs_of, i, mask, BLOCK: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _shape_gradient(a, b, c, det, h, hxx, hxy, hyy, ANTIALIASED: tl.constexpr):
-    """Return Sigma2d's gradient from the moments of h, with antialiasing: -K G K, K = Sigma2d^-1, G = dL/dK."""
+def _shape_gradient(a, b, c, det, h, hxx, hxy, hyy, DIMMED: tl.constexpr):
+    """Return Sigma2d's gradient from the moments of h, with the opacity's factor: -K G K, K = Sigma2d^-1, G = dL/dK."""
     A, B, C = c / det, -b / det, a / det
     gA, gB, gC = -hxx / 2, -hxy / 2, -hyy / 2
     m00, m01, m10, m11 = gA * A + gB * B, gA * B + gB * C, gB * A + gC * B, gB * B + gC * C
     da, db, dc = -(A * m00 + B * m10), -2 * (A * m01 + B * m11), -(B * m01 + C * m11)
-    if ANTIALIASED:  # of the root of det(Sigma2d); `_area_gradient` has that of the root of det0
+    if DIMMED:  # of the root of det(Sigma2d); `_area_gradient` or `still_gradient` has that of the other root
         da, db, dc = da - h / 2 * A, db - h * B, dc - h / 2 * C
     return da, db, dc
 
@@ -194,6 +238,28 @@ def _area_gradient(r, q, det0, h, f, g):
         g[1] + over * (n[2] * r[0] - n[0] * r[2]),
         g[2] + over * (n[0] * r[1] - n[1] * r[0]),
     )
+
+
+@triton.jit
+@no_type_check
+def _factor_gradient(r, q, det0, still, h, f, g, ANTIALIASED: tl.constexpr, LENS: tl.constexpr):
+    """Add to the gradients of r and q the part of the opacity's factor that is not of the drawn ellipse."""
+    if ANTIALIASED:
+        f, g = _area_gradient(r, q, det0, h, f, g)
+    elif LENS == 2:
+        f, g = still_gradient(r, q, still, h, f, g)
+    return f, g
+
+
+@triton.jit
+@no_type_check
+def _place_gradient(norms, camera, conic, sums, i, touched, mask):
+    """Return the gradient of the image position, and store its norm."""
+    A, B, C = conic
+    gu, gv = A * sums[5] + B * sums[6], B * sums[5] + C * sums[6]
+    nu, nv = gu * tl.load(camera + SIZE_AT) / 2, gv * tl.load(camera + SIZE_AT + 1) / 2
+    _store_if(norms, 1, 0, i, tl.sqrt(nu * nu + nv * nv), touched, mask)
+    return gu, gv
 
 
 @triton.jit
@@ -277,11 +343,26 @@ def _store_means(
 
 @triton.jit
 @no_type_check
+def _store_seen(grad_seen, at, d, e, deep, w, direction, distance, i, touched, mask):
+    """Store the gradients of image position, rows of J W (d, e), depth, and direction: from that of its unit vector."""
+    along = dot3(w[0], w[1], w[2], direction[0], direction[1], direction[2])
+    for k in tl.static_range(2):
+        _store_if(grad_seen, SEEN, k, i, at[k], touched, mask)
+    for k in tl.static_range(3):
+        _store_if(grad_seen, SEEN, 2 + k, i, d[k], touched, mask)
+        _store_if(grad_seen, SEEN, 5 + k, i, e[k], touched, mask)
+        _store_if(grad_seen, SEEN, 9 + k, i, (w[k] - along * direction[k]) / distance, touched, mask)
+    _store_if(grad_seen, SEEN, 8, i, deep, touched, mask)
+    _store_if(grad_seen, SEEN, 12, i, 0.0 * deep, touched, mask)
+
+
+@triton.jit
+@no_type_check
 def project_backward_kernel(
-    means, quats, log_scales, sh0, sh_rest, logits, camera, slots, slot_begin, pairs_of,
+    means, quats, log_scales, sh0, sh_rest, logits, camera, seen_by_lens, slots, slot_begin, pairs_of,
     grad_means, grad_quats, grad_log_scales, grad_sh0, grad_sh_rest, grad_logits, norms, camera_sums, n,
     DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, DILATION: tl.constexpr,
-    WITH_CAMERA: tl.constexpr, BLOCK: tl.constexpr,
+    WITH_CAMERA: tl.constexpr, LENS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Add slots and propagate to raw parameters: conic -> Sigma2d -> (J W, M); colour -> (coefficients, direction).
 
@@ -291,52 +372,65 @@ def project_backward_kernel(
     mask = i < n
     sums = _sums(slots, slot_begin, pairs_of, i, mask, BLOCK)
     touched = mask & sums[10]
-    o0, o1, o2, x, y, z = into_camera(means, camera, i, mask)
+    if LENS:
+        (o0, o1, o2), x, y, z, (t0, t1, t2), (p0, p1, p2) = _through_lens(seen_by_lens, i, mask)
+    else:
+        o0, o1, o2, x, y, z = into_camera(means, camera, i, mask)
+        t0, t1, t2, ratio_x = jacobian_row(camera, 0, x, z)
+        p0, p1, p2, ratio_y = jacobian_row(camera, 1, y, z)
     qw, qx, qy, qz, length = unit_quaternion(quats, i, mask)
     R = rotation(qw, qx, qy, qz)
     l0, l1, l2 = load3(log_scales, i, mask)
     s0, s1, s2 = tl.exp(l0), tl.exp(l1), tl.exp(l2)
-    t0, t1, t2, ratio_x = jacobian_row(camera, 0, x, z)
-    p0, p1, p2, ratio_y = jacobian_row(camera, 1, y, z)
     r = onto_axes(t0, t1, t2, R, s0, s1, s2)
     q = onto_axes(p0, p1, p2, R, s0, s1, s2)
     a0, b, c0, det0, det = shape_on_screen(r, q, DILATION)
     a, c = a0 + DILATION, c0 + DILATION
     opacity = 1 / (1 + tl.exp(-tl.load(logits + i, mask=mask, other=0.0)))
     _store_if(grad_logits, 1, 0, i, (1 - opacity) * sums[4], touched, mask)
-    A, B, C = c / det, -b / det, a / det
-    gu, gv = A * sums[5] + B * sums[6], B * sums[5] + C * sums[6]
-    nu, nv = gu * tl.load(camera + SIZE_AT) / 2, gv * tl.load(camera + SIZE_AT + 1) / 2
-    _store_if(norms, 1, 0, i, tl.sqrt(nu * nu + nv * nv), touched, mask)
-    da, db, dc = _shape_gradient(a, b, c, det, sums[4], sums[7], sums[8], sums[9], ANTIALIASED)
-
+    still = (a, b, c, det)
+    if LENS == 2:
+        g0, g1, a, b, c, det = blurred(seen_by_lens, i, mask, r, q, still, DILATION)
+    gu, gv = _place_gradient(norms, camera, (c / det, -b / det, a / det), sums, i, touched, mask)
+    da, db, dc = _shape_gradient(a, b, c, det, sums[4], sums[7], sums[8], sums[9], ANTIALIASED or LENS == 2)
     # From Sigma2d to r and q, the rows of J W M; then to M's rotation and scales, and to J W.
     f = (2 * da * r[0] + db * q[0], 2 * da * r[1] + db * q[1], 2 * da * r[2] + db * q[2])
     g = (2 * dc * q[0] + db * r[0], 2 * dc * q[1] + db * r[1], 2 * dc * q[2] + db * r[2])
-    if ANTIALIASED:
-        f, g = _area_gradient(r, q, det0, sums[4], f, g)
+    f, g = _factor_gradient(r, q, det0, still, sums[4], f, g, ANTIALIASED, LENS)
+    if LENS == 2:
+        store_blur_gradient(grad_means, g0, g1, da, db, dc, i, touched, mask)
     _store_shape(
         grad_quats, grad_log_scales, (qw, qx, qy, qz, length), R, (s0, s1, s2), (t0, t1, t2), (p0, p1, p2),
         f, g, i, touched, mask,
     )  # fmt: skip
     d = _along_rows(R, s0 * f[0], s1 * f[1], s2 * f[2])
     e = _along_rows(R, s0 * g[0], s1 * g[1], s2 * g[2])
-    gm = _mean_gradient(camera, x, y, z, ratio_x, ratio_y, (t0, t1, t2), (p0, p1, p2), d, e, gu, gv, sums[3])
-
     distance = tl.sqrt(dot3(o0, o1, o2, o0, o1, o2))
     direction = (o0 / distance, o1 / distance, o2 / distance)
     colors = _colors(sh0, sh_rest, i, direction[0], direction[1], direction[2], mask, DEGREE, REST)
     w0, w1, w2 = _color_gradient(
         sh0, sh_rest, grad_sh0, grad_sh_rest, i, direction, colors, sums, mask, touched, DEGREE, REST
     )
-    _store_means(
-        grad_means, camera, camera_sums, gm, (w0, w1, w2), direction, distance, i, touched, mask, WITH_CAMERA
-    )
-    if WITH_CAMERA:
-        _camera_gradient(
-            camera, camera_sums, (o0, o1, o2), (x, y, z), (ratio_x, ratio_y), (t0, t1, t2), (p0, p1, p2), d, e,
-            gu, gv, gm, touched,
+    if LENS:
+        _store_seen(grad_means, (gu, gv), d, e, sums[3], (w0, w1, w2), direction, distance, i, touched, mask)
+    else:
+        _store_pinhole(
+            grad_means, camera, camera_sums, (o0, o1, o2), (x, y, z), (ratio_x, ratio_y), (t0, t1, t2), (p0, p1, p2),
+            d, e, gu, gv, sums[3], (w0, w1, w2), direction, distance, i, touched, mask, WITH_CAMERA,
         )  # fmt: skip
+
+
+@triton.jit
+@no_type_check
+def _store_pinhole(
+    grad_means, camera, camera_sums, offset, at, ratio, t, p, d, e, gu, gv, deep, w, direction, distance,
+    i, touched, mask, WITH_CAMERA: tl.constexpr,
+):  # fmt: skip
+    """Store the means' gradient through a pinhole, and the camera's."""
+    g = _mean_gradient(camera, at[0], at[1], at[2], ratio[0], ratio[1], t, p, d, e, gu, gv, deep)
+    _store_means(grad_means, camera, camera_sums, g, w, direction, distance, i, touched, mask, WITH_CAMERA)
+    if WITH_CAMERA:
+        _camera_gradient(camera, camera_sums, offset, at, ratio, t, p, d, e, gu, gv, g, touched)
 
 
 @triton.jit

@@ -7,6 +7,9 @@ runs give the same bits. All launches are on torch's current stream. The host sy
 numbers of pairs and of visible Gaussians, and once per gradient of a camera. With TRITON_INTERPRET=1 the same kernels
 run on CPU tensors.
 
+Where a lens or a rolling shutter sees the Gaussians is a separate operation before project, whose backward pass takes
+what project_backward returns (`gsplat_edu.render.triton.lens`).
+
 Features are composited by the same kernels, in place of colours and depth, four channels per pass.
 """
 
@@ -24,11 +27,12 @@ from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.constants import TILE
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
+from gsplat_edu.render.camera_tensors import POSE, CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.triton.composite import composite_backward_kernel, composite_kernel
 from gsplat_edu.render.triton.intersect import count_kernel, emit_kernel
+from gsplat_edu.render.triton.lens import seen_through
 from gsplat_edu.render.triton.project import (
     CAMERA_NUMBERS,
     RECORD,
@@ -70,10 +74,17 @@ class _Call:
     camera: Camera
     settings: RenderSettings
     sh_degree: int
+    lens: bool
+    optics: int  # LENS of the kernels: 0 for a pinhole at rest, 2 for a camera with an exposure, 1 for others
     visible: Tensor = field(init=False)
     radii: Tensor = field(init=False)
     num_pairs: int = field(init=False)
     norms: Tensor | None = None
+
+    @property
+    def wraps(self) -> bool:
+        """Whether the left and right edges of the image meet."""
+        return self.camera.projection.kind == "equirectangular"
 
 
 @dataclass(frozen=True)
@@ -113,12 +124,17 @@ def render_triton(
             f"features: are {features.dtype} on {features.device}, but the Gaussians are float32 on {means.device}"
         )
     value, pose = split_camera(camera)
-    call = _Call(value, settings, min(settings.sh_degree, gaussians.sh_degree))
+    lens, degree = not camera.pinhole, min(settings.sh_degree, gaussians.sh_degree)
+    call = _Call(value, settings, degree, lens, lens + (value.exposure > 0))
     tensors = gaussians.tensors()
     parameters = [tensors[name] for name in RAW]
     with torch.cuda.device_of(gaussians.means):  # type: ignore[no-untyped-call]
+        seen = None
+        if call.lens:
+            seen = seen_through(means, camera, settings.z_near, jacobian_limit=settings.jacobian_limit)
+        camera_parts = (None,) * POSE if call.lens else pose  # a lens has its gradients through `seen`
         image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
-            call, extra.background, *pose, features, *parameters
+            call, extra.background, features, seen, *camera_parts, *parameters
         )
 
     def norms() -> Tensor:
@@ -147,15 +163,15 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         call: _Call,
         background: Tensor,
-        R: Tensor | None,
-        eye: Tensor | None,
-        intrinsics: Tensor | None,
         features: Tensor | None,
-        *parameters: Tensor,
+        seen: Tensor | None,
+        *tensors: Tensor | None,  # the camera's, then the parameters
     ) -> tuple[Tensor, ...]:
+        parameters = [tensor for tensor in tensors[POSE:] if tensor is not None]
         settings = call.settings
         kept = [p.detach().contiguous() for p in parameters]
-        lists = _intersect(call, _project(call, kept))
+        given_seen = None if seen is None else seen.detach()
+        lists = _intersect(call, _project(call, kept, given_seen))
         shown = _composite(
             call, lists, background.detach().contiguous(), settings.depth, settings.median_depth
         )
@@ -167,13 +183,13 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(median)
         ctx.call, ctx.lists = call, lists
-        ctx.save_for_backward(given, mixed, image, transmittance, depth, *kept)
+        ctx.save_for_backward(given, given_seen, mixed, image, transmittance, depth, *kept)
         return image, transmittance, depth, mixed, median
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        features, mixed, image, transmittance, depth, *kept = ctx.saved_tensors
+        features, seen, mixed, image, transmittance, depth, *kept = ctx.saved_tensors
         call: _Call = ctx.call
         lists: _Lists = ctx.lists
         grad_image, grad_T, grad_depth, grad_mixed, _ = (None if g is None else g.contiguous() for g in grads)
@@ -185,24 +201,14 @@ class _Rasterize(torch.autograd.Function):
         to_features = None
         if grad_mixed is not None and features is not None:
             to_features = _features_backward(call, lists, (features, mixed, transmittance), grad_mixed, slots)
-        outgoing = [torch.empty_like(p) for p in kept]  # fully overwritten
-        count = len(kept[0])
-        norms = kept[0].new_zeros(count)
-        blocks, with_camera = -(-count // BACKWARD_BLOCK), any(ctx.needs_input_grad[2:5])
-        camera_sums = kept[0].new_empty(blocks if with_camera else 0, CAMERA_NUMBERS.value)
-        if count:
-            project_backward_kernel[(blocks,)](
-                *kept, _camera_row(call, image.device), slots, lists.slot_begin, lists.pairs_of, *outgoing, norms,
-                camera_sums, count,
-                DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
-                DILATION=call.settings.dilation, WITH_CAMERA=with_camera, BLOCK=BACKWARD_BLOCK,
-                num_warps=PROJECT_BACKWARD_WARPS,
-            )  # fmt: skip
-        call.norms = norms if call.norms is None else call.norms + norms
+        wanted_pose = ctx.needs_input_grad[4 : 4 + POSE]
+        outgoing, camera_sums = _project_backward(call, lists, kept, seen, slots, any(wanted_pose))
         wanted = ctx.needs_input_grad[1]
         background = (grad_image * transmittance[..., None]).sum(dim=(0, 1)) if wanted else None
-        pose = camera_gradients(camera_sums.double().sum(dim=0).cpu() if with_camera else None)
-        return None, background, *pose, to_features, *outgoing
+        pose = camera_gradients(None if camera_sums is None else camera_sums.cpu(), wanted_pose)
+        to_seen = outgoing[0] if call.lens else None
+        to_means = None if call.lens else outgoing[0]
+        return None, background, to_features, to_seen, *pose, to_means, *outgoing[1:]
 
 
 def _composite(
@@ -216,7 +222,7 @@ def _composite(
     composite_kernel[(tiles,)](
         lists.records, lists.gaussians, lists.tile_begin, background, *images, camera.W, camera.H, tiles_x,
         math.log2(call.settings.alpha_max),
-        WITH_DEPTH=with_depth, WITH_MEDIAN=with_median, BATCH=BATCH, PRECISION=PRECISION,
+        WITH_DEPTH=with_depth, WITH_MEDIAN=with_median, WRAPS=call.wraps, BATCH=BATCH, PRECISION=PRECISION,
     )  # fmt: skip
     return images
 
@@ -232,7 +238,7 @@ def _composite_backward(
         lists.records, lists.gaussians, lists.slots, lists.tile_begin, *images,
         grad_image, image if grad_T is None else grad_T, image if grad_depth is None else grad_depth, slots,
         call.camera.W, call.camera.H, tiles_x, math.log2(call.settings.alpha_max),
-        WITH_T=grad_T is not None, WITH_DEPTH=grad_depth is not None, BATCH=BATCH,
+        WITH_T=grad_T is not None, WITH_DEPTH=grad_depth is not None, WRAPS=call.wraps, BATCH=BATCH,
         num_warps=COMPOSITE_BACKWARD_WARPS,
     )  # fmt: skip
     return slots
@@ -292,16 +298,48 @@ def _features_backward(
     return found
 
 
-def _project(call: _Call, kept: list[Tensor]) -> Tensor:
+def _project(call: _Call, kept: list[Tensor], seen: Tensor | None) -> Tensor:
     count = len(kept[0])
     records = kept[0].new_empty(count, RECORD.value)
     if count:
         project_kernel[(-(-count // BLOCK),)](
-            *kept, _camera_row(call, kept[0].device), records, count,
+            *kept, _camera_row(call, kept[0].device), records if seen is None else seen, records, count,
             DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
-            DILATION=call.settings.dilation, BLOCK=BLOCK,
+            DILATION=call.settings.dilation, LENS=call.optics, WRAPS=call.wraps, BLOCK=BLOCK,
         )  # fmt: skip
     return records
+
+
+def _project_backward(
+    call: _Call, lists: _Lists, kept: list[Tensor], seen: Tensor | None, slots: Tensor, with_camera: bool
+) -> tuple[list[Tensor], Tensor | None]:
+    """Return the gradients of the parameters, and the camera's numbers in float64; set the norms of the call.
+
+    Args:
+        call: The render.
+        lists: Its lists.
+        kept: Raw parameters.
+        seen: What the lens has seen; its gradient takes the place of that of the means. None for a pinhole.
+        slots: Slots of all pairs.
+        with_camera: Whether a pinhole's gradient is wanted.
+    """
+    count = len(kept[0])
+    blocks = -(-count // BACKWARD_BLOCK)
+    outgoing = [torch.empty_like(p) for p in kept]  # fully overwritten
+    if seen is not None:
+        outgoing[0] = torch.zeros_like(seen)  # its rows are padded
+    norms = kept[0].new_zeros(count)
+    camera_sums = kept[0].new_empty(blocks if with_camera else 0, CAMERA_NUMBERS.value)
+    if count:
+        project_backward_kernel[(blocks,)](
+            *kept, _camera_row(call, slots.device), slots if seen is None else seen, slots, lists.slot_begin,
+            lists.pairs_of, *outgoing, norms, camera_sums, count,
+            DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
+            DILATION=call.settings.dilation, WITH_CAMERA=with_camera, LENS=call.optics, BLOCK=BACKWARD_BLOCK,
+            num_warps=PROJECT_BACKWARD_WARPS,
+        )  # fmt: skip
+    call.norms = norms if call.norms is None else call.norms + norms
+    return outgoing, camera_sums.double().sum(dim=0) if with_camera else None
 
 
 def _intersect(call: _Call, records: Tensor) -> _Lists:
@@ -313,7 +351,7 @@ def _intersect(call: _Call, records: Tensor) -> _Lists:
     pairs_of = torch.zeros(count, dtype=torch.int32, device=device)
     blocks = (-(-count // BLOCK),)
     if count:
-        count_kernel[blocks](records, pairs_of, count, camera.W, camera.H, BLOCK=BLOCK)
+        count_kernel[blocks](records, pairs_of, count, camera.W, camera.H, WRAPS=call.wraps, BLOCK=BLOCK)
     ends = torch.cumsum(pairs_of[order], dim=0, dtype=torch.int64)
     begin = torch.empty_like(ends)
     begin[order] = ends - pairs_of[order]
@@ -321,7 +359,8 @@ def _intersect(call: _Call, records: Tensor) -> _Lists:
     call.num_pairs, num_visible = totals.tolist()  # the only synchronisation of the host
     call.visible = order[:num_visible]
     call.radii = records[call.visible, 10:12]
-    tile_of = torch.zeros(call.num_pairs, dtype=torch.int32, device=device)
+    # the two kernels may round differently: a pair that is counted and not written belongs to no tile
+    tile_of = torch.full((call.num_pairs,), tiles, dtype=torch.int32, device=device)
     gaussians = torch.zeros_like(tile_of)
     if call.num_pairs:
         emit_kernel[blocks](
@@ -335,6 +374,7 @@ def _intersect(call: _Call, records: Tensor) -> _Lists:
             camera.W,
             camera.H,
             tiles_x,
+            WRAPS=call.wraps,
             BLOCK=BLOCK,
         )
     tile_of, slots = torch.sort(tile_of, stable=True)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 import pycolmap
+
+COUNT_EVERY = 0.25
+"""Seconds between two counts of what a job has written."""
 
 
 @contextmanager
@@ -17,6 +21,41 @@ def opened(path: str) -> Iterator[pycolmap.Database]:
         yield database
     finally:
         database.close()
+
+
+@contextmanager
+def counted(
+    path: str, tell: Callable[[int], None], count: Callable[[pycolmap.Database], int]
+) -> Iterator[pycolmap.Database]:
+    """Open a database for the block, in which COLMAP writes to it, and report now and then how much has been written.
+
+    The connection stays open, and belongs to this process, because COLMAP does not wait for locks: SQLite locks the
+    whole file while a process opens it first or closes it last, and a COLMAP that opens it in that moment fails. A
+    program that watches from outside must therefore not open the file.
+
+    Args:
+        path: The database; created if missing.
+        tell: Called with each count, in a thread of its own, and once after the block.
+        count: Counts what has been written.
+
+    Yields:
+        The open database, for use before and after COLMAP's own work.
+    """
+    ended = threading.Event()
+
+    def watch(database: pycolmap.Database) -> None:
+        while not ended.wait(COUNT_EVERY):
+            tell(count(database))
+
+    with opened(path) as database:
+        watcher = threading.Thread(target=watch, args=(database,), daemon=True)
+        watcher.start()
+        try:
+            yield database
+        finally:
+            ended.set()
+            watcher.join()
+        tell(count(database))
 
 
 def add_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
@@ -39,7 +78,8 @@ def add_photo(database: pycolmap.Database, name: str, number: int, camera: int) 
 def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: dict[int, int]) -> str:
     """Copy a database without descriptors, and assign new cameras to its photos.
 
-    If photos of different sizes share a camera, their features are scaled to the camera's size.
+    If photos of different sizes share a camera, their features are scaled to the camera's size. Fisheyes keep their
+    model and intrinsics.
 
     Args:
         source: The database.
@@ -63,6 +103,9 @@ def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: 
                 camera = pycolmap.Camera.create_from_model_name(
                     number, model, before.mean_focal_length(), before.width, before.height
                 )
+                if is_wide(before):
+                    camera.model = before.model
+                    camera.params = list(before.params)
                 camera.has_prior_focal_length = before.has_prior_focal_length
                 add_camera(new, camera)
             scale = np.array([before.width / own.width, before.height / own.height, 1.0])
@@ -77,6 +120,11 @@ def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: 
             new.write_two_view_geometry(first, second, geometry)
             new.write_matches(first, second, old.read_matches(first, second))
     return target
+
+
+def is_wide(camera: pycolmap.Camera) -> bool:
+    """Return whether a camera's model is that of a fisheye."""
+    return camera.model_name.endswith("FISHEYE")
 
 
 def with_rig(source: str, target: str, rotations: Sequence[np.ndarray], panoramas: list[list[str]]) -> str:

@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -16,11 +15,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from .database import add_camera, add_photo, opened, with_cameras, with_rig
+from .database import add_camera, add_photo, counted, opened, with_cameras, with_rig
 from .judge import agreement, scattered, steady_points
 from .kin import placed_anew
 from .lenses import Kin, refined, simplified
 from .mappers import Options, Tell, all_at_once, incremental, repaired, without_doubtful
+from .turning import moving_share
 
 BLOCK = 64
 """Number of pairs matched between two writes to the database: an interruption loses at most these."""
@@ -51,12 +51,12 @@ def features(
     """Find SIFT features in photos; photos that already have features in the database are skipped.
 
     Args:
-        tell: Not called: the parent process counts rows of the database. This process cannot, because two SQLite
-            libraries in one process, COLMAP's and Python's, would break each other's locks.
+        tell: Called with the number of photos done.
         database: The database; created if missing.
         photos: Folder of the photos.
         masks: Folder of their masks, NAME.png; features are found where a mask is not zero. Empty for none.
-        groups: Photos that share a camera: "names", "width" and "height", and the "focal" length if known, px.
+        groups: Photos that share a camera: "names", "width" and "height", and the "focal" length if known, px. "lens"
+            is None, or a fisheye: "model", and "focal", "cx" and "cy" with the first pixel's centre at (0.5, 0.5), px.
         max_features: Largest number of features per photo.
         threads: Number of threads, -1 for all.
         seed: Seed of COLMAP's generator.
@@ -73,34 +73,47 @@ def features(
     with opened(database) as db, pycolmap.DatabaseTransaction(db):
         numbers = {name: i for i, name in enumerate(names, 1)}
         for number, group in enumerate([] if db.num_images() else groups, 1):
-            focal = group["focal"] or FOCAL * max(group["width"], group["height"])
-            camera = pycolmap.Camera.create_from_model_name(
-                number, FIRST_LENS, focal, group["width"], group["height"]
-            )
-            camera.has_prior_focal_length = group["focal"] is not None
-            add_camera(db, camera)
+            add_camera(db, _first_camera(number, group))
             for name in group["names"]:
                 add_photo(db, name, numbers[name], number)
     reading = pycolmap.ImageReaderOptions()
     reading.mask_path = masks
-    pycolmap.extract_features(
-        database,
-        photos,
-        image_names=names,
-        reader_options=reading,
-        extraction_options=options,
-        device=pycolmap.Device.cpu,
-    )
-    with opened(database) as db:
+    with counted(database, tell, lambda db: sum(map(db.exists_descriptors, range(1, len(names) + 1)))) as db:
+        pycolmap.extract_features(
+            database,
+            photos,
+            image_names=names,
+            reader_options=reading,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
         found = {image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
     return {"features": found}
+
+
+def _first_camera(number: int, group: dict[str, Any]) -> pycolmap.Camera:
+    """Return the camera of a group of photos before mapping.
+
+    The focal length of a fisheye counts as known: without one, COLMAP verifies matches in pixels, as of a pinhole.
+    """
+    lens = group.get("lens") or {"model": FIRST_LENS, "focal": group["focal"]}
+    focal = lens["focal"] or FOCAL * max(group["width"], group["height"])
+    camera = pycolmap.Camera.create_from_model_name(
+        number, lens["model"], focal, group["width"], group["height"]
+    )
+    if "cx" in lens:
+        params = np.array(camera.params)
+        params[list(camera.principal_point_idxs())] = lens["cx"], lens["cy"]
+        camera.params = params.tolist()
+    camera.has_prior_focal_length = lens["focal"] is not None
+    return camera
 
 
 def matches(tell: Tell, database: str, pairs: str, threads: int, seed: int) -> dict[str, Any]:
     """Match features and keep the matches that one geometry explains; pairs already matched are skipped.
 
     Args:
-        tell: Not called, as for `features`.
+        tell: Called with the number of pairs done.
         database: The database.
         pairs: File with two photo names per line.
         threads: Number of threads, -1 for all.
@@ -116,14 +129,14 @@ def matches(tell: Tell, database: str, pairs: str, threads: int, seed: int) -> d
     pairing.match_list_path, pairing.block_size = pairs, BLOCK
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    pycolmap.match_image_pairs(
-        database,
-        matching_options=matching,
-        pairing_options=pairing,
-        verification_options=verification,
-        device=pycolmap.Device.cpu,
-    )
-    with opened(database) as db:
+    with counted(database, tell, pycolmap.Database.num_verified_image_pairs) as db:
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=matching,
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
         names = {image.image_id: image.name for image in db.read_all_images()}
         ids, counts = db.read_two_view_geometry_num_inliers()
     verified = []
@@ -164,8 +177,8 @@ def mapping(
         "models", each with its "folder" in `out`; the "names" of the photos whose pose counts; "doubtful", the photos
         whose pose does not; "unclear", those of them with an ambiguous focal length; "points", their number; "steady",
         the number of points that three photos see; "agreement", the fraction of all matches that fit the poses; "lens",
-        the refined lens of the camera with the most photos; and "error", the mean reprojection error in px of the given
-        photos.
+        the refined lens of the camera with the most photos; "error", the mean reprojection error in px of the given
+        photos; and for panoramas "moving", as `moving_share` returns it.
     """
     pycolmap.set_random_seed(seed)
     lens = FREE_LENS if attempt["free"] else FIRST_LENS if attempt["model"] == "auto" else attempt["model"]
@@ -205,7 +218,8 @@ def _judged(
         return None
     if options.known:
         lenses = dict.fromkeys(model.cameras, f"a rig of {len(model.cameras)} faces")
-        return _written(model, database, folder, (placed, unclear, lenses))
+        facts = _written(model, database, folder, (placed, unclear, lenses))
+        return facts | {"moving": moving_share(model, database)}
     if attempt["free"]:
         simplified(model, FIRST_LENS, options.threads)
     if not per_photo:
@@ -267,7 +281,7 @@ def finish(
     scale: float,
     photos: dict[str, dict[str, Any]],
 ) -> dict[str, Any]:
-    """Transform a model to another frame, and write it with the pinhole cameras of the undistorted photos.
+    """Transform a model to another frame, and write it with the cameras of the capture's photos.
 
     Args:
         tell: Called with the number of photos done.
@@ -276,51 +290,82 @@ def finish(
         rotation: R of x' = scale R x + move.
         move: Translation, world units.
         scale: Scale factor.
-        photos: The photos to keep, by their names in the model: new "name", size "W" and "H", intrinsics "fx", "fy",
-            "cx", "cy" with the first pixel's centre at (0.5, 0.5), and "turns", the number of clockwise quarter turns
-            applied to the photo.
+        photos: The photos to keep, by their names in the model: new "name", COLMAP's "model", size "W" and "H" and
+            "params" of the new photo's camera, and the "rotation" from the old camera's axes to the new one's. Photos
+            with one new name, the faces of a panorama, become one.
 
     Returns:
         "points", their number, and "error", their mean reprojection error in px of the new photos.
     """
     before = pycolmap.Reconstruction(model)
     before.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(np.array(rotation)), np.array(move)))
-    after, cameras = pycolmap.Reconstruction(), dict[tuple[float, ...], int]()
+    after, cameras = pycolmap.Reconstruction(), dict[tuple[Any, ...], int]()
     kept: dict[int, dict[int, tuple[int, int]]] = {}  # observations by point
-    by_name = sorted(
-        (photos[before.image(i).name]["name"], i)
-        for i in before.reg_image_ids()
-        if before.image(i).name in photos
-    )
-    for number, (name, image) in enumerate(by_name, 1):
-        old, new = before.image(image), photos[before.image(image).name]
-        key = (new["W"], new["H"], new["fx"], new["fy"], new["cx"], new["cy"])
+    by_name: dict[str, list[int]] = {}
+    for image in sorted(before.reg_image_ids()):
+        if before.image(image).name in photos:
+            by_name.setdefault(photos[before.image(image).name]["name"], []).append(image)
+    for number, (name, images) in enumerate(sorted(by_name.items()), 1):
+        first = photos[before.image(images[0]).name]
+        key = (first["model"], first["W"], first["H"], *first["params"])
         if key not in cameras:
             cameras[key] = len(cameras) + 1
-            after.add_camera_with_trivial_rig(_pinhole(key, cameras[key]))
-        turn = np.linalg.matrix_power(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), new["turns"] % 4)
-        seen = [p for p in old.points2D if p.has_point3D()]
-        where = before.camera(old.camera_id).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2))
-        where = where @ turn[:2, :2].T * key[2:4] + key[4:6]
-        for index, observed in enumerate(seen):
-            kept.setdefault(observed.point3D_id, {})[number] = (number, index)
-        pose = pycolmap.Rigid3d(turn @ old.cam_from_world().matrix())
-        written = pycolmap.Image(name=name, keypoints=where, camera_id=cameras[key], image_id=number)
+            after.add_camera_with_trivial_rig(_camera(key, cameras[key]))
+        places = list[np.ndarray]()
+        for image in images:
+            points, where = _seen_by(before, image, after.camera(cameras[key]), photos)
+            index = sum(map(len, places))
+            for i, point in enumerate(points):
+                kept.setdefault(point, {})[number] = (number, index + i)
+            places.append(where)
+        turn = np.array(first["rotation"])
+        pose = pycolmap.Rigid3d(turn @ before.image(images[0]).cam_from_world().matrix())
+        written = pycolmap.Image(
+            name=name, keypoints=np.concatenate(places), camera_id=cameras[key], image_id=number
+        )
         after.add_image_with_trivial_frame(written, pose)
         tell(number)
-    for point, observations in sorted(kept.items()):
-        if len(observations) >= 2:
-            track = pycolmap.Track([pycolmap.TrackElement(*pair) for pair in observations.values()])
-            after.add_point3D(before.point3D(point).xyz, track, before.point3D(point).color)
-    after.update_point_3d_errors()
+    _write_points(after, before, kept)
     Path(out).mkdir(parents=True, exist_ok=True)
     after.write_binary(out)
     return {"points": after.num_points3D(), "error": float(after.compute_mean_reprojection_error())}
 
 
-def _pinhole(key: tuple[float, ...], number: int) -> pycolmap.Camera:
-    W, H, *intrinsics = key
-    return pycolmap.Camera(model="PINHOLE", width=W, height=H, params=intrinsics, camera_id=number)
+def _write_points(
+    after: pycolmap.Reconstruction,
+    before: pycolmap.Reconstruction,
+    kept: dict[int, dict[int, tuple[int, int]]],
+) -> None:
+    """Add the points that two photos of the new model see.
+
+    Args:
+        after: The new model.
+        before: The model with the points.
+        kept: By number of a point and of a new photo, that photo's number and the index of the observation.
+    """
+    for point, observations in sorted(kept.items()):
+        if len(observations) >= 2:
+            track = pycolmap.Track([pycolmap.TrackElement(*pair) for pair in observations.values()])
+            after.add_point3D(before.point3D(point).xyz, track, before.point3D(point).color)
+    after.update_point_3d_errors()
+
+
+def _seen_by(
+    model: pycolmap.Reconstruction, image: int, camera: pycolmap.Camera, photos: dict[str, dict[str, Any]]
+) -> tuple[list[int], np.ndarray]:
+    """Return the points that a photo sees, and their places (n, 2) in the new photo, px."""
+    old = model.image(image)
+    seen = [p for p in old.points2D if p.has_point3D()]
+    places = np.array([p.xy for p in seen], dtype=np.float64).reshape(-1, 2)
+    plane: np.ndarray = model.camera(old.camera_id).cam_from_img(places)  # type: ignore[assignment]
+    rays = np.column_stack([plane, np.ones(len(plane))]) @ np.array(photos[old.name]["rotation"]).T
+    where = np.array(camera.img_from_cam(rays))
+    return [p.point3D_id for p in seen], where.reshape(-1, 2)
+
+
+def _camera(key: tuple[Any, ...], number: int) -> pycolmap.Camera:
+    model, W, H, *params = key
+    return pycolmap.Camera(model=model, width=W, height=H, params=params, camera_id=number)
 
 
 def pinholes(tell: Tell, database: str, views: list[dict[str, Any]]) -> dict[str, Any]:
@@ -334,7 +379,7 @@ def pinholes(tell: Tell, database: str, views: list[dict[str, Any]]) -> dict[str
     """
     with opened(database) as db, pycolmap.DatabaseTransaction(db):
         for number, view in enumerate(views, 1):
-            add_camera(db, _pinhole(_pinhole_key(view), number))
+            add_camera(db, _camera(_pinhole_key(view), number))
             add_photo(db, view["name"], number, number)
     return {}
 
@@ -366,7 +411,7 @@ def triangulation(
     model = pycolmap.Reconstruction()
     with opened(database) as db:
         for number, view in enumerate(views, 1):
-            model.add_camera_with_trivial_rig(_pinhole(_pinhole_key(view), number))
+            model.add_camera_with_trivial_rig(_camera(_pinhole_key(view), number))
             seen = (
                 np.array(db.read_keypoints(number))[:, :2]
                 if db.exists_keypoints(number)
@@ -384,8 +429,8 @@ def triangulation(
     return {"points": found.num_points3D()}
 
 
-def _pinhole_key(view: dict[str, Any]) -> tuple[float, ...]:
-    return (view["W"], view["H"], view["fx"], view["fy"], view["cx"], view["cy"])
+def _pinhole_key(view: dict[str, Any]) -> tuple[Any, ...]:
+    return ("PINHOLE", view["W"], view["H"], view["fx"], view["fy"], view["cx"], view["cy"])
 
 
 JOBS: dict[str, Callable[..., dict[str, Any]]] = {
@@ -399,7 +444,7 @@ JOBS: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def main() -> int:
-    """Run the job described on stdin."""
+    """Run the job that the first line of stdin describes; stdin ends with the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches this process too, but its parent decides
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # all other output goes to the log
@@ -410,15 +455,13 @@ def main() -> int:
         except OSError:  # the parent has gone
             os._exit(1)
 
-    parent = os.getppid()
-
     def end_with_parent() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
+        while os.read(0, 1):  # ends with the parent, even one that was killed while this process started
+            pass
         os._exit(1)  # a later run must not find this process using the database
 
+    order = json.loads(sys.stdin.readline())
     threading.Thread(target=end_with_parent, daemon=True).start()
-    order = json.load(sys.stdin)
     job = JOBS[order.pop("job")]
     answer({"result": job(lambda done: answer({"done": done}), **order)})
     return 0

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from .database import opened
+from .database import is_wide, opened
 
 SUPPORT = 30
 """Smallest number of points that determine a pose: COLMAP's own bound for registering a photo."""
@@ -215,8 +215,9 @@ def agreement(model: pycolmap.Reconstruction, database: str) -> Agreement:
                     rays[image] = np.column_stack([plane, np.ones(len(plane))])
             a, b = (rays[i][geometry.inlier_matches[:, k]] for k, i in enumerate((first, second)))
             relative = model.image(second).cam_from_world() * model.image(first).cam_from_world().inverse()
-            focal = model.camera(model.image(first).camera_id).mean_focal_length()
-            good = int((_sampson(relative, a, b) * focal < AGREED).sum())
+            cameras = [model.camera(model.image(i).camera_id) for i in (first, second)]
+            apart = _angles if any(map(is_wide, cameras)) else _sampson
+            good = int((apart(relative, a, b) * cameras[0].mean_focal_length() < AGREED).sum())
             for image in (first, second):
                 found.agree[image] = found.agree.get(image, 0) + good
                 found.total[image] = found.total.get(image, 0) + len(a)
@@ -228,6 +229,15 @@ def _sampson(relative: pycolmap.Rigid3d, a: np.ndarray, b: np.ndarray) -> np.nda
     E = pycolmap.essential_matrix_from_pose(relative)
     Ea, Eb = a @ E.T, b @ E
     slopes = (Ea[:, :2] ** 2).sum(axis=1) + (Eb[:, :2] ** 2).sum(axis=1)
+    return np.asarray(np.abs((b * Ea).sum(axis=1)) / np.sqrt(np.maximum(slopes, 1e-30)))
+
+
+def _angles(relative: pycolmap.Rigid3d, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return first-order angles from the epipolar planes, radians, for rays far from the optical axis."""
+    E = pycolmap.essential_matrix_from_pose(relative)
+    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
+    Ea, Eb = a @ E.T, b @ E
+    slopes = (Ea**2).sum(axis=1) + (Eb**2).sum(axis=1)
     return np.asarray(np.abs((b * Ea).sum(axis=1)) / np.sqrt(np.maximum(slopes, 1e-30)))
 
 

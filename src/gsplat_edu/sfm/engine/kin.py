@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from .database import opened
+from .database import is_wide, opened
 from .judge import take_out
 from .lenses import Kin, adjust
 from .mappers import Options
@@ -75,6 +75,8 @@ def placed_anew(
         camera: [i for i in sorted(model.reg_image_ids()) if model.image(i).camera_id == camera]
         for camera in sorted({model.image(i).camera_id for i in model.reg_image_ids()})
     }
+    if not (images := {camera: rows for camera, rows in images.items() if not is_wide(model.camera(camera))}):
+        return model, {}, set()
     with opened(database) as reader:
         known = {camera for camera in images if reader.read_camera(camera).has_prior_focal_length}
     few = {camera for camera in images if camera not in known and len(images[camera]) < OWN}

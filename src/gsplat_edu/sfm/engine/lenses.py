@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from .database import is_wide
 from .judge import residuals, take_out
 
 WITNESSES = 20
@@ -31,6 +32,9 @@ GAIN = 0.02
 
 CENTRED = 0.1
 """Largest distance of a principal point from the image centre, as a fraction of the size."""
+
+CIRCLE_CENTRED = 0.2
+"""The same of a fisheye, whose circle may lie off the middle of the sensor."""
 
 REFINEMENTS = 30
 """Iterations of the adjustments for cross-validation, which start from the solution of a simpler lens."""
@@ -57,6 +61,19 @@ LENS_LADDER = (
     Rung("OPENCV", centre=True),
 )
 """Lens models with increasing freedom: 2, 3, 6 and 8 parameters."""
+
+
+FISHEYE_LADDER = (
+    Rung("SIMPLE_RADIAL_FISHEYE", centre=False),
+    Rung("SIMPLE_RADIAL_FISHEYE", centre=True),
+    Rung("RADIAL_FISHEYE", centre=True),
+    Rung("OPENCV_FISHEYE", centre=True),
+)
+"""The same of fisheyes: 2, 4, 5 and 8 parameters."""
+
+RIM = 0.5
+"""Radius up to which the polynomial of a fisheye has to grow, as a fraction of the longer side: where its round image
+usually ends."""
 
 
 class Kin(NamedTuple):
@@ -108,7 +125,7 @@ def refined(
 
 
 def simplified(model: pycolmap.Reconstruction, name: str, threads: int) -> None:
-    """Give all cameras a simpler lens model with a centred principal point, and run a bundle adjustment.
+    """Give all cameras but fisheyes a simpler lens with a centred principal point, and run a bundle adjustment.
 
     `refined` can then choose the freedom that their photos support, as for models mapped with that lens model.
 
@@ -118,6 +135,8 @@ def simplified(model: pycolmap.Reconstruction, name: str, threads: int) -> None:
         threads: Number of threads.
     """
     for number, camera in model.cameras.items():
+        if is_wide(camera):
+            continue
         bends = [camera.params[i] for i in camera.extra_params_idxs()]
         after = pycolmap.Camera.create_from_model_name(
             number, name, camera.mean_focal_length(), camera.width, camera.height
@@ -146,11 +165,8 @@ def _follow(model: pycolmap.Reconstruction, kin: dict[int, Kin]) -> None:
 def _climbed(model: pycolmap.Reconstruction, camera: int, climb: bool, threads: int) -> Rung:
     """Return the freest rung that still improves the fit of held-out photos."""
     given = Rung(model.camera(camera).model_name, centre=False)
-    rungs = (
-        [rung for rung in LENS_LADDER if rung.model != given.model]
-        if climb
-        else [given._replace(centre=True)]
-    )
+    ladder = FISHEYE_LADDER if is_wide(model.camera(camera)) else LENS_LADDER
+    rungs = [rung for rung in ladder if rung != given] if climb else [given._replace(centre=True)]
     images = sorted(
         (i for i in model.reg_image_ids() if model.image(i).camera_id == camera),
         key=lambda i: model.image(i).name,
@@ -251,4 +267,17 @@ def adjust(
 def _believable(camera: pycolmap.Camera) -> bool:
     """Return whether intrinsics are plausible."""
     x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
-    return max(abs(x - 0.5), abs(y - 0.5)) <= CENTRED and not camera.has_bogus_params(0.1, 10.0, 1.0)
+    if is_wide(camera) and not _grows(camera):
+        return False
+    centred = CIRCLE_CENTRED if is_wide(camera) else CENTRED
+    return max(abs(x - 0.5), abs(y - 0.5)) <= centred and not camera.has_bogus_params(0.1, 10.0, 1.0)
+
+
+def _grows(camera: pycolmap.Camera) -> bool:
+    """Return whether a fisheye's polynomial grows up to `RIM`, beyond the angles at which features were used."""
+    bends = [camera.params[i] for i in camera.extra_params_idxs()]
+    theta = np.linspace(0.0, np.pi, 1024)
+    image = theta * (1.0 + sum(k * theta ** (2 * i) for i, k in enumerate(bends, 1)))
+    rim = RIM * max(camera.width, camera.height) / camera.mean_focal_length()
+    turned = np.flatnonzero(np.diff(image) <= 0)
+    return bool(image[turned[0] if len(turned) else -1] >= rim)

@@ -27,13 +27,26 @@ async function ask(method, address, body) {
   const answer = await fetch(address, { method, ...given }).catch(() => {
     throw new ApiError(GONE, 0);
   });
-  const text = method === "HEAD" && !answer.ok ? await fetch(address).then((other) => other.text()) : await answer.text();
+  const isJson = (answer.headers.get("content-type") ?? "").startsWith("application/json");
+  const text = method === "HEAD" && isJson ? await fetch(address).then((other) => other.text()) : await answer.text();
   if (!answer.ok) throw new ApiError(lineOf(answer.status, text), answer.status);
-  return (answer.headers.get("content-type") ?? "").startsWith("application/json") ? JSON.parse(text) : text;
+  return isJson && text ? JSON.parse(text) : text;
 }
 
 export const get = (address) => ask("GET", address);
-export const head = (address) => ask("HEAD", address);
+
+// For what may not be there yet: a refusal throws the same error, but the browser's console stays empty.
+async function quietly(method, address) {
+  const found = await ask(method, `${address}${address.includes("?") ? "&" : "?"}quiet=1`).catch((error) => {
+    if (error instanceof SyntaxError) return ""; // it has come in between, and is no JSON
+    throw error;
+  });
+  if (typeof found?.error === "string") throw new ApiError(found.error, found.status);
+  return found;
+}
+
+export const getQuietly = (address) => quietly("GET", address);
+export const head = (address) => quietly("HEAD", address);
 export const post = (address, body = {}) => ask("POST", address, body);
 export const remove = (address) => ask("DELETE", address);
 

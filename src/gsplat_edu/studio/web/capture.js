@@ -1,12 +1,13 @@
 // The screen of a capture: previews, the doctor's findings, and the start of a training with its forecast.
 
 import { at, get } from "./api.js";
-import { attempt, bytes, button, duration, errorLine, h, heading, keyed, link, put, whole } from "./dom.js";
+import { attempt, button, errorLine, forecastText, h, heading, keyed, link, put } from "./dom.js";
+import { choices } from "./choices.js";
 import { doctor } from "./doctor.js";
 import { gallery } from "./gallery.js";
-import { freeName } from "./intake.js";
 import { startJob } from "./jobs.js";
 import { addressOf, entryHead, factsOf, management, withEntry } from "./library.js";
+import { places } from "./places.js";
 
 const QUALITIES = [
   ["draft", "Draft", "a quick look"],
@@ -14,107 +15,109 @@ const QUALITIES = [
   ["high", "High", "fine detail, several times as long"],
 ];
 
-const OUTSIDE = [
-  ["", "decide from the masks"],
-  ["empty", "empty: the masks cut out an object"],
-  ["ignore", "ignore: the masks hide something in front"],
-];
-
-const PURPOSES = [
-  ["", "to look at"],
-  ["surface", "for a mesh: learn surfaces"],
-];
-
-const DEPTHS = [
-  ["", "none"],
-  ["points", "the points that photos share"],
-  ["capture", "the capture's own depth maps"],
-];
-
-const NUMBER_OR_AUTO = "auto|[0-9]+([.][0-9]+)?";
-
 export function capture(given) {
-  const { main, store } = given;
   return withEntry(given, (entry) => {
-    const head = entryHead(entry, "Capture");
-    const line = errorLine();
-    const pictures = gallery(entry.entry);
-    const checked = doctor(
-      store,
-      entry.entry,
-      "Looks for blurred photos, wrong poses, gaps and other faults before you spend time on a training.",
-      (marks) => pictures.mark(marks),
-    );
-    const start = startForm(store, entry);
-    const later = h("div", { class: "later", hidden: true }, management(store, entry));
-    const runs = h("ul", { class: "plain" });
-    const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
-    main.append(head.element, start.element, past, checked.element, pictures.element, line, later);
+    let part = entry.unfinished ? search(given, entry) : training(given, entry);
     return {
       entry,
+      close: () => part.close?.(),
       update(now) {
-        head.update(now);
-        checked.update(now);
-        start.update(now);
-        pictures.read(now).then(() => (later.hidden = false), (error) => put(line, error.message));
-        const own = store.entries("runs").filter((run) => run.capture && store.entryAt(run.capture)?.entry === entry.entry);
-        past.hidden = !own.length;
-        keyed(runs, own, ({ name }) => name, (run) => h("li", { class: "row" }, link(run.name, addressOf(run)), h("span", { class: "quiet" })), (item, run) => {
-          item.lastChild.textContent = factsOf(run).filter(Boolean).join(" · ");
-        });
+        if (part.unfinished && now.unfinished === false) {
+          part.clear();
+          part = training(given, now);
+        }
+        part.update(now);
       },
     };
   });
 }
 
-function chooser(id, choices) {
-  return h("select", { id }, choices.map(([value, text]) => h("option", { value }, text)));
+// A capture that has no poses: its search runs, or was stopped, or failed.
+function search({ main, store }, entry) {
+  const head = entryHead(store, entry, "Capture");
+  const job = [...store.jobs.values()].filter(({ job: { work } }) => work.command === "sfm" && work.outputs[0] === entry.entry).at(-1);
+  const said = h("p", {}, "This capture has no poses yet. They come from its photos, where the search for them runs, or can be tried again.");
+  const photos = job ? h("p", { class: "next" }, link("Go to the photos", `#/${at(job.job.subject).slice(5)}`, { class: "button" })) : null;
+  const parts = [head.element, said, photos, management(store, entry)].filter(Boolean);
+  main.append(...parts);
+  return { unfinished: true, update: (now) => head.update(now), clear: () => parts.forEach((part) => part.remove()) };
+}
+
+// The screen of a capture with poses.
+function training({ main, store }, entry) {
+  const head = entryHead(store, entry, "Capture");
+  const line = errorLine();
+  const pictures = gallery(entry.entry, (photo, out) => {
+    taken.left(new Map([[photo, out]]));
+    store.refresh();
+  }, () => store.refresh(), store);
+  const taken = places(entry, (photo, out) => {
+    pictures.left(photo, out);
+    store.refresh();
+  }, (drawn) => start.drawn(drawn));
+  const checked = doctor(
+    store,
+    entry.entry,
+    "Looks for blurred photos, wrong poses, gaps and other faults before you spend time on a training.",
+    (marks) => [pictures, taken].forEach((part) => part.mark(marks)),
+    (photo, out) => {
+      pictures.left(photo, out);
+      taken.left(new Map([[photo, out]]));
+    },
+  );
+  const start = startForm(store, entry, () => taken.draw());
+  const later = h("div", { class: "later", hidden: true }, management(store, entry));
+  const runs = h("ul", { class: "plain" });
+  const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
+  main.append(head.element, start.element, past, taken.element, checked.element, pictures.element, line, later);
+  let version = entry.modified;
+  return {
+    close: () => taken.close(),
+    update(now) {
+      head.update(now);
+      checked.update(now);
+      start.update(now);
+      if (now.modified !== version) taken.changed();
+      version = now.modified;
+      const shown = () => {
+        later.hidden = false;
+        taken.left(pictures.out); // another tab may have left some out
+      };
+      pictures.read(now).then(shown, (error) => put(line, error.message));
+      const own = store.entries("runs").filter((run) => store.captureOf(run)?.entry === entry.entry);
+      past.hidden = !own.length;
+      keyed(runs, own, ({ name }) => name, (run) => h("li", { class: "row" }, link(run.name, addressOf(run)), h("span", { class: "quiet" })), (item, run) => {
+        item.lastChild.textContent = factsOf(run).filter(Boolean).join(" · ");
+      });
+    },
+  };
 }
 
 // Choose a quality, see what it takes, and start.
-function startForm(store, entry) {
+function startForm(store, entry, draw) {
   const line = errorLine();
   const forecastLine = errorLine();
   const said = new Map();
-  const choices = QUALITIES.map(([value, title, hint], index) => {
+  const qualities = QUALITIES.map(([value, title, hint], index) => {
     const facts = h("span", { class: "forecast quiet" }, "\u00a0");
     said.set(value, facts);
     const input = h("input", { type: "radio", name: "quality", value, checked: index === 1 });
     return h("label", { class: "choice" }, input, h("strong", {}, title), h("span", { class: "quiet" }, hint), facts);
   });
-  const fields = {
-    iterations: h("input", { id: "iterations", type: "number", min: 1, max: 1000000, inputmode: "numeric" }),
-    resolution: h("input", { id: "resolution", type: "text", placeholder: "full size", autocomplete: "off", pattern: NUMBER_OR_AUTO }),
-    time_limit: h("input", { id: "time-limit", type: "text", placeholder: "30m", autocomplete: "off" }),
-    max_memory: h("input", { id: "max-memory", type: "text", placeholder: "8G", autocomplete: "off" }),
-    max_gaussians: h("input", { id: "max-gaussians", type: "number", min: 1, inputmode: "numeric" }),
-    outside_masks: chooser("outside-masks", OUTSIDE),
-    surface: chooser("surface", PURPOSES),
-    depth: chooser("depth", DEPTHS),
-  };
-  const labels = {
-    iterations: "Iterations instead of a quality",
-    resolution: "Size of the photos: 2 for half, longest side in px, or auto",
-    time_limit: "Time instead of a quality",
-    max_memory: "Memory limit",
-    max_gaussians: "Splats at most",
-    outside_masks: "Outside of the photos' masks",
-    surface: "What the scene is for",
-    depth: "Depth to learn from",
-  };
-  const name = h("input", { id: "run-name", type: "text", autocomplete: "off" });
-  const go = h("button", { class: "primary" }, "Start training");
+  const more = choices(draw);
+  const name = h("input", { id: "run-name", type: "text", autocomplete: "off", placeholder: "a free one after the capture" });
+  const go = h("button", { "data-own": "" }, "Start training");
   const measure = button("Forecast time and memory", () => forecast());
 
   async function forecast() {
     measure.hidden = true;
     for (const facts of said.values()) facts.textContent = "measuring ...";
     try {
-      const resolution = fields.resolution.value ? `?resolution=${encodeURIComponent(fields.resolution.value)}` : "";
-      const { qualities } = await get(at(entry.entry, "forecast") + resolution);
+      const size = more.resolution();
+      const resolution = size ? `?resolution=${encodeURIComponent(size)}` : "";
+      const { qualities: forecasts } = await get(at(entry.entry, "forecast") + resolution);
       for (const [value, facts] of said) {
-        const { seconds, bytes: memory, gaussians, iterations } = qualities[value];
-        facts.textContent = `about ${duration(seconds)}, ${bytes(memory)} of memory; ${whole(iterations)} iterations, up to ${whole(gaussians)} splats`;
+        facts.textContent = forecastText(forecasts[value]);
       }
     } catch (error) {
       for (const facts of said.values()) facts.textContent = "\u00a0";
@@ -131,43 +134,55 @@ function startForm(store, entry) {
     h(
       "form",
       {
+        id: "train",
+        "data-next": `train ${entry.entry}`,
         onsubmit: (event) => {
           event.preventDefault();
           attempt(go, line, async () => {
-            const own = fields.iterations.value || fields.time_limit.value; // takes the place of a quality
-            const options = own ? {} : { quality: new FormData(event.target).get("quality") };
-            for (const [key, field] of Object.entries(fields)) {
-              if (!field.value) continue;
-              const number = field.type === "number" || (key === "resolution" && field.value !== "auto");
-              options[key] = key === "surface" || (number ? Number(field.value) : field.value);
-            }
-            const to = name.value || freeName(store, "runs", entry.name);
-            const { job } = await startJob(store, { command: "train", subject: entry.entry, to, options });
+            const options = more.options(new FormData(event.target).get("quality"));
+            const to = name.value ? { to: name.value } : {}; // without one, the studio chooses a free name
+            const { job } = await startJob(store, { command: "train", subject: entry.entry, ...to, options });
             await store.refresh();
             location.hash = `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`;
           });
         },
       },
-      h("fieldset", {}, h("legend", {}, "Quality"), h("div", { class: "choices" }, choices)),
+      h("fieldset", {}, h("legend", {}, "Quality"), h("div", { class: "choices" }, qualities)),
       forecastLine,
       h(
         "details",
         {},
-        h("summary", {}, "Options"),
-        h("div", { class: "grid" }, [
-          h("label", {}, "Name of the run", name),
-          Object.entries(fields).map(([key, field]) => h("label", {}, labels[key], field)),
-        ]),
+        h("summary", {}, "More"),
+        h("label", { class: "wide" }, "Name of the run", name),
+        more.element,
       ),
       h("div", { class: "row" }, go, measure),
       line,
     ),
   );
   let asked = false;
+  // the training and the page of the cameras also report a box that cannot be read
+  let [version, questions, isDrawn] = [null, 0, false];
+
+  // The capture has a box, or none. What the user has chosen stays if that is as before.
+  function drawn(is) {
+    questions += 1; // answers to earlier questions are old
+    if (is !== isDrawn) more.drawn(is);
+    isDrawn = is;
+  }
+
+  async function askForBox() {
+    const asked = ++questions;
+    const { region } = await get(at(entry.entry, "region"));
+    if (asked === questions) drawn(Boolean(region));
+  }
+
   return {
     element,
-    update() {
-      name.placeholder = freeName(store, "runs", entry.name);
+    drawn,
+    update(now) {
+      if (now.modified !== version) askForBox().catch((error) => put(line, error.message));
+      version = now.modified;
       if (asked || !store.entry("captures", entry.name)?.layout) return; // that of a new capture comes later
       asked = true;
       // measuring takes seconds of the processor, which a running job needs

@@ -11,8 +11,8 @@ export function curve(title, shown) {
   const drawing = h("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", role: "img" }, path);
   const name = h("span", {}, title);
   const value = h("output", {}, "–");
-  const [high, low, last] = [h("span", { class: "high" }), h("span", { class: "low" }), h("span", { class: "last" })];
-  const axis = h("div", { class: "axis quiet", "aria-hidden": "true" }, h("span", {}, "0"), h("span", {}, "iteration"), last);
+  const [high, low, right] = [h("span", { class: "high" }), h("span", { class: "low" }), h("span", { class: "last" })];
+  const axis = h("div", { class: "axis quiet", "aria-hidden": "true" }, h("span", {}, "0"), h("span", {}, "iteration"), right);
   const element = h(
     "figure",
     { class: "curve" },
@@ -21,8 +21,8 @@ export function curve(title, shown) {
     axis,
   );
 
-  // Shows values at iterations; a value may be null. `of` is what they were measured on.
-  function show(iterations, values, of = "") {
+  // Shows values at iterations; a value may be null. `of` is what they were measured on, `planned` the last iteration.
+  function show(iterations, values, of = "", planned = 0) {
     name.textContent = of ? `${title} ${of}` : title;
     const points = averaged(iterations.map((x, i) => [x, values[i]]).filter(([, y]) => Number.isFinite(y)));
     if (!points.length) {
@@ -31,15 +31,17 @@ export function curve(title, shown) {
     }
     const heights = points.map(([, y]) => y);
     const [least, most] = [Math.min(...heights), Math.max(...heights)];
-    const end = points.at(-1)[0];
+    const last = points.at(-1)[0];
+    const end = Math.max(last, planned);
     const across = (x) => (WIDTH * x) / Math.max(1, end);
     const down = (y) => HEIGHT - 4 - ((HEIGHT - 8) * (y - least)) / (most - least || 1);
     const line = points.map(([x, y]) => `${across(x).toFixed(1)} ${down(y).toFixed(1)}`);
-    path.setAttribute("d", points.length > 1 ? `M${line.join("L")}` : `M0 ${down(least)}L${WIDTH} ${down(least)}`);
+    path.setAttribute("d", points.length > 1 ? `M${line.join("L")}` : `M${line[0]}h0`); // one value is a point
+    path.classList.toggle("point", points.length === 1);
     value.textContent = shown(heights.at(-1));
     [high.textContent, low.textContent] = least === most ? ["", ""] : [shown(most), shown(least)];
-    last.textContent = whole(end);
-    const range = `from ${shown(heights[0])} to ${shown(heights.at(-1))} after ${whole(end)} iterations`;
+    right.textContent = whole(end);
+    const range = `from ${shown(heights[0])} to ${shown(heights.at(-1))} after ${whole(last)} iterations`;
     drawing.setAttribute("aria-label", `${title}: ${range}`);
   }
 

@@ -1,22 +1,57 @@
 // The part of a screen that asks the doctor.
 
 import { at, get } from "./api.js";
-import { attempt, button, errorLine, h, heading } from "./dom.js";
+import { attempt, button, errorLine, h, heading, link } from "./dom.js";
 import { showFindings } from "./gallery.js";
 import { jobPlace, startJob } from "./jobs.js";
 
-// marked(marks) gets the names of findings by photo.
-export function doctor(store, entry, hint, marked = () => {}) {
+const AGAIN = { left: "Train again without what is left out", masked: "Train again with the masks" };
+
+// marked(marks) gets the names of findings by photo; left(photo, out) is called when one of them was left out or taken back.
+export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
   const line = errorLine();
   const found = h("div", { class: "found" });
   const job = jobPlace(store, entry, ["doctor"]);
   const ask = button("Examine", () =>
     attempt(ask, line, () => startJob(store, { command: "doctor", subject: entry })),
   );
-  let read = "";
+  const again = h("p", { class: "row", hidden: true });
+  let [read, request] = ["", null];
+
+  // After photos were left out or masked, a run is trained again without them.
+  const kinds = new Set();
+  function noted(kind) {
+    store.refresh();
+    if (!request || kinds.has(kind)) return;
+    kinds.add(kind);
+    const label = kinds.size > 1 ? "Train again with these changes" : AGAIN[kind];
+    again.replaceChildren(offer({ label, request }));
+    again.hidden = false;
+  }
+
+  const heard = {
+    store,
+    left(photo, out) {
+      left(photo, out);
+      noted("left");
+    },
+    drawn: () => noted("masked"),
+  };
+
+  function offer({ label, request: asked, place }) {
+    if (place) return link(label, place, { class: "button" });
+    const begin = button(label, () =>
+      attempt(begin, line, async () => {
+        const { job: begun } = await startJob(store, { ...asked, begun: { by: label, at: entry } });
+        await store.refresh();
+        location.hash = `#/${begun.subject.split("/").map(encodeURIComponent).join("/")}`;
+      }),
+    );
+    return begin;
+  }
 
   return {
-    element: h("section", { "aria-label": "doctor" }, heading(2, "Doctor"), h("p", { class: "quiet" }, hint), ask, line, job.element, found),
+    element: h("section", { "aria-label": "doctor" }, heading(2, "Doctor"), h("p", { class: "quiet" }, hint), ask, line, job.element, again, found),
     update(now) {
       job.update();
       const view = job.view;
@@ -27,7 +62,11 @@ export function doctor(store, entry, hint, marked = () => {}) {
       if (!view || version === read) return;
       read = version;
       get(at(entry, "findings")).then(
-        (answer) => version === read && marked(showFindings(found, answer)),
+        (answer) => {
+          if (version !== read) return;
+          request = answer.again;
+          marked(showFindings(found, offer, heard, answer));
+        },
         (error) => (line.hidden = !(line.textContent = error.message)),
       );
     },

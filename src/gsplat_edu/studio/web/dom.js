@@ -61,6 +61,10 @@ export function duration(seconds) {
   return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
+// What a training takes, in words: one quality of a forecast.
+export const forecastText = ({ seconds, bytes: memory, gaussians, iterations }) =>
+  `about ${duration(seconds)}, ${bytes(memory)} of memory; ${whole(iterations)} iterations, up to ${whole(gaussians)} splats`;
+
 export const decibels = (value) => (typeof value === "number" ? `${value.toFixed(2)} dB` : "–");
 
 // Says something to screen readers.

@@ -1,23 +1,39 @@
 // The editor: our page of the scene with its tools, which saves through the API.
 
 import { at, get, head } from "./api.js";
-import { h, link, put } from "./dom.js";
+import { h, put } from "./dom.js";
+import { bringBack, keep, writeDown } from "./draft.js";
 import { frame } from "./frame.js";
-import { addressOf } from "./library.js";
 import { newestOf } from "./mesh.js";
 
-export function edit({ place, entry }) {
+const WRITE = 1000; // milliseconds between two looks at what is not saved
+const LOOK = 250; // milliseconds between two looks whether the editor has started
+
+export function edit({ place, store, entry }) {
   const scene = frame(`editor of ${entry.name}`);
   scene.element.classList.add("tall");
   const note = h("p", { class: "quiet", hidden: true });
+  const draft = h("p", { class: "notice", role: "status" });
+  const unkept = h("p", { class: "notice", role: "alert", hidden: true });
   place.append(
-    h("p", { class: "quiet" }, "Save in the editor; then export with the edits. The scene itself stays as it is."),
     note,
+    draft,
+    unkept,
     scene.element,
-    h("div", { class: "row" }, scene.full, link("Share it", `${addressOf(entry)}/share`, { class: "button" })),
+    h("p", { class: "quiet" }, "Save in the editor; then export with the edits. The scene itself stays as it is."),
+    h("div", { class: "row" }, scene.full),
   );
   const page = `${at(entry.entry, "page")}?edit=1`;
-  let closed = false;
+  let [closed, started] = [false, false];
+  const timer = setInterval(() => {
+    if (!scene.editor) return;
+    clearInterval(timer);
+    bringBack(entry.entry, scene.editor, draft, () => store.changed());
+    started = true; // what an earlier tab left has been read
+  }, LOOK);
+  const write = () => started && scene.editor && put(unkept, writeDown(scene.editor));
+  const writing = setInterval(write, WRITE);
+  addEventListener("pagehide", write);
   open();
 
   // With a mesh, if there is one that a page can show: what is measured snaps to it.
@@ -38,6 +54,11 @@ export function edit({ place, entry }) {
   return {
     close() {
       closed = true;
+      clearInterval(timer);
+      clearInterval(writing);
+      removeEventListener("pagehide", write);
+      write();
+      keep(entry.entry, scene.editor);
       scene.close();
     },
   };

@@ -41,14 +41,21 @@ export function frame(title) {
     timer = setTimeout(open, RETRY);
   });
 
+  function within(name) {
+    try {
+      return inner.contentWindow?.[name] ?? null;
+    } catch {
+      return null;
+    }
+  }
+
   return {
     element,
     photo,
     full,
-    // hides the panel of the page inside, which would lie on the photo
-    fold() {
-      const inside = (id) => inner.contentDocument?.getElementById(id);
-      if (inside("tools")?.hidden === false) inside("fold")?.click();
+    // hides the panel of the page inside while a photo is shown, on which it would lie
+    bare(on) {
+      inner.contentDocument?.documentElement.classList.toggle("bare", on);
     },
     show(next, why = "Loading the scene ...") {
       if (inner.hidden) put(message, why);
@@ -62,11 +69,11 @@ export function frame(title) {
     },
     // the viewer inside, once it has started
     get viewer() {
-      try {
-        return inner.contentWindow?.viewer ?? null;
-      } catch {
-        return null;
-      }
+      return within("viewer");
+    },
+    // the editor inside, once it has started
+    get editor() {
+      return within("editor");
     },
   };
 }
@@ -104,6 +111,7 @@ export function beside(scene, captureOf) {
   function free() {
     chosen = null;
     select.value = "";
+    scene.bare(false);
     scene.photo.hidden = range.disabled = true;
     note.textContent = "";
   }
@@ -120,12 +128,13 @@ export function beside(scene, captureOf) {
     const scaled = (value) => (value + 0.5) * share - 0.5;
     const size = { W: Math.round(camera.W * share), H: Math.round(camera.H * share) };
     const lens = { fx: camera.fx * share, fy: camera.fy * share, cx: scaled(camera.cx), cy: scaled(camera.cy) };
-    scene.fold();
+    scene.bare(true);
     viewer.goTo(Number(select.value));
-    viewer.exact = chosen = { ...camera, ...lens, ...size };
+    const view = (viewer.exact = chosen = { ...camera, ...lens, ...size });
     viewer.askFrame();
     const entry = captureOf();
     photos ??= entry ? (await get(at(entry.entry, "photos")).catch(() => ({ photos: [] }))).photos : [];
+    if (chosen !== view) return; // another view was chosen meanwhile, or the user moved
     const name = photoOf(photos, camera.name);
     range.disabled = scene.photo.hidden = !name;
     note.textContent = name ? (camera.held_out ? "held out of the training" : "") : "The photo of this view is not in the library.";

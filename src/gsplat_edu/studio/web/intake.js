@@ -1,6 +1,6 @@
 // Takes in photos, folders, zip files, videos and scenes: dropped, chosen, or named by their path.
 
-import { at, post, upload } from "./api.js";
+import { at, post, remove, upload } from "./api.js";
 import { announce, attempt, bytes, button, count, errorLine, h, heading } from "./dom.js";
 
 const AT_ONCE = 3;
@@ -65,13 +65,8 @@ async function sorted(files, wanted) {
   return found;
 }
 
-// A name that no entry has yet.
-export function freeName(store, kind, name) {
-  const cleaned = name.replace(/[\\/:*?"|]/g, "_").replace(/^[.\- ]+|[. ]+$/g, "") || NAMELESS;
-  const taken = new Set(store.entries(kind).map((entry) => entry.name.normalize("NFC")));
-  if (!taken.has(cleaned.normalize("NFC"))) return cleaned;
-  for (let i = 2; ; ++i) if (!taken.has(`${cleaned}-${i}`)) return `${cleaned}-${i}`;
-}
+// A name for a new entry that no other tab gets. The studio makes it; it changes what a name may not have.
+const promised = async (kind, wish) => (await post("/api/names", { kind, wish })).name;
 
 // One upload of many files: its progress, and the files that were refused.
 class Batch {
@@ -167,11 +162,12 @@ export function intake(store, into = null) {
     if (!groups.some((group) => group.files.length)) throw new Error("What was dropped holds no files.");
     let landed = null;
     for (const group of groups) {
-      if (!into) group.name = freeName(store, group.kind, group.name);
+      if (!into) group.name = await promised(group.kind, group.name);
       const batch = new Batch(store, group);
       batches.append(batch.element);
       uploading += 1;
       const done = await batch.run().finally(() => (uploading -= 1));
+      if (!into && !done) await remove(at("names", group.kind, group.name)).catch(() => {}); // nobody waits for it
       await store.refresh();
       if (done && !batch.refused) batch.element.remove();
       if (done && !batch.refused) landed ??= `#/${group.kind}/${encodeURIComponent(group.name)}`;
@@ -199,7 +195,7 @@ export function intake(store, into = null) {
     "section",
     { class: "drop", "aria-label": into ? "Add photos" : "Add photos, a video or a scene" },
     h("p", { class: "hint" }, into ? "Drop more photos here, or" : "Drop photos, folders, a zip file, a video or a scene here, or"),
-    h("div", { class: "row" }, choose({}, "Choose files", { "data-key-u": "", class: "primary" }), into ? null : choose({ webkitdirectory: true }, "Choose a folder")),
+    h("div", { class: "row" }, choose({}, "Choose files", { "data-key-u": "" }), into ? null : choose({ webkitdirectory: true }, "Choose a folder")),
     into ? null : h("p", { class: "row" }, h("label", { for: "take-as" }, "Take them in as "), kind),
     into ? null : pathForm(store),
     line,
@@ -234,9 +230,7 @@ function pathForm(store) {
       onsubmit: (event) => {
         event.preventDefault();
         attempt(add, line, async () => {
-          const stem = path.value.replace(/[\\/]+$/, "").split(/[\\/]/).at(-1).replace(/\.[^.]+$/, "");
-          const name = freeName(store, kind.value, stem);
-          const made = await post("/api/adopt", { kind: kind.value, path: path.value, name });
+          const made = await post("/api/adopt", { kind: kind.value, path: path.value });
           await store.refresh();
           location.hash = `#/${made.kind}/${encodeURIComponent(made.name)}`;
         });

@@ -12,6 +12,7 @@ const STATES = {
   failed: "failed",
   cancelled: "stopped",
   interrupted: "interrupted",
+  unfinished: "no poses yet",
 };
 
 export const badge = (state) => h("span", { class: `badge ${state}` }, STATES[state] ?? state);
@@ -96,8 +97,11 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     if (known || !found.active) [bar.max, bar.value] = known ? [progress.total, progress.done] : [1, ended ? 1 : 0];
     else if (job.state === "running") bar.removeAttribute("value");
     else bar.value = 0;
+    bar.parentElement.hidden = !found.active && !ended; // how far the last stage was says nothing of a job that failed
     left.textContent = known && found.active ? leftOf(progress, found.stages.length > 1) : "";
-    said.textContent = found.active ? (messages.at(-1) ?? "") : "";
+    const pausing = job.state === "paused" ? "Paused. Resume continues it." : "";
+    said.textContent = pausing || (found.active ? (messages.at(-1) ?? "") : "");
+    said.hidden = !found.active; // a running job's line keeps its place
     waits.textContent = job.state === "queued" ? waitingFor(store, job.waits_for) : "";
     waits.hidden = !waits.textContent;
     line.classList.toggle("error", job.state !== "cancelled"); // stopping is no error
@@ -128,9 +132,9 @@ function waitingFor(store, others) {
 }
 
 // Progress is that of the present stage.
-function leftOf({ done, total, seconds_left: left }, isStage) {
+function leftOf({ done, total, seconds_left: left, is_least: isLeast }, isStage) {
   const share = `${Math.floor((100 * done) / total)} %`;
-  return left === null || left === undefined ? share : `${share}, ${duration(left)} left${isStage ? " in this step" : ""}`;
+  return left === null || left === undefined ? share : `${share}, ${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
 }
 
 // The newest job about an entry; the card is replaced when another job begins.

@@ -44,6 +44,8 @@ export function judge({ place, store, entry, where }) {
     h("section", { "aria-label": "held-out views" }, heading(2, "Held-out views"), facts, line, large, choice, list),
     checked.element,
   );
+  const report = h("p", { hidden: true }, link("Open the report", at(entry.entry, "report"), { class: "button", target: "_blank" }));
+  list.after(report);
   choice.hidden = checked.element.hidden = true; // until what is above them is there
   let [views, read, opened] = [[], "", where.query.get("view")];
   const base = `#/runs/${encodeURIComponent(entry.name)}/judge`;
@@ -81,6 +83,10 @@ export function judge({ place, store, entry, where }) {
     },
     update(now) {
       checked.update(now);
+      const reveal = () => {
+        choice.hidden = checked.element.hidden = false;
+        report.hidden = !now.finished; // a training writes it at its end
+      };
       const runs = store.entries("runs").filter(({ name }) => name !== entry.name);
       const names = runs.map(({ name }) => name).join("\n");
       if (others.dataset.names !== names) {
@@ -97,15 +103,26 @@ export function judge({ place, store, entry, where }) {
           const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
           facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";
           show();
-          choice.hidden = checked.element.hidden = false;
+          reveal();
         },
         (error) => {
           put(line, error.message);
-          choice.hidden = checked.element.hidden = false;
+          reveal();
         },
       );
     },
   };
+}
+
+// Which of two runs is better, in words: the winner is named first, whichever was opened.
+function verdict(one, other, views) {
+  const scored = views.filter(({ gain }) => typeof gain === "number");
+  if (!scored.length) return "Their views have no scores.";
+  const mean = (side) => decibels(scored.reduce((sum, view) => sum + view[side].psnr, 0) / scored.length);
+  const wins = [scored.filter(({ gain }) => gain < 0).length, scored.filter(({ gain }) => gain > 0).length];
+  const [winner, count] = wins[1] > wins[0] ? [other, wins[1]] : [one, wins[0]];
+  const begin = wins[0] === wins[1] ? `Both are better in ${count}` : `${winner} is better in ${count}`;
+  return `${begin} of ${scored.length} views. Mean PSNR: ${one} ${mean("a")}, ${other} ${mean("b")}. The views are ordered by the gain of ${other}, the smallest first.`;
 }
 
 // Two runs, view by view.
@@ -118,11 +135,8 @@ export function compare({ place, entry, where }) {
   place.append(h("section", { "aria-label": "comparison" }, heading(2, `${entry.name} and ${other}`), h("p", {}, link("Close", back, { class: "button" })), facts, line, list));
   const [a, b] = [entry.entry, `runs/${other}`];
   get(`/api/compare?a=${encodeURIComponent(entry.name)}&b=${encodeURIComponent(other)}`).then(({ views, only_a: onlyA, only_b: onlyB }) => {
-    const better = views.filter(({ gain }) => gain > 0).length;
     const rest = onlyA.length + onlyB.length ? ` ${onlyA.length + onlyB.length} views are held out of one of them only.` : "";
-    facts.textContent = views.length
-      ? `${other} is better in ${better} of ${views.length} views. The largest losses come first.${rest}`
-      : "These runs hold out no common view.";
+    facts.textContent = views.length ? `${verdict(entry.name, other, views)}${rest}` : "These runs hold out no common view.";
     list.append(...views.map(({ name, a: one, b: two, gain }) => {
       const pictures = [[a, one, "photo", "photo"], [a, one, "render", entry.name], [b, two, "render", other]].map(([from, view, what, title]) => {
         const score = what === "render" ? ` ${decibels(view.psnr)}` : "";

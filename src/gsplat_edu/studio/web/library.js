@@ -2,15 +2,12 @@
 
 import { at, get, post, remove } from "./api.js";
 import { announce, attempt, bytes, button, count, decibels, errorLine, h, heading, keyed, link, put, whole } from "./dom.js";
+import { follow } from "./draft.js";
 import { intake } from "./intake.js";
 import { badge } from "./jobs.js";
+import { nextStep, timeline } from "./project.js";
 
-const PARTS = {
-  photos: ["Photos", "Photos without poses. Drop some above; the first step finds where each was taken."],
-  captures: ["Captures", "Photos with poses. They come from photos, or from other programs as a folder or zip file."],
-  runs: ["Runs", "Trainings. Open a capture and start one."],
-  scenes: ["Scenes", "Finished scenes of other programs, and cleaned ones. Drop a .ply, .spz, .splat, .sog or .glb file above."],
-};
+const KINDS = { photos: "Photos", captures: "Capture", runs: "Run", scenes: "Scene" };
 
 export const addressOf = ({ kind, name }) => `#/${kind}/${encodeURIComponent(name)}`;
 
@@ -20,16 +17,24 @@ export function factsOf(entry) {
   if (kind === "photos" || kind === "captures") {
     const videos = entry.videos ? count(entry.videos, "video") : "";
     const photos = entry.photos || !videos ? count(entry.photos, "photo") : "";
-    return [photos, videos, kind === "captures" ? (entry.layout ?? "no poses found") : "", bytes(entry.bytes)];
+    if (entry.unfinished) return [bytes(entry.bytes)];
+    return [photos, videos, kind === "captures" ? (entry.layout ?? "no poses found") : "", searchOf(entry), bytes(entry.bytes)];
   }
   if (kind === "scenes") return [entry.file ? entry.file.split(".").at(-1) : "no scene file", bytes(entry.scene_bytes)];
   const done = entry.iterations ?? 0;
   return [
-    entry.finished ? `${whole(done)} iterations` : entry.planned ? `${whole(done)} of ${whole(entry.planned)} iterations` : "no iterations yet",
+    entry.training ? "in training" : entry.finished ? `${whole(done)} iterations` : entry.planned ? `${whole(done)} of ${whole(entry.planned)} iterations` : "no iterations yet",
     entry.psnr === null ? "" : decibels(entry.psnr),
     entry.num_gaussians ? `${whole(entry.num_gaussians)} splats` : "",
     entry.edited ? "edited" : "",
   ];
+}
+
+// What the search for a capture's poses found; empty if they come from another program.
+export function searchOf({ search }) {
+  if (!search) return "";
+  const all = search.photos === null ? "" : `${whole(search.posed)} of ${count(search.photos, "photo")} ${search.photos === 1 ? "has" : "have"} a pose`;
+  return [all, `mean error ${search.error.toFixed(2)} px`].filter(Boolean).join(", ");
 }
 
 // Address of a small picture of an entry; null if there is none.
@@ -45,25 +50,70 @@ async function pictureOf(entry) {
   return good ? `${at(entry.entry, "thumbs", good.name)}?side=256` : null;
 }
 
-function card(entry) {
+// A project's card: its picture, timeline and next step, and a list of everything in it.
+function card(store, project) {
   const image = h("img", { alt: "", loading: "lazy", hidden: true, onerror: () => (image.hidden = true) });
-  const element = h(
-    "a",
-    { class: "card", href: addressOf(entry) },
-    h("span", { class: "thumb", "aria-hidden": "true" }, image),
-    h("span", { class: "name" }, entry.name),
-    h("span", { class: "facts quiet" }),
-    h("span", { class: "states" }),
-  );
-  element.image = image;
+  const [name, facts, states] = [heading(2, "", { class: "name" }), h("span", { class: "facts quiet" }), h("span", { class: "states" })];
+  const top = h("a", { class: "card" }, h("span", { class: "thumb", "aria-hidden": "true" }, image), name, facts, states);
+  top.image = image;
+  const [stages, next] = [timeline(), nextStep(store, project.name)];
+  const [summary, list] = [h("summary", {}), h("ul", { class: "plain" })];
+  const element = h("article", { class: "project" }, top, stages.element, next.element, h("details", {}, summary, list));
+  element.show = (now) => {
+    const entries = now.entries.map((entry) => store.entry(...entry.split("/"))).filter(Boolean);
+    const present = entries.filter(({ unfinished }) => !unfinished).at(-1) ?? entries[0];
+    if (!present) return;
+    element.setAttribute("aria-label", now.name);
+    put(name, now.name);
+    top.href = addressOf(present);
+    facts.textContent = factsOf(present).filter(Boolean).join(" · ");
+    const all = entries.map((entry) => stateOf(store, entry));
+    showState(states, all.findLast(Boolean) ?? "");
+    stages.update(now);
+    next.update(now, now.next);
+    summary.textContent = `Everything in it (${entries.length})`;
+    keyed(list, entries, ({ entry }) => entry, (entry) => h("li", {}, link(`${KINDS[entry.kind]} ${entry.name}`, addressOf(entry)), h("span", { class: "quiet" }), h("span", {})), (item, entry) => {
+      item.children[1].textContent = ` ${factsOf(entry).filter(Boolean).join(" · ")} `;
+      showState(item.lastChild, stateOf(store, entry));
+    });
+    const shown = entries.find(({ entry }) => entry === now.picture);
+    if (shown) picture(top, shown);
+    else image.hidden = true;
+  };
   return element;
 }
 
+function showState(place, state) {
+  if (place.dataset.state === state) return;
+  place.dataset.state = state;
+  place.replaceChildren(...(state ? [badge(state)] : []));
+}
+
+// The studio draws the pictures of scenes, one after the other, and only those that somebody sees.
+let drawn = Promise.resolve();
+const covers = new IntersectionObserver((seen) => {
+  for (const { target, isIntersecting } of seen) {
+    const { cover, image } = target;
+    if (!isIntersecting || !cover) continue;
+    target.cover = null;
+    drawn = drawn.then(async () => {
+      if (!target.isConnected || !(await fetch(cover).catch(() => ({}))).ok) return;
+      Object.assign(image, { src: cover, hidden: false });
+    });
+  }
+});
+
 // Reads the picture again once the entry has changed.
 function picture(element, entry) {
-  const version = `${entry.modified} ${entry.files} ${entry.finished}`;
-  if (element.version === version || entry.kind === "scenes") return;
+  const version = `${entry.entry} ${entry.modified} ${entry.files} ${entry.finished}`;
+  if (element.version === version) return;
   element.version = version;
+  if (entry.kind === "scenes") {
+    element.cover = entry.file && `${at(entry.entry, "cover")}?of=${entry.modified}`;
+    covers.unobserve(element);
+    covers.observe(element); // tells at once if it is seen
+    return;
+  }
   pictureOf(entry).then(
     (address) => {
       element.image.hidden = !address;
@@ -74,45 +124,28 @@ function picture(element, entry) {
 }
 
 export function library({ main, store }) {
-  const lists = Object.entries(PARTS).map(([kind, [title, empty]]) => {
-    const list = h("div", { class: "cards" });
-    const hint = h("p", { class: "quiet" }, empty);
-    return { kind, list, hint, section: h("section", { "aria-label": title }, heading(2, title), hint, list) };
-  });
-  const first = h("p", { class: "first" }, "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then follow the buttons.");
+  const list = h("div", { class: "projects" });
+  const section = h("section", { "aria-label": "Projects" }, list);
+  const first = h("p", { class: "first" }, "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then press Next.");
   first.hidden = true;
+  const trash = link("Trash", "#/trash");
   const foot = h("p", { class: "quiet" });
-  const footer = h("footer", {}, foot, link("Trash", "#/trash"));
-  main.append(
-    heading(1, "Library"),
-    intake(store),
-    first,
-    ...lists.map(({ section }) => section),
-    footer,
-  );
-  const later = [...lists.map(({ section }) => section), footer];
-  for (const part of later) part.hidden = true; // until it is known what is in them, so that nothing moves
+  const footer = h("footer", {}, foot, trash);
+  const add = intake(store);
+  main.append(heading(1, "Library"), add, first, section, footer);
+  for (const part of [section, footer]) part.hidden = true; // until it is known what is in them, so that nothing moves
   return {
     update() {
       const { library: all } = store;
       if (!all) return;
-      for (const part of later) part.hidden = false;
-      first.hidden = lists.some(({ kind }) => store.entries(kind).length);
-      for (const { kind, list, hint } of lists) {
-        hint.hidden = store.entries(kind).length > 0;
-        const entries = [...store.entries(kind)].sort((a, b) => b.modified - a.modified);
-        keyed(list, entries, ({ name }) => name, card, (element, entry) => {
-          element.querySelector(".facts").textContent = factsOf(entry).filter(Boolean).join(" · ");
-          const state = stateOf(store, entry);
-          const place = element.querySelector(".states");
-          if (place.dataset.state !== state) {
-            place.dataset.state = state;
-            place.replaceChildren(...(state ? [badge(state)] : []));
-          }
-          picture(element, entry);
-        });
-      }
+      const { projects } = all;
+      footer.hidden = false;
+      section.hidden = !projects.length;
+      first.hidden = projects.length > 0;
+      add.querySelector("[data-key-u]").classList.toggle("primary", !projects.length);
+      keyed(list, projects, ({ entries }) => entries[0], (project) => card(store, project), (element, project) => element.show(project));
       foot.textContent = `${all.folder} · ${bytes(all.used_bytes)} used, ${bytes(all.free_bytes)} free`;
+      trash.textContent = all.trash_bytes ? `Trash (${bytes(all.trash_bytes)})` : "Trash";
     },
   };
 }
@@ -121,6 +154,7 @@ function stateOf(store, entry) {
   const job = store.jobsOf(entry.entry)[0];
   if (job && (job.active || ["held", "failed", "interrupted"].includes(job.job.state))) return job.job.state;
   if (entry.problem) return "damaged";
+  if (entry.unfinished) return "unfinished";
   return "";
 }
 
@@ -129,6 +163,8 @@ export function management(store, entry) {
   const line = errorLine();
   const name = h("input", { id: "rename", type: "text", value: entry.name, required: true, autocomplete: "off" });
   const rename = h("button", {}, "Rename");
+  const [all, said] = [h("input", { type: "checkbox", checked: true }), h("span", {})];
+  const too = h("label", { class: "check", hidden: true }, all, said);
   const away = button("Move to the trash", () =>
     attempt(away, line, async () => {
       await remove(at(entry.entry));
@@ -144,7 +180,9 @@ export function management(store, entry) {
       onsubmit: (event) => {
         event.preventDefault();
         attempt(rename, line, async () => {
-          const made = await post(at(entry.entry, "rename"), { to: name.value });
+          const along = !too.hidden && all.checked;
+          const made = await post(at(entry.entry, "rename"), along ? { to: name.value, along } : { to: name.value });
+          for (const [old, now] of Object.entries(made.renamed ?? { [entry.entry]: made.entry })) follow(old, now);
           await store.refresh();
           location.hash = addressOf(made);
         });
@@ -155,40 +193,71 @@ export function management(store, entry) {
     rename,
     away,
   );
-  return h("details", {}, h("summary", {}, "Rename or remove"), h("p", { class: "quiet" }, entry.path), form, line);
+  // what came from it keeps its link either way; the names only follow
+  const tell = () => {
+    const others = store.namedAfter(entry);
+    too.hidden = !others.length;
+    said.textContent = ` rename what came from it, too: ${others.map(({ kind, name: other }) => `${KINDS[kind].toLowerCase()} ${other}`).join(", ")}`;
+  };
+  const ontoggle = ({ target }) => target.open && tell();
+  return h("details", { ontoggle }, h("summary", {}, "Rename or remove"), h("p", { class: "quiet" }, entry.path), form, too, line);
 }
 
 // The top of an entry's screen.
-export function entryHead(entry, kindTitle) {
-  const facts = h("p", { class: "quiet facts" });
-  const problem = errorLine();
-  const element = h("div", { class: "head" }, h("p", { class: "kind" }, kindTitle), heading(1, entry.name), facts, problem);
+export function entryHead(store, entry, kindTitle) {
+  const [facts, problem] = [h("span", {}), errorLine()];
+  const from = h("span", { class: "from", hidden: true }, " · Trained from the capture ", link("", "#/"));
+  const line = h("p", { class: "quiet facts" }, facts, from);
+  const [stages, next] = [timeline(), nextStep(store)];
+  const element = h("div", { class: "head" }, h("p", { class: "kind" }, kindTitle), heading(1, entry.name), line, stages.element, next.element, problem);
   return {
     element,
-    update(now) {
+    // source: the entry that this one was made from, or null
+    update(now, source = null) {
       if (!now) return;
+      from.hidden = !source;
+      if (source) Object.assign(from.lastChild, { href: addressOf(source), textContent: source.name });
       facts.textContent = factsOf(now).filter(Boolean).join(" · ");
       put(problem, now.problem ?? "");
+      const project = store.projectOf(now.entry);
+      stages.update(project);
+      next.update(project, now.next ?? project?.next ?? null);
     },
   };
 }
 
-// Waits for an entry of the library to be known, then shows its screen.
+// Waits for an entry of the library to be known, then shows its screen. Only the studio says that an entry is missing:
+// the list of this tab may be old.
 export function withEntry({ main, store, where }, show) {
-  let inner = null;
+  let [inner, asked] = [null, false];
+  const gone = errorLine();
+  const path = `${where.kind}/${where.name}`;
   main.append(heading(1, where.name || "…"));
+
+  async function ask() {
+    asked = true;
+    const error = h("p", { class: "error" });
+    try {
+      if (await store.find(where.kind, where.name)) return;
+      error.textContent = `${path} is not in this library; it may have been renamed or removed.`;
+    } catch ({ message }) {
+      error.textContent = message;
+    }
+    if (!inner) main.append(error, link("Back to the library", "#/"));
+  }
+
   return {
     follows: (place) => inner?.follows?.(place) ?? false,
     close: () => inner?.close?.(),
     update() {
       const entry = store.entry(where.kind, where.name);
       if (!inner && entry && store.read) {
-        main.replaceChildren();
+        main.replaceChildren(gone);
         inner = show(entry);
-      } else if (!inner && store.library && store.read && !main.querySelector(".error")) {
-        const missing = `${where.kind}/${where.name} is not in this library; it may have been renamed or removed.`;
-        main.append(h("p", { class: "error" }, missing), link("Back to the library", "#/"));
+      } else if (!inner && store.library && store.read && !asked) {
+        ask();
       }
+      put(gone, inner && !entry ? `${path} is not in this library any more; it was renamed or removed.` : "");
       inner?.update?.(entry ?? { ...inner.entry });
     },
   };

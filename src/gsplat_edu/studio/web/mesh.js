@@ -16,7 +16,7 @@ export function meshes(store, entry) {
   };
   const texture = h("input", { type: "checkbox" });
   const painted = h("label", { class: "check", hidden: entry.kind !== "runs" }, texture, " texture of the photos instead of a colour per vertex");
-  const make = h("button", { class: "primary" }, "Make a mesh");
+  const make = h("button", {}, "Make a mesh");
   const coarse = button("Make a collider", () => attempt(coarse, line, () => start("collider.glb")), {
     title: "A coarse mesh for collisions in a game engine",
   });

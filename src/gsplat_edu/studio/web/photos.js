@@ -2,9 +2,9 @@
 
 import { attempt, errorLine, h, heading, link, put } from "./dom.js";
 import { gallery } from "./gallery.js";
-import { freeName, intake } from "./intake.js";
+import { intake } from "./intake.js";
 import { jobPlace, startJob } from "./jobs.js";
-import { addressOf, entryHead, management, withEntry } from "./library.js";
+import { addressOf, entryHead, management, searchOf, withEntry } from "./library.js";
 
 const MATCHERS = [
   ["", "chosen by what the photos are"],
@@ -15,23 +15,25 @@ const MATCHERS = [
 export function photos(given) {
   const { main, store } = given;
   return withEntry(given, (entry) => {
-    const head = entryHead(entry, "Photos");
+    const head = entryHead(store, entry, "Photos");
     const pictures = gallery(entry.entry);
     const line = errorLine();
     const job = jobPlace(store, entry.entry, ["sfm"], { main: true });
     const matcher = h("select", { id: "matcher" }, MATCHERS.map(([value, text]) => h("option", { value }, text)));
     const frames = h("input", { id: "frames", type: "number", min: 3, max: 5000, inputmode: "numeric" });
     const exact = h("input", { type: "checkbox" });
-    const find = h("button", { class: "primary" }, "Find the poses");
+    const find = h("button", { "data-own": "" }, "Find the poses");
     const next = h("p", { class: "next", hidden: true });
     const form = h(
       "form",
       {
+        id: "find",
+        "data-next": `sfm ${entry.entry}`,
         onsubmit: (event) => {
           event.preventDefault();
           attempt(find, line, () => {
             const options = { matcher: matcher.value || null, frames: entry.videos && frames.value ? Number(frames.value) : null, threads: exact.checked ? 1 : null };
-            return startJob(store, { command: "sfm", subject: entry.entry, to: freeName(store, "captures", entry.name), options });
+            return startJob(store, { command: "sfm", subject: entry.entry, options });
           });
         },
       },
@@ -39,7 +41,7 @@ export function photos(given) {
       h(
         "details",
         {},
-        h("summary", {}, "Options"),
+        h("summary", {}, "More"),
         h("p", { class: "row" }, h("label", { for: "matcher" }, "Compare"), matcher),
         h("p", { class: "row", hidden: !entry.videos }, h("label", { for: "frames" }, "Frames of the video"), frames),
         h("label", { class: "check" }, exact, " the same poses to the bit every time (one thread, slower)"),
@@ -64,18 +66,18 @@ export function photos(given) {
     return {
       entry,
       update(now) {
-        head.update(now);
         job.update();
+        head.update(now);
         pictures.read(now).then(() => (later.hidden = false), (error) => put(line, error.message));
         form.hidden = Boolean(job.view?.active);
         const made = store.madeBy(job.view);
-        if (made && next.dataset.entry !== made.entry) {
-          next.dataset.entry = made.entry;
-          next.replaceChildren(link(`Continue with the capture ${made.name}`, addressOf(made), { class: "button primary" }));
+        if (made && next.dataset.shown !== made.entry) {
+          next.dataset.shown = made.entry;
+          next.replaceChildren(link(`Continue with the capture ${made.name}`, addressOf(made), { class: "button" }), " ", h("span", {}));
         }
+        if (made) put(next.lastElementChild, searchOf(made)); // the link stays: a press on it would be lost with it
         next.hidden = !made;
         find.textContent = made ? "Find the poses again" : "Find the poses";
-        find.classList.toggle("primary", !made);
       },
     };
   });

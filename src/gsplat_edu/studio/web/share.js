@@ -2,6 +2,7 @@
 
 import { at, get, remove } from "./api.js";
 import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put } from "./dom.js";
+import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
 import { meshes, newestOf } from "./mesh.js";
@@ -25,13 +26,16 @@ export function share({ place, store, entry }) {
   const withEdits = h("label", { class: "check", hidden: true }, edits, " apply the edits");
   const surface = h("input", { type: "checkbox" });
   const withMesh = h("label", { class: "check", hidden: true }, surface, h("span", {}));
+  const proof = h("input", { type: "checkbox" });
+  const withProof = h("label", { class: "check", hidden: true }, proof, " let visitors check the scene: 12 of your photos (480 px, without file names or other data) beside the picture, and a switch that colours what fewer than two photos saw");
+  const unsaved = h("p", { class: "notice", hidden: true }, "Edits that are not saved yet are not exported. Save them under ", link("Edit", `${addressOf(entry)}/edit`), ".");
   const note = h("p", { class: "quiet" });
   const choices = FORMATS.map(([value, name, hint], index) => {
     const input = h("input", { type: "radio", name: "format", value, checked: index === 0, onchange: () => explain() });
     return h("label", { class: "choice" }, input, h("strong", {}, name), h("span", { class: "quiet" }, hint));
   });
-  const form = h("form", {});
-  const make = h("button", { class: "primary" }, "Export");
+  const form = h("form", { id: "export", "data-next": `convert ${entry.entry}` });
+  const make = h("button", {}, "Export");
   const film = button("Make a video", () => attempt(film, line, () => start({ command: "render" })));
   const job = jobPlace(store, entry.entry, ["convert", "render"], { main: true });
   const list = h("ul", { class: "plain exports", "aria-label": "exported files" });
@@ -40,8 +44,9 @@ export function share({ place, store, entry }) {
   let [read, now] = ["", entry];
   let shown = {}; // the newest surface and collider, which a page can show
 
-  const start = (more) => {
-    const edited = now.edited && edits.checked;
+  const start = async (more) => {
+    await store.refresh(); // edits may have been saved just now
+    const edited = (store.entry(entry.kind, entry.name) ?? now).edited && edits.checked;
     return startJob(store, { subject: entry.entry, to: title.value, ...(edited ? { edits: true } : {}), ...more });
   };
 
@@ -50,13 +55,16 @@ export function share({ place, store, entry }) {
   function explain() {
     const page = isPage();
     withMesh.hidden = !page || !shown.surface;
-    put(note, page ? "The title is the page's heading. Start view, named views and camera path come from the edits: set them under Edit and save." : "");
+    withProof.hidden = !page || entry.kind !== "runs";
+    put(note, page ? "The title is the page's heading. Start view, named views, guided tour (views with a text) and camera path come from the edits: set them under Edit and save." : "");
   }
 
   form.append(
     h("fieldset", {}, h("legend", {}, "Format"), h("div", { class: "choices" }, choices)),
     h("p", { class: "row" }, h("label", { for: "title" }, "Title and name of the file"), title, withEdits, withMesh),
+    withProof,
     note,
+    unsaved,
     h("div", { class: "row" }, make, film),
   );
   form.addEventListener("submit", (event) => {
@@ -64,14 +72,14 @@ export function share({ place, store, entry }) {
     const format = new FormData(form).get("format");
     const files = isPage() && shown.surface && surface.checked ? Object.entries(shown).filter(([, found]) => found) : [];
     const along = Object.fromEntries(files.map(([name, { file }]) => [name, file]));
-    attempt(make, line, () => start({ command: "convert", format, ...along }));
+    attempt(make, line, () => start({ command: "convert", format, ...along, ...(isPage() && !withProof.hidden && proof.checked ? { options: { verify: "photos" } } : {}) }));
   });
   explain();
   place.append(
     h("section", { "aria-label": "export" }, heading(2, "Export"), form, line, job.element),
     h("section", { "aria-label": "exported files" }, heading(2, "Exported files"), none, list),
     mesh.element,
-    entry.kind === "runs" ? cleaning(store, entry) : noCleaning(),
+    entry.kind === "runs" ? cleaning(store, entry, () => now) : noCleaning(),
   );
 
   function item(found) {
@@ -112,6 +120,7 @@ export function share({ place, store, entry }) {
     update(found) {
       now = found;
       withEdits.hidden = !now.edited;
+      unsaved.hidden = !hasDraft(entry.entry);
       job.update();
       mesh.update(now);
       make.disabled = film.disabled = entry.kind === "runs" && !now.files;
@@ -125,17 +134,30 @@ export function share({ place, store, entry }) {
   };
 }
 
-// Removes what few photos saw, into a new scene.
-function cleaning(store, entry) {
+// Removes what few photos saw, into a new scene with the run's edits.
+function cleaning(store, entry, entryNow) {
   const line = errorLine();
   const job = jobPlace(store, entry.entry, ["clean"]);
+  const found = h("ul", { class: "plain", "aria-label": "what was cleaned", hidden: true });
   const next = h("p", { hidden: true });
-  const clean = button("Clean", () => attempt(clean, line, () => startJob(store, { command: "clean", subject: entry.entry })));
+  const clean = button("Clean", () =>
+    attempt(clean, line, async () => {
+      await store.refresh(); // edits may have been saved just now
+      const { edited } = store.entry(entry.kind, entry.name) ?? entryNow();
+      return startJob(store, { command: "clean", subject: entry.entry, ...(edited ? { edits: true } : {}) });
+    }),
+  );
   const update = () => {
     if (!next.isConnected) return store.removeEventListener("change", update);
     job.update();
-    const made = store.madeBy(job.view);
-    if (made && next.hidden) next.append(link(`Open the scene ${made.name}`, addressOf(made), { class: "button" }));
+    const { view } = job;
+    const said = view?.job.state === "done" ? view.messages.filter((text) => !/^wrote /.test(text)) : [];
+    if (found.dataset.said !== said.join()) found.replaceChildren(...said.map((text) => h("li", {}, text.trim().replace(/\s+/g, " "))));
+    found.dataset.said = said.join();
+    found.hidden = !said.length;
+    const made = store.madeBy(view);
+    if (made && next.dataset.made !== made.name) next.replaceChildren(link(`Open the scene ${made.name}`, addressOf(made), { class: "button" }));
+    if (made) next.dataset.made = made.name;
     next.hidden = !made;
     return undefined;
   };
@@ -145,10 +167,11 @@ function cleaning(store, entry) {
     "section",
     { "aria-label": "cleaning" },
     heading(2, "Clean"),
-    h("p", { class: "quiet" }, "Removes specks that float in the air and splats that no photo needs, and makes a new scene. The run stays as it is."),
+    h("p", { class: "quiet" }, "Removes specks that float in the air and splats that no photo needs, and makes a new scene with the same edits. It renders each photo's view, which takes about a minute. The run stays as it is."),
     clean,
     line,
     job.element,
+    found,
     next,
   );
 }

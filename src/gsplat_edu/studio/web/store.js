@@ -5,6 +5,7 @@ import { at, get } from "./api.js";
 export const ACTIVE = new Set(["queued", "running", "paused"]);
 
 const RECONNECT = 2000; // milliseconds, after the stream was closed for good
+const CLEARLY = 1.1; // times the time left that is shown; a forecast beyond it makes that a least time
 const TOGETHER = 300; // milliseconds in which changes of the library are read once
 
 // A job and what its events say.
@@ -15,18 +16,28 @@ class JobView {
   }
 
   clear() {
-    Object.assign(this, { last: 0, stages: [], progress: null, messages: [], metrics: new Map() });
+    Object.assign(this, { last: 0, stages: [], progress: null, least: null, messages: [], metrics: new Map() });
   }
 
   take(event) {
     if (event.number <= this.last) return;
     this.last = event.number;
-    if (event.event === "started") Object.assign(this, { stages: [], progress: null });
+    if (event.event === "started") Object.assign(this, { stages: [], progress: null, least: null });
     if (event.event === "stage" && !this.stages.includes(event.name)) this.stages.push(event.name);
     if (event.event === "stage") this.progress = null;
-    if (event.event === "progress") this.progress = event;
+    if (event.event === "progress") this.progress = { ...event, ...this.leftOf(event) };
     if (event.event === "message") this.messages = [...this.messages.slice(-199), event.text];
     if (event.event === "metric") this.metrics.set(`${event.name} ${event.of}`, event);
+  }
+
+  // The time left of a stage never rises: what was said before stays until the forecast has come down to it. Meanwhile
+  // it is a least time, if the forecast is clearly larger.
+  leftOf({ stage, seconds_left: left }) {
+    if (this.least?.stage !== stage) this.least = { stage, left: Infinity };
+    const known = left ?? Infinity;
+    const isLeast = known > CLEARLY * this.least.left;
+    this.least.left = Math.min(this.least.left, known);
+    return { seconds_left: Number.isFinite(this.least.left) ? this.least.left : null, is_least: isLeast };
   }
 
   get active() {
@@ -49,6 +60,7 @@ export class Store extends EventTarget {
   constructor() {
     super();
     Object.assign(this, { library: null, jobs: new Map(), damaged: new Map(), heard: new Map(), connected: null, trouble: "", read: false });
+    Object.assign(this, { questions: 0, latest: 0 }); // about the library: how many, and which one was answered last
   }
 
   // "change": something is different; detail.job is the id of a job, if it is one.
@@ -77,6 +89,11 @@ export class Store extends EventTarget {
     return (kind && this.entry(kind, name)) || null;
   }
 
+  // The project that an entry belongs to; null until the library's list has it.
+  projectOf(entry) {
+    return this.library?.projects.find(({ entries }) => entries.includes(entry)) ?? null;
+  }
+
   // The entry that a path lies in.
   entryAt(path) {
     for (const kind of ["photos", "captures", "runs", "scenes"]) {
@@ -88,6 +105,23 @@ export class Store extends EventTarget {
     return null;
   }
 
+  // The capture of a run: what the studio says it was made from, under its present name.
+  captureOf(run) {
+    const [kind, name] = run.made_from?.split("/") ?? [];
+    if (kind === "captures") return this.entry(kind, name);
+    return run.capture ? this.entryAt(run.capture) : null;
+  }
+
+  // What was made from an entry and is named after it.
+  namedAfter({ entry, name }) {
+    const all = ["captures", "runs", "scenes"].flatMap((kind) => this.library?.[kind] ?? []);
+    const isFrom = (one, depth = 0) => {
+      if (!one?.made_from || depth > 9) return false;
+      return one.made_from === entry || isFrom(all.find((other) => other.entry === one.made_from), depth + 1);
+    };
+    return all.filter((one) => isFrom(one) && (one.name === name || one.name.startsWith(`${name}-`)));
+  }
+
   // Jobs about an entry, newest first.
   jobsOf(entry, ...commands) {
     const all = [...this.jobs.values()].filter(({ job }) => job.subject === entry);
@@ -95,19 +129,33 @@ export class Store extends EventTarget {
     return found.sort((a, b) => b.job.id.localeCompare(a.job.id));
   }
 
+  // Reads the library. An answer that comes after that to a later question is older, and dropped.
   async refresh() {
-    try {
-      this.library = await get("/api/library");
-      this.trouble = this.library.trouble.join(" ");
-    } catch (error) {
-      this.trouble = error.message;
-    }
+    const question = ++this.questions;
+    const [library, trouble] = await get("/api/library").then((found) => [found, found.trouble.join(" ")], (error) => [null, error.message]);
+    if (question < this.latest) return;
+    this.latest = question;
+    if (library) this.library = library;
+    this.trouble = trouble;
     this.changed();
   }
 
+  // Asks the studio for an entry that the list lacks; the list may be old. Returns whether the studio has it.
+  async find(kind, name) {
+    const found = await get(at(kind, name)).catch((error) => {
+      if (error.status !== 404) throw error;
+      return null;
+    });
+    if (found && !this.entry(kind, found.name)) this.library[kind].push(found);
+    this.changed();
+    return Boolean(found);
+  }
+
   refreshSoon() {
-    clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.refresh(), TOGETHER);
+    this.timer ||= setTimeout(() => {
+      this.timer = 0;
+      this.refresh();
+    }, TOGETHER);
   }
 
   // Takes a job from an answer. The stream may already have brought a newer state: `heard` is how often it had spoken of
@@ -122,7 +170,7 @@ export class Store extends EventTarget {
     const before = known?.job.state;
     if (known) known.job = job;
     else this.jobs.set(job.id, new JobView(job));
-    if (before !== job.state && before !== undefined) this.refreshSoon();
+    if (before !== job.state && (before !== undefined || this.read)) this.refreshSoon();
     this.changed(job.id);
     return this.jobs.get(job.id);
   }
@@ -176,6 +224,7 @@ export class Store extends EventTarget {
       if (event.event === "stage") this.refreshSoon(); // a stage makes files
       this.changed(event.job);
     });
+    source.addEventListener("library", () => this.refreshSoon());
     source.addEventListener("removed", ({ data }) => {
       const { id } = JSON.parse(data);
       this.jobs.delete(id);

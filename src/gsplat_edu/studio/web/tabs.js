@@ -1,10 +1,12 @@
 // The screens of runs and scenes: a row of tabs, each of which shows one part.
 
 import { h, link } from "./dom.js";
+import { hasDraft } from "./draft.js";
 import { edit } from "./edit.js";
 import { compare, judge } from "./judge.js";
 import { entryHead, management, withEntry } from "./library.js";
 import { share } from "./share.js";
+import { undoBegun } from "./undo.js";
 import { look, watch } from "./watch.js";
 
 const RUN = { "": ["Watch", watch], judge: ["Judge", judge], edit: ["Edit", edit], share: ["Share", share] };
@@ -16,16 +18,30 @@ export const scene = (given) => tabbed(given, "Scene", SCENE);
 function tabbed(given, title, tabs) {
   const { store, main } = given;
   return withEntry(given, (entry) => {
-    const head = entryHead(entry, title);
+    const head = entryHead(store, entry, title);
     const base = `#/${entry.kind}/${encodeURIComponent(entry.name)}`;
     const links = new Map(
       Object.entries(tabs).map(([tab, [text]]) => [tab, link(text, tab ? `${base}/${tab}` : base)]),
     );
     const place = h("div", { class: "tab" });
-    main.append(head.element, h("nav", { class: "tabs", "aria-label": `parts of ${entry.name}` }, [...links.values()]), place);
+    const begun = undoBegun(store, entry);
+    main.append(head.element, begun.element, h("nav", { class: "tabs", "aria-label": `parts of ${entry.name}` }, [...links.values()]), place);
     const manage = management(store, entry);
     main.append(manage);
     let [part, now] = [null, entry];
+
+    const top = () => {
+      const training = Boolean(store.jobsOf(entry.entry, "train")[0]?.active); // its screen counts the iterations once
+      head.update({ ...now, training }, store.captureOf(now));
+    };
+
+    const mark = () => {
+      const unsaved = hasDraft(entry.entry);
+      const shown = links.get("edit");
+      shown.textContent = unsaved ? "Edit •" : "Edit"; // a phone has no room for the word
+      if (unsaved) shown.setAttribute("aria-label", "Edit (unsaved)");
+      else shown.removeAttribute("aria-label");
+    };
 
     function open(where) {
       part?.close?.();
@@ -38,22 +54,27 @@ function tabbed(given, title, tabs) {
       place.replaceChildren();
       part = (tab === "compare" ? compare : tabs[tab][1])({ place, store, entry, where });
       part.tab = tab;
+      mark();
       part.update?.(now);
     }
 
+    begun.update();
     open(given.where);
     return {
       entry,
       follows(where) {
         if (where.kind !== entry.kind || where.name !== entry.name) return false;
         if (!(part.tab === where.tab && part.follows?.(where))) open(where);
+        top(); // another tab has another next step
         return true;
       },
       close: () => part.close?.(),
       update(found) {
         if (found.path) now = found;
-        head.update(now);
+        begun.update();
+        mark();
         part.update?.(now);
+        top();
       },
     };
   });

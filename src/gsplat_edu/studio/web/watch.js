@@ -1,7 +1,7 @@
 // A training as it runs: the scene, how far it is, and its curves. Also the view of a finished scene.
 
-import { at, get } from "./api.js";
-import { decibels, duration, h, heading, link, whole } from "./dom.js";
+import { at, get, getQuietly, head } from "./api.js";
+import { decibels, duration, h, heading, link, put, whole } from "./dom.js";
 import { curve } from "./curves.js";
 import { beside, frame } from "./frame.js";
 import { jobPlace } from "./jobs.js";
@@ -10,22 +10,49 @@ import { addressOf } from "./library.js";
 const EVERY = 2000; // milliseconds between two looks at the curves
 const REFRESH = 5; // looks at the curves between two looks at the library
 
+// The page of a scene as exports have it: with the saved edits, unless they do not fit it or are switched off.
+function edited(store, entry) {
+  const box = h("input", { type: "checkbox", checked: true, onchange: () => store.changed() });
+  const label = h("label", { class: "check", hidden: true }, box, " with the saved edits");
+  const note = h("p", { class: "notice", hidden: true });
+  let [asked, refused] = ["", ""];
+  return {
+    element: h("div", {}, label, note),
+    address(now) {
+      const plain = at(entry.entry, "page");
+      const address = `${plain}?edited=1&of=${now.modified}`;
+      label.hidden = !now.edited;
+      if (!now.edited || !box.checked) return plain;
+      if (asked !== address) {
+        [asked, refused] = [address, ""];
+        head(address).catch(({ status, message }) => {
+          if (status !== 400 || asked !== address) return; // the frame asks again
+          refused = message;
+          store.changed();
+        });
+      }
+      put(note, refused && `The saved edits are not shown. ${refused}`);
+      return refused ? plain : address;
+    },
+  };
+}
+
 // The screen of a scene without a training.
-export function look({ place, entry }) {
+export function look({ place, store, entry }) {
   const scene = frame(`scene ${entry.name}`);
-  place.append(scene.element, h("div", { class: "row" }, scene.full));
-  scene.show(at(entry.entry, "page"));
-  return { close: () => scene.close() };
+  const page = edited(store, entry);
+  place.append(scene.element, h("div", { class: "row" }, scene.full), page.element);
+  return { close: () => scene.close(), update: (now) => scene.show(page.address(now)) };
 }
 
 export function watch({ place, store, entry }) {
   const scene = frame(`scene of ${entry.name}`);
   const captureOf = () => {
-    const found = entryNow().capture && store.entryAt(entryNow().capture);
-    return found || null;
+    return store.captureOf(entryNow());
   };
   const entryNow = () => store.entry("runs", entry.name) ?? entry;
   const slider = beside(scene, captureOf);
+  const page = edited(store, entry);
   const job = jobPlace(store, entry.entry, ["train"], { main: true, level: 2 });
   const figures = h("dl", { class: "figures-list" });
   const curves = {
@@ -38,8 +65,8 @@ export function watch({ place, store, entry }) {
     h(
       "div",
       { class: "watch" },
-      h("div", { class: "left-side" }, scene.element, slider.element),
-      h("div", { class: "right-side" }, next, figures, job.element),
+      h("div", { class: "left-side" }, scene.element, slider.element, page.element),
+      h("div", { class: "right-side" }, figures, next, job.element),
     ),
     h(
       "section",
@@ -67,7 +94,7 @@ export function watch({ place, store, entry }) {
         data.next = found.next;
       }
       if (job.view?.active) {
-        const state = await get(at(entry.entry, "live", "state"));
+        const state = await getQuietly(at(entry.entry, "live", "state"));
         if (state?.history) data.live = [state.history.iteration, state.history.psnr];
       }
     } catch {
@@ -75,12 +102,13 @@ export function watch({ place, store, entry }) {
     } finally {
       busy = false;
     }
-    curves.loss.show(data.points[0], data.points[1]);
-    curves.count.show(data.points[0], data.points[2]);
-    const { iterations, psnr } = entryNow();
-    if (data.scores[0].length > 1) curves.psnr.show(...data.scores, "of held-out views");
-    else if (data.live[0].length) curves.psnr.show(...data.live, "of training photos");
-    else if (psnr !== null) curves.psnr.show([iterations], [psnr], "of held-out views");
+    const { iterations, psnr, planned } = entryNow();
+    const end = job.view?.active ? planned : 0; // the axis does not count along
+    curves.loss.show(data.points[0], data.points[1], "", end);
+    curves.count.show(data.points[0], data.points[2], "", end);
+    if (data.scores[0].length > 1) curves.psnr.show(...data.scores, "of held-out views", end);
+    else if (data.live[0].length) curves.psnr.show(...data.live, "of training photos", end);
+    else if (psnr !== null) curves.psnr.show([iterations], [psnr], "of held-out views", end);
     if (again) readCurves();
   }
 
@@ -108,13 +136,14 @@ export function watch({ place, store, entry }) {
         readCurves();
       }
       const waits = view?.job.state === "queued" ? "This training waits for other jobs." : "The training has not begun yet.";
+      page.element.hidden = active;
       if (active && view.job.state !== "queued" && now.files) scene.show(at(entry.entry, "live", "page"), waits);
       else if (active) scene.show(null, waits);
-      else if (now.files) scene.show(at(entry.entry, "page"));
+      else if (now.files) scene.show(page.address(now));
       else scene.show(null, "There is no scene.");
       showFigures(figures, now, view, data);
       if (now.finished && !active && !next.children.length) {
-        next.append(link("Judge it", `${addressOf(now)}/judge`, { class: "button" }), link("Share it", `${addressOf(now)}/share`, { class: "button primary" }));
+        next.append(link("Judge it", `${addressOf(now)}/judge`, { class: "button" }));
       }
     },
   };
@@ -122,7 +151,7 @@ export function watch({ place, store, entry }) {
 
 function showFigures(list, now, view, { points }) {
   const training = view?.active && /train/.test(view.progress?.stage ?? "") ? view.progress : null;
-  const done = Math.max(training?.done ?? 0, now.iterations ?? 0);
+  const done = training?.done ?? now.iterations ?? 0; // of the job's bar, which has the time left as well
   const splats = (view?.active && points[2].at(-1)) || now.num_gaussians;
   const rows = [
     ["iterations", now.planned ? `${whole(done)} of ${whole(now.planned)}` : "–"],

@@ -9,6 +9,8 @@ const FARTHEST = 3; // the same, and of the pivot from the initial one, in dista
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const plus = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
+const transposed = (rows) => [0, 1, 2].map((i) => rows.map((row) => row[i]));
+const radians = (degrees) => (degrees * Math.PI) / 180;
 
 // Rotates a vector about an axis of length 1 by the right-hand rule (Rodrigues' formula).
 function turned(vector, axis, angle) {
@@ -21,22 +23,29 @@ function turned(vector, axis, angle) {
 // Most that a wide window enlarges the image beyond fitting it: at most a fifth of its height is cropped.
 const MOST_CROPPED = 1.25;
 
-// Width of a narrow window, in widths of the subject that has to be in view.
+// Width of a narrow window and height of a wide one, in those of the subject that has to be in view.
 const ROOM = 1.1;
 
-// Fits a camera to a window of another shape. A narrow window is filled and the sides are cropped, since no camera saw
-// anything above and below the image, but as much as `subject` (left, top, right, bottom in px of the image) stays in
-// view. A wide window keeps most of the height, since a square photo of an object would lose its top and bottom, and
-// shows some more at the sides. The centre of the image, or of the subject, is in the middle.
-function fitted(camera, width, height) {
+// Least part of a window's height below the panel; in a lower window, the panel lies over the picture.
+const LEAST_FREE = 0.2;
+
+// Fits a camera to a window of another shape, of which a panel covers `covered` px at the top. A narrow window is filled
+// and the sides are cropped, since no camera saw anything above and below the image, but as much as `subject` (left, top,
+// right, bottom in px of the image) stays in view. A wide window shows some more at the sides and crops a little of the
+// height, but not the subject. The centre of the image, or of the subject, is in the middle of the part without a panel.
+function fitted(camera, width, height, covered = 0) {
   const { subject, ...rest } = camera;
-  const [across, down] = [width / camera.W, height / camera.H];
+  const free = height - covered < LEAST_FREE * height ? height : height - covered;
+  const [across, down] = [width / camera.W, free / camera.H];
   let scale = across > down ? Math.min(across, MOST_CROPPED * down) : down;
   let [x, y] = [0.5 * camera.W, 0.5 * camera.H];
-  if (subject && across < down) {
+  if (subject) {
     const [left, top, right, bottom] = subject;
-    scale = Math.min(down, Math.max(across, width / (ROOM * (right - left))));
-    [x, y] = [within(0.5 * (left + right), camera.W, width / scale), within(0.5 * (top + bottom), camera.H, height / scale)];
+    if (across < down) {
+      scale = Math.min(down, Math.max(across, width / (ROOM * (right - left))));
+      x = within(0.5 * (left + right), camera.W, width / scale);
+    } else scale = Math.min(scale, Math.max(down, free / (ROOM * (bottom - top))));
+    y = within(0.5 * (top + bottom), camera.H, free / scale);
   }
   const moved = (middle, from, to) => (middle + 0.5 - from) * scale - 0.5 + 0.5 * to;
   return {
@@ -44,7 +53,7 @@ function fitted(camera, width, height) {
     fx: camera.fx * scale,
     fy: camera.fy * scale,
     cx: moved(camera.cx, x, width),
-    cy: moved(camera.cy, y, height),
+    cy: moved(camera.cy, y, free) + height - free,
     W: width,
     H: height,
   };
@@ -64,13 +73,18 @@ function pointAt(camera, u, v, depth) {
 }
 
 // Bounds of x/z and y/z in the Jacobian, as in Camera.jacobian_bounds; without a limit, the largest float.
-function ratioBounds(camera, limit) {
-  if (limit === null) return { low: [-3e38, -3e38], high: [3e38, 3e38] };
+function ratioBounds(camera, { jacobian_limit: limit, beyond }) {
+  const edges = [
+    Math.max(0.5 + camera.cx, camera.W - 0.5 - camera.cx) / camera.fx,
+    Math.max(0.5 + camera.cy, camera.H - 0.5 - camera.cy) / camera.fy,
+  ];
+  const widest = edges.map((edge) => (beyond ? Math.max(beyond[0] * edge, beyond[1]) : 3e38));
+  if (limit === null) return { low: [-3e38, -3e38], high: [3e38, 3e38], widest };
   const bounds = (side) => [
     (0.5 * (camera.W - 1) + side * 0.5 * limit * camera.W - camera.cx) / camera.fx,
     (0.5 * (camera.H - 1) + side * 0.5 * limit * camera.H - camera.cy) / camera.fy,
   ];
-  return { low: bounds(-1), high: bounds(1) };
+  return { low: bounds(-1), high: bounds(1), widest };
 }
 
 // The user's viewpoint and the pivot of orbits.

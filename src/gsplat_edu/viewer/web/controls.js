@@ -33,7 +33,8 @@ if (EMBEDDED) document.documentElement.classList.add("embedded");
 class Controls {
   // actions: moved() after every move, awake() when a held key starts to move, shown() for the camera on the screen,
   // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by), saveView(),
-  // playPath(). `cameras` is how many cameras the horizontal arrows step through.
+  // playPath(), guide(), compare(), seen(), slide(by), dismiss(). `cameras` is how many cameras the horizontal arrows
+  // step through.
   constructor(canvas, view, actions, cameras = 0) {
     Object.assign(this, { canvas, view, actions, cameras, flying: false, pointers: new Map(), held: new Set(), hurried: false });
     this.lastTap = null;
@@ -126,6 +127,12 @@ class Controls {
       h: () => this.actions.help(),
       k: () => this.actions.saveView(),
       p: () => this.actions.playPath(),
+      t: () => this.actions.guide?.(),
+      c: () => this.actions.compare?.(),
+      v: () => this.actions.seen?.(),
+      ",": () => this.actions.slide?.(-1),
+      ".": () => this.actions.slide?.(1),
+      escape: () => this.actions.dismiss?.(),
       arrowleft: () => this.actions.step(-1),
       arrowright: () => this.actions.step(1),
     }[event.key.toLowerCase()];

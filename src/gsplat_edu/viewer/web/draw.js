@@ -32,6 +32,7 @@ class Renderer {
     this.thinning = 0;
     this.framebuffer = gl.createFramebuffer();
     this.setUpOrder();
+    this.seen = facts.seen ? new SeenTexture(this) : null;
     if (gl.getError() !== gl.NO_ERROR) throw new Error("This scene does not fit into the graphics processor's memory.");
     gl.disable(gl.DITHER);
   }
@@ -189,9 +190,10 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0 + this.textures.length);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
     gl.uniform1i(place("order"), this.textures.length);
+    this.seen?.bind();
     gl.uniform1i(place("batch_splats"), BATCH_SPLATS);
     gl.uniform1f(place("thinning"), this.thinning);
-    const { low, high } = ratioBounds(camera, settings.jacobian_limit);
+    const { low, high, widest } = ratioBounds(camera, settings);
     gl.uniform1i(place("texture_width"), this.textureWidth);
     gl.uniform1i(place("coefficients"), (this.facts.sh_degree + 1) ** 2);
     gl.uniform1i(place("degree"), Math.min(settings.sh_degree, this.facts.sh_degree));
@@ -202,6 +204,7 @@ class Renderer {
     gl.uniform2f(place("middle"), camera.cx, camera.cy);
     gl.uniform2f(place("size"), camera.W, camera.H);
     gl.uniform2fv(place("ratio_low"), low);
+    gl.uniform2fv(place("widest"), widest);
     gl.uniform2fv(place("ratio_high"), high);
   }
 
@@ -307,22 +310,4 @@ function nearestTexture(gl) {
     gl.texParameteri(gl.TEXTURE_2D, name, value);
   }
   return texture;
-}
-
-function linked(gl, name) {
-  const program = gl.createProgram();
-  for (const [stage, type] of [
-    ["vert", gl.VERTEX_SHADER],
-    ["frag", gl.FRAGMENT_SHADER],
-  ]) {
-    const shader = gl.createShader(type);
-    gl.shaderSource(shader, document.getElementById(`${name}.${stage}`).textContent.trim());
-    gl.compileShader(shader);
-    gl.attachShader(program, shader);
-    const log = gl.getShaderInfoLog(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`${name}.${stage}: ${log}`);
-  }
-  gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(`${name}: ${gl.getProgramInfoLog(program)}`);
-  return program;
 }

@@ -9,7 +9,7 @@ const LEAST_SHARE = 1e-6; // opacities at or beyond this from 0 and 1 leave the 
 //
 // viewer: the page's Viewer; it must draw a whole scene, with shaders that were made for editing.
 // scene: {count, sha256, origin} as an edits file has them, file (a name for downloads), commands ({convert, render},
-//   or none), values: {count, means, log_scales, logits, sh0}, float32 arrays with the scene's exact parameters.
+//   or none), floaters (where the server proposes splats to delete, or none), values: {count, means, log_scales, logits, sh0}, float32 arrays with the scene's exact parameters.
 // edits: the parsed content of an edits file of this scene, or null.
 // save: async (text) => anything, which stores the content of an edits file or throws an Error with one line; null for
 //   no button.
@@ -21,8 +21,10 @@ class Editor {
   constructor(viewer, scene, operations, save) {
     Object.assign(this, { viewer, scene, values: scene.values });
     this.save = save;
+    this.storing = null; // the save that is on its way
     this.overlayAsked = 0;
     this.how = "replace";
+    this.frontOnly = false; // whether selections in the picture leave out what lies behind the visible surface
     this.radius = 24; // of the brush, CSS pixels
     this.history = new EditHistory(scene.values, operations);
     this.stored = this.text();
@@ -33,7 +35,11 @@ class Editor {
     this.opened = { camera, pivot, up, path: viewer.keyframes.path, text: "" };
     this.lastViews = "";
     this.panel = new EditPanel(this);
+    this.mover = new Mover(this);
+    this.leveller = new Leveller(this);
     this.tools = new EditTools(this);
+    this.look = new EditLook(this);
+    this.tour = new EditTour(this);
     this.follow();
     this.stateChanged();
     document.body.classList.add("editing");
@@ -48,6 +54,7 @@ class Editor {
     const put = viewer.put.bind(viewer);
     viewer.put = (camera) => {
       put(camera);
+      this.look.draw(camera);
       this.drawOverlay(camera);
     };
     viewer.depthAt = (camera, column, row) => this.tools.depthAt(camera, column, row);
@@ -68,7 +75,9 @@ class Editor {
     }
     const crop = this.history.done.findLast(({ op }) => op === "crop");
     if (crop) this.overlay.lines(boxLines(crop), "#9fe8a0", true);
+    if (this.tools.tool === "floor") this.leveller.draw(this.overlay, camera);
     this.tools.draw(this.overlay);
+    this.panel.histogram.viewed();
   }
 
   // Draws the overlay again. The splats below are not drawn again, which takes much longer without a graphics processor.
@@ -91,6 +100,11 @@ class Editor {
 
   chooseHow(how) {
     this.how = how;
+    this.changed();
+  }
+
+  chooseFront(frontOnly) {
+    this.frontOnly = frontOnly;
     this.changed();
   }
 
@@ -123,8 +137,14 @@ class Editor {
 
   stateChanged() {
     this.texture.write(this.history.flags);
+    this.together = this.viewer.meshes ? movedTogether(this.values, this.history.flags) : null;
+    this.mover.follow();
+    this.mover.placeMesh();
+    this.leveller.reset();
+    this.look.changed();
     this.applyViews(this.history.views());
     this.panel.list();
+    this.panel.histogram.changed();
     this.panel.saved(this.text() === this.stored ? "" : "not saved");
     this.changed();
     this.viewer.refresh();
@@ -190,11 +210,22 @@ class Editor {
     this.selectRange("size", log(low), log(high));
   }
 
-  selectRange(by, low, high) {
+  // Selects by the distance from a point; null for no limit.
+  selectDistance(center, low, high) {
+    this.selectRange("distance", low, high, { center });
+  }
+
+  // Grows or shrinks the selection by a radius, in world units.
+  near(op, radius) {
+    if (!(radius >= 1e-30 && radius <= 1e30)) return this.say("Give a radius above 0.");
+    return this.perform({ op, radius });
+  }
+
+  selectRange(by, low, high, more = {}) {
     if (low === null && high === null) return this.say("Give a lower or an upper limit.");
     if (low !== null && high !== null && low > high) return this.say("The lower limit is above the upper one.");
     const range = { ...(low === null ? {} : { low }), ...(high === null ? {} : { high }) };
-    return this.perform({ op: "select", how: this.how, by, ...range });
+    return this.perform({ op: "select", how: this.how, by, ...more, ...range });
   }
 
   // Turns the scene upright by three points of the floor, of which the eye is above; returns whether they span a plane.
@@ -230,9 +261,9 @@ class Editor {
     this.perform({ op: "start", ...storedView(camera), pivot: focus });
   }
 
-  keepView(name) {
+  keepView(name, text) {
     if (!name) return this.say("Give the view a name.");
-    return this.perform({ op: "view", name, ...storedView(this.viewer.view.camera) });
+    return this.perform({ op: "view", name, ...storedView(this.viewer.view.camera), ...(text ? { text } : {}) });
   }
 
   goTo(view) {
@@ -256,7 +287,7 @@ class Editor {
     renderer.setOrder(splatsAt(this.values, this.history.flags, camera, column, row, facts.near));
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(column, camera.H - 1 - row, 1, 1);
-    renderer.draw(camera, settings);
+    this.look.plainly(() => renderer.draw(camera, settings));
     const pixel = new Float32Array(4);
     gl.readPixels(column, camera.H - 1 - row, 1, 1, gl.RGBA, gl.FLOAT, pixel);
     gl.disable(gl.SCISSOR_TEST);
@@ -275,8 +306,17 @@ class Editor {
     return `{\n${lines.join("")} "operations": [${operations.join(",")}${operations.length ? "\n " : ""}]\n}\n`;
   }
 
+  // Saves what there is now. A second save waits for the first one, whose answer has the version that it replaces.
   async store() {
     if (!this.save) return this.download();
+    const again = () => (this.text() === this.stored ? undefined : this.storeNow());
+    const mine = (this.storing = this.storing ? this.storing.then(again) : this.storeNow());
+    await mine;
+    if (this.storing === mine) this.storing = null;
+    return undefined;
+  }
+
+  async storeNow() {
     const text = this.text();
     this.panel.saved("saving ...");
     try {
@@ -287,7 +327,6 @@ class Editor {
       this.say(error.message);
     }
     this.panel.saved(this.text() === this.stored ? "saved" : "not saved");
-    return undefined;
   }
 
   download() {
@@ -305,7 +344,7 @@ function storedPath(path) {
 }
 
 function pathOf(stored) {
-  if (!stored) return { loop: false, duration: null, keyframes: [] };
-  const { loop, duration = null, keyframes } = stored;
-  return { loop, duration, keyframes: keyframes.map(readKeyframe) };
+  if (!stored) return { loop: false, duration: null, ease: null, keyframes: [] };
+  const { loop, duration = null, ease = null, keyframes } = stored;
+  return { loop, duration, ease, keyframes: keyframes.map(readKeyframe) };
 }

@@ -6,7 +6,7 @@
 
 const EDIT_NEAR = 0.05; // world units: splats at this camera depth or closer are not seen in a picture
 
-// Calls found(i, u, v) for every splat in front of a picture's camera: u = (fx x) / z + cx, v = (fy y) / z + cy.
+// Calls found(i, u, v, z) for every splat in front of a picture's camera: u = (fx x) / z + cx, v = (fy y) / z + cy.
 function eachSeen({ camera }, { count, means }, found) {
   const [ex, ey, ez] = camera.position;
   const [[r00, r01, r02], [r10, r11, r12], [r20, r21, r22]] = camera.rotation; // camera to world: columns are the axes
@@ -17,7 +17,7 @@ function eachSeen({ camera }, { count, means }, found) {
     if (!(z > EDIT_NEAR)) continue;
     const x = r00 * a + r10 * b + r20 * c;
     const y = r01 * a + r11 * b + r21 * c;
-    found(i, (fx * x) / z + cx, (fy * y) / z + cy);
+    found(i, (fx * x) / z + cx, (fy * y) / z + cy, z);
   }
 }
 
@@ -132,12 +132,12 @@ function members(region, values, work = new EditWork()) {
       const [u0, v0, u1, v1] = region.corners;
       const inside = new Uint8Array(values.count);
       for (const i of seenWithin(region, values, [u0, u1], [v0, v1]).at) inside[i] = 1;
-      return inside;
+      return inFront(region, values, inside, work);
     }
     case "lasso":
-      return lassoMembers(region, values, work);
+      return inFront(region, values, lassoMembers(region, values, work), work);
     case "brush":
-      return brushMembers(region, values, work);
+      return inFront(region, values, brushMembers(region, values, work), work);
     case "sphere": {
       const [cx, cy, cz] = region.center;
       const square = region.radius * region.radius;
@@ -156,6 +156,16 @@ function members(region, values, work = new EditWork()) {
       return everyMember(values, (k) =>
         isBetween(Math.max(Math.max(log_scales[k], log_scales[k + 1]), log_scales[k + 2]), low, high),
       );
+    case "distance": {
+      const [cx, cy, cz] = region.center;
+      const [least, most] = [low, high].map((end) => (end === undefined ? undefined : end * end));
+      return everyMember(values, (k) => {
+        const [x, y, z] = [means[k] - cx, means[k + 1] - cy, means[k + 2] - cz];
+        return isBetween(x * x + y * y + z * z, least, most);
+      });
+    }
+    case "list":
+      return listMembers(region, values);
     case "all":
       return everyMember(values, () => true);
   }

@@ -7,21 +7,24 @@ const EDIT_PANEL = `
 <button data-tool="navigate" title="V: drags turn the view">navigate</button>
 <button data-tool="rectangle" title="T: select by a rectangle">rectangle</button>
 <button data-tool="lasso" title="L: select by a freehand outline">lasso</button>
+<button data-tool="polygon" title="Shift L: select by a polygon, corner after corner">polygon</button>
 <button data-tool="brush" title="B: select by painting; [ and ] change the size">brush</button>
 <button data-tool="sphere" title="O: select by a sphere">sphere</button>
 <button data-tool="box" title="X: select by a box, or crop to it">box</button>
+<button data-tool="move" title="Shift V: move and turn the selected splats">move</button>
 <button data-tool="color" title="G: select by colour">colour</button>
 <button data-tool="floor" title="Z: turn the scene upright by three points of the floor">floor</button>
 <button data-tool="scale" title="C: set the scale by two points">scale</button>
 <button data-tool="measure" title="M: measure between two points">measure</button>
 </p>
 <p id="edit-hint"></p>
-<p class="row" data-for="rectangle lasso brush sphere box color" role="group" aria-label="how selections combine">
+<p class="row" data-for="rectangle lasso polygon brush sphere box color" role="group" aria-label="how selections combine">
 <button data-how="replace" title="1: select only these">new</button>
 <button data-how="add" title="2, or Shift: add to the selection">add</button>
 <button data-how="subtract" title="3, or Ctrl: remove from the selection">subtract</button>
 <button data-how="intersect" title="4, or Shift Ctrl: keep what both select">intersect</button>
 </p>
+${FRONT_ROW}${POLYGON_ROW}
 <p class="row" data-for="brush"><label>size <input id="edit-radius" type="range" min="2" max="200" value="24"></label></p>
 <div data-for="sphere box">
 <p class="row" id="edit-center" role="group" aria-label="centre"><span>centre</span></p>
@@ -29,6 +32,19 @@ const EDIT_PANEL = `
 <p class="row" data-for="box" id="edit-half" role="group" aria-label="half sizes"><span>half size</span></p>
 <p class="row"><button data-do="select-shape" title="Enter">select</button>
 <button data-do="crop" data-for="box" title="Delete everything outside the box">crop to box</button></p>
+</div>
+<div data-for="move">
+<p class="row numbers" id="edit-by" role="group" aria-label="moved by"><span>moved by</span></p>
+<p class="row"><button data-do="move" title="Enter">move</button></p>
+</div>
+<div id="edit-handle" data-for="sphere box move"></div>
+<div data-for="floor">
+<p class="row" id="edit-cameras"><button data-do="level" title="Level the scene by its cameras, which are rarely rolled">level by the cameras</button></p>
+<p id="edit-turned" role="status"></p>
+<p class="row" role="group" aria-label="level by angles"><label>pitch <input id="edit-pitch" type="range" min="-45" max="45" step="0.1" value="0" title="Moves the horizon up and down"></label>
+<label>roll <input id="edit-roll" type="range" min="-45" max="45" step="0.1" value="0" title="Turns the horizon"></label>
+<span id="edit-tilts"></span>
+<button data-do="level-angles" title="Turn the scene so that the line is its horizon">level by the line</button></p>
 </div>
 <p class="row" data-for="color"><label>colour <input id="edit-color" type="color" value="#808080"></label>
 <label>tolerance <input id="edit-tolerance" type="range" min="1" max="128" value="24"></label>
@@ -46,14 +62,16 @@ const EDIT_PANEL = `
 <button data-do="hide" title="J: hide the selected splats">hide</button>
 <button data-do="show" title="Shift J: show hidden splats again">show</button>
 </p>
-<details><summary>by opacity and size</summary>
+${LOOK_ROW}
+${NEAR_PANEL}${HISTOGRAM_PANEL}
+<details><summary>by numbers of opacity and size</summary>
 <p class="row"><label>opacity from <input id="edit-opacity-low" type="number" min="0" max="1" step="0.01" value="0"></label>
 <label>to <input id="edit-opacity-high" type="number" min="0" max="1" step="0.01" value="0.1"></label>
 <button data-do="select-opacity">select</button></p>
 <p class="row"><label>size from <input id="edit-size-low" type="number" min="0" step="any"></label>
 <label>to <input id="edit-size-high" type="number" min="0" step="any"></label>
 <button data-do="select-size">select</button></p>
-</details>
+</details>${FLOATERS_PANEL}
 <p id="edit-count" role="status"></p>
 <p class="row">
 <button data-do="undo" title="U or Ctrl Z: undo">undo</button>
@@ -65,8 +83,11 @@ const EDIT_PANEL = `
 <p id="edit-message" role="alert"></p>
 <details id="edit-views"><summary></summary>
 <p class="row"><button data-do="start" title="The exported page opens in this view">start here</button>
-<label>name <input id="edit-name" maxlength="100"></label><button data-do="view">keep view</button></p>
-<ol></ol></details>
+<label>name <input id="edit-name" maxlength="100"></label></p>
+<label for="edit-text">text for the guided tour of the exported page (empty: no step)</label>
+<textarea id="edit-text" maxlength="2000" rows="2"></textarea>
+<p class="row"><button data-do="view" title="A view of the same name is replaced">keep view</button></p>
+<ol></ol>${TOUR_ROW}</details>
 <details id="edit-list"><summary></summary><ol></ol></details>
 <details id="edit-commands"><summary>commands</summary><p>The saved edits, applied:</p><pre tabindex="0"></pre>
 <p>Video of the camera path (preview: P):</p><pre tabindex="0"></pre></details>
@@ -76,11 +97,13 @@ const EDIT_HINTS = {
   navigate: "Drag turns the view. Choose a tool to select splats.",
   rectangle: "Drag a rectangle. Right drag and wheel still move the view; hold Space to turn it.",
   lasso: "Draw around what to select. Hold Space to turn the view.",
+  polygon: "Click corner after corner. Enter, or a click on the first corner, closes the polygon.",
   brush: "Paint over what to select. Hold Space to turn the view.",
-  sphere: "Drag from the centre on a surface, then select.",
-  box: "Drag the dots on the sides, or a new box from its centre.",
+  sphere: "Drag from the centre on a surface, or move the handle; then select.",
+  box: "Drag the handle, the dots on the sides, or a new box from its centre.",
+  move: "Select splats first. Then drag the handle: arrows move, rings turn.",
   color: "Click a colour in the picture, then select.",
-  floor: "Click three points of the floor, far apart.",
+  floor: "Click three points of the floor, far apart, or lay the line on the horizon.",
   scale: "Click two points whose distance you know.",
   measure: "Click two points.",
 };
@@ -90,9 +113,11 @@ const EDIT_KEYS = {
   v: "[data-tool=navigate]",
   t: "[data-tool=rectangle]",
   l: "[data-tool=lasso]",
+  "Shift+l": "[data-tool=polygon]",
   b: "[data-tool=brush]",
   o: "[data-tool=sphere]",
   x: "[data-tool=box]",
+  "Shift+v": "[data-tool=move]",
   g: "[data-tool=color]",
   z: "[data-tool=floor]",
   c: "[data-tool=scale]",
@@ -101,6 +126,11 @@ const EDIT_KEYS = {
   2: "[data-how=add]",
   3: "[data-how=subtract]",
   4: "[data-how=intersect]",
+  5: "[data-do=front]",
+  6: "[data-look=tint]",
+  7: "[data-look=centres]",
+  8: "[data-look=rings]",
+  9: "[data-look=outline]",
   0: "[data-do=all]",
   n: "[data-do=none]",
   i: "[data-do=invert]",
@@ -108,6 +138,8 @@ const EDIT_KEYS = {
   backspace: "[data-do=delete]",
   j: "[data-do=hide]",
   "Shift+j": "[data-do=show]",
+  ".": "[data-do=grow]",
+  ",": "[data-do=shrink]",
   u: "[data-do=undo]",
   y: "[data-do=redo]",
 };
@@ -116,6 +148,7 @@ const EDIT_KEYS = {
 const EDIT_APPLIES = {
   sphere: "select-shape",
   box: "select-shape",
+  move: "move",
   color: "select-color",
   scale: "scale",
   measure: "measure",
@@ -127,6 +160,9 @@ class EditPanel {
     document.body.insertAdjacentHTML("beforeend", EDIT_PANEL);
     this.root = element("edit");
     this.listKeys();
+    this.histogram = new EditHistogram(editor);
+    this.floaters = new EditFloaters(editor, this);
+    element("edit-near").value = proposedRadius(editor.values);
     this.numbers = { center: this.addNumbers("edit-center"), half: this.addNumbers("edit-half") };
     this.root.addEventListener("click", (event) => this.click(event.target.closest("button")));
     this.root.addEventListener("input", (event) => this.input(event.target));
@@ -152,6 +188,7 @@ class EditPanel {
       [, "Space", "held: drags turn the view"],
       [, "Escape", "drop what is drawn, then leave the tool"],
       [, "[ ]", "size of the brush"],
+      [, "Shift X", "choose a part of the handle, which the arrows then move; finer with Shift"],
     ];
     const heading = document.createElement("h2");
     heading.textContent = "Editor";
@@ -167,25 +204,19 @@ class EditPanel {
   }
 
   addNumbers(id) {
-    return ["x", "y", "z"].map((axis) => {
-      const label = document.createElement("label");
-      const input = document.createElement("input");
-      Object.assign(input, { type: "number", step: "any" });
-      label.append(`${axis} `, input);
-      element(id).append(label);
-      return input;
-    });
+    return numberFields(id);
   }
 
   click(button) {
     const { editor } = this;
     if (!button) return;
-    const { tool, how } = button.dataset;
+    const { tool, how, look } = button.dataset;
     if (tool) editor.tools.choose(tool);
     else if (how) editor.chooseHow(how);
+    else if (look) editor.look.choose(look);
     else if (button.dataset.do) this.act(button.dataset.do);
     // a disabled button loses the focus
-    if (button.disabled) [this.button("undo"), this.button("redo"), this.button("all")].find((one) => !one.disabled).focus();
+    if (button.disabled && document.activeElement !== editor.viewer.canvas) [this.button("undo"), this.button("redo"), this.button("all")].find((one) => !one.disabled).focus();
   }
 
   act(name) {
@@ -198,13 +229,25 @@ class EditPanel {
       delete: () => editor.perform({ op: "delete" }),
       hide: () => editor.perform({ op: "hide" }),
       show: () => editor.perform({ op: "show" }),
+      grow: () => editor.near("grow", values("edit-near")),
+      shrink: () => editor.near("shrink", values("edit-near")),
+      propose: () => this.floaters.propose(),
+      "stop-proposing": () => this.floaters.stop(),
+      "select-range": () => this.histogram.select(),
+      front: () => editor.chooseFront(!editor.frontOnly),
+      "close-polygon": () => editor.tools.polygon.close(editor.how),
+      "corner-back": () => editor.tools.polygon.back(),
       undo: () => editor.undo(),
       redo: () => editor.redo(),
       save: () => editor.store(),
       download: () => editor.download(),
       crop: () => editor.crop(),
+      move: () => editor.mover.perform(),
+      level: () => editor.leveller.level(),
+      "level-angles": () => editor.leveller.levelByAngles(),
       start: () => editor.startHere(),
-      view: () => editor.keepView(element("edit-name").value.trim()),
+      view: () => editor.keepView(element("edit-name").value.trim(), element("edit-text").value.trim()),
+      tour: () => editor.tour.guide.toggle(),
       scale: () => editor.setScale(values("edit-length"), element("edit-unit").value),
       measure: () => editor.keepMeasure(element("edit-note").value.trim()),
       "select-shape": () => editor.selectShape(),
@@ -218,7 +261,7 @@ class EditPanel {
   // Whether Enter applies something chosen before.
   get ready() {
     const { tool, shape, apart } = this.editor.tools;
-    return Boolean({ sphere: shape, box: shape, color: true, scale: apart, measure: apart }[tool]);
+    return Boolean({ sphere: shape, box: shape, move: this.editor.mover.moved, color: true, scale: apart, measure: apart }[tool]);
   }
 
   apply() {
@@ -233,16 +276,17 @@ class EditPanel {
       this.input(element("edit-radius"));
       return true;
     }
+    if (key === "Shift+x") return this.editor.tools.gizmo.chooseNext();
     const button = EDIT_KEYS[key] && this.root.querySelector(EDIT_KEYS[key]);
     button?.click();
     return Boolean(button);
   }
 
   typed(event) {
-    if (!event.target.matches("input, select")) return;
+    if (!event.target.matches("input, select, textarea")) return;
     event.stopPropagation();
     if (event.key === "Escape") event.target.blur();
-    if (event.key === "Enter" && event.target.type !== "color") this.apply();
+    if (event.key === "Enter" && event.target.matches("input:not([type=color]), select")) this.apply();
   }
 
   // Takes numbers of the shape that were typed.
@@ -277,6 +321,9 @@ class EditPanel {
     this.showCounts(history.counts());
     this.button("undo").disabled = !history.done.length;
     this.button("redo").disabled = !history.undone.length;
+    this.button("front").setAttribute("aria-pressed", this.editor.frontOnly);
+    this.button("close-polygon").disabled = !tools.polygon.canClose;
+    this.button("corner-back").disabled = !tools.polygon.corners.length;
     this.button("select-shape").disabled = this.button("crop").disabled = !tools.shape;
     this.button("scale").disabled = this.button("measure").disabled = tools.apart === null;
     this.showShape();
@@ -293,7 +340,7 @@ class EditPanel {
     const number = (value) => value.toLocaleString("en");
     const parts = [`${number(selected)} selected`, hidden && `${number(hidden)} hidden`, `${number(all - hidden - deleted)} of ${number(all)} left`];
     element("edit-count").textContent = parts.filter(Boolean).join(" · ");
-    for (const name of ["delete", "hide"]) this.button(name).disabled = !selected;
+    for (const name of ["delete", "hide", "grow", "shrink"]) this.button(name).disabled = !selected;
     this.button("show").disabled = !hidden;
   }
 
@@ -305,6 +352,8 @@ class EditPanel {
     this.numbers.center.forEach((input, i) => fill(input, shape?.center[i]));
     this.numbers.half.forEach((input, i) => fill(input, shape?.half?.[i]));
     fill(element("edit-sphere"), shape?.radius);
+    this.editor.tools.gizmo.panel.update();
+    this.editor.mover.update();
   }
 
   // Replaces the items of a list; the focus stays at its place in it.
@@ -334,14 +383,17 @@ class EditPanel {
       item.append(...parts);
       return item;
     };
+    const names = [...views.named.keys()];
     const rows = [...views.named.values()].map((view) =>
       row(
-        button(view.name, `go to ${view.name}`, () => editor.goTo(view)),
+        button(view.text ? `${view.name} · tour` : view.name, `go to ${view.name}`, () => this.show(view)),
+        ...editor.tour.buttons(view.name, names, button),
         button("×", `remove ${view.name}`, () => editor.perform({ op: "remove_view", name: view.name })),
       ),
     );
     if (views.start) rows.unshift(row(button("start", "go to the start view", () => editor.goTo(views.start))));
     this.fill("edit-views", rows);
+    editor.tour.follow(views);
     element("edit-views").querySelector("summary").textContent = `views (${rows.length})`;
     const operations = [...history.done, ...[...history.undone].reverse()];
     const items = operations.map((operation, i) =>
@@ -351,6 +403,13 @@ class EditPanel {
     items.forEach((item, i) => item.classList.toggle("undone", i > history.done.length));
     this.fill("edit-list", items);
     element("edit-list").querySelector("summary").textContent = `operations (${history.done.length})`;
+  }
+
+  // Goes to a named view, whose name and text can then be changed.
+  show(view) {
+    element("edit-name").value = view.name;
+    element("edit-text").value = view.text ?? "";
+    this.editor.goTo(view);
   }
 
   showColor(color) {
@@ -365,6 +424,8 @@ class EditPanel {
 function describeOperation(operation) {
   const { op, how, by, name, note } = operation;
   const verbs = { replace: "select", add: "add", subtract: "subtract", intersect: "intersect" };
+  if (op === "grow" || op === "shrink") return `${op} by ${shortNumber(operation.radius)}`;
+  if (by === "list") return `${verbs[how]}: ${operation.reason}`;
   if (op === "select") return by === "all" ? "select all" : `${verbs[how]} by ${by === "color" ? "colour" : by}`;
   if (op === "scale") {
     const apart = length3(plus(...operation.points, -1));
@@ -374,10 +435,12 @@ function describeOperation(operation) {
     deselect: "select none",
     invert: "invert",
     crop: "crop to box",
+    move: "move the selection",
     show: "show hidden",
     upright: "turn upright",
     start: "start view",
     view: `view ${name}`,
+    order_views: "order of the views",
     remove_view: `remove view ${name}`,
     path: operation.path ? `camera path of ${operation.path.keyframes.length} views` : "no camera path",
     measure: `distance${note ? `: ${note}` : ""}`,

@@ -104,6 +104,28 @@ function withSideMoved(box, { axis, side, direction }, by) {
   return { ...box, half, center: plus(box.center, direction, (side * step) / 2) };
 }
 
+// The side of a box whose dot a stroke begins on; null if there is none.
+function sideAt(box, { camera, began }, perPixel, near) {
+  const apart = ({ point }) => {
+    const { u, v, depth } = seenAt(camera, point);
+    return depth > near ? Math.hypot(u - began.u, v - began.v) / perPixel : Infinity;
+  };
+  const best = boxHandles(box).reduce((a, b) => (apart(a) <= apart(b) ? a : b));
+  return apart(best) < 2 * HANDLE ? best : null;
+}
+
+// The box of a stroke after one of its sides was dragged, by the pixels along the side's axis as it is seen; null along
+// the line of sight. `distance` is that of the view from its pivot.
+function sideDragged({ box, handle, camera, began, at }, distance) {
+  const step = 1e-3 * distance;
+  const [from, to] = [handle.point, plus(handle.point, handle.direction, step)].map((point) => seenAt(camera, point));
+  const axis = [to.u - from.u, to.v - from.v];
+  const square = axis[0] ** 2 + axis[1] ** 2;
+  if (square < 1e-9) return null;
+  const along = ((at.u - began.u) * axis[0] + (at.v - began.v) * axis[1]) / square;
+  return withSideMoved(box, handle, along * step);
+}
+
 // Three circles around a sphere, along the axes of the view.
 function sphereLines({ center, radius }, R) {
   const lines = [];

@@ -4,7 +4,7 @@
 const [SELECTED, HIDDEN, DELETED] = [1, 2, 4]; // at most one at a time; 0 is a splat that is merely there
 const UNDO_BYTES = 128 << 20; // changes remembered for undo; older operations are undone by repeating those before
 
-// Applies one operation to the states, in place. Throws an Error, before anything is changed, if the work is too much.
+// Applies one operation to the states, in place; returns what undoes a move of splats. Throws an Error, before anything is changed, if the work is too much.
 function applyOperation(operation, values, flags, work) {
   const change = (next) => {
     if (operation.op !== "crop") work.add(flags.length);
@@ -17,12 +17,18 @@ function applyOperation(operation, values, flags, work) {
       return change((flag) => (flag === SELECTED ? 0 : flag));
     case "invert":
       return change((flag) => (flag <= SELECTED ? flag ^ SELECTED : flag));
+    case "grow":
+    case "shrink":
+      return applyNear(operation, values, flags, work);
     case "delete":
       return change((flag) => (flag === SELECTED ? DELETED : flag));
     case "hide":
       return change((flag) => (flag === SELECTED ? HIDDEN : flag));
     case "show":
       return change((flag) => (flag === HIDDEN ? 0 : flag));
+    case "move":
+      work.add(flags.length);
+      return (values.motion ??= new Motion(values)).apply(operation, flags);
     case "crop": {
       work.add(flags.length);
       const inside = boxMembers(operation, values);
@@ -65,33 +71,34 @@ class EditHistory {
   step(operation) {
     const before = this.flags.slice();
     const { left } = this.work;
+    let moved;
     try {
-      applyOperation(operation, this.values, this.flags, this.work);
+      moved = applyOperation(operation, this.values, this.flags, this.work);
     } catch (error) {
       this.work.left = left;
       throw error;
     }
     this.tests.push(left - this.work.left);
     this.done.push(operation);
-    this.remember(before);
+    this.remember(before, moved);
   }
 
-  remember(before) {
+  remember(before, moved = null) {
     let count = 0;
     for (let i = 0; i < before.length; ++i) if (before[i] !== this.flags[i]) ++count;
-    const change = { at: new Uint32Array(count), was: new Uint8Array(count) };
+    const change = { at: new Uint32Array(count), was: new Uint8Array(count), moved, bytes: 5 * count + (moved?.bytes ?? 0) };
     for (let i = 0, j = 0; j < count; ++i) {
       if (before[i] === this.flags[i]) continue;
       change.at[j] = i;
       change.was[j++] = before[i];
     }
     this.changes.push(change);
-    this.bytes += 5 * count;
+    this.bytes += change.bytes;
     for (let i = 0; this.bytes > UNDO_BYTES && i < this.changes.length; ++i) this.forget(i);
   }
 
   forget(index) {
-    if (this.changes[index]) this.bytes -= 5 * this.changes[index].at.length;
+    if (this.changes[index]) this.bytes -= this.changes[index].bytes;
     this.changes[index] = null;
   }
 
@@ -103,10 +110,12 @@ class EditHistory {
     this.work.left += this.tests.pop();
     const change = this.changes.pop();
     if (change) {
-      this.bytes -= 5 * change.at.length;
+      this.bytes -= change.bytes;
+      if (change.moved) this.values.motion.undo(change.moved);
       for (let j = 0; j < change.at.length; ++j) this.flags[change.at[j]] = change.was[j];
     } else {
       this.flags.fill(0);
+      this.values.motion?.reset();
       for (const earlier of this.done) applyOperation(earlier, this.values, this.flags, new EditWork());
     }
     return operation;
@@ -137,9 +146,15 @@ class EditHistory {
       if (op === "upright" || op === "scale" || op === "start") found[op] = operation;
       else if (op === "path") found.path = operation.path;
       else if (op === "view") found.named.set(name, operation);
+      else if (op === "order_views") found.named = orderedViews(found.named, operation.names);
       else if (op === "remove_view") found.named.delete(name);
       else if (op === "measure") found.measures.push(operation);
     }
     return found;
   }
+}
+
+// The named views with some names first; names without a view have no effect, and views without a name here follow.
+function orderedViews(named, names) {
+  return new Map([...names.filter((name) => named.has(name)).map((name) => [name, named.get(name)]), ...named]);
 }

@@ -1,20 +1,22 @@
 // The editor's tools: what pointers and keys in the picture do.
 "use strict";
 
-const EDIT_TOOLS = ["navigate", "rectangle", "lasso", "brush", "sphere", "box", "color", "floor", "scale", "measure"];
+const LONG_FRONT = 50000; // splats from which the measure of a visible surface is announced
+const EDIT_TOOLS = ["navigate", "rectangle", "lasso", "polygon", "brush", "sphere", "box", "move", "color", "floor", "scale", "measure"];
 const POINTS_OF = { floor: 3, scale: 2, measure: 2 }; // points that a tool takes from the surface
 const LEAST_STEP = 2; // CSS pixels between the points of a stroke
 const LEAST_DRAG = 3; // CSS pixels; a shorter drag is a click
 const MOST_STROKE = 20000; // points of a stroke, as in an edits file
 const CLICKED_SIZE = 0.15; // of the distance to the pivot: radius of a sphere that was only clicked
-const CURSOR_STEP = 8; // CSS pixels per key; 1 with Shift
 
 const hundredths = (x) => Math.round(x * 100) / 100;
 
 class EditTools {
   constructor(editor) {
     Object.assign(this, { editor, viewer: editor.viewer, tool: "navigate", stroke: null, shape: null, points: [] });
-    this.hover = null; // where the brush would paint
+    this.gizmo = new Gizmo(this);
+    this.polygon = new EditPolygon(this);
+    this.hover = null; // where the brush would paint, or the polygon would go on
     this.cursor = null; // the keyboard's place in the picture, CSS pixels
     this.cursorMoved = false;
     this.space = false; // held: pointers navigate
@@ -34,16 +36,21 @@ class EditTools {
 
   choose(tool) {
     this.cancel();
-    this.tool = tool;
-    this.cursor = this.hover = null;
+    [this.tool, this.shape] = [tool, null];
+    this.cursor = this.hover = this.gizmo.chosen = null;
+    this.editor.leveller.reset();
+    if (tool === "move") this.editor.mover.begin();
     if (tool === "box") this.shape = boxAround(this.editor.values, this.editor.history.flags, this.viewer.view.up);
     this.editor.changed();
   }
 
   // Forgets what is being drawn; returns whether there was anything.
   cancel() {
-    const some = this.stroke || this.shape || this.points.length;
+    const isMove = this.tool === "move";
+    const drawn = this.polygon.drop() || this.stroke || (isMove ? this.editor.mover.moved : this.shape);
+    const some = drawn || this.points.length;
     [this.stroke, this.shape, this.points] = [null, null, []];
+    if (isMove) this.editor.mover.begin();
     this.editor.redraw();
     return Boolean(some);
   }
@@ -71,17 +78,23 @@ class EditTools {
     this.take(event);
     this.cursor = null;
     this.viewer.canvas.focus();
-    this.press(event.pointerId, event.clientX, event.clientY);
+    this.press(event.pointerId, event.clientX, event.clientY, event.pointerType);
   }
 
   move(event) {
     if (this.stroke?.id === event.pointerId) {
       this.take(event);
       this.drag(event.clientX, event.clientY);
-    } else if (this.tool === "brush" && event.target === this.viewer.canvas) {
+    } else if ((this.tool === "brush" || this.tool === "polygon") && event.target === this.viewer.canvas) {
       this.hover = this.pointOf(this.viewer.camera(), event.clientX, event.clientY);
       this.editor.redraw();
-    }
+    } else if (this.shape) this.gizmo.hovers(event);
+  }
+
+  // The handle or a number has changed the shape.
+  shapeMoved() {
+    if (this.tool === "move") this.editor.mover.preview(this.shape);
+    this.editor.panel.showShape();
   }
 
   up(event) {
@@ -100,7 +113,8 @@ class EditTools {
 
   // A second finger: both navigate, and what the first one drew is dropped.
   hand() {
-    const { id, at } = this.stroke;
+    const { id, at, grip } = this.stroke;
+    if (grip) this.gizmo.take(grip.shape);
     this.stroke = null;
     this.handed = true;
     const first = { pointerId: id, clientX: at.x, clientY: at.y, button: 0, shiftKey: false, preventDefault() {} };
@@ -115,12 +129,12 @@ class EditTools {
     return control ? "subtract" : this.editor.how;
   }
 
-  press(id, x, y) {
+  press(id, x, y, pointerType) {
     this.viewer.stop();
     const camera = this.viewer.camera();
     const at = this.pointOf(camera, x, y);
     this.stroke = { id, camera, began: at, at, points: [[at.u, at.v]] };
-    this[`${this.tool}Begins`]?.(this.stroke);
+    if (!this.gizmo.takes(this.stroke, pointerType)) this[`${this.tool}Begins`]?.(this.stroke);
     this.editor.redraw();
   }
 
@@ -132,14 +146,16 @@ class EditTools {
       stroke.points.push([stroke.at.u, stroke.at.v]);
       stroke.lastKept = stroke.at;
     }
-    this[`${this.tool}Drags`]?.(stroke);
+    if (stroke.grip) this.gizmo.drag(stroke);
+    else this[`${this.tool}Drags`]?.(stroke);
     this.editor.redraw();
   }
 
   release(how) {
     const { stroke } = this;
     this.stroke = null;
-    this[`${this.tool}Ends`]?.(stroke, how);
+    if (!stroke.grip) this[`${this.tool}Ends`]?.(stroke, how);
+    else if (this.tool === "move") this.editor.mover.perform();
     this.editor.changed();
   }
 
@@ -147,24 +163,38 @@ class EditTools {
     return Math.hypot(at.x - began.x, at.y - began.y) < LEAST_DRAG;
   }
 
-  select(how, region) {
-    this.editor.perform({ op: "select", how, ...region });
+  // Selects by a shape in the picture of a camera. Where it may take seconds to measure the visible surface, the panel
+  // says so first.
+  select(how, region, camera) {
+    const { editor } = this;
+    const perform = (front) => editor.perform({ op: "select", how, ...region, ...front });
+    if (!editor.frontOnly) return perform({});
+    if (editor.values.count < LONG_FRONT) return perform({ front: this.frontOf(region, camera) });
+    editor.say("Measuring the visible surface ...");
+    // after the browser has painted the line
+    return requestAnimationFrame(() => setTimeout(() => perform({ front: this.frontOf(region, camera) })));
+  }
+
+  frontOf(region, camera) {
+    const { settings, facts } = this.viewer;
+    const { values, history } = this.editor;
+    return frontOf(region, camera, { values, flags: history.flags, settings, near: facts.near }, this.perPixel);
   }
 
   rectangleEnds(stroke, how) {
     if (this.wasClick(stroke)) return;
     const { began: a, at: b } = stroke;
     const corners = [Math.min(a.u, b.u), Math.min(a.v, b.v), Math.max(a.u, b.u), Math.max(a.v, b.v)];
-    this.select(how, { by: "rectangle", camera: pictureOf(stroke.camera), corners });
+    this.select(how, { by: "rectangle", camera: pictureOf(stroke.camera), corners }, stroke.camera);
   }
 
   lassoEnds({ camera, points }, how) {
-    if (points.length > 2) this.select(how, { by: "lasso", camera: pictureOf(camera), points });
+    if (points.length > 2) this.select(how, { by: "lasso", camera: pictureOf(camera), points }, camera);
   }
 
   brushEnds({ camera, points }, how) {
     const radius = hundredths(this.editor.radius * this.perPixel);
-    this.select(how, { by: "brush", camera: pictureOf(camera), radius, points });
+    this.select(how, { by: "brush", camera: pictureOf(camera), radius, points }, camera);
   }
 
   // The surface at a point of the picture; null where there is none. Points to measure lie on the page's mesh, where it
@@ -199,15 +229,9 @@ class EditTools {
   }
 
   boxBegins(stroke) {
-    const near = (handle) => {
-      const { u, v, depth } = seenAt(stroke.camera, handle.point);
-      const apart = Math.hypot(u - stroke.at.u, v - stroke.at.v) / this.perPixel;
-      return depth > this.viewer.facts.near ? apart : Infinity;
-    };
-    const handles = this.shape ? boxHandles(this.shape) : [];
-    const best = handles.reduce((a, b) => (a && near(a) <= near(b) ? a : b), null);
-    if (best && near(best) < 2 * HANDLE) {
-      [stroke.handle, stroke.box] = [best, this.shape];
+    const side = this.shape && sideAt(this.shape, stroke, this.perPixel, this.viewer.facts.near);
+    if (side) {
+      [stroke.handle, stroke.box] = [side, this.shape];
       return;
     }
     stroke.found = this.surface(stroke);
@@ -217,17 +241,9 @@ class EditTools {
   }
 
   boxDrags(stroke) {
-    const { handle, found, began, at, camera } = stroke;
-    if (handle) {
-      // pixels along the side's axis as it is seen, in world units
-      const [a, b] = [handle.point, plus(handle.point, handle.direction, 1e-3 * this.viewer.view.distance)];
-      const [from, to] = [seenAt(camera, a), seenAt(camera, b)];
-      const axis = [to.u - from.u, to.v - from.v];
-      const square = axis[0] ** 2 + axis[1] ** 2;
-      if (square < 1e-9) return;
-      const along = ((at.u - began.u) * axis[0] + (at.v - began.v) * axis[1]) / square;
-      this.shape = withSideMoved(stroke.box, handle, along * 1e-3 * this.viewer.view.distance);
-    } else if (found && !this.wasClick(stroke)) {
+    const { found, began, at, camera } = stroke;
+    if (stroke.handle) this.shape = sideDragged(stroke, this.viewer.view.distance) ?? this.shape;
+    else if (found && !this.wasClick(stroke)) {
       const size = (Math.hypot(at.u - began.u, at.v - began.v) * found.depth) / camera.fx;
       this.shape.half = [size, size, size];
     }
@@ -274,6 +290,8 @@ class EditTools {
       overlay.lines(boxLines(shape));
       for (const { point } of boxHandles(shape)) overlay.dot(point);
     }
+    if (tool === "move" && shape) overlay.lines(boxLines(shape), "#ffd24a", true);
+    this.gizmo.draw(overlay);
     points.forEach((point, i) => overlay.dot(point, String(i + 1)));
     if (this.apart !== null) overlay.lines([points]);
     if (stroke && tool === "rectangle") {
@@ -282,6 +300,7 @@ class EditTools {
     }
     if (stroke && tool === "lasso") overlay.polyline([...stroke.points, [stroke.at.u, stroke.at.v]].map(([u, v]) => ({ u, v })), true);
     if (stroke && tool === "brush") overlay.band(stroke.points.map(([u, v]) => ({ u, v })), radius);
+    this.polygon.draw(overlay);
     if (tool === "brush" && (stroke?.at || this.hover)) overlay.circle(stroke?.at ?? this.hover, radius);
     if (this.cursor) {
       const at = this.pointOf(overlay.camera, this.cursor.x, this.cursor.y);
@@ -303,22 +322,27 @@ class EditTools {
       this.editor[undone]();
       return;
     }
+    if (key.startsWith("Arrow") && target.closest?.("#strip")) return; // they move a view, or the playhead
     const onButton = target.closest?.("button, summary, a");
     if (code === "Space" && !onButton) this.space = true;
-    else if (key.startsWith("Arrow") && this.tool !== "navigate" && !onButton) this.moveCursor(event);
+    else if (key.startsWith("Arrow") && this.tool !== "navigate" && (!onButton || this.gizmo.chosen)) this.moveCursor(event);
     else if (key === "Enter" && !onButton && this.tool !== "navigate") this.enter(event);
     else if (key === "Escape") this.escape();
+    else if (key === "Backspace" && this.polygon.back()) this.cursorMoved = true;
     else if (!this.editor.panel.pressKey(event.shiftKey ? `Shift+${key.toLowerCase()}` : key.toLowerCase())) return;
     this.take(event);
   }
 
   escape() {
+    if (this.viewer.guide.on) return this.viewer.dismiss();
     if (!this.cancel() && !this.cursor) this.choose("navigate");
     this.cursor = null;
-    this.editor.changed();
+    return this.editor.changed();
   }
 
-  moveCursor({ key, shiftKey }) {
+  moveCursor(event) {
+    if (this.gizmo.step(event)) return;
+    const { key, shiftKey } = event;
     const { left, top, width, height } = this.viewer.canvas.getBoundingClientRect();
     const step = shiftKey ? 1 : CURSOR_STEP;
     const [dx, dy] = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key];
@@ -332,6 +356,7 @@ class EditTools {
 
   // Presses at the cursor, releases, or applies what was chosen.
   enter(event) {
+    if (this.polygon.enter(event)) return;
     if (this.stroke) {
       this.cursorMoved = false;
       this.release(this.howOf(event));

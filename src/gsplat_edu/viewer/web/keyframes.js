@@ -5,8 +5,10 @@ class Keyframes {
   // actions: view() for the current camera, goToView(camera), playPath() to start or stop, pathChanged().
   constructor(facts, actions) {
     Object.assign(this, { facts, actions });
-    const { loop, duration = null, keyframes } = facts.path ?? { loop: false, keyframes: [] };
-    this.path = { loop, duration, keyframes: keyframes.map(readKeyframe) };
+    const { loop, duration = null, ease = null, keyframes } = facts.path ?? { loop: false, keyframes: [] };
+    // a visitor removes none of the author's views
+    this.path = { loop, duration, ease, keyframes: keyframes.map((entry) => ({ ...readKeyframe(entry), given: Boolean(facts.shared) })) };
+    this.timeline = new Timeline(this);
     element("save-view").addEventListener("click", () => this.save());
     element("play").addEventListener("click", () => actions.playPath());
     element("download-path").addEventListener("click", () => this.download());
@@ -17,35 +19,50 @@ class Keyframes {
   // Appends the current view. On a path with times, it follows after the mean time between the others.
   save() {
     const { keyframes } = this.path;
-    const { R, eye, H, fy } = this.actions.view();
-    const view = { R, eye, fov: (2 * Math.atan((0.5 * H) / fy) * 180) / Math.PI };
+    const view = this.current();
     const [first, last] = [keyframes[0], keyframes[keyframes.length - 1]];
-    if (last?.time !== undefined) view.time = last.time + (last.time - first.time) / (keyframes.length - 1);
+    if (last?.time !== undefined) view.time = last.time + restOf(last) + (last.time - first.time) / (keyframes.length - 1);
     this.edited({ keyframes: [...keyframes, view] });
     element("path").open = true;
+  }
+
+  // The current view as a keyframe without a time.
+  current() {
+    const { R, eye, H, fy } = this.actions.view();
+    return { R, eye, fov: (2 * Math.atan((0.5 * H) / fy) * 180) / Math.PI };
   }
 
   remove(index) {
     const kept = this.path.keyframes.filter((_, i) => i !== index);
     // one keyframe has no time between it and another
-    this.edited({ keyframes: kept.length > 1 ? kept : kept.map(({ R, eye, fov }) => ({ R, eye, fov })) });
+    this.edited({ keyframes: kept.length > 1 ? kept : kept.map(({ time, hold, ...view }) => view) });
     // the button is gone; the next one gets the keyboard's focus
     const buttons = element("path").querySelectorAll("li button:last-child");
     (buttons[Math.min(index, buttons.length - 1)] ?? element("save-view")).focus();
   }
 
-  // After a change, a path lasts as long as its keyframes' times say, or as usual; a loop with times needs time for the
-  // way back.
   edited(changes) {
-    this.path = { ...this.path, ...changes, duration: null };
-    const { loop, keyframes } = this.path;
-    const [first, last] = [keyframes[0], keyframes[keyframes.length - 1]];
-    if (loop && last?.time !== undefined) {
-      const span = last.time - first.time;
-      this.path.duration = span + span / (keyframes.length - 1);
-    }
+    this.set(this.grown(changes));
+  }
+
+  set(path) {
+    this.path = path;
     this.actions.pathChanged();
     this.list();
+  }
+
+  // The path after a change of its number of segments. It lasts as long as its keyframes' times say, or as long per
+  // segment as before; a loop with times needs time for the way back.
+  grown(changes) {
+    const path = { ...this.path, ...changes, duration: null };
+    const { loop, keyframes } = path;
+    const [first, last] = [keyframes[0], keyframes[keyframes.length - 1]];
+    const segments = (of) => of.keyframes.length - (of.loop ? 0 : 1);
+    if (last?.time === undefined) {
+      const pace = this.path.keyframes[0]?.time === undefined && segments(this.path) > 0 ? this.path.duration / segments(this.path) : 0;
+      path.duration = pace * segments(path) || null;
+    } else if (loop) path.duration = last.time + restOf(last) - first.time + (last.time - first.time) / (keyframes.length - 1);
+    return path;
   }
 
   get playable() {
@@ -65,17 +82,19 @@ class Keyframes {
 
   // The content of the file that `gsplat-edu render --path` reads, in the coordinates of the scene's file.
   document() {
-    const { loop, duration, keyframes } = this.path;
+    const { loop, duration, ease, keyframes } = this.path;
     return {
       format: "gsplat_edu path",
       version: 1,
       loop,
+      ...(ease ? { ease } : {}),
       ...(duration === null ? {} : { duration }),
-      keyframes: keyframes.map(({ R, eye, fov, time }) => ({
+      keyframes: keyframes.map(({ R, eye, fov, time, hold }) => ({
         position: plus(eye, this.facts.origin),
         rotation: transposed(R),
         fov,
         ...(time === undefined ? {} : { time }),
+        ...(hold ? { hold } : {}),
       })),
     };
   }
@@ -105,10 +124,11 @@ class Keyframes {
       const item = document.createElement("li");
       const goTo = () => this.actions.goToView(this.camera(keyframe));
       item.append(button(`view ${i + 1}`, `go to view ${i + 1}`, goTo));
-      item.append(button("×", `remove view ${i + 1}`, () => this.remove(i)));
+      if (!keyframe.given) item.append(button("×", `remove view ${i + 1}`, () => this.remove(i)));
       return item;
     });
     element("path").querySelector("ol").replaceChildren(...items);
+    this.timeline.changed();
   }
 
   playing(on) {
@@ -116,8 +136,6 @@ class Keyframes {
   }
 }
 
-const transposed = (rows) => [0, 1, 2].map((i) => rows.map((row) => row[i]));
-
-function readKeyframe({ position, rotation, fov, time }) {
-  return { eye: position, R: transposed(rotation), fov, time };
+function readKeyframe({ position, rotation, fov, time, hold }) {
+  return { eye: position, R: transposed(rotation), fov, time, hold };
 }

@@ -25,6 +25,10 @@ function unframed(buffer) {
   return { header, splats: arraysIn(buffer, 4 + length, header) };
 }
 
+// In the studio, the screen around the page has the one counter, clock and curves, and the buttons.
+const INSIDE = window.parent !== window;
+if (INSIDE) document.documentElement.classList.add("inside");
+
 class Live {
   constructor(viewer, { step }) {
     Object.assign(this, { viewer, state: null, over: false, wake: () => {} });
@@ -75,12 +79,15 @@ class Live {
     let [version, failures] = [-1, 0];
     while (failures < TRIES) {
       try {
-        const answer = await fetch(`state?after=${version}`);
+        const answer = await fetch(`state?after=${version}&quiet=1`);
         if (!answer.ok) throw new Error(answer.statusText);
-        failures = 0;
-        if (answer.status === 204) continue;
+        if (answer.status === 204) {
+          failures = 0;
+          continue;
+        }
         const state = await answer.json();
-        version = state.version;
+        if (state.error) throw new Error(state.error);
+        [version, failures] = [state.version, 0];
         this.show(state);
       } catch {
         ++failures;
@@ -132,9 +139,10 @@ class Live {
     say("Waiting for the first splats ...");
     while (!this.over) {
       await this.visible();
-      const answer = await fetch(`scene?after=${iteration}`).catch(() => null);
-      if (!answer?.ok || answer.status === 204) {
-        if (!answer?.ok) await this.rest(TRY_EVERY);
+      const answer = await fetch(`scene?after=${iteration}&quiet=1`).catch(() => null);
+      const refused = !answer?.ok || answer.headers.get("content-type")?.startsWith("application/json");
+      if (refused || answer.status === 204) {
+        if (refused) await this.rest(TRY_EVERY);
         continue;
       }
       const began = performance.now();
@@ -145,7 +153,7 @@ class Live {
       await this.viewer.renderer.drawn();
       iteration = header.iteration;
       say("");
-      element("count").textContent += ` after ${whole(iteration)} iterations`;
+      if (!INSIDE) element("count").textContent += ` after ${whole(iteration)} iterations`;
       const spent = performance.now() - began;
       await this.rest(Math.min(LONGEST_REST, Math.max(SHORTEST_REST, REST_FACTOR * spent)));
     }

@@ -19,6 +19,7 @@ class Viewer {
     this.exact = null; // the camera given to setCamera, until the user moves
     this.lost = false;
     this.meshes = null; // beside the splats
+    this.seen = this.compare = this.guide = null; // see seen.js, compare.js and guide.js
     this.pace = new Pace();
     this.movedAt = -Infinity;
     this.gauged = false;
@@ -30,8 +31,10 @@ class Viewer {
     this.smoothed = 0; // seconds per frame
     const actions = this.actions();
     this.panel = new Panel(facts, actions);
+    this.frustums = new Frustums(this);
     this.keyframes = new Keyframes(facts, actions);
     this.journey = null; // the curve and the time it began, while the camera path is played
+    this.flight = null; // to a camera, with its index, while the view moves there
     this.controls = new Controls(this.canvas, this.view, actions, facts.cameras.length);
     this.panel.mark(this.cameraIndex);
     this.levels?.attach(this.renderer, this.sorter);
@@ -63,6 +66,11 @@ class Viewer {
       saveView: () => this.keyframes.save(),
       playPath: () => (this.journey ? this.stop() : this.play()),
       pathChanged: () => this.stop(),
+      guide: () => this.guide?.toggle(),
+      compare: () => this.compare?.toggle(),
+      seen: () => this.seen?.toggle(),
+      slide: (by) => this.compare?.slide(by),
+      dismiss: () => this.dismiss(),
       degree: (degree) => {
         this.settings.sh_degree = degree;
         this.refresh();
@@ -74,7 +82,8 @@ class Viewer {
   camera() {
     if (this.exact) return this.exact;
     const side = (length) => Math.max(1, Math.round(length * (window.devicePixelRatio || 1)));
-    return fitted(this.view.camera, side(this.canvas.clientWidth), side(this.canvas.clientHeight));
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map(side);
+    return fitted(this.view.camera, width, height, Math.round(this.panel.covered() * (window.devicePixelRatio || 1)));
   }
 
   // For programs: draws with exactly this camera, regardless of the window's size, and returns float32 RGB with the
@@ -155,35 +164,69 @@ class Viewer {
   }
 
   goTo(index) {
-    this.view.goTo(this.facts.cameras[index]);
+    this.arrive(this.facts.cameras[index], index);
+  }
+
+  // index: the camera's in the page's list, or -1.
+  arrive(camera, index) {
+    this.view.goTo(camera);
     this.moved(index);
   }
 
-  // Goes to the next or previous camera; to the first or last one if the view is at none.
+  // Moves the view to a camera; at once if the visitor prefers less motion.
+  flyTo(camera, index) {
+    if (STILL_PREFERRED.matches) return this.arrive(camera, index);
+    const flight = new Flight(this.view.camera, camera);
+    this.moved(-1);
+    this.flight = { flight, index };
+    return undefined;
+  }
+
+  // Moves the view to where the flight is now.
+  soar(now) {
+    const { flight, index } = this.flight;
+    const camera = flight.camera(now);
+    if (!camera) return this.arrive(flight.to, index);
+    this.view.goTo(camera);
+    return this.askFrame();
+  }
+
+  // Ends the tour, or the comparison with photos.
+  dismiss() {
+    this.guide?.close();
+    if (this.compare?.on) this.compare.toggle();
+  }
+
+  // Goes to the next or previous step of the tour, photo of the comparison, or camera; to the first or last one if the
+  // view is at none.
   step(by) {
+    if (this.guide?.on) return this.guide.step(by);
+    if (this.compare?.on) return this.compare.step(by);
     const { length } = this.facts.cameras;
     const from = this.cameraIndex < 0 && by < 0 ? 0 : this.cameraIndex;
     if (length) this.goTo((from + by + length) % length);
+    return undefined;
   }
 
-  // Plays the camera path from its beginning until its end, in a loop forever, or until the user moves.
+  // Plays the camera path from the playhead until its end, in a loop forever, or until the user moves.
   play() {
     if (!this.keyframes.playable) return;
     this.moved(-1);
-    this.journey = { curve: this.keyframes.curve(), began: null };
+    this.journey = { curve: this.keyframes.curve(), from: this.keyframes.timeline.from, began: null };
     this.keyframes.playing(true);
   }
 
   stop() {
     if (this.journey) this.keyframes.playing(false);
-    this.journey = null;
+    this.journey = this.flight = null;
   }
 
   // Moves the view to where the journey is now.
   follow(now) {
-    const { curve, began } = this.journey;
+    const { curve, from, began } = this.journey;
     if (began === null) this.journey.began = now;
-    const seconds = (now - this.journey.began) / 1000;
+    const seconds = from + (now - this.journey.began) / 1000;
+    this.keyframes.timeline.reached(seconds);
     this.view.goTo(this.keyframes.camera(curve.pose(seconds)));
     if (!curve.loop && seconds >= curve.seconds) this.stop();
     this.askFrame();
@@ -195,6 +238,7 @@ class Viewer {
     this.movedAt = performance.now();
     this.cameraIndex = cameraIndex;
     this.panel.mark(cameraIndex);
+    this.compare?.mark(cameraIndex);
     this.askFrame();
   }
 
@@ -213,6 +257,7 @@ class Viewer {
     const seconds = this.lastFrame ? (now - this.lastFrame) / 1000 : 0;
     if (this.controls.advance(Math.min(seconds, LONGEST_STEP))) this.moved(-1);
     if (this.journey) this.follow(now);
+    if (this.flight) this.soar(now);
     const camera = this.camera();
     this.levels?.load(camera).catch((error) => this.levels.fail(error));
     this.isWhole = false;
@@ -243,6 +288,9 @@ class Viewer {
     if (this.canvas.height !== camera.H) this.canvas.height = camera.H;
     this.renderer.show();
     this.meshes?.show(camera);
+    this.compare?.place();
+    this.frustums.place(camera);
+    element("poster")?.remove();
   }
 
   // Shows the picture again, after a change of what lies over the splats.
@@ -286,7 +334,7 @@ class Viewer {
   }
 
   isMoving() {
-    return this.journey !== null || this.controls.held.size > 0 || performance.now() - this.movedAt < STILL;
+    return this.journey !== null || this.flight !== null || this.controls.held.size > 0 || performance.now() - this.movedAt < STILL;
   }
 
   async drawCoarse() {
@@ -374,6 +422,9 @@ async function start() {
   const splats = FACTS.lod ? null : await unpackSplats(FACTS);
   const viewer = splats ? new Viewer(FACTS, splats) : streamed(FACTS);
   if (FACTS.meshes) viewer.meshes = await Meshes.open(viewer);
+  if (FACTS.seen) viewer.seen = await Seen.open(viewer);
+  if (FACTS.photos) viewer.compare = await Compare.open(viewer);
+  viewer.guide = Guide.of(viewer);
   if (viewer.levels) await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
   else {
     await viewer.gauge();

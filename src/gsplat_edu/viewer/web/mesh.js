@@ -166,6 +166,7 @@ class Meshes {
     Object.assign(this, { viewer, gl, program: linked(gl, "mesh"), surface, collider });
     this.buffers = [surface, collider].map((mesh, i) => mesh && new MeshBuffers(gl, mesh, images[i]));
     [this.below, this.above] = [new Layer(gl), new Layer(gl)]; // the surface, and the collider over everything
+    this.placed = { R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], t: [0, 0, 0] }; // where edits have moved the whole scene
     this.style = "surface"; // or "edges" on it, or "wireframe"
     this.showsCollider = collider !== null;
     this.share = viewer.facts.edit ? 1 : 0.5; // of the picture's width, from the left, that shows the splats
@@ -178,6 +179,7 @@ class Meshes {
     const count = this.surface.faces.length / 3;
     element("mesh-count").textContent = `${count.toLocaleString("en")} triangles`;
     for (const id of ["mesh", "mesh-line", "mesh-help"]) element(id).hidden = false;
+    element("mesh-stays").hidden = !this.surface.stays;
     collider.parentElement.hidden = !this.collider;
     collider.checked = this.showsCollider;
     range.addEventListener("input", () => this.split(Number(range.value) / 100));
@@ -202,6 +204,12 @@ class Meshes {
       this.split((event.clientX - left) / width);
     });
     this.split(this.share);
+  }
+
+  // For the editor: the whole scene was moved by {R, t}; stays: some splats were moved without the others.
+  place({ R, t }, stays) {
+    this.placed = { R, t };
+    element("mesh-stays").hidden = !stays;
   }
 
   // Moves the line.
@@ -230,7 +238,9 @@ class Meshes {
   depthAt({ R, eye, fx, fy, cx, cy }, u, v) {
     const ray = [(u - cx) / fx, (v - cy) / fy, 1];
     const direction = [0, 1, 2].map((axis) => R[0][axis] * ray[0] + R[1][axis] * ray[1] + R[2][axis] * ray[2]);
-    const depth = rayMeets(this.surface, eye, direction, this.viewer.facts.near);
+    const { R: turn, t } = this.placed;
+    const back = (v) => [0, 1, 2].map((i) => turn[0][i] * v[0] + turn[1][i] * v[1] + turn[2][i] * v[2]);
+    const depth = rayMeets(this.surface, back(plus(eye, t, -1)), back(direction), this.viewer.facts.near);
     return depth < Infinity ? depth : null;
   }
 
@@ -260,7 +270,7 @@ class Meshes {
     const [surface, collider] = this.buffers;
     const { R, eye, fx, fy, cx, cy, W, H } = camera;
     const { background } = this.viewer.settings;
-    const key = JSON.stringify([R, eye, fx, fy, cx, cy, W, H, background, this.style]);
+    const key = JSON.stringify([R, eye, fx, fy, cx, cy, W, H, background, this.style, this.placed]);
     if (this.below.key !== key && this.share < 1) {
       this.begin(this.below, camera);
       this.below.fill([...background, 1], () => this.drawSurface(surface, background));
@@ -278,6 +288,8 @@ class Meshes {
     const place = (name) => gl.getUniformLocation(program, name);
     layer.resize(camera.W, camera.H);
     gl.useProgram(program);
+    gl.uniformMatrix3fv(place("turn"), true, this.placed.R.flat());
+    gl.uniform3fv(place("shift"), this.placed.t);
     gl.uniformMatrix3fv(place("R"), true, camera.R.flat());
     gl.uniform3fv(place("eye"), camera.eye);
     gl.uniform2f(place("focal"), camera.fx, camera.fy);

@@ -3,6 +3,8 @@
 
 precision highp float;
 
+uniform mat3 turn;  // of the mesh, with the scene
+uniform vec3 shift;
 uniform mat3 R;
 uniform vec3 eye;
 uniform vec2 focal;
@@ -19,7 +21,7 @@ out vec3 paint;
 out vec2 place;
 
 void main() {
-    seen = R * (position - eye);
+    seen = R * (turn * position + shift - eye);
     vec2 pixel = focal * seen.xy + (middle + 0.5) * seen.z;  // from the top left corner of the image, times depth
     vec2 ndc = 2.0 * pixel / size - seen.z;
     gl_Position = vec4(ndc.x, -ndc.y, seen.z - 2.0 * near, seen.z);

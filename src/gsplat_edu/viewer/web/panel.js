@@ -5,13 +5,6 @@ const POINT_SHOWN = 800; // milliseconds
 
 const SMALL = "(max-width: 600px) and (orientation: portrait)"; // as in style.css
 
-const element = (id) => document.getElementById(id);
-
-function say(text) {
-  element("message").textContent = text;
-  element("message").hidden = !text;
-}
-
 class Panel {
   // actions: fly(), reset(), goTo(index), degree(value).
   constructor(facts, actions) {
@@ -31,6 +24,14 @@ class Panel {
   fold(away) {
     element("tools").hidden = away;
     element("fold").setAttribute("aria-expanded", !away);
+  }
+
+  // How much of the window the closed panel covers at the top, CSS px: on a phone it is as wide as the window.
+  covered() {
+    if (!matchMedia(SMALL).matches) return 0;
+    const { top, width } = element("panel").getBoundingClientRect();
+    const { bottom } = element("count").parentElement.getBoundingClientRect();
+    return width ? bottom + 2 * top : 0; // with as much space inside and below as above it
   }
 
   counted(count) {
@@ -58,10 +59,9 @@ class Panel {
     });
   }
 
+  // The views that the author named, and those of the photos.
   fillCameras(actions) {
-    const { cameras } = this.facts;
-    element("cameras").hidden = cameras.length === 0;
-    element("cameras").querySelector("summary").textContent = `cameras (${cameras.length})`;
+    const { cameras, shared } = this.facts;
     this.buttons = cameras.map(({ name, held_out }, index) => {
       const button = document.createElement("button");
       button.textContent = name;
@@ -74,12 +74,20 @@ class Panel {
       button.addEventListener("click", () => actions.goTo(index));
       return button;
     });
-    const items = this.buttons.map((button) => {
+    this.listed("views", "views", this.buttons.filter((_, i) => cameras[i].saved));
+    this.listed("cameras", shared ? "photos" : "cameras", this.buttons.filter((_, i) => !cameras[i].saved));
+  }
+
+  // Fills a list that can be closed.
+  listed(id, title, buttons) {
+    element(id).hidden = buttons.length === 0;
+    element(id).querySelector("summary").textContent = `${title} (${buttons.length})`;
+    const items = buttons.map((button) => {
       const item = document.createElement("li");
       item.append(button);
       return item;
     });
-    element("cameras").querySelector("ol").append(...items);
+    element(id).querySelector("ol").append(...items);
   }
 
   // Highlights the current camera; none once the view has moved away from it.

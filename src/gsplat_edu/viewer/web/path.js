@@ -6,7 +6,6 @@ const SAME = 1e-9; // fraction of the length below which consecutive keyframes c
 const SEGMENT_SECONDS = 2; // from one keyframe to the next, on average, without times and duration
 
 const norm = (vector) => Math.hypot(...vector);
-const radians = (degrees) => (degrees * Math.PI) / 180;
 
 // The unit quaternion (w, x, y, z) of the rotation from camera to world, whose columns are the rows of R. The largest
 // component comes from the diagonal, the others from sums and differences across it.
@@ -61,7 +60,8 @@ function mixedStates(a, b, share) {
 
 // Interpolates a non-decreasing table by cubics that do not decrease either and whose slope is continuous.
 class Monotone {
-  constructor(x, y, loop) {
+  // ease: "ends" makes the slope zero at both ends, "views" in each row.
+  constructor(x, y, loop, ease = null) {
     const h = x.slice(1).map((value, i) => value - x[i]);
     const secants = h.map((step, i) => (y[i + 1] - y[i]) / step);
     const last = h.length - 1;
@@ -72,7 +72,9 @@ class Monotone {
     };
     const inner = h.slice(1).map((_, i) => mean(i, i + 1));
     const ends = loop ? [mean(last, 0), mean(last, 0)] : [secants[0], secants[last]];
-    Object.assign(this, { x, y, h, slopes: [ends[0], ...inner, ends[1]] });
+    const slopes = [ends[0], ...inner, ends[1]];
+    const stops = (i) => ease === "views" || (ease === "ends" && (i === 0 || i === h.length));
+    Object.assign(this, { x, y, h, slopes: slopes.map((slope, i) => (stops(i) ? 0 : slope)) });
   }
 
   at(value) {
@@ -102,13 +104,14 @@ function sums(steps) {
 }
 
 class PathCurve {
-  // path: {loop, duration or null, keyframes: [{eye, R, fov, time or undefined}]}, at least two keyframes.
-  constructor({ loop, duration, keyframes }) {
+  // path: {loop, duration or null, ease: "ends", "views" or none, keyframes: [{eye, R, fov, time, hold}]}, at least two
+  // keyframes; time and hold may be undefined.
+  constructor({ loop, duration, ease, keyframes }) {
     const timed = keyframes[0].time !== undefined;
     const times = timed ? keyframes.map(({ time }) => time - keyframes[0].time) : [];
     const segments = keyframes.length - (loop ? 0 : 1);
     this.loop = loop;
-    this.seconds = duration ?? (timed ? times[times.length - 1] : SEGMENT_SECONDS * segments);
+    this.seconds = duration ?? (timed ? times.at(-1) + (keyframes.at(-1).hold ?? 0) : SEGMENT_SECONDS * segments);
     const states = statesOf(loop ? [...keyframes, keyframes[0]] : keyframes);
     this.chooseRadius(states);
     const steps = states.slice(1).map((state, i) => this.distance(states[i], state));
@@ -116,10 +119,20 @@ class PathCurve {
     this.nodes = states.filter((_, i) => i === 0 || steps[i - 1] > least);
     this.knots = sums(steps.filter((step) => step > least).map(Math.sqrt));
     this.measure();
-    if (!timed) return;
     const nodeOf = sums(steps.map((step) => (step > least ? 1 : 0)));
-    const places = nodeOf.map((node) => this.lengths[CHORDS * node]);
-    this.places = new Monotone(loop ? [...times, this.seconds] : times, places, loop);
+    this.stops = keyframes.map((_, i) => this.lengths[CHORDS * nodeOf[i]]); // the distance at which each is met
+    if (timed) this.places = this.timed(times, keyframes, ease);
+    else if (ease && this.length > 0) {
+      const lengths = this.lengths.filter((_, i) => i % CHORDS === 0);
+      this.places = new Monotone(lengths.map((length) => this.seconds * (length / this.length)), lengths, loop, ease);
+    }
+  }
+
+  // The distance covered over time, with keyframes at given times; a rest has two rows.
+  timed(times, keyframes, ease) {
+    const rows = times.flatMap((time, i) => [0, ...(keyframes[i].hold ? [keyframes[i].hold] : [])].map((after) => [time + after, this.stops[i]]));
+    if (this.loop) rows.push([this.seconds, this.length]);
+    return new Monotone(rows.map(([time]) => time), rows.map(([, place]) => place), this.loop, ease);
   }
 
   // World units per radian: L / max(A, 2 pi) on a path of length L that turns by A.

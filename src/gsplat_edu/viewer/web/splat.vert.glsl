@@ -18,6 +18,19 @@ uniform float thinning;          // of a sample of the splats, see sort_worker.j
 #ifdef EDITING
 uniform highp usampler2D flags;  // 0, 1: selected; above: hidden or deleted
 uniform vec3 highlight;          // colour of selected splats
+uniform highp usampler2D turned; // which rotation a moved splat has; 0 for none
+uniform highp sampler2D turns;   // rows of the rotations, three texels each
+uniform int turns_across;        // rotations in a row of that texture; 0 if no splat has one
+uniform bool moving;             // whether the selected splats are being moved:
+uniform mat3 moving_turn;        // turned about one point, which goes to another one
+uniform vec3 moving_from;
+uniform vec3 moving_to;
+uniform float highlight_share;   // of it in their colour
+#endif
+#ifdef SEEN
+uniform highp usampler2D photos_seen;  // number of photos that saw a splat
+uniform uint fewest;             // splats that fewer photos saw are tinted, the others grey; 0 for neither
+uniform vec3 tint;
 #endif
 uniform int texture_width;
 uniform int coefficients;  // stored per splat
@@ -30,6 +43,7 @@ uniform vec2 middle;
 uniform vec2 size;
 uniform vec2 ratio_low;  // bounds of x/z and y/z in the Jacobian
 uniform vec2 ratio_high;
+uniform vec2 widest;     // largest |x/z| and |y/z| of a mean that is drawn
 uniform bool antialiased;
 uniform float farthest;  // largest camera depth that is drawn
 
@@ -74,6 +88,17 @@ vec3 color(int splat, vec3 d) {
     return sum + C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(splat, 12);
 }
 
+#ifdef EDITING
+// The rotation of a splat since the scene was opened.
+mat3 turn_of(ivec2 place) {
+    if (turns_across == 0) return mat3(1.0);
+    int index = int(texelFetch(turned, place, 0).r);
+    ivec2 at = ivec2(3 * (index % turns_across), index / turns_across);
+    return transpose(mat3(texelFetch(turns, at, 0).xyz, texelFetch(turns, at + ivec2(1, 0), 0).xyz,
+                          texelFetch(turns, at + ivec2(2, 0), 0).xyz));
+}
+#endif
+
 // By how much a splat of a sample is enlarged, to cover for others; a little less than they covered, as these overlap.
 float enlarged(vec3 scales, float logit) {
     float area = scales.x * scales.y * scales.z / min(scales.x, min(scales.y, scales.z));
@@ -98,14 +123,26 @@ void main() {
     uint flag = texelFetch(flags, place, 0).r;
     if (flag > 1u) return;
 #endif
-    vec3 offset = texelFetch(means, place, 0).xyz - eye;
+    vec3 mean = texelFetch(means, place, 0).xyz;
+#ifdef EDITING
+    mat3 turn = turn_of(place);
+    if (moving && flag == 1u) {
+        mean = moving_turn * (mean - moving_from) + moving_to;
+        turn = moving_turn * turn;
+    }
+#endif
+    vec3 offset = mean - eye;
     vec3 p = R * offset;
     if (!(p.z > Z_NEAR && p.z <= farthest)) return;
+    if (any(greaterThan(abs(p.xy), widest * p.z))) return;
 
     vec4 q = vec4(texelFetch(quats, place, 0));
     float length2 = dot(q, q);
     if (length2 == 0.0) return;
     mat3 RS = rotation(q / sqrt(length2));
+#ifdef EDITING
+    RS = turn * RS;
+#endif
     vec3 scales = exp(texelFetch(log_scales, place, 0).xyz);
     if (thinning > 0.0) scales *= enlarged(scales, texelFetch(logit_opacities, place, 0).r);
     RS[0] *= scales.x, RS[1] *= scales.y, RS[2] *= scales.z;
@@ -129,11 +166,21 @@ void main() {
     vec2 half_box = sqrt(level * vec2(a, c));
     if (any(lessThan(mean2d + half_box, vec2(-1.0))) || any(greaterThan(mean2d - half_box, size))) return;
 
-    vec3 seen = color(splat, offset / sqrt(dot(offset, offset)));
+    vec3 direction = offset / sqrt(dot(offset, offset));
+#ifdef EDITING
+    direction = direction * turn;  // seen from the splat, whose harmonics turn with it
+#endif
+    vec3 seen = color(splat, direction);
     if (!(all(lessThanEqual(abs(seen), vec3(COLOR_LIMIT))))) return;
     paint = vec4(max(seen, 0.0), opacity);
 #ifdef EDITING
-    if (flag == 1u) paint.rgb = mix(paint.rgb, highlight, 0.6);
+    if (flag == 1u) paint.rgb = mix(paint.rgb, highlight, highlight_share);
+#endif
+#ifdef SEEN
+    if (fewest > 0u) {
+        float grey = dot(paint.rgb, vec3(0.299, 0.587, 0.114));  // Rec. 601
+        paint.rgb = texelFetch(photos_seen, place, 0).r < fewest ? mix(vec3(grey), tint, 0.75) : vec3(grey);
+    }
 #endif
     conic = vec3(c, -b, a) / det;
 

@@ -1,0 +1,59 @@
+"""`gsplat-edu view CAPTURE`: a real server in its own process, which the doctor's work does not keep from ending."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+
+import pytest
+
+import gsplat_edu.cli.main as command_line
+from viewer.captures import ring
+
+COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
+
+
+@pytest.mark.own_process
+def test_a_capture_is_served_with_its_photos_and_findings(tmp_path):
+    views = ring(tmp_path / "egg", skipped=(4, 5, 6))
+    words = [*COMMAND, str(tmp_path / "egg"), "--port", "0", "--no-open"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        lines = [process.stdout.readline() for _ in range(3)]
+        assert lines[0] == f"{tmp_path / 'egg'}: {len(views)} photos, 200 points\n"
+        assert "an arc of 120 degrees" in lines[1]
+        url, token = re.fullmatch(
+            r"(http://\S+/)(\?token=\S+)   \(press Ctrl-C to stop\)\n", lines[2]
+        ).groups()
+        page = urllib.request.urlopen(f"{url}{token}", timeout=30)
+        assert "script-src 'sha256-" in page.headers["Content-Security-Policy"]
+        assert b"view_003.png" in page.read()
+        photo = urllib.request.urlopen(f"{url}thumbs/images/view_003.png{token}&side=128", timeout=30).read()
+        assert photo[:2] == b"\xff\xd8"
+        end = time.monotonic() + 120
+        while not json.load(urllib.request.urlopen(f"{url}findings{token}", timeout=30))["done"]:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        rest, complaints = process.communicate(timeout=60)
+        assert (process.returncode, rest, complaints) == (0, "ended\n", "")
+    finally:
+        process.kill()
+
+
+@pytest.mark.parametrize(
+    "words", [["--budget", "5"], ["--edit"], ["--path", "a.json"], ["--surface", "a.glb"]]
+)
+def test_options_of_scenes_are_refused(tmp_path, capsys, words):
+    ring(tmp_path / "egg", count=4)
+    assert command_line.main(["view", str(tmp_path / "egg"), "--port", "0", "--no-open", *words]) == 2
+    assert f"{words[0]}: {tmp_path / 'egg'} is a capture" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_folder_without_poses_says_how_to_find_them(tmp_path, capsys):
+    ring(tmp_path / "egg", count=4)
+    assert command_line.main(["view", str(tmp_path / "egg" / "images"), "--port", "0", "--no-open"]) == 2
+    assert "gsplat-edu sfm" in capsys.readouterr().err.replace("\n", " ")

@@ -1,0 +1,111 @@
+"""Further choices of a training: behind one "More", in plain words, and as options of the command."""
+
+import re
+
+import pytest
+
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.region import read_region, write_region
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.studio.command_options import TRAIN_OPTIONS
+from studio.test_page_watch import at
+
+
+@pytest.fixture(scope="module")
+def plain(library):
+    """A capture of eight photos."""
+    root = library[0].library.root
+    write_colmap(root / "captures" / "choices", *procedural_capture(32, 8, splats=60))
+
+
+def chosen(tab, library, choices):
+    """Choose and start; return the options of the job, which is stopped."""
+    tab.locator("summary", has_text="More").click()
+    for label, value in choices.items():
+        field = tab.get_by_label(label, exact=True)
+        if field.evaluate("field => field.tagName") == "SELECT":
+            field.select_option(value)
+        else:
+            field.fill(value)
+    tab.get_by_role("button", name="Start training").click()
+    tab.wait_for_url(re.compile("#/runs/"))
+    job = library[0].queue.jobs()[-1]
+    library[0].queue.cancel(job.id)
+    return job
+
+
+def test_choices_in_words_become_options_of_the_command(visitor, library, plain):
+    person = visitor()
+    tab = at(person, "captures/choices")
+    job = chosen(
+        tab,
+        library,
+        {
+            "Brightness": "exposure",
+            "Poses": "auto",
+            "Lens": "auto",
+            "What moved between the photos": "mask",
+            "Sky": "none",
+            "Purpose": "surface",
+        },
+    )
+    assert job.work.options == {
+        "quality": "standard",
+        "appearance": "exposure",
+        "refine": "auto",
+        "lens": "auto",
+        "transients": "mask",
+        "sky": "none",
+        "surface": True,
+    }
+    words = job.command
+    assert "--appearance exposure" in words and "--lens auto" in words and "--surface" in words
+
+
+def test_another_recipe_takes_the_place_of_a_quality(visitor, library, plain):
+    person = visitor()
+    tab = at(person, "captures/choices")
+    job = chosen(tab, library, {"Recipe": "mcmc", "Splats at most": "500"})
+    assert job.work.options == {"strategy": "mcmc", "max_gaussians": 500}
+
+
+def test_without_choices_only_the_quality_is_given(visitor, library, plain):
+    person = visitor()
+    tab = at(person, "captures/choices")
+    assert chosen(tab, library, {}).work.options == {"quality": "standard"}
+
+
+def test_every_choice_of_the_page_is_one_of_the_command(visitor, plain):
+    tab = at(visitor(), "captures/choices")
+    tab.locator("summary", has_text="More").click()
+    offered = tab.evaluate(
+        """[...document.querySelectorAll("[aria-label=training] select")].map(
+            (field) => [field.id, [...field.options].map(({ value }) => value).filter(Boolean)])"""
+    )
+    assert len(offered) >= 8
+    for name, values in offered:
+        option = name.replace("-", "_")
+        for value in values:
+            assert TRAIN_OPTIONS[option](option, True if option == "surface" else value)
+
+
+def test_the_box_is_chosen_while_there_is_one(visitor, library, plain):
+    folder = library[0].library.root / "captures" / "choices"
+    tab = at(visitor(), "captures/choices")
+    tab.set_viewport_size({"width": 1200, "height": 900})
+    tab.locator("summary", has_text="More").click()
+    box = tab.get_by_label("Learn only what is in the box")
+    assert box.is_disabled() and not box.is_checked()
+    tab.get_by_role("button", name="Draw the box").click()
+    frame = tab.locator("iframe:not([hidden])").element_handle().content_frame()
+    frame.get_by_role("button", name="save the box").click()
+    tab.get_by_role("button", name="Change the box").wait_for()
+    assert read_region(folder) is not None and box.is_checked()
+    box.uncheck()
+    tab.get_by_role("button", name="Start training").click()
+    tab.wait_for_url(re.compile("#/runs/"))
+    job = library[0].queue.jobs()[-1]
+    library[0].queue.cancel(job.id)
+    write_region(folder, None)
+    assert job.work.options == {"quality": "standard", "set": {"region": "none"}}
+    assert "region=none" in job.command

@@ -1,0 +1,117 @@
+"""Where the photos of a capture were taken, on its screen: cameras in a frame, findings as colours, photos left out."""
+
+import json
+import re
+
+import pytest
+
+from gsplat_edu.data.left_out import LEFT_OUT, read_left_out, write_left_out
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.scene.views import View
+from studio.pages import until
+from studio.test_page_watch import at
+
+pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
+
+STYLES = "viewer.cameras.list.map((_, i) => [...viewer.cameras.styles.slice(8 * viewer.cameras.firsts[i]).slice(0, 3)])"
+"""Colour of each camera's lines."""
+
+
+@pytest.fixture(scope="module")
+def dimmed(library):
+    """A capture of 15 photos, some of which are darker by a stop; a sixteenth place is empty."""
+    views, points, colors = procedural_capture(96, 16, splats=400)
+    views = [
+        View(view.camera, view.read().image // (2 if i % 3 == 0 else 1), name=view.name)
+        for i, view in enumerate(views)
+    ]
+    folder = library[0].library.root / "captures" / "dimmed"
+    write_colmap(folder, views, points, colors)
+    return folder
+
+
+def cameras(tab):
+    """Scroll to the section and return it with the frame inside, once it has started."""
+    section = tab.get_by_role("region", name="cameras")
+    section.scroll_into_view_if_needed()
+    frame = section.locator("iframe:not([hidden])").element_handle().content_frame()
+    frame.wait_for_url(re.compile("/captures/dimmed/page"), wait_until="commit")
+    until(tab, frame, "Boolean(window.viewer?.isWhole) && document.getElementById('message').hidden")
+    return section, frame
+
+
+def test_cameras_are_shown_with_their_photos(visitor, dimmed):
+    tab = at(visitor(), "captures/dimmed")
+    section, frame = cameras(tab)
+    assert section.get_by_role("heading", name="Where the photos were taken").is_visible()
+    assert frame.evaluate("viewer.cameras.list.length") == 16
+    frame.evaluate("viewer.choose(4)")
+    until(tab, frame, "document.getElementById('photo').naturalWidth === 96")
+    assert frame.evaluate("viewer.renderer.gl.getError()") == 0
+    assert frame.locator("#doctor").is_hidden()  # the studio's own part of the screen asks the doctor
+
+
+def test_findings_color_the_cameras(visitor, library, dimmed):
+    tab = at(visitor(), "captures/dimmed")
+    part = tab.get_by_role("region", name="doctor")
+    _, frame = cameras(tab)
+    before = frame.evaluate(STYLES)
+    assert len({tuple(color) for color in before}) == 1
+    part.get_by_role("button", name=re.compile("^Examine")).click()
+    part.locator(".findings li").first.wait_for()
+    until(tab, frame, "viewer.cameras.list.some(({ marks }) => marks.includes('exposure'))")
+    marked = frame.evaluate("viewer.cameras.list.map(({ marks }) => marks.length > 0)")
+    found = json.loads(tab.evaluate("fetch('/api/captures/dimmed/findings').then((answer) => answer.text())"))
+    named = {name for finding in found["findings"] for name in finding["images"]}
+    assert {f"view_{i:03d}.png" for i, is_marked in enumerate(marked) if is_marked} == {
+        name for name in named if " and " not in name
+    }
+    after = frame.evaluate(STYLES)
+    assert [color != before[0] for color in after] == marked
+    # a page that opens later has the colours as well
+    tab.reload()
+    _, frame = cameras(tab)
+    until(tab, frame, "viewer.cameras.list.some(({ marks }) => marks.includes('exposure'))")
+    assert frame.evaluate(STYLES) == after
+
+
+def test_a_photo_is_left_out_in_the_frame_and_taken_back_in_the_gallery(visitor, dimmed):
+    tab = at(visitor(), "captures/dimmed")
+    gallery = tab.get_by_role("region", name="photos")
+    gallery.locator(".thumbs li").first.wait_for()
+    _, frame = cameras(tab)
+    frame.evaluate("viewer.choose(2)")
+    frame.locator("#leave").click()
+    item = gallery.locator(".thumbs li.left-out")
+    item.wait_for()
+    assert "view_002.png" in item.inner_text()
+    assert read_left_out(dimmed) == ("images/view_002.png",)
+    assert frame.evaluate(STYLES)[2] != frame.evaluate(STYLES)[1]
+    item.get_by_role("button", name=re.compile("^Use again")).click()
+    item.wait_for(state="detached")
+    until(tab, frame, "!viewer.cameras.list[2].left_out")
+    assert not (dimmed / LEFT_OUT).exists()
+    assert frame.locator("#leave").inner_text() == "leave out"
+
+
+def test_the_page_follows_the_capture(page, studio, tmp_path):
+    """It is made again after a photo was left out, and names no capture outside of the library."""
+    views, points, colors = procedural_capture(48, 6)
+    folder = studio.library.root / "captures" / "six"
+    write_colmap(folder, views, points, colors)
+    answer = page.get("/api/captures/six/page")
+    assert answer.status_code == 200
+    assert "frame-ancestors 'self'" in answer.headers["Content-Security-Policy"]
+    assert '"left_out":true' not in answer.text
+    cached = list((studio.library.hidden("cache") / "pages").glob("*.html"))
+    assert page.get("/api/captures/six/page").text == answer.text
+    assert list((studio.library.hidden("cache") / "pages").glob("*.html")) == cached
+    write_left_out(folder, ["images/view_001.png"])
+    assert page.get("/api/captures/six/page").text.count('"left_out":true') == 1
+    for name in ("gone", "..", "%2e%2e"):
+        assert page.get(f"/api/captures/{name}/page").status_code in (400, 404), name
+    (studio.library.root / "captures" / "none").mkdir()
+    refused = page.get("/api/captures/none/page")
+    assert refused.status_code == 400
+    assert "is not a capture" in refused.json()["error"]

@@ -1,0 +1,249 @@
+"""A run in the studio's page: one counter and clock, curves, the photo beside the render, Judge and Share."""
+
+import json
+import re
+
+import pytest
+
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.edits.document import empty_document
+from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.runs.source import open_source
+from processes import Program
+from studio.pages import COMMAND, DROP, encoded, png, until
+
+pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
+
+
+@pytest.fixture(scope="module")
+def runs(library, tmp_path_factory):
+    """A capture and two runs of it in the library; the second one was trained longer."""
+    root = library[0].library.root
+    write_colmap(root / "captures" / "egg", *procedural_capture(48, 8, splats=120))
+    for name, iterations in (("egg", 20), ("egg-2", 80)):
+        words = [
+            "train",
+            root / "captures" / "egg",
+            "--out",
+            root / "runs" / name,
+            "--iterations",
+            iterations,
+        ]
+        assert Program(COMMAND, [*words, "--test-every", 4], tmp_path_factory.mktemp(name)).ended()[0] == 0
+    return root / "runs"
+
+
+def at(person, place):
+    person.tab.goto(f"{person.tab.url.split('#')[0]}#/{place}")
+    return person.tab
+
+
+def frame_of(tab):
+    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
+    until(tab, frame, "Boolean(window.viewer) && document.getElementById('message').hidden")
+    return frame
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
+def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
+    person = visitor()
+    tab = at(person, "runs/egg")
+    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    frame = frame_of(tab)
+    until(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
+    tab.get_by_label("View", exact=True).select_option(index=2)
+    tab.locator(".over-photo:not([hidden])").wait_for()
+    assert not frame.locator("#panel").is_visible(), "the panel lies on the photo"
+    tab.get_by_label("View", exact=True).select_option(index=0)
+    assert frame.locator("#panel").is_visible()
+
+
+PHOTOS_SHOWN = """() => {
+  const photo = document.querySelector(".over-photo");
+  window.photosShown = [];
+  new MutationObserver(() => photo.hidden || photosShown.push(photo.src)).observe(photo, { attributes: true });
+}"""
+
+
+def test_a_photo_that_comes_late_is_not_laid_over_another_view(visitor, runs):
+    """The list of photos is on its way when the free view is chosen again."""
+    tab, held = at(visitor(), "runs/egg"), []
+    frame_of(tab)
+    until(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
+    tab.evaluate(PHOTOS_SHOWN)
+    tab.route("**/captures/egg/photos", lambda route: route.continue_() if held else held.append(route))
+    view = tab.get_by_label("View", exact=True)
+    names = view.locator("option").all_inner_texts()
+    view.select_option(index=2)
+    for _ in range(9000):
+        if held:
+            break
+        tab.wait_for_timeout(20)
+    view.select_option(index=0)
+    held[0].continue_()
+    view.select_option(index=1)
+    tab.locator(".over-photo:not([hidden])").wait_for()
+    shown = tab.evaluate("photosShown")
+    assert all(names[1].split(" ")[0] in one for one in shown), shown
+
+
+def test_clean_says_what_it_removed_and_carries_the_edits_over(visitor, runs):
+    source = open_source(runs / "egg-2")
+    identity = identity_of(source.scene.gaussians, source.origin)
+    mine = json.loads(empty_document(identity)) | {
+        "operations": [{"op": "measure", "points": [[0, 0, 0], [1, 0, 0]], "note": "a"}]
+    }
+    (runs / "egg-2" / "edits.json").write_text(json.dumps(mine))
+    person = visitor()
+    tab = at(person, "runs/egg-2/share")
+    section = tab.get_by_role("region", name="cleaning")
+    tab.get_by_label("apply the edits").wait_for()
+    section.get_by_role("button", name="Clean", exact=True).click()
+    section.get_by_role("link", name="Open the scene egg-2-clean").wait_for()
+    said = section.get_by_role("list", name="what was cleaned").inner_text()
+    assert "removed" in said and "PSNR of" in said, said
+    carried = json.loads((runs.parent / "scenes" / "egg-2-clean" / "edits.json").read_text())
+    assert carried["operations"] == mine["operations"]
+    section.get_by_role("link", name="Open the scene egg-2-clean").click()
+    person.reach("#/scenes/egg-2-clean")
+
+
+def test_visitors_of_an_exported_run_can_check_it(visitor, runs):
+    person = visitor()
+    tab = at(person, "runs/egg/share")
+    box = tab.get_by_label("let visitors check the scene")
+    box.check()
+    tab.get_by_label("SPZ").first.check()
+    assert not box.is_visible()  # only a page shows photos
+    tab.get_by_label("HTML page").check()
+    tab.get_by_label("Title and name of the file").fill("proof")
+    tab.get_by_role("button", name="Export").click()
+    tab.locator(".exports li", has_text="proof.html").wait_for()
+    assert person.command("export of proof.html").endswith("--verify photos")
+    other = tab.context.new_page()
+    other.goto((runs / "egg" / "exports" / "proof.html").as_uri())
+    other.wait_for_selector("#message", state="hidden")
+    assert other.evaluate("viewer.compare.urls.length") == 8, "the capture has no more photos"
+    assert other.get_by_role("button", name="what photos saw").is_visible()
+    other.close()
+
+
+def test_one_held_out_score_is_a_point(visitor, runs):
+    tab = at(visitor(), "runs/egg")
+    plot = tab.locator(".curve", has_text="PSNR of held-out views").locator("path")
+    plot.wait_for(state="attached")
+    box = plot.evaluate("(path) => { const { x, width } = path.getBBox(); return [x, width]; }")
+    assert box == [300, 0], "the score lies at the last iteration, and nowhere else"
+
+
+@pytest.mark.parametrize(("opened", "other"), [("egg", "egg-2"), ("egg-2", "egg")])
+def test_the_better_run_is_named_whichever_was_opened(visitor, runs, opened, other):
+    tab = at(visitor(), f"runs/{opened}/compare/{other}")
+    facts = tab.get_by_role("region", name="comparison").locator(".facts:not(:empty)")
+    facts.wait_for()
+    said = facts.inner_text()
+    assert said.startswith("egg-2 is better in 2 of 2 views. Mean PSNR: "), said
+    means = {run: float(mean) for run, mean in re.findall(r"(egg\S*) ([\d.]+) dB", said)}
+    assert means["egg-2"] > means["egg"]
+
+
+COUNTERS = re.compile(r"[\d,]+ of 100,000|[Aa]fter [\d,]+ iterations|iteration [\d,]+\b(?!: test PSNR)")
+"""Texts that say how far a training is; the line about a score names the iteration of the score."""
+
+CLOCKS = re.compile(r"\bleft\b")
+
+
+def test_a_training_has_one_counter_and_one_clock(visitor, runs):
+    """All texts of the screen and of the page inside, of one moment."""
+    person = visitor()
+    tab = at(person, "captures/egg")
+    tab.set_viewport_size({"width": 1440, "height": 900})
+    tab.locator("summary", has_text="More").click()
+    tab.get_by_label("Iterations instead of a quality").fill("100000")
+    tab.get_by_role("button", name="Start training").click()
+    person.reach("#/runs/egg-run-2")
+    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
+    until(tab, frame, "Boolean(window.live?.state?.iteration) && document.getElementById('message').hidden")
+    tab.locator(".left", has_text=CLOCKS).wait_for()
+    tab.locator(".curve .axis .last:not(:empty)").first.wait_for()
+    for unfold in (False, True):
+        if unfold and not frame.locator("#tools").is_visible():
+            frame.locator("#fold").click()
+        texts = [tab.inner_text("main"), frame.inner_text("#panel")]
+        found = [COUNTERS.findall(text) for text in texts]
+        assert len(found[0]) == 1 and found[1] == [], found
+        assert [len(CLOCKS.findall(text)) for text in texts] == [1, 0], texts
+    tab.get_by_role("button", name="Stop", exact=True).click()
+    tab.locator(".job .state", has_text="stopp").wait_for()
+    assert "training" not in frame.inner_text("body")
+    tab.locator(".job .state", has_text="stopped").wait_for()
+
+
+def test_normal_use_leaves_no_errors_in_the_console(visitor, runs):
+    """From the start of a training to its judgement; a browser logs each answer from 400 on as an error."""
+    person = visitor()
+    said = []
+    person.tab.on(
+        "console", lambda message: said.append((message.type, message.text, message.location.get("url")))
+    )
+    tab = at(person, "captures/egg")
+    tab.locator("summary", has_text="More").click()
+    tab.get_by_label("Iterations instead of a quality").fill("150")
+    tab.get_by_role("button", name="Start training").click()
+    tab.get_by_role("link", name="Judge it").wait_for()
+    frame_of(tab)
+    tab.get_by_role("link", name="Judge it").click()
+    tab.locator(".views li").first.wait_for()
+    tab.locator(".tabs").get_by_role("link", name="Share", exact=True).click()
+    tab.get_by_role("button", name="Export", exact=True).wait_for()
+    tab.get_by_role("link", name="Edit", exact=True).click()
+    frame_of(tab)
+    assert [one for one in said if one[0] == "error"] == []
+
+
+def test_the_report_is_linked(visitor, runs):
+    tab = at(visitor(), "runs/egg/judge")
+    with tab.context.expect_page() as opened:
+        tab.get_by_role("link", name="Open the report").click()
+    opened.value.locator("body", has_text="held-out photos").wait_for()
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
+def test_nothing_pushes_the_pictures_down(visitor, runs, size):
+    tab = at(visitor(), "runs/egg")
+    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    frame_of(tab)
+    if size[0] > 960:  # two columns
+        live, figures = (
+            tab.locator(place).bounding_box()["y"] for place in (".scene", ".right-side > :first-child")
+        )
+        assert figures == live, f"the column beside the scene begins {figures - live:.0f} px below it"
+        assert tab.locator(".right-side > :first-child").inner_text().startswith("iterations")
+    tab.get_by_role("link", name="Edit", exact=True).click()
+    editor = tab.locator(".scene.tall")  # until it is there, the screen still shows the scene of *Watch*
+    editor.wait_for()
+    top = editor.bounding_box()["y"] + tab.evaluate("scrollY")
+    assert "null" not in tab.inner_text("main")
+    assert top < 190, f"the editor begins {top:.0f} px down"
+
+
+@pytest.mark.parametrize("size", [(320, 700), (390, 844), (1440, 900)])
+def test_the_text_of_an_upload_stays_in_its_card(visitor, size):
+    tab = visitor().tab
+    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    tab.route("**/files/**", lambda route: None)  # the upload waits
+    tab.locator(".drop").wait_for()
+    photos = [[f"a-rather-long-folder-name/IMG_{i:04}.png", encoded(png(i, (300, 200)))] for i in range(112)]
+    tab.evaluate(DROP, [photos, ".drop"])
+    card = tab.locator(".batches .job")
+    card.wait_for()
+    inside = card.bounding_box()
+    for part in card.locator(".progress > *").all():
+        box = part.bounding_box()
+        hidden = part.evaluate("(element) => element.scrollWidth - element.clientWidth")
+        over = max(hidden, box["x"] + box["width"] - inside["x"] - inside["width"])
+        assert over <= 0 and box["x"] >= inside["x"], f"{part.inner_text()!r} is {over:.0f} px too wide"
+    assert tab.evaluate("document.documentElement.scrollWidth") <= size[0]
+    tab.get_by_role("button", name="Stop", exact=True).click()
+    tab.unroute("**/files/**")

@@ -1,0 +1,69 @@
+"""Drags of the handle in the editor's picture, and where the page shows it."""
+
+import time
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from browsers import PATIENCE
+
+ARROW, RING = 88, 64
+"""CSS pixels: length of the arrows and radius of the rings."""
+
+SHAPE = "editor.tools.shape"
+
+
+class Scale:
+    """Where the page shows points, and the world units of a CSS pixel at a depth. The page has one device pixel per
+    CSS pixel."""
+
+    def __init__(self, shown):
+        self.camera = shown.camera()
+
+    def place(self, point):
+        """Return the CSS pixel of a point: that of the middle of pixel (0, 0) is (0.5, 0.5)."""
+        x, y, z = self.camera.R @ (np.asarray(point) - self.camera.eye)
+        return (
+            np.array([self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy]) + 0.5
+        )
+
+    def pixel(self, point):
+        return float((self.camera.R @ (np.asarray(point) - self.camera.eye))[2] / self.camera.fx)
+
+
+def shape(shown):
+    found = shown.tab.evaluate(SHAPE)
+    return {name: np.array(value) for name, value in found.items()}
+
+
+def drag(shown, start, end):
+    mouse = shown.tab.mouse
+    mouse.move(*start)
+    mouse.down()
+    mouse.move(*((np.asarray(start) + end) / 2))
+    mouse.move(*end)
+    mouse.up()
+
+
+def about(axis, angle):
+    return Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix()
+
+
+FRAME = "new Promise((done) => requestAnimationFrame(() => setTimeout(done)))"
+"""Resolves after the next frame, before which a page gets the moves of fingers."""
+
+
+def touch(session, kind, *points):
+    """Put fingers down at some points, move them there, or lift those that have no point; wait until the page has heard
+    of it."""
+    points = [{"x": float(x), "y": float(y), "id": i} for i, (x, y) in enumerate(points)]
+    session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    session.send("Runtime.evaluate", {"expression": FRAME, "awaitPromise": True})
+
+
+def until(tab, expression, patience=PATIENCE / 1000):
+    """Wait until an expression is true. Playwright's function needs eval, which the pages' policies forbid."""
+    end = time.monotonic() + patience
+    while not tab.evaluate(expression):
+        assert time.monotonic() < end, f"never: {expression}"
+        tab.wait_for_timeout(20)

@@ -1,0 +1,124 @@
+"""What a page shows at first, in windows of any shape: nothing that matters is cropped or lies under the panel."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.viewer import page
+from gsplat_edu.viewer.page_start import Start
+
+DESKTOP, PHONE = (1440, 900), (390, 844)
+UP = np.array([0.0, -1.0, 0.0])
+
+EDGES = """[...document.querySelectorAll('button, select')].filter((one) => one.checkVisibility()).map((one) => {
+  const sheet = one.closest('#panel, #help, #edit');
+  const { borderTopWidth, borderTopColor, backgroundColor } = getComputedStyle(one);
+  const edge = parseFloat(borderTopWidth) ? borderTopColor : backgroundColor;
+  return [one.id, edge, getComputedStyle(sheet).backgroundColor];
+})"""
+
+
+def figure(random_gaussians):
+    """A body of 1.6 units with a head of 50 splats above it, and nothing else."""
+    body = random_gaussians(1500)
+    spread = np.random.default_rng(4).uniform(-1.0, 1.0, (1500, 3)) * (0.3, 0.75, 0.2) + (0.0, 0.05, 0.0)
+    head = np.random.default_rng(5).uniform(-1.0, 1.0, (50, 3)) * (0.1, 0.12, 0.1) + (0.0, -0.85, 0.0)
+    body.means.copy_(torch.tensor(np.concatenate([head, spread[50:]]), dtype=torch.float32))
+    body.logit_opacities.fill_(4.0)
+    return body, head
+
+
+def around(W, H, focal):
+    """Twelve cameras around zero."""
+    views = []
+    for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        eye = (3 * np.sin(angle), 0.0, -3 * np.cos(angle))
+        camera = Camera(look_at(eye, (0, 0, 0)), eye, focal, focal, (W - 1) / 2, (H - 1) / 2, H, W)
+        views.append((f"{angle:.2f}", camera))
+    return views
+
+
+def on_the_screen(seen, points):
+    """Return columns and rows of points in the window, CSS px."""
+    camera = seen.camera()
+    u, v, _ = camera.project(camera.world_to_cam(points))
+    return u, v
+
+
+def test_no_head_is_cut_off_in_a_wide_window(visit, tmp_path, random_gaussians):
+    body, head = figure(random_gaussians)
+    page.write(tmp_path / "figure.html", Scene(body), around(640, 480, 700.0))
+    seen = visit(*DESKTOP).open(tmp_path / "figure.html").ready()
+    _, rows = on_the_screen(seen, head)
+    assert rows.min() > 0, f"the head begins {-rows.min():.0f} px above the window"
+
+
+def test_the_panel_of_a_phone_lies_above_the_subject(visit, tmp_path, random_gaussians):
+    body, head = figure(random_gaussians)
+    page.write(tmp_path / "figure.html", Scene(body), around(480, 640, 940.0))
+    seen = visit(*PHONE).open(tmp_path / "figure.html").ready()
+    below = seen.tab.evaluate("element('panel').getBoundingClientRect().bottom")
+    columns, rows = on_the_screen(seen, head)
+    assert rows.min() > below, f"the head begins at {rows.min():.0f} px, the panel ends at {below:.0f} px"
+    before = rows.min()
+    seen.tab.click("#fold")
+    assert on_the_screen(seen, head)[1].min() == before, "the picture does not jump when the panel opens"
+    assert columns.min() > 0 and columns.max() < PHONE[0]
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE, (844, 390)])
+def test_a_saved_view_keeps_its_content_in_a_window_of_any_shape(visit, tmp_path, random_gaussians, size):
+    """The view is chosen by hand: two heaps, one of which few cameras of the capture see."""
+    gaussians = random_gaussians(200)
+    heaps = np.random.default_rng(6).uniform(-0.15, 0.15, (200, 3))
+    heaps[:, 0] += np.where(np.arange(200) % 2, 0.9, -0.9)
+    gaussians.means.copy_(torch.tensor(heaps, dtype=torch.float32))
+    gaussians.logit_opacities.fill_(4.0)
+    eye = (0.0, 0.0, -3.0)
+    chosen = Camera(look_at(eye, (0, 0, 0)), eye, 400.0, 400.0, 159.5, 119.5, 240, 320)
+    tour = page.Tour(start=Start(chosen, np.zeros(3), UP, -1), views=[("both heaps", chosen)])
+    page.write(tmp_path / "heaps.html", Scene(gaussians), around(640, 480, 2000.0), tour=tour)
+    seen = visit(*size).open(tmp_path / "heaps.html").ready()
+    for go in ("0", "viewer.goTo(3)", "viewer.goTo(0)", "viewer.reset()"):
+        seen.tab.evaluate(go)
+        if go == "viewer.goTo(3)":
+            continue
+        columns, rows = on_the_screen(seen, heaps)
+        assert columns.min() > 0 and columns.max() < size[0], f"{columns.min():.0f} to {columns.max():.0f}"
+        assert rows.min() > 0 and rows.max() < size[1]
+        assert columns.max() - columns.min() > 0.4 * min(size), "and is not small"
+
+
+def brightness(color):
+    """Relative luminance of WCAG 2 of a colour in 0 to 255."""
+    value = np.array(color) / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) @ (
+        0.2126,
+        0.7152,
+        0.0722,
+    )
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+@pytest.mark.parametrize("scene", [0, 255])
+def test_buttons_are_seen_over_a_scene_of_any_brightness(
+    visit, tmp_path, random_gaussians, three_views, scheme, scene
+):
+    page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views)
+    seen = visit(640, 480, color_scheme=scheme).open(tmp_path / "a.html").ready()
+    seen.tab.keyboard.press("h")
+    found = seen.tab.evaluate(EDGES)
+    assert len(found) >= 5
+    for name, edge, sheet in found:
+        line, (*color, opacity) = (
+            [float(x) for x in re.findall(r"[\d.]+", one)][:4]
+            for one in (edge, sheet if "rgba" in sheet else f"{sheet} 1")
+        )
+        behind = opacity * np.array(color) + (1 - opacity) * scene
+        lights = sorted((brightness(line[:3]), brightness(behind)))
+        ratio = (lights[1] + 0.05) / (lights[0] + 0.05)
+        assert ratio >= 3, f"{name or 'a button'}: contrast {ratio:.2f} of its edge with the panel"
