@@ -2,10 +2,8 @@ import hashlib
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,33 +188,56 @@ WORDS = (
 )
 
 
+KILLED = """
+import os, signal, sys, time
+
+from gsplat_edu.cli.main import main
+from gsplat_edu.runs.training import CaptureRun
+
+save = CaptureRun.save
+
+
+def save_and_die(run):
+    save(run)
+    while not any(run.folder.checkpoints.glob("*.safetensors")):  # the first rank writes it
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+if os.environ["RANK"] == os.environ["VICTIM"] and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0":
+    CaptureRun.save = save_and_die
+sys.exit(main(sys.argv[1:]))
+"""
+"""The command line as a program, whose rank VICTIM is killed once there is a checkpoint. The others wait for its part
+of the next step, so the run cannot end before.
+"""
+
+
 @pytest.mark.own_process
 @pytest.mark.sliced(1, group="several processes")
 @pytest.mark.parametrize(("size", "victim"), [(2, 0), (2, 1), (4, None), (4, 3)])
 def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
     assert main(["train", str(capture), "--out", str(tmp_path / "alone"), *WORDS]) == 0
-    out = tmp_path / "several"
+    out, program = tmp_path / "several", tmp_path / "program.py"
+    program.write_text(KILLED)
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={size}"]
-    command = [*launcher, "--max-restarts=1", "-m", "gsplat_edu", "train", str(capture), "--out", str(out)]
-    with (tmp_path / "said").open("w") as said:
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        process = subprocess.Popen([*command, *WORDS, "--resume"], env=environment, stdout=said, stderr=said)
-    try:
-        if victim is not None:
-            deadline = time.monotonic() + PATIENCE
-            while not list((out / "checkpoints").glob("*.safetensors")):
-                assert time.monotonic() < deadline and process.poll() is None
-                time.sleep(0.02)
-            os.kill(rank_of(process.pid, victim), signal.SIGKILL)
-        assert process.wait(PATIENCE) == 0, (tmp_path / "said").read_text()
-    finally:
-        process.kill()
+    command = [*launcher, "--max-restarts=1", str(program), "train", str(capture), "--out", str(out)]
+    done = subprocess.run(
+        [*command, *WORDS, "--resume"],
+        env={**os.environ, "OMP_NUM_THREADS": "1", "VICTIM": str(victim)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
     path = "point_cloud/iteration_240/point_cloud.ply"
     found = [
         hashlib.sha256((tmp_path / name / path).read_bytes()).hexdigest() for name in ("alone", "several")
     ]
     assert found[0] == found[1]
-    assert victim is None or "resuming after" in (tmp_path / "said").read_text()
+    assert ("resuming after" in done.stdout) == (victim is not None), done.stdout
 
 
 @pytest.mark.sliced(1, group="several processes")
@@ -257,14 +278,6 @@ def test_the_first_process_gives_the_start_points(capture, tmp_path):
 
     together(2, work)
     assert scene(tmp_path / "run") == scene(tmp_path / "alone")
-
-
-def rank_of(launcher, rank):
-    """Return the child process of torchrun that has a rank."""
-    for pid in Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split():
-        if f"RANK={rank}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
-            return int(pid)
-    raise AssertionError("has no such rank")
 
 
 @pytest.mark.own_process

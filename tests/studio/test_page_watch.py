@@ -45,6 +45,25 @@ def frame_of(tab):
     return frame
 
 
+def test_a_scene_that_goes_while_its_frame_opens_is_shown_once_it_is_back(visitor, runs):
+    person, refused = visitor(), []
+    away = runs.parent / "away"
+
+    def opened(route):
+        if not refused and route.request.method == "GET":
+            (runs / "egg").rename(away)
+            answer = route.fetch()
+            refused.append(answer.status)
+            away.rename(runs / "egg")
+            route.fulfill(response=answer)
+        else:
+            route.continue_()
+
+    person.tab.route("**/api/runs/egg/page*", opened)
+    frame_of(at(person, "runs/egg"))
+    assert refused == [404]
+
+
 @pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
 def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     person = visitor()

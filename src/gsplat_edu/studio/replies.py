@@ -33,6 +33,9 @@ Act = Callable[[Studio, Request, Any], Any]
 CLOSE = {"Connection": "close"}
 """Header of an answer to a request whose body may not have been read to its end."""
 
+FRAMED = {"Content-Security-Policy": "default-src 'none'; frame-ancestors 'self'"}
+"""Header of a refusal: where the studio's page wanted to show a scene in a frame, the frame gets it."""
+
 MOST_DRAINED = 64 << 20
 """Largest number of bytes of a refused body that are still received; see `drain`."""
 
@@ -130,7 +133,7 @@ async def drain(request: Request, status: HTTPStatus) -> None:
 
 def refusal(line: str, status: HTTPStatus) -> JSONResponse:
     """Return an error as an answer: {"error": the line}."""
-    return JSONResponse({"error": bounded(legible(line))}, status, headers=CLOSE)
+    return JSONResponse({"error": bounded(legible(line))}, status, headers=CLOSE | FRAMED)
 
 
 async def json_body(request: Request) -> Any:  # noqa: ANN401

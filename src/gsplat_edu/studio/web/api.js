@@ -1,4 +1,7 @@
-// The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives.
+// The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives. Answers wait while a button is
+// pressed, because they change the page.
+
+import { released } from "./press.js";
 
 export class ApiError extends Error {
   constructor(line, status) {
@@ -22,7 +25,15 @@ const lineOf = (status, text) => {
   }
 };
 
-async function ask(method, address, body) {
+async function ask(...question) {
+  try {
+    return await answerTo(...question);
+  } finally {
+    await released();
+  }
+}
+
+async function answerTo(method, address, body) {
   const given = body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
   const answer = await fetch(address, { method, ...given }).catch(() => {
     throw new ApiError(GONE, 0);

@@ -1,6 +1,7 @@
 // The page: which screen the address names, keys, and what every screen shares.
 
 import { announce, keptFocus, put } from "./dom.js";
+import { released } from "./press.js";
 import { Store } from "./store.js";
 import { library } from "./library.js";
 import { trash } from "./trash.js";
@@ -68,12 +69,19 @@ store.addEventListener("change", ({ detail }) => {
   tell(detail.job);
   if (asked) return;
   asked = true;
-  requestAnimationFrame(() => {
-    asked = false;
-    update();
-  });
-  setTimeout(() => asked && ((asked = false), update()), 500); // hidden tabs get no frames
+  nextFrame()
+    .then(released)
+    .then(() => {
+      asked = false;
+      update();
+    });
 });
+
+const nextFrame = () =>
+  new Promise((resolve) => {
+    requestAnimationFrame(resolve);
+    setTimeout(resolve, 500); // hidden tabs get no frames
+  });
 
 // Says to screen readers when a job begins, ends, or has done another quarter of a stage.
 const announced = new Map();

@@ -33,9 +33,9 @@ export function frame(title) {
     }
   }
 
-  // the page may have gone between the two requests; the browser then shows an error of its own
+  // the page may have gone between the two requests; the frame then has the server's line, or the browser's own error
   inner.addEventListener("load", () => {
-    if (inner.hidden || inner.contentDocument) return;
+    if (inner.hidden || inner.contentDocument?.contentType === "text/html") return;
     inner.hidden = true;
     put(message, "Loading the scene ...");
     timer = setTimeout(open, RETRY);

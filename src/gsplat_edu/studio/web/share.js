@@ -6,6 +6,7 @@ import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
 import { meshes, newestOf } from "./mesh.js";
+import { released } from "./press.js";
 
 const FORMATS = [
   ["html", "HTML page", "one file that shows the scene in any browser, also offline"],
@@ -148,7 +149,7 @@ function cleaning(store, entry, entryNow) {
     }),
   );
   const update = () => {
-    if (!next.isConnected) return store.removeEventListener("change", update);
+    if (!next.isConnected) return store.removeEventListener("change", look);
     job.update();
     const { view } = job;
     const said = view?.job.state === "done" ? view.messages.filter((text) => !/^wrote /.test(text)) : [];
@@ -161,7 +162,8 @@ function cleaning(store, entry, entryNow) {
     next.hidden = !made;
     return undefined;
   };
-  store.addEventListener("change", update);
+  const look = () => released().then(update);
+  store.addEventListener("change", look);
   setTimeout(update);
   return h(
     "section",
