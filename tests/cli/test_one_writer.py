@@ -2,11 +2,15 @@
 
 import subprocess
 import sys
+import time
+from types import SimpleNamespace
 
 import pytest
 
 from gsplat_edu.base.locks import locked_file
 from gsplat_edu.cli.main import main
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.formats import read_scene, write_scene
 from scene_files import make_run, random_scene
 from splat_ball import ball
@@ -88,3 +92,24 @@ def test_a_cleaned_scene_has_one_writer(tmp_path, capsys):
     said = capsys.readouterr().err
     assert f"--out: {out} is in use by `gsplat-edu clean`" in said and said.count("\n") == 1
     assert not out.exists()
+
+
+def test_a_training_waits_with_its_export_for_another_that_writes_the_same_files(tmp_path, monkeypatch):
+    """What a training has reached is not lost for a file that is in use: it is written after the other's."""
+    write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=40))
+    out = tmp_path / "web" / "meta.json"
+    held = locked_file("--export", out, "gsplat-edu train", pytest.fail)
+    held.__enter__()
+    out.write_text("written by the other command")
+    waited = []
+
+    def ends(seconds):
+        waited.append(out.read_text())
+        held.__exit__(None, None, None)
+
+    clock = SimpleNamespace(**(vars(time) | {"sleep": ends}))
+    monkeypatch.setattr("gsplat_edu.base.locks.time", clock)
+    words = ["train", tmp_path / "capture", "--out", tmp_path / "run", "--iterations", 5, "--export", out]
+    assert main([str(word) for word in words]) == 0
+    assert waited == ["written by the other command"]
+    assert len(read_scene(out).gaussians)

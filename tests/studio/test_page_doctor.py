@@ -134,8 +134,11 @@ def test_every_tab_offers_the_undo_until_the_result_is_kept_or_undone(visitor, l
             if library[0].queue.get(job.id).state in ACTIVE:
                 library[0].queue.cancel(job.id)
             continue
+        for one in tabs:
+            one.get_by_role("button", name="Undo: stop it and go back").wait_for()
+        library[0].queue.cancel(job.id)
         for one in tabs:  # pressed in both
-            one.get_by_role("button", name="Undo").click(no_wait_after=True)
+            one.get_by_role("button", name="Undo: remove it and go back").click(no_wait_after=True)
         for one in tabs:
             one.wait_for_url(re.compile(f"#/captures/{jumping}$"))
         assert all(found.id != job.id for found in library[0].queue.jobs())

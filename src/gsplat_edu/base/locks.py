@@ -83,7 +83,9 @@ def locked(
 
 
 @contextmanager
-def locked_file(name: str, path: Path, what: str, say: Callable[[str], None]) -> Iterator[None]:
+def locked_file(
+    name: str, path: Path, what: str, say: Callable[[str], None], patience: float = 0.0
+) -> Iterator[None]:
     """Keep other processes from writing a file, and files that belong to it, inside the block; see `locked`.
 
     The lock is a hidden file beside it. Other files of the folder may be written meanwhile.
@@ -93,11 +95,12 @@ def locked_file(name: str, path: Path, what: str, say: Callable[[str], None]) ->
         path: The file.
         what: The activity of this process.
         say: Receives a sentence if the file system has no locks.
+        patience: Seconds to wait for another process that writes it.
 
     Raises:
         ArgumentError: another process writes the file (the message names the process), or as for `locked`.
     """
-    with locked(name, path.parent, what, say, file=f".{path.name}{LOCK}", place=path):
+    with locked(name, path.parent, what, say, patience, f".{path.name}{LOCK}", path):
         yield
 
 

@@ -9,11 +9,16 @@ from typing import Any
 
 from rich.progress import Progress, TaskID
 
+from gsplat_edu.base.locks import locked_file
 from gsplat_edu.evaluate.metrics import ImageScore
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Metric
 from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer import export
+
+PATIENCE = 600.0
+"""Longest time that the export of a trained scene waits for another command that writes the same file, s: it takes a
+minute, and the training has taken longer."""
 
 
 def check_and_say(
@@ -32,14 +37,18 @@ def check_and_say(
 def export_all(
     paths: Sequence[Path], bar: Progress, backend: str, say: Callable[[str], None], source: Source
 ) -> list[dict[str, Any]]:
-    """Write a scene to every path, check each file, and return the entries for metrics.json."""
+    """Write a scene to every path, check each file, and return the entries for metrics.json.
+
+    Each file is written and checked once no other command writes it.
+    """
     written = []
     for path in paths:
         for note in export.losses(path, source):
             say(note)
-        export.write(path, source)
-        emitter.report_output(path)
-        written.append(check_and_say(path, source, backend, bar, say).document())
+        with locked_file("--export", path, "gsplat-edu train", say, PATIENCE):
+            export.write(path, source)
+            emitter.report_output(path)
+            written.append(check_and_say(path, source, backend, bar, say).document())
     return written
 
 

@@ -35,10 +35,10 @@ function before(store, { begun_at: place, work }) {
 // A line with the button, on the screen of a run that was begun so; it is hidden on others.
 export function undoBegun(store, entry) {
   const line = errorLine();
-  const newest = () => store.jobsOf(entry.entry, "train")[0]?.job;
-  const undo = button("Undo: stop it and go back", () =>
+  const newest = () => store.jobsOf(entry.entry, "train")[0];
+  const undo = button("", () =>
     attempt(undo, line, async () => {
-      const job = newest();
+      const { job } = newest();
       const address = at("jobs", job.id, "undo");
       while (!(await post(address, { created: job.created })).undone) await ended(store, job.id);
       announce(`${entry.name} is in the trash`);
@@ -48,7 +48,7 @@ export function undoBegun(store, entry) {
   );
   const keep = button("Keep it", () =>
     attempt(keep, line, async () => {
-      const { id } = newest();
+      const { id } = newest().job;
       const heard = store.heard.get(id);
       store.answered(await post(at("jobs", id, "keep")), heard);
     }),
@@ -58,7 +58,9 @@ export function undoBegun(store, entry) {
   return {
     element,
     update() {
-      const label = newest()?.begun_by;
+      const view = newest();
+      const label = view?.job.begun_by;
+      put(undo, view?.active ? "Undo: stop it and go back" : "Undo: remove it and go back");
       put(said, label ? `The doctor's “${label}” began this training. Undo moves its run to the trash.` : "");
       element.hidden = !label && line.hidden;
     },
