@@ -3,6 +3,8 @@
 import re
 import time
 
+import pytest
+
 from browsers import PATIENCE
 from gsplat_edu.data.left_out import read_left_out
 from viewer.handles import until
@@ -75,6 +77,14 @@ def test_a_press_counts_although_findings_arrive_meanwhile(opened, served):
     pressed_while(tab, "draw a box", arrive)
     until(tab, "viewer.region.drawing")
     tab.get_by_text("The doctor found something about 4 photos.").wait_for()
+
+
+@pytest.mark.parametrize("call", ["mark(new Map([[name, ['dark']]]))", "left(new Map([[photo, true]]))"])
+def test_a_press_counts_although_the_page_around_tells_something_meanwhile(opened, call):
+    tab = opened()
+    tell = f"() => {{ const {{ name, photo }} = viewer.cameras.list[1]; viewer.{call}; }}"
+    pressed_while(tab, "draw a box", lambda: tab.evaluate(tell))
+    until(tab, "viewer.region.drawing && document.querySelectorAll('#legend li').length === 2")
 
 
 def test_a_press_counts_although_the_photo_arrives_meanwhile(opened):

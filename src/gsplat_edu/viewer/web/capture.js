@@ -188,14 +188,14 @@ class CaptureView {
     this.cameras.list.forEach((camera, i) => {
       camera.marks = [...new Set([...this.facts.cameras[i].marks, ...found(camera)])];
     });
-    this.paint();
+    released().then(() => this.paint());
   }
 
   // For a page around this one: photos were left out there, or taken back; a Map from photos to whether they are left out.
   left(changes) {
     const other = this.cameras.list.filter(({ photo, left_out: out }) => (changes.get(photo) ?? out) !== out);
     for (const camera of other) camera.left_out = changes.get(camera.photo);
-    if (other.length) this.paint();
+    if (other.length) released().then(() => this.paint());
   }
 
   // Asks the server what the doctor found, until it knows.
