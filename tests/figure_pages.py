@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from chapters import ROOT, tool
+from viewer.handles import touch, until
 
 STATIC = ROOT / "docs" / "site" / "static"
 FIGURES = [(figure.chapter, figure.name) for figure in tool("site_figures").FIGURES]
@@ -67,18 +68,22 @@ def drag(page, start, end):
 
 
 def swipe(page, start, end):
-    """Drag with a finger."""
-    touch = page.context.new_cdp_session(page)
-
-    def send(kind, *points):
-        touch.send(
-            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": y} for x, y in points]}
-        )
-
-    send("touchStart", start)
+    """Drag with a finger; wait until the page has heard of it."""
+    session = page.context.new_cdp_session(page)
+    touch(session, "touchStart", start)
     for share in (0.25, 0.5, 0.75, 1.0):
-        send("touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
-    send("touchEnd")
+        touch(session, "touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
+    touch(session, "touchEnd")
+
+
+def tap(page, place):
+    """Tap an element, or a place of the window; wait until the page has heard of it, which Playwright does not."""
+    page.evaluate(
+        "() => { window.tapped = false;"
+        " addEventListener('click', () => setTimeout(() => { window.tapped = true; }), { once: true }); }"
+    )
+    page.touchscreen.tap(*place) if isinstance(place, tuple) else place.tap()
+    until(page, "window.tapped")
 
 
 def chapter_functions(chapter, names, **given):

@@ -18,7 +18,7 @@ from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import LiveView
 from gsplat_edu.viewer.snapshots import Broadcast
 
-PATIENCE = 60.0
+PATIENCE = 180.0
 """Longest time that a test waits, seconds."""
 
 GROWING = ["--max-gaussians", "600", "--set", "densify_start=5", "densify_every=10"]

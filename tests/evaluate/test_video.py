@@ -2,13 +2,13 @@
 
 import base64
 import os
-import shutil
 import struct
 
 import cv2
 import numpy as np
 import pytest
 
+from browsers import chromium
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.evaluate.images import write_frames
 from gsplat_edu.evaluate.video import streamable
@@ -133,21 +133,14 @@ def test_data_that_is_not_a_video_is_refused():
 )
 def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width, sphere):
     """Chromium does not play MPEG-4 Part 2, and assumes BT.709 for untagged videos of any size."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("chromium is not installed")
     frames = [quarters(height, width, i) for i in range(4)]
     (path,) = write_frames(tmp_path / "v.mp4", frames, fps=10, sphere=sphere)
-    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=flags)
+    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as browser:
         tab = browser.new_page()
         tab.set_content("<video muted playsinline></video>")
         data = base64.b64encode(path.read_bytes()).decode()
         expected = [np.roll(COLOURS, i, axis=0).tolist() for i in range(len(frames))]
         played = tab.evaluate(PLAY, ["video/mp4", data, expected])
-        browser.close()
     assert played["size"] == [width + width % 2, height + height % 2]
     assert played["duration"] == pytest.approx(0.4, abs=0.01) and played["time"] == pytest.approx(
         0.4, abs=0.01

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from chapters import ROOT, tool
-from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, drag, read_data, state, swipe, told
+from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, drag, read_data, state, swipe, tap, told
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
 
 
@@ -135,7 +135,7 @@ def test_the_sphere_follows_mouse_finger_and_keys(opened):
     for key in ("ArrowLeft", "ArrowUp", "s"):
         page.keyboard.press(key)
     assert not state(page, "sphere")["sorted"] and "order of storage" in told(page, "sphere")
-    page.get_by_label("sorted by depth").tap()
+    tap(page, page.get_by_label("sorted by depth"))
     assert state(page, "sphere")["sorted"]
     shown = page.evaluate(
         """([x, y]) => [...document.querySelector("[data-play=sphere] canvas").getContext("2d")
@@ -157,7 +157,7 @@ def test_sliders_follow_keys_and_touch(opened, name, key):
     assert stepped > before and told(page, name) != words
     assert slider.get_attribute("aria-valuetext") == told(page, name)
     box = slider.bounding_box()
-    page.touchscreen.tap(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2)
+    tap(page, (box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2))
     assert state(page, name)[key] > stepped
     drag(page, (box["x"] + 0.9 * box["width"], box["y"] + 5), (box["x"] + 2, box["y"] + 5))
     assert state(page, name)[key] < before or state(page, name)[key] == 0
@@ -254,7 +254,7 @@ def test_the_line_follows_mouse_finger_and_keys(opened):
     assert slider.get_attribute("aria-valuetext") == told(page, "wipe")
     render = shown()
     assert 1 < np.abs(render - photo).mean() < 30, "the render is close to the photo, but not the same"
-    page.get_by_label("error instead of the render").tap()
+    tap(page, page.get_by_label("error instead of the render"))
     assert state(page, "wipe")["error"] and told(page, "wipe").endswith("error")
     error = shown()
     assert error.mean() < min(photo.mean(), render.mean()) - 20, "most of the error is dark"

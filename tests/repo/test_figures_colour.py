@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from chapters import ROOT, tool
-from figure_pages import chapter_functions, drag, read_data, state, swipe, told
+from figure_pages import chapter_functions, drag, read_data, state, swipe, tap, told
 from gsplat_edu import C0, build_cov3d_batch, eval_sh, orbit_camera, render_gaussians, sh_basis
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.evaluate.metrics import psnr
@@ -225,7 +225,7 @@ def test_the_reader_follows_mouse_finger_keys_boxes_and_slider(opened):
     canvas.focus()
     page.keyboard.press("3")
     assert not state(page, "scene")["kept"]["colours"] and "100.0 dB" not in told(page, "scene")
-    page.get_by_role("checkbox", name="colours").tap()
+    tap(page, page.get_by_role("checkbox", name="colours"))
     assert state(page, "scene")["kept"]["colours"] and "100.0 dB" in told(page, "scene")
     page.get_by_label("opacity at least").focus()
     page.keyboard.press("End")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from figure_pages import canvas_box, chapter_functions, drag, state, swipe, told
+from figure_pages import canvas_box, chapter_functions, drag, state, swipe, tap, told
 from gsplat_edu import Z_NEAR, Camera, build_cov3d, orbit_camera, quat_to_R
 from gsplat_edu.scene.gaussian_math import project_cov3d
 
@@ -142,7 +142,7 @@ def test_the_gaussian_follows_mouse_finger_keys_and_sliders(opened):
     keys_change(page, "tangent", {"+": ("z", 0.1), "-": ("z", -0.1)})
     page.keyboard.press("c")
     assert state(page, "tangent")["clamped"]
-    page.get_by_label("clamp x/z").tap()
+    tap(page, page.get_by_label("clamp x/z"))
     assert not state(page, "tangent")["clamped"]
     page.get_by_label("size across").focus()
     page.keyboard.press("ArrowRight")
@@ -211,7 +211,7 @@ def test_the_points_follow_mouse_finger_keys_and_sliders(opened):
     )
     page.keyboard.press("n")
     assert not state(page, "points")["nearest"]
-    page.get_by_label("the nearest point wins").tap()
+    tap(page, page.get_by_label("the nearest point wins"))
     assert state(page, "points")["nearest"]
 
     def holes():

@@ -6,13 +6,14 @@ import numpy as np
 import torch
 
 from chapters import tool
-from figure_pages import canvas_box, drag, read_data, state, swipe, told
+from figure_pages import canvas_box, drag, read_data, state, swipe, tap, told
 from gsplat_edu import Camera
 from gsplat_edu.fit2d.fit import Fit2DSettings, fit_2d
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
 from gsplat_edu.fit2d.splats import Splats2D, render_2d
 from gsplat_edu.render.api import render
 from gsplat_edu.scene.gaussians import Gaussians
+from viewer.handles import until
 
 WIDTHS = {"means": 2, "log_scales": 2, "angles": 1, "colors": 3, "logit_opacities": 1}
 
@@ -82,18 +83,18 @@ def test_the_fit_follows_buttons_keys_and_touch(opened):
     page = opened("08_fit_an_image")
     canvas, _ = canvas_box(page, "fit")
     words = told(page, "fit")
-    page.get_by_role("button", name="step").tap()
+    tap(page, page.get_by_role("button", name="step"))
     assert state(page, "fit")["steps"] == 1 and told(page, "fit") != words
     canvas.focus()
     page.keyboard.press("ArrowRight")
     assert state(page, "fit")["steps"] == 2
     page.keyboard.press(" ")
-    page.wait_for_function("gsplatPlay.live.fit.state.steps > 5", timeout=20_000)
+    until(page, "gsplatPlay.live.fit.state.steps > 5")
     page.get_by_role("button", name="pause").click()
     losses = state(page, "fit")["losses"]
     assert losses[-1] < losses[0] and not state(page, "fit")["running"]
     page.keyboard.press("r")
-    page.get_by_label("one rate for all numbers").tap()
+    tap(page, page.get_by_label("one rate for all numbers"))
     assert state(page, "fit")["plain"] and state(page, "fit")["steps"] == 0
     start = np.array(read_data("fit")["start"])
     page.evaluate("() => { for (let i = 0; i < 10; i++) gsplatPlay.live.fit.step(); }")
@@ -173,6 +174,6 @@ def test_the_number_follows_mouse_finger_keys_and_buttons(opened):
         # ten decimals are shown; the chapter's bound on a difference is 1e-10 of the largest slope
         assert abs(chain - differences) < 3e-10, lines[0]
     before = float(lines[0].split()[-1])
-    page.get_by_role("button", name="20 steps downhill").tap()
+    tap(page, page.get_by_role("button", name="20 steps downhill"))
     lines = told(page, "chain").splitlines()
     assert float(lines[0].split()[-1]) < before

@@ -9,7 +9,7 @@ import torch
 
 from browsers import chromium
 from chapters import ROOT, tool
-from figure_pages import NO_ADAPTER, canvas_box, drag, read_data, state, swipe, told, write_pages
+from figure_pages import NO_ADAPTER, canvas_box, drag, read_data, state, swipe, tap, told, write_pages
 
 sys.path.append(str(ROOT / "benchmarks"))
 from ladder.oracle import oracle, tolerance
@@ -236,7 +236,7 @@ def test_other_orders_have_other_sums(opened):
     page.keyboard.press("r")
     assert state(page, "slots")["tries"] == 200
     assert page.evaluate("gsplatPlay.live.slots.state.results.size") > 1
-    page.get_by_role("button").tap()
+    tap(page, page.get_by_role("button"))
     assert "400 random orders" in told(page, "slots")
     before = state(page, "slots")
     page.keyboard.press("Tab")
@@ -245,7 +245,7 @@ def test_other_orders_have_other_sums(opened):
     page.keyboard.press("ArrowUp")
     after = state(page, "slots")
     assert (after["splat"], after["tile"], after["tries"]) == (before["splat"] + 1, before["tile"] - 1, 0)
-    page.touchscreen.tap(box["x"] + 0.51 / 16 * box["width"], box["y"] + 2.5 / 24 * box["height"])
+    tap(page, (box["x"] + 0.51 / 16 * box["width"], box["y"] + 2.5 / 24 * box["height"]))
     assert [state(page, "slots")[key] for key in ("splat", "tile")] == [0, 2]
 
 
@@ -255,7 +255,7 @@ def test_a_pixel_is_marked_by_mouse_finger_and_keys(opened):
     scale = box["width"] / 72
     page.mouse.move(box["x"] + 10.5 * scale, box["y"] + 5.5 * scale)
     assert [state(page, "naive")[key] for key in "xy"] == [10, 5]
-    page.touchscreen.tap(box["x"] + 60.5 * scale, box["y"] + 40.5 * scale)
+    tap(page, (box["x"] + 60.5 * scale, box["y"] + 40.5 * scale))
     assert [state(page, "naive")[key] for key in "xy"] == [60, 40]
     canvas.focus()
     for key in ("ArrowLeft", "ArrowUp", "+"):

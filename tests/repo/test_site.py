@@ -203,7 +203,7 @@ def test_the_wheel_scrolls_the_landing_page_until_the_scene_is_clicked(site, bro
     before = scene.evaluate("viewer.view.distance")
     tab.locator("#scene").hover()
     tab.mouse.wheel(0, 100)
-    tab.wait_for_function("scrollY > 0", timeout=PATIENCE)
+    until(lambda: tab.evaluate("scrollY > 0"))
     assert scene.evaluate("viewer.view.distance") == before
     tab.locator("#scene").click()
     tab.mouse.wheel(0, 100)

@@ -15,6 +15,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.edit_page import editing_of
+from viewer.handles import until
 
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
@@ -44,6 +45,10 @@ READING = "GPU stall due to ReadPixels"
 must not cause it, so `test_live_browser.py` does not ignore it."""
 
 
+RESTS = "Boolean(window.viewer?.isWhole && !viewer.frameAsked && !viewer.catching && !viewer.timing)"
+"""Whether a page draws nothing more by itself."""
+
+
 class Visit:
     """An open page. It records the console messages, errors and requests."""
 
@@ -70,7 +75,9 @@ class Visit:
         return self
 
     def ready(self):
+        """Wait until the page shows its whole picture, which a slow computer draws in parts, and rests."""
         self.tab.wait_for_selector("#message", state="hidden")
+        until(self.tab, RESTS)
         return self
 
     def message(self, text):

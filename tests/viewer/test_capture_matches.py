@@ -26,7 +26,9 @@ MATCHED = """() => {
 DOTS = """() => {
   const canvas = document.getElementById("dots");
   if (canvas.hidden) return false;
-  return canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some(Boolean);
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d"); // a canvas that is read often warns
+  copy.drawImage(canvas, 0, 0);
+  return copy.getImageData(0, 0, canvas.width, canvas.height).data.some(Boolean);
 }"""
 
 

@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import os
+import signal
 import threading
 
 import numpy as np
@@ -18,15 +20,14 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, FLOATERS, EditServer
+from viewer.handles import until
 
 pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
 
-PATIENCE = 120_000
 N = 400
 
 
 READY = "async () => { while (!window.editor) await new Promise((done) => setTimeout(done, 20)); }"
-DRAWN = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 SET = """([id, value]) => {
   element(id).value = value;
   element(id).dispatchEvent(new Event("input", { bubbles: true }));
@@ -95,7 +96,7 @@ def flags(tab):
 def test_floaters_are_proposed_with_reasons_selected_undone_and_deleted(opened, served):
     tab = opened()
     tab.click("[data-do=propose]")
-    tab.wait_for_selector("#edit-groups button", timeout=PATIENCE)
+    tab.wait_for_selector("#edit-groups button")
     assert tab.inner_text("#edit-proposed").startswith("Judged by shape alone, without photos: ")
     texts = [button.inner_text() for button in tab.query_selector_all("#edit-groups button")]
     assert texts == ["1 · too large: wider than half of the scene", "1 · floating: far from all other splats"]
@@ -119,6 +120,15 @@ def test_floaters_are_proposed_with_reasons_selected_undone_and_deleted(opened, 
 
 def test_a_judgement_can_be_stopped_and_a_lost_server_is_said(opened, served):
     tab = opened()
+    start = served.proposing.start
+
+    def start_and_stand_still():
+        start()
+        os.kill(
+            served.proposing._process.pid, signal.SIGSTOP
+        )  # so that it has not ended before it is stopped
+
+    served.proposing.start = start_and_stand_still
     tab.click("[data-do=propose]")
     tab.wait_for_selector("[data-do=stop-proposing]:visible")
     assert tab.evaluate("document.activeElement.dataset.do") == "stop-proposing"
@@ -127,6 +137,34 @@ def test_a_judgement_can_be_stopped_and_a_lost_server_is_said(opened, served):
     tab.wait_for_selector("[data-do=propose]:not([disabled])")
     assert tab.is_hidden("[data-do=stop-proposing]") and tab.inner_text("#edit-groups") == ""
     assert served.proposing.state() == {"state": "idle"}
+
+
+def test_a_press_counts_although_proposals_arrive_meanwhile(opened):
+    """Their list moves the buttons below it, and what has moved under the pointer is not clicked."""
+    tab, held = opened(), []
+
+    def last_one_held(route):
+        answer = route.fetch()
+        if answer.json()["state"] == "done":
+            held.append((route, answer))
+        else:
+            route.fulfill(response=answer)
+
+    tab.evaluate("editor.perform({ op: 'select', how: 'replace', by: 'all' })")
+    tab.route(f"**{FLOATERS}", last_one_held)
+    tab.click("[data-do=propose]")
+    while not held:
+        tab.wait_for_timeout(20)
+    tab.hover("[data-do=undo]")
+    tab.mouse.down()
+    ((route, answer),) = held
+    with tab.expect_response(f"**{FLOATERS}"):
+        route.fulfill(response=answer)
+    tab.wait_for_timeout(300)  # in which the page would show them
+    assert tab.locator("#edit-groups button").count() == 0
+    tab.mouse.up()
+    tab.wait_for_selector("#edit-groups button")
+    assert tab.evaluate("editor.history.done.length") == 0, "the press has undone the selection"
 
 
 LATE = """async () => {
@@ -157,7 +195,7 @@ def test_only_the_page_may_start_a_judgement(served):
     }
 
     def ask(method, path=FLOATERS, **headers):
-        connection = http.client.HTTPConnection(*served.server_address[:2], timeout=10)
+        connection = http.client.HTTPConnection(*served.server_address[:2], timeout=60)
         connection.request(method, path, headers=headers)
         answer = connection.getresponse()
         return answer.status, answer.read()
@@ -180,7 +218,7 @@ def set_range(tab, low, high):
 
 
 def chart(tab):
-    tab.evaluate(DRAWN)
+    until(tab, "Boolean(editor.panel.histogram.ends && !editor.panel.histogram.asked)")
     return tab.evaluate("[[...editor.panel.histogram.all], [...editor.panel.histogram.selected]]")
 
 

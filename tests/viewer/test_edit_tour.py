@@ -47,8 +47,8 @@ def arrives(shown, name):
 
 
 def picture(shown):
-    shown.tab.evaluate("viewer.settled()")
-    return np.array(shown.tab.evaluate("[...viewer.renderer.pixels()].slice(0, 60000)"))
+    pixels = "async () => { await viewer.settled(); return [...viewer.renderer.pixels()].slice(0, 60000); }"
+    return np.array(shown.tab.evaluate(pixels))
 
 
 def test_the_tour_goes_by_keys_as_a_visitor_sees_it(opened):

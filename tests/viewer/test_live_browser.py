@@ -105,6 +105,25 @@ def test_a_page_shows_and_pauses_a_training_and_may_be_closed(
         until(lambda: made.iteration > held + 20, "more iterations without the page")
 
 
+def test_a_press_on_pause_pauses_although_another_page_does_meanwhile(capture, tmp_path, browser):
+    """Its button would be the one that resumes before it is released."""
+    with (
+        training(capture, tmp_path / "run", "--iterations", "100000") as made,
+        Tab(browser, made.view.url) as tab,
+    ):
+        tab.says(r"training, iteration ([\d,]+) of")
+        tab.page.get_by_role("button", name="pause", exact=True).hover()
+        tab.page.mouse.down()
+        client = Client(made.view.url)
+        client.control("pause")
+        held = client.states(state="paused")["iteration"]
+        tab.page.wait_for_timeout(500)  # in which the page would say so
+        tab.page.mouse.up()
+        tab.says(r"paused, iteration ([\d,]+) of")
+        tab.page.wait_for_timeout(300)
+        assert made.iteration == held
+
+
 def test_without_webgl2_the_page_shows_our_own_renders(capture, tmp_path, browser):
     with (
         training(capture, tmp_path / "run", "--iterations", "100000") as made,

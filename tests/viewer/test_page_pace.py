@@ -9,7 +9,6 @@ pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
 
 PARTS = """async () => {
   const { renderer } = viewer;
-  if (!viewer.isWhole) await viewer.followed(); // a slow browser still draws the page's first picture
   const sizes = [];
   const drawPart = renderer.drawPart.bind(renderer);
   renderer.drawPart = (camera, settings, from, to, ...rest) => {

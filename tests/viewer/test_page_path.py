@@ -170,6 +170,18 @@ def test_saved_views_become_the_file_that_render_reads(opened, tmp_path):
     np.testing.assert_array_equal(again.keyframes[1].eye, found.keyframes[2].eye)
 
 
+def test_a_held_key_saves_one_view_and_the_focus_stays_in_the_list(opened):
+    tab = opened(fresh=True).tab
+    tab.keyboard.down("k")
+    tab.keyboard.down("k")  # as the keyboard repeats it
+    tab.keyboard.up("k")
+    assert tab.inner_text("#path summary") == "camera path (1)"
+    tab.focus('button[aria-label="go to view 1"]')
+    tab.keyboard.press("k")
+    assert tab.inner_text("#path summary") == "camera path (2)"
+    assert tab.evaluate("document.activeElement.getAttribute('aria-label')") == "go to view 1"
+
+
 def test_an_embedded_path_is_written_unchanged_and_keeps_its_times_when_it_grows(opened, tmp_path):
     path = KeyframePath(around(1.0, 1.5, 4.0, 5.0), True, 7.5)
     shown = opened(path, fresh=True)

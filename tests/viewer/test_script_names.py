@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from gsplat_edu.viewer import page_parts
+from gsplat_edu.viewer import capture_page, page_parts
 
 KINDS = {
     "plain": page_parts.PLAIN,
@@ -20,14 +20,19 @@ DEFINED = re.compile(
 )
 
 
-@pytest.mark.parametrize("name", KINDS)
+PAGES = {
+    name: (*page_parts.SCRIPTS, *kind.scripts, page_parts.LAST_SCRIPT) for name, kind in KINDS.items()
+} | {"capture": capture_page.SCRIPTS}
+
+
+@pytest.mark.parametrize("name", PAGES)
 def test_no_two_definitions_have_one_name(name):
-    scripts = (*page_parts.SCRIPTS, *KINDS[name].scripts, page_parts.LAST_SCRIPT)
+    scripts = PAGES[name]
     defined = Counter(
         word
         for script in scripts
         for found in DEFINED.findall(page_parts.web(script))
         for word in re.findall(r"\w+", found)
     )
-    assert defined["PathCurve"] == 1 and defined["Viewer"] == 1
+    assert defined["View"] == 1 and defined["CaptureView" if name == "capture" else "Viewer"] == 1
     assert [word for word, count in defined.items() if count > 1] == []

@@ -20,6 +20,7 @@ from gsplat_edu.viewer.page_parts import web
 
 SCRIPTS = (
     "common.js",
+    "press.js",
     "scene.js",
     "region.js",
     "camera.js",

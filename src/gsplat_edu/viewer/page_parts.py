@@ -16,6 +16,7 @@ from gsplat_edu.base.content_policy import content_policy, policy_element
 
 SCRIPTS = (
     "common.js",
+    "press.js",
     "scene.js",
     "region.js",
     "camera.js",

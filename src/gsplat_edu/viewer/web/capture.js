@@ -23,6 +23,7 @@ class CaptureView {
     this.frameAsked = 0;
     this.through = null; // the camera that is looked through, until the view moves
     this.lost = false;
+    this.leaving = Promise.resolve(); // once every photo that was pressed is left out, or used again
     this.controls = new Controls(this.canvas, this.view, this.actions(), facts.cameras.length);
     this.renderer = null;
     this.region = new RegionTool(this);
@@ -85,8 +86,8 @@ class CaptureView {
       this.lost = true;
       say("The graphics processor stopped drawing this page; reload it.");
     });
-    addEventListener("keydown", ({ key, ctrlKey, metaKey, altKey }) => {
-      if (ctrlKey || metaKey || altKey) return;
+    addEventListener("keydown", ({ key, repeat, ctrlKey, metaKey, altKey }) => {
+      if (repeat || ctrlKey || metaKey || altKey) return;
       const action = { Escape: "close", t: "look", x: "leave", m: "matches" }[key];
       if (action && this.cameras.chosen >= 0) this.actions()[action]();
     });
@@ -155,17 +156,22 @@ class CaptureView {
     const address = await this.photos.load(camera.photo, 1024).catch(() => null);
     if (!address || this.through !== camera) return;
     picture.src = address;
+    this.lay(this.camera());
     picture.hidden = false;
-    this.askFrame();
   }
 
-  // Leaves the chosen photo out, or takes it back.
-  async leave() {
+  // Leaves the chosen photo out, or takes it back. A second press waits for the answer to the first one.
+  leave() {
     const camera = this.cameras.list[this.cameras.chosen];
-    if (!camera) return;
+    if (camera) this.leaving = this.leaving.then(() => this.leaveNow(camera));
+    return this.leaving;
+  }
+
+  async leaveNow(camera) {
     const out = !camera.left_out;
     try {
       const all = new Set(await this.photos.leaveOut(camera.photo, !out));
+      await released();
       for (const one of this.cameras.list) one.left_out = all.has(one.photo);
       this.panel.trouble("");
       this.panel.say(out ? `${camera.name} is left out` : `${camera.name} is used again`);
@@ -182,14 +188,14 @@ class CaptureView {
     this.cameras.list.forEach((camera, i) => {
       camera.marks = [...new Set([...this.facts.cameras[i].marks, ...found(camera)])];
     });
-    this.paint();
+    released().then(() => this.paint());
   }
 
   // For a page around this one: photos were left out there, or taken back; a Map from photos to whether they are left out.
   left(changes) {
     const other = this.cameras.list.filter(({ photo, left_out: out }) => (changes.get(photo) ?? out) !== out);
     for (const camera of other) camera.left_out = changes.get(camera.photo);
-    if (other.length) this.paint();
+    if (other.length) released().then(() => this.paint());
   }
 
   // Asks the server what the doctor found, until it knows.
@@ -197,9 +203,10 @@ class CaptureView {
     this.panel.doctor("The doctor examines the photos ...");
     for (;;) {
       const answer = await fetch(this.facts.findings).catch(() => null);
-      if (!answer?.ok) return this.panel.doctor("");
+      if (!answer?.ok) return released().then(() => this.panel.doctor(""));
       const { done, marks, trouble } = await answer.json();
       if (done) {
+        await released();
         this.mark(new Map(Object.entries(marks)));
         const count = this.cameras.list.filter((camera) => camera.marks.length).length;
         return this.panel.doctor(trouble || (count ? `The doctor found something about ${numbered(count, "photo")}.` : "The doctor found nothing about single photos."));

@@ -85,13 +85,14 @@ class MatchPanel {
       item.append(button);
       return item;
     });
-    element("sharing").replaceChildren(...items);
+    refill(element("sharing"), items, element("next"));
   }
 
   // Draws the points over the photo, which fills its place as far as its shape allows.
   draw() {
     const [canvas, photo] = [element("dots"), element("photo")];
-    canvas.hidden = !this.shown || photo.hidden || !photo.naturalWidth;
+    const isOther = photo.alt !== this.cameras.list[this.chosen]?.name; // the chosen one is still on its way
+    canvas.hidden = !this.shown || photo.hidden || !photo.naturalWidth || isOther;
     if (canvas.hidden) return;
     const { clientWidth: width, clientHeight: height } = photo;
     const dense = window.devicePixelRatio || 1;

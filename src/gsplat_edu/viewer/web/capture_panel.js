@@ -101,11 +101,14 @@ class CapturePanel {
     this.describe(camera);
     try {
       const address = await this.photos.load(camera.photo, 512);
+      await decodedPhoto(address); // it takes its place at once
+      await released();
       if (asked !== this.asked) return;
       element("photo").src = address;
       element("photo").alt = camera.name;
       element("photo").hidden = false;
     } catch (error) {
+      await released();
       if (asked !== this.asked) return;
       element("photo").hidden = true;
       this.trouble(error.message);
@@ -150,6 +153,14 @@ class CapturePanel {
       if (this.hovered === index) caption([NOT_THERE]);
     }
   }
+}
+
+// A photo in memory, ready to be shown.
+async function decodedPhoto(address) {
+  const picture = new Image();
+  picture.src = address;
+  await picture.decode();
+  return picture;
 }
 
 const numbered = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;

@@ -41,6 +41,7 @@ class RegionTool {
     const asked = ++this.questions;
     try {
       const region = await this.viewer.photos.region();
+      await released();
       if (asked !== this.questions) return; // a box was saved here meanwhile, or a later question was answered
       this.saved = region && { ...region, center: plus(region.center, this.viewer.facts.origin, -1) };
       const before = this.stored;

@@ -1,4 +1,4 @@
-// What the pages of scenes and of captures share: elements, the message, and shader programs.
+// What the pages of scenes and of captures share: elements, the message, lists, and shader programs.
 "use strict";
 
 const element = (id) => document.getElementById(id);
@@ -6,6 +6,15 @@ const element = (id) => document.getElementById(id);
 function say(text) {
   element("message").textContent = text;
   element("message").hidden = !text;
+}
+
+// Replaces the items of a list. The keyboard's focus stays at its place in it; in an empty list it goes elsewhere.
+function refill(list, items, elsewhere) {
+  const at = [...list.querySelectorAll("button")].indexOf(document.activeElement);
+  list.replaceChildren(...items);
+  if (at < 0) return;
+  const buttons = list.querySelectorAll("button");
+  (buttons[Math.min(at, buttons.length - 1)] ?? elsewhere).focus();
 }
 
 // A program of the shaders whose texts the page has under NAME.vert and NAME.frag.

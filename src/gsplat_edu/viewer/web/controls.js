@@ -25,6 +25,8 @@ const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 const TURN = 0.8; // radians per second
 const NUDGE = 0.03; // radians at once, so that a short press is seen
 
+const ONCE = ["f", "h", "k", "p", "t", "c", "v"]; // keys that act once, however long they are held
+
 // In a document that shows the page as a figure (scene.html#embedded), wheel and vertical drags scroll that document
 // until the canvas has the focus.
 const EMBEDDED = location.hash === "#embedded";
@@ -143,8 +145,9 @@ class Controls {
       if (!event.repeat) this.orbit(event.code, NUDGE);
       this.held.add(event.code);
       this.actions.moved();
-    } else if (action) action();
-    else return;
+    } else if (action) {
+      if (!event.repeat || !ONCE.includes(event.key.toLowerCase())) action();
+    } else return;
     event.preventDefault();
   }
 

@@ -45,6 +45,7 @@ class EditFloaters {
     } catch (error) {
       said = { state: "failed", error: quiet ? "" : error.message };
     }
+    await released();
     if (question === this.questions) this.show(said); // an answer to an earlier question is older
   }
 

@@ -356,14 +356,8 @@ class EditPanel {
     this.editor.mover.update();
   }
 
-  // Replaces the items of a list; the focus stays at its place in it.
   fill(id, items) {
-    const list = element(id).querySelector("ol");
-    const at = [...list.querySelectorAll("button")].indexOf(document.activeElement);
-    list.replaceChildren(...items);
-    if (at < 0) return;
-    const buttons = list.querySelectorAll("button");
-    (buttons[Math.min(at, buttons.length - 1)] ?? element(id).querySelector("summary")).focus();
+    refill(element(id).querySelector("ol"), items, element(id).querySelector("summary"));
   }
 
   // Lists of views and operations; only after a change of them.

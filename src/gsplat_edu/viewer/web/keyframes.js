@@ -127,7 +127,7 @@ class Keyframes {
       if (!keyframe.given) item.append(button("×", `remove view ${i + 1}`, () => this.remove(i)));
       return item;
     });
-    element("path").querySelector("ol").replaceChildren(...items);
+    refill(element("path").querySelector("ol"), items, element("save-view"));
     this.timeline.changed();
   }
 

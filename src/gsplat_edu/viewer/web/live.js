@@ -88,6 +88,7 @@ class Live {
         const state = await answer.json();
         if (state.error) throw new Error(state.error);
         [version, failures] = [state.version, 0];
+        await released();
         this.show(state);
       } catch {
         ++failures;
