@@ -18,7 +18,7 @@ from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import LiveView
 from gsplat_edu.viewer.snapshots import Broadcast
 
-PATIENCE = 60.0
+PATIENCE = 180.0
 """Longest time that a test waits, seconds."""
 
 GROWING = ["--max-gaussians", "600", "--set", "densify_start=5", "densify_every=10"]
@@ -81,9 +81,11 @@ class Training:
 
 
 @contextmanager
-def training(capture, out, *words):
+def training(capture, out, *words, pressed=None):
+    """Train with a live view until the end of the block; a button may be pressed before the first iteration."""
     made = Training(capture, out, *words)
     with made.view:
+        assert pressed is None or Client(made.view.url).control(pressed) == 204
         made.thread.start()
         try:
             yield made
