@@ -388,7 +388,7 @@ def ask(server, path, data=None, token=True, **headers):
         address += f"{'&' if '?' in path else '?'}token={server.guard.token}"
     request = urllib.request.Request(address, data, headers)
     try:
-        with urllib.request.urlopen(request, timeout=20) as answer:
+        with urllib.request.urlopen(request, timeout=180) as answer:
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
