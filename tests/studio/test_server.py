@@ -225,7 +225,8 @@ def check_the_bytes(folder, downloaded, run, tmp_path):
 def raw(server, request, wait=5.0):
     """Send bytes; return the answer until the connection is closed, or nothing more comes for some seconds."""
     with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE) as connection:
-        connection.sendall(request)
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it may answer before all was sent
+            connection.sendall(request)
         found = b""
         with contextlib.suppress(TimeoutError, ConnectionResetError):
             while piece := connection.recv(65536):
