@@ -81,9 +81,11 @@ class Training:
 
 
 @contextmanager
-def training(capture, out, *words):
+def training(capture, out, *words, pressed=None):
+    """Train with a live view until the end of the block; a button may be pressed before the first iteration."""
     made = Training(capture, out, *words)
     with made.view:
+        assert pressed is None or Client(made.view.url).control(pressed) == 204
         made.thread.start()
         try:
             yield made

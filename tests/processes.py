@@ -57,7 +57,7 @@ class Program:
     def send(self, number: int) -> None:
         os.kill(self.process.pid, number)
 
-    def ended(self, patience: float = 120.0) -> tuple[int, str, str]:
+    def ended(self, patience: float = 300.0) -> tuple[int, str, str]:
         """Wait for the end; return the exit code (negative for a signal), stdout and stderr."""
         self.process.join(patience)
         assert not self.process.is_alive(), "the program did not end in time"

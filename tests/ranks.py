@@ -13,7 +13,7 @@ import torch.distributed as dist
 from gsplat_edu.base.errors import ProcessLostError
 from gsplat_edu.runs.processes import Processes
 
-MEETING = timedelta(seconds=60)
+MEETING = timedelta(seconds=180)
 
 
 def together(size: int, work: Callable, patience: float = 120.0) -> list:

@@ -164,4 +164,4 @@ with reused_buffers():
     os.waitpid(child, 0)
     assert bool((image == 1.0).all())
 """
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=120)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=300)

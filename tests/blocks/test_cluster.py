@@ -24,6 +24,36 @@ SCHEDULER = "from distributed.cli.dask_scheduler import main; main()"
 WORKER = "from distributed.cli.dask_worker import main; main()"
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
+WAITING_WORKER = """
+import sys, time
+from pathlib import Path
+from distributed.cli.dask_worker import main
+from gsplat_edu.runs.training import CaptureRun
+
+train, passed, patience = CaptureRun.train, Path(sys.argv.pop(1)), float(sys.argv.pop(1))
+
+def waiting(run, stop, callbacks=()):
+    end = None
+
+    def wait(trainer, event):
+        nonlocal end
+        if trainer.iteration > 30:
+            (passed / run.folder.path.name).touch()
+            end = end or time.monotonic() + patience
+            while len(list(passed.iterdir())) == 4 and time.monotonic() < end:
+                time.sleep(0.02)
+
+    return train(run, stop, [*callbacks, wait])
+
+CaptureRun.train = waiting
+main()
+"""
+"""A worker in which the last of four blocks to pass its 30th step waits, and any block that is not finished then.
+
+It waits long enough for a test to kill the scheduler. It does not wait forever: the block of another worker that was
+killed may be waiting for this one.
+"""
+
 PATIENCE = 180.0
 """Longest time that a test waits for an event, seconds."""
 
@@ -78,11 +108,12 @@ class Cluster:
         wait_for(lambda: answers(self.port))
         return program
 
-    def worker(self):
+    def worker(self, passed=None):
+        """Start a worker; one that waits, if it is given a folder to note the blocks that passed their 30th step."""
         space = self.folder / f"space_{self.started}"
-        return self.start(
-            WORKER, self.address, "--no-nanny", "--nthreads", 1, "--no-dashboard", "--local-directory", space
-        )
+        code, words = (WORKER, ()) if passed is None else (WAITING_WORKER, (passed, PATIENCE / 2))
+        options = ("--no-nanny", "--nthreads", 1, "--no-dashboard", "--local-directory", space)
+        return self.start(code, *words, self.address, *options)
 
 
 def kill(program):
@@ -107,8 +138,9 @@ def wait_for(condition):
 def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, serial, tmp_path):
     draw = random.Random(SEED)
     moments = sorted(draw.sample(range(5, 120), 2))  # a whole block is left
-    run = tmp_path / "run"
+    run, passed = tmp_path / "run", tmp_path / "passed"
     shutil.copytree(split, run)
+    passed.mkdir()
     plan, folder = BlockPlan.read(run), BlocksFolder(run)
     digest = plan.digest()
 
@@ -118,11 +150,11 @@ def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, s
     words = ["train", city, "--out", run, "--blocks", "4", *RECIPE, "--resume", "--scheduler"]
     with Cluster(tmp_path / "first") as cluster:
         scheduler = cluster.scheduler()
-        workers = [cluster.worker(), cluster.worker()]
+        workers = [cluster.worker(passed), cluster.worker(passed)]
         command = cluster.start(COMMAND, *words, cluster.address)
         wait_for(lambda: steps() >= moments[0] or not command.runs)
         kill(draw.choice(workers))
-        cluster.worker()
+        cluster.worker(passed)
         wait_for(lambda: steps() >= moments[1] or not command.runs)
         kill(scheduler)
         code, _, err = command.ended()

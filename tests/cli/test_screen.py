@@ -12,6 +12,9 @@ from pathlib import Path
 
 import gsplat_edu
 
+PATIENCE = 180.0
+"""Longest time that a test waits, seconds."""
+
 BROWSER = """#!{python}
 import html, json, os, re, sys, urllib.request
 path = sys.argv[1].removeprefix("file://")
@@ -42,7 +45,7 @@ def test_the_browser_of_a_studio_gets_a_private_file_that_leads_to_the_page(tmp_
         while b"token=" not in printed or b"\n" not in printed.partition(b"token=")[2]:
             printed += os.read(near, 65536)
         (token,) = re.findall(r"token=(\S+)", printed.decode())
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE
         while not out.is_file():
             assert time.monotonic() < end
             time.sleep(0.02)
@@ -54,7 +57,7 @@ def test_the_browser_of_a_studio_gets_a_private_file_that_leads_to_the_page(tmp_
         assert stat.S_IMODE(found["file"]) == 0o600 and stat.S_IMODE(found["folder"]) == 0o700
     finally:
         process.send_signal(signal.SIGINT)
-        process.wait(60)
+        process.wait(PATIENCE)
         os.close(near)
     assert list(private.iterdir()) == []
 

@@ -14,6 +14,7 @@ import gsplat_edu.cli.main as command_line
 from viewer.captures import ring
 
 COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
+PATIENCE = 180.0
 
 
 @pytest.mark.own_process
@@ -28,17 +29,19 @@ def test_a_capture_is_served_with_its_photos_and_findings(tmp_path):
         url, token = re.fullmatch(
             r"(http://\S+/)(\?token=\S+)   \(press Ctrl-C to stop\)\n", lines[2]
         ).groups()
-        page = urllib.request.urlopen(f"{url}{token}", timeout=30)
+        page = urllib.request.urlopen(f"{url}{token}", timeout=PATIENCE)
         assert "script-src 'sha256-" in page.headers["Content-Security-Policy"]
         assert b"view_003.png" in page.read()
-        photo = urllib.request.urlopen(f"{url}thumbs/images/view_003.png{token}&side=128", timeout=30).read()
+        photo = urllib.request.urlopen(
+            f"{url}thumbs/images/view_003.png{token}&side=128", timeout=PATIENCE
+        ).read()
         assert photo[:2] == b"\xff\xd8"
-        end = time.monotonic() + 120
-        while not json.load(urllib.request.urlopen(f"{url}findings{token}", timeout=30))["done"]:
+        end = time.monotonic() + PATIENCE
+        while not json.load(urllib.request.urlopen(f"{url}findings{token}", timeout=PATIENCE))["done"]:
             assert time.monotonic() < end
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
-        rest, complaints = process.communicate(timeout=60)
+        rest, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, rest, complaints) == (0, "ended\n", "")
     finally:
         process.kill()

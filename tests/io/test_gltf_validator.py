@@ -23,7 +23,7 @@ def validated(*files):
     if not (FOLDER / "node_modules" / "gltf-validator").is_dir():
         pytest.skip("gltf-validator is not installed: npm ci --prefix tests/npm")
     words = [node, FOLDER / "validate.mjs", *files]
-    finished = subprocess.run(words, capture_output=True, text=True, timeout=120, check=True)
+    finished = subprocess.run(words, capture_output=True, text=True, timeout=300, check=True)
     return json.loads(finished.stdout)
 
 

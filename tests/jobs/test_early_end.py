@@ -42,7 +42,7 @@ runpy.run_module("gsplat_edu", run_name="__main__", alter_sys=True)
 """The command line, which waits for a signal in the import of one of its modules."""
 
 
-def until(condition, patience=60.0):
+def until(condition, patience=180.0):
     end = time.monotonic() + patience
     while not condition():
         assert time.monotonic() < end, "the awaited state did not occur"

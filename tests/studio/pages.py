@@ -69,12 +69,12 @@ def served(folder, worker, limits=None):
         server = _Server(_config(app), ready.set, studio.stream.close)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]})
         thread.start()
-        assert ready.wait(60)
+        assert ready.wait(PATIENCE / 1000)
         try:
             yield studio, f"http://127.0.0.1:{port}/?token={TOKEN}"
         finally:
             server.should_exit = True
-            thread.join(60)
+            thread.join(PATIENCE / 1000)
             studio.close()
 
 

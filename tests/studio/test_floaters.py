@@ -60,7 +60,7 @@ def test_closing_the_studio_ends_the_judgement(page, studio, scenes):
     (running,) = [one for one in studio.proposals._kept.values() if one.running]
     process = running._process
     studio.proposals.close()
-    assert process.wait(10) < 0
+    assert process.wait(PATIENCE) < 0
 
 
 def test_other_pages_may_not_start_one(page, scenes):

@@ -36,7 +36,7 @@ def read(piece, wait, count, seconds):
             found.extend(message["body"])
             more = message["more_body"]
 
-    asyncio.run(asyncio.wait_for(Patience(app, seconds)({"type": "http"}, receive, None), 20))
+    asyncio.run(asyncio.wait_for(Patience(app, seconds)({"type": "http"}, receive, None), 180))
     return len(found)
 
 
@@ -66,7 +66,7 @@ REQUESTS = {
 def connected(url):
     port = int(url.partition("127.0.0.1:")[2].partition("/")[0])
     head = f"HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAuthorization: Bearer {TOKEN}\r\n"
-    return socket.create_connection(("127.0.0.1", port), timeout=20), head
+    return socket.create_connection(("127.0.0.1", port), timeout=180), head
 
 
 def test_every_request_whose_body_stalls_ends(tmp_path):

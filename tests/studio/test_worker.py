@@ -11,7 +11,7 @@ from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.worker import answer
 from gsplat_edu.studio.workers import Worker
 
-PATIENCE = 60.0
+PATIENCE = 180.0
 """Longest time that a test waits, seconds."""
 
 

@@ -201,7 +201,7 @@ def test_a_file_that_vanished_is_named(folder, served, browser):
 )
 def test_only_files_that_the_index_names_are_served(folder, served, path, status):
     server = served(COUNT)
-    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=60)
+    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=180)
     connection.request("GET", path)
     answer = connection.getresponse()
     body = answer.read()

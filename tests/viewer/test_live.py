@@ -115,9 +115,8 @@ def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
     clock, ahead = time.perf_counter, []
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + sum(ahead))
     monkeypatch.setattr(live, "GRACE", 1e9)
-    with training(capture, tmp_path / "run", "--iterations", "60") as made:
+    with training(capture, tmp_path / "run", "--iterations", "60", pressed="step") as made:
         client = Client(made.view.url)
-        client.control("step")
         client.states(state="paused")
         ahead.append(3600.0)
         client.control("resume")
@@ -158,10 +157,9 @@ def test_watching_does_not_change_the_bits_of_a_training(capture, tmp_path, stra
     words = ("--iterations", "120", "--random-background", *STRATEGIES[strategy])
     alone = made_run(capture, tmp_path / "alone", *words)
     alone.train()
-    with training(capture, tmp_path / "watched", *words) as made:
+    with training(capture, tmp_path / "watched", *words, pressed="step") as made:
         one, two = Client(made.view.url), Client(made.view.url)
         camera = camera_json(made.run.dataset.train[0].camera)
-        one.control("step")
         held = one.states(state="paused")["iteration"]
         for _ in range(4):
             one.control("step")
@@ -305,13 +303,20 @@ def test_a_picture_that_comes_too_late_is_not_that_of_the_next_camera(capture, t
     run = made_run(capture, tmp_path / "run", "--iterations", "30")
     cameras = [view.camera for view in run.dataset.train[:2]]
     images = [run.options.renderer(run.trainer.gaussians, camera) for camera in cameras]
+    monkeypatch.setattr(live, "PICTURE_WAIT", PATIENCE)
     with live.LiveView(run, port=0) as view:
-        monkeypatch.setattr(live, "PICTURE_WAIT", 1.0)
+        waits, over = view._news.wait_for, threading.Event()
+        monkeypatch.setattr(
+            view._news, "wait_for", lambda true, time: waits(lambda: true() or over.is_set(), time)
+        )
         late = threading.Thread(target=view.picture, args=(cameras[0],))
         late.start()
         until(lambda: view.camera() is cameras[0], "the first request")
-        late.join(PATIENCE)  # it gives up while the picture is drawn
-        monkeypatch.setattr(live, "PICTURE_WAIT", PATIENCE)
+        with view._news:  # its time is over while the picture is drawn
+            over.set()
+            view._news.notify_all()
+        late.join(PATIENCE)
+        over.clear()
         found = []
         second = threading.Thread(target=lambda: found.append(view.picture(cameras[1])))
         second.start()

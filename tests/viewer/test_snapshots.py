@@ -22,7 +22,7 @@ from gsplat_edu.train.checkpoint import list_checkpoints
 from gsplat_edu.viewer import live_folder, page_data, snapshots
 from gsplat_edu.viewer.live_folder import LiveFolder, header_of
 from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, page_facts, snapshot_of
-from live_clients import until
+from live_clients import PATIENCE, until
 
 GROWING = ["--max-gaussians", "300", "--set", "densify_start=5", "densify_every=10", "--seed", "3"]
 
@@ -44,11 +44,11 @@ class Watched:
 
     def __init__(self, capture, out, *words):
         self.run, self.live, self.said = made_run(capture, out, *words), LiveFolder(out), []
-        watcher = FolderWatcher(self.live, lambda: page_facts(self.run), self.said.append)
+        self.watcher = FolderWatcher(self.live, lambda: page_facts(self.run), self.said.append)
         self.stopped, self.failure = threading.Event(), None
-        self.broadcast = Broadcast(self.run, self.stopped.is_set, [watcher])
+        self.broadcast = Broadcast(self.run, self.stopped.is_set, [self.watcher])
         self.thread = threading.Thread(target=self._train)
-        self.close = watcher.close
+        self.close = self.watcher.close
 
     def _train(self):
         try:
@@ -62,7 +62,7 @@ class Watched:
 
     def __exit__(self, *_):
         self.stopped.set()
-        self.thread.join(60)
+        self.thread.join(PATIENCE)
         assert self.failure is None and not self.thread.is_alive()
         self.close()
 
@@ -78,7 +78,7 @@ def scene_of(path):
 
 def test_no_files_are_written_unless_somebody_watches(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "60") as made:
-        made.thread.join(60)
+        made.thread.join(PATIENCE)
         assert not made.live.path.exists()
 
 
@@ -117,6 +117,7 @@ def test_no_files_are_written_after_the_watcher_left(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "100000") as made:
         until(lambda: (made.live.ask(), made.live.scene.exists())[1], "a scene")
         os.utime(made.live.wanted, (0, 0))
+        until(lambda: not made.watcher._wanted, "that the training has noticed it")
         held = made.run.trainer.iteration
         until(lambda: made.run.trainer.iteration > held + 20, "many more iterations")
         before = made.live.state.stat().st_mtime_ns
@@ -131,20 +132,26 @@ def bits(run):
 
 
 def test_watching_and_pausing_by_files_does_not_change_the_bits(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(snapshots, "SHARE", 1.0)
+    """The files are written after every iteration, however fast the training is and however late a reader comes."""
     alone = made_run(capture, tmp_path / "alone", "--iterations", "50", "--random-background")
     alone.train()
-    run = tmp_path / "watched"
+    monkeypatch.setattr(snapshots, "SHARE", 1e9)
+    monkeypatch.setattr(snapshots, "POLL", 0.0)
+    monkeypatch.setattr(live_folder, "FRESH", PATIENCE)
+    run, shown = tmp_path / "watched", []
     LiveFolder(run).set_paused(True)
+    LiveFolder(run).ask()
     with Watched(capture, run, "--iterations", "50", "--random-background") as made:
+        write = made.watcher.take_scene
+        monkeypatch.setattr(
+            made.watcher, "take_scene", lambda *words: (shown.append(words[0]), write(*words))
+        )
         until(lambda: made.said, "the pause")
-        scenes = set()
         made.live.set_paused(False)
         while made.thread.is_alive():
             made.live.ask()
-            header = header_of(made.live.scene)
-            scenes.add(None if header is None else header["iteration"])
-    assert len(scenes) > 2, "the training was watched"
+            header_of(made.live.scene)
+    assert len(shown) > 40, "the training was watched"
     assert bits(made.run) == bits(alone)
 
 
@@ -154,7 +161,7 @@ def test_stopping_the_program_ends_a_pause(capture, tmp_path):
         until(lambda: made.said, "the pause")
         held = made.run.trainer.iteration
         made.stopped.set()
-        made.thread.join(60)
+        made.thread.join(PATIENCE)
     assert list_checkpoints(made.run.folder.checkpoints)[-1].stem == f"iteration_{held}"
 
 
