@@ -27,9 +27,13 @@ export function put(element, text) {
   element.hidden = !text;
 }
 
-// Makes the children of a container those of a list: `make(item)` for new keys, `update(child, item)` for all.
+// Makes the children of a container those of a list: `make(item)` for new keys, `update(child, item)` for all. The focus
+// stays where it is, although what is moved loses it.
 export function keyed(container, items, keyOf, make, update = () => {}) {
+  const focused = document.activeElement;
   const old = new Map([...container.children].map((child) => [child.dataset.key, child]));
+  const kept = new Set(items.map((item) => String(keyOf(item))));
+  for (const [key, child] of old) if (!kept.has(key)) child.remove(); // first, so that the others need not be moved
   items.forEach((item, index) => {
     const key = String(keyOf(item));
     let child = old.get(key);
@@ -41,7 +45,7 @@ export function keyed(container, items, keyOf, make, update = () => {}) {
     update(child, item);
     if (container.children[index] !== child) container.insertBefore(child, container.children[index] ?? null);
   });
-  for (const child of old.values()) child.remove();
+  if (document.activeElement !== focused && container.contains(focused)) focused.focus({ preventScroll: true });
 }
 
 export const count = (number, one, many = `${one}s`) => `${whole(number)} ${number === 1 ? one : many}`;
