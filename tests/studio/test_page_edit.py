@@ -26,7 +26,9 @@ HELD = """(() => {
   const ask = window.fetch.bind(window);
   let held = null;
   window.unanswered = 0;
-  window.hold = () => (held = new Promise((resolve) => (window.release = resolve)));
+  window.hold = () => {
+    held = new Promise((resolve) => (window.release = resolve));
+  };
   window.fetch = async (address, ...more) => {
     if (!String(address).startsWith("/api/library")) return ask(address, ...more);
     await held;
