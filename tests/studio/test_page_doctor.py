@@ -15,7 +15,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import ACTIVE, JobFolder
 from gsplat_edu.scene.views import View
 from processes import Program
-from studio.pages import COMMAND, awaited, waiting
+from studio.pages import COMMAND, awaited, until, waiting
 from studio.test_page_watch import at, runs
 
 pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
@@ -231,6 +231,19 @@ def test_a_photo_of_a_finding_is_left_out_and_taken_back(visitor, library, jumpi
     tab.reload()
     gallery.locator(".thumbs li").first.wait_for()
     assert not gallery.locator(".left-out").count()
+
+
+def test_findings_that_are_shown_anew_keep_the_focus_and_what_was_unfolded(visitor, library, jumping):
+    tab = at(visitor(), f"captures/{jumping}")
+    part = examined(tab)
+    part.locator("summary", has_text="Facts").click()
+    leave = part.get_by_role("button", name=re.compile("^Leave out")).nth(1)
+    photo = leave.get_attribute("aria-label").removeprefix("Leave out ")
+    leave.focus()
+    tab.keyboard.press("Enter")
+    part.get_by_text("This has changed since the doctor looked").wait_for()
+    until(tab, tab, f"document.activeElement.getAttribute('aria-label') === 'Use again {photo}'")
+    assert part.locator("details table").is_visible()
 
 
 def test_a_run_is_trained_again_without_a_photo_of_a_wrong_pose(visitor, library, swapped):

@@ -48,6 +48,18 @@ export function keyed(container, items, keyOf, make, update = () => {}) {
   if (document.activeElement !== focused && container.contains(focused)) focused.focus({ preventScroll: true });
 }
 
+// Replaces what is in a place. The control that takes the place of the one with the focus gets it, and what was unfolded
+// stays so.
+export function renew(place, ...children) {
+  const all = (kind) => [...place.querySelectorAll(kind)];
+  const controls = "button, a, summary";
+  const focused = all(controls).indexOf(document.activeElement);
+  const unfolded = all("details").map(({ open }) => open);
+  place.replaceChildren(...children);
+  all("details").forEach((one, index) => (one.open = Boolean(unfolded[index])));
+  all(controls)[focused]?.focus({ preventScroll: true });
+}
+
 export const count = (number, one, many = `${one}s`) => `${whole(number)} ${number === 1 ? one : many}`;
 
 export const whole = (number) => Math.round(number).toLocaleString("en");
