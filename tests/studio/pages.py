@@ -133,6 +133,49 @@ def _holds(frame, condition):
         return False
 
 
+def awaited(tab, condition, patience=PATIENCE / 1000):
+    """Let a tab and its routes go on until a condition of the test's process holds; return its value."""
+    end = time.monotonic() + patience
+    while not (found := condition()):
+        assert time.monotonic() < end, "the awaited state did not occur"
+        tab.wait_for_timeout(20)
+    return found
+
+
+def held_back(tab, address, of=lambda request: True):
+    """Hold the answers to a tab's requests back; returns the list of (route, answer) that they join.
+
+    Args:
+        tab: The tab.
+        address: Pattern of the addresses.
+        of: Whether the answer to a request is held back.
+    """
+    held = []
+
+    def hold(route):
+        if of(route.request):
+            held.append((route, route.fetch()))
+        else:
+            route.continue_()
+
+    tab.route(address, hold)
+    return held
+
+
+@contextlib.contextmanager
+def waiting(studio):
+    """Let the jobs that are started inside wait, so that none has ended before it is looked at; then forget them."""
+    before = {job.id for job in studio.queue.jobs()}
+    studio.queue.at_once = 0
+    try:
+        yield
+    finally:
+        for job in studio.queue.jobs():
+            if job.id not in before:
+                studio.queue.remove(job.id)
+        studio.queue.at_once = 1
+
+
 def encoded(data):
     return base64.b64encode(data).decode()
 

@@ -48,6 +48,7 @@ def test_a_capture_with_its_choices_its_places_and_its_findings(visitor, library
     tab = at(visitor(), "captures/seen")
     tab.locator("summary", has_text="More").click()
     examined(tab)
+    tab.get_by_role("region", name="cameras").scroll_into_view_if_needed()
     frame_of(tab).locator("#canvas").wait_for()
     assert grave_faults_in_all_styles(tab) == []
 

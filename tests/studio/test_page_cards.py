@@ -7,6 +7,7 @@ import pytest
 from accessibility import grave_faults_in_all_styles
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from studio.pages import waiting
 
 pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
 
@@ -83,8 +84,8 @@ def test_a_card_says_what_a_training_takes_before_it_starts(visitor, library):
             assert grave_faults_in_all_styles(tab) == []
             card.get_by_role("button", name="Not now").click()
             assert not card.locator(".forecast").is_visible()
-    card.get_by_role("button", name="Next: Start it, told").click()
-    tab.wait_for_url(re.compile("#/runs/told"))
-    (job,) = library[0].queue.jobs()
-    library[0].queue.cancel(job.id)
+    with waiting(library[0]):
+        card.get_by_role("button", name="Next: Start it, told").click()
+        tab.wait_for_url(re.compile("#/runs/told"))
+        (job,) = library[0].queue.jobs()
     assert job.work.options == {"quality": "standard"} and job.work.inputs == ("captures/told",)

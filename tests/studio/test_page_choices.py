@@ -8,6 +8,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.region import read_region, write_region
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.studio.command_options import TRAIN_OPTIONS
+from studio.pages import waiting
 from studio.test_page_watch import at
 
 
@@ -19,7 +20,7 @@ def plain(library):
 
 
 def chosen(tab, library, choices):
-    """Choose and start; return the options of the job, which is stopped."""
+    """Choose and start; return the job, which never runs."""
     tab.locator("summary", has_text="More").click()
     for label, value in choices.items():
         field = tab.get_by_label(label, exact=True)
@@ -27,11 +28,14 @@ def chosen(tab, library, choices):
             field.select_option(value)
         else:
             field.fill(value)
-    tab.get_by_role("button", name="Start training").click()
-    tab.wait_for_url(re.compile("#/runs/"))
-    job = library[0].queue.jobs()[-1]
-    library[0].queue.cancel(job.id)
-    return job
+    return started(tab, library)
+
+
+def started(tab, library):
+    with waiting(library[0]):
+        tab.get_by_role("button", name="Start training").click()
+        tab.wait_for_url(re.compile("#/runs/"))
+        return library[0].queue.jobs()[-1]
 
 
 def test_choices_in_words_become_options_of_the_command(visitor, library, plain):
@@ -102,10 +106,7 @@ def test_the_box_is_chosen_while_there_is_one(visitor, library, plain):
     tab.get_by_role("button", name="Change the box").wait_for()
     assert read_region(folder) is not None and box.is_checked()
     box.uncheck()
-    tab.get_by_role("button", name="Start training").click()
-    tab.wait_for_url(re.compile("#/runs/"))
-    job = library[0].queue.jobs()[-1]
-    library[0].queue.cancel(job.id)
+    job = started(tab, library)
     write_region(folder, None)
     assert job.work.options == {"quality": "standard", "set": {"region": "none"}}
     assert "region=none" in job.command

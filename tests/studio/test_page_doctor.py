@@ -1,11 +1,13 @@
 """What the page says of findings and of stopped jobs: in its own words, with a button for what it can do."""
 
+import contextlib
 import json
 import re
 
 import pytest
 
 from accessibility import grave_faults
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.left_out import LEFT_OUT, read_left_out
 from gsplat_edu.data.procedural import procedural_capture
@@ -13,7 +15,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import ACTIVE, JobFolder
 from gsplat_edu.scene.views import View
 from processes import Program
-from studio.pages import COMMAND
+from studio.pages import COMMAND, awaited, until, waiting
 from studio.test_page_watch import at, runs
 
 pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
@@ -63,10 +65,10 @@ def test_exposure_jumps_are_corrected_by_a_button(visitor, library, jumping):
     part = examined(tab)
     said = part.locator(".found").inner_text()
     assert "exposure correction" in said and not COMMANDS.search(said), said
-    part.get_by_role("button", name="Train with exposure correction").first.click()
-    tab.wait_for_url(re.compile(f"#/runs/{jumping}"))
-    job = library[0].queue.jobs()[-1]
-    library[0].queue.cancel(job.id)
+    with waiting(library[0]):
+        part.get_by_role("button", name="Train with exposure correction").first.click()
+        tab.wait_for_url(re.compile(f"#/runs/{jumping}"))
+        job = library[0].queue.jobs()[-1]
     assert job.work.options == {"appearance": "exposure"} and job.work.inputs == (f"captures/{jumping}",)
 
 
@@ -96,13 +98,27 @@ def test_a_press_counts_although_the_page_changes_meanwhile(visitor, library, ju
     tab.on("response", lambda answer: heard.append(answer.url.rpartition("/")[2]))
     tab.mouse.down() if by == "mouse" else tab.keyboard.down(" ")
     other.get_by_role("button", name="Leave out").first.click()
-    while "library" not in heard:
-        tab.wait_for_timeout(30)
+    awaited(tab, lambda: "library" in heard)
     tab.wait_for_timeout(1000)  # in which the page would ask for the findings, and show them
     assert "findings" not in heard and held.evaluate("(button) => button.isConnected")
-    tab.mouse.up() if by == "mouse" else tab.keyboard.up(" ")
-    tab.wait_for_url(re.compile(f"#/runs/{jumping}"))
-    library[0].queue.cancel(library[0].queue.jobs()[-1].id)
+    with waiting(library[0]):
+        tab.mouse.up() if by == "mouse" else tab.keyboard.up(" ")
+        tab.wait_for_url(re.compile(f"#/runs/{jumping}"))
+
+
+def press_undo(tabs):
+    """Press *Undo* in some tabs before the studio hears of the first press: what is undone offers it no longer."""
+    asked = []
+
+    def hold(route):
+        asked.append(route)
+
+    for tab in tabs:
+        tab.route("**/undo", hold, times=1)
+        tab.get_by_role("button", name="Undo").click()
+    awaited(tabs[0], lambda: len(asked) == len(tabs))
+    for route in asked:
+        route.continue_()
 
 
 def test_every_tab_offers_the_undo_until_the_result_is_kept_or_undone(visitor, library, jumping):
@@ -131,14 +147,16 @@ def test_every_tab_offers_the_undo_until_the_result_is_kept_or_undone(visitor, l
                 one.reload()
                 one.locator("nav.tabs").wait_for()
                 assert one.locator(".begun").is_hidden()
-            if library[0].queue.get(job.id).state in ACTIVE:
+            with contextlib.suppress(ArgumentError):  # it has ended
                 library[0].queue.cancel(job.id)
+            # one that still stops would be in the way of the next, which does the same
+            awaited(tab, lambda name=job.id: library[0].queue.get(name).state not in ACTIVE)
             continue
+        with contextlib.suppress(ArgumentError):  # it has ended
+            library[0].queue.cancel(job.id)
         for one in tabs:
-            one.get_by_role("button", name="Undo: stop it and go back").wait_for()
-        library[0].queue.cancel(job.id)
-        for one in tabs:  # pressed in both
-            one.get_by_role("button", name="Undo: remove it and go back").click(no_wait_after=True)
+            one.get_by_role("button", name="Undo: remove it and go back").wait_for()
+        press_undo(tabs)
         for one in tabs:
             one.wait_for_url(re.compile(f"#/captures/{jumping}$"))
         assert all(found.id != job.id for found in library[0].queue.jobs())
@@ -219,6 +237,19 @@ def test_a_photo_of_a_finding_is_left_out_and_taken_back(visitor, library, jumpi
     assert not gallery.locator(".left-out").count()
 
 
+def test_findings_that_are_shown_anew_keep_the_focus_and_what_was_unfolded(visitor, library, jumping):
+    tab = at(visitor(), f"captures/{jumping}")
+    part = examined(tab)
+    part.locator("summary", has_text="Facts").click()
+    leave = part.get_by_role("button", name=re.compile("^Leave out")).nth(1)
+    photo = leave.get_attribute("aria-label").removeprefix("Leave out ")
+    leave.focus()
+    tab.keyboard.press("Enter")
+    part.get_by_text("This has changed since the doctor looked").wait_for()
+    until(tab, tab, f"document.activeElement.getAttribute('aria-label') === 'Use again {photo}'")
+    assert part.locator("details table").is_visible()
+
+
 def test_a_run_is_trained_again_without_a_photo_of_a_wrong_pose(visitor, library, swapped):
     person = visitor()
     capture = library[0].library.root / "captures" / "swapped"
@@ -230,10 +261,10 @@ def test_a_run_is_trained_again_without_a_photo_of_a_wrong_pose(visitor, library
     again = part.get_by_role("button", name="Train again without what is left out")
     assert not again.is_visible()
     part.get_by_role("button", name="Leave out view_005.png").first.click()
-    again.click()
-    tab.wait_for_url(re.compile("#/runs/swapped-run"))
-    job = library[0].queue.jobs()[-1]
-    library[0].queue.cancel(job.id)
+    with waiting(library[0]):
+        again.click()
+        tab.wait_for_url(re.compile("#/runs/swapped-run"))
+        job = library[0].queue.jobs()[-1]
     assert job.work.inputs == ("captures/swapped",) and read_left_out(capture) == ("images/view_005.png",)
 
 
@@ -262,10 +293,10 @@ def test_a_short_run_is_trained_longer_by_a_button(visitor, library, runs):
     part = examined(at(person, "runs/egg/judge"))
     said = part.locator(".found").inner_text()
     assert "short training" in said and not COMMANDS.search(said), said
-    part.get_by_role("button", name="Train longer").first.click()
-    person.tab.wait_for_url(re.compile("#/runs/egg-run"))
-    job = library[0].queue.jobs()[-1]
-    library[0].queue.cancel(job.id)
+    with waiting(library[0]):
+        part.get_by_role("button", name="Train longer").first.click()
+        person.tab.wait_for_url(re.compile("#/runs/egg-run"))
+        job = library[0].queue.jobs()[-1]
     assert job.work.inputs == ("captures/egg",) and job.work.options["iterations"] > 20
 
 

@@ -22,17 +22,21 @@ def opened(tab, address):
     return frame
 
 
-HELD = """() => {
+HELD = """(() => {
   const ask = window.fetch.bind(window);
-  let open;
-  const released = new Promise((resolve) => (open = resolve));
-  window.release = open;
-  window.fetch = async (address, ...more) => {
-    if (String(address).startsWith("/api/library")) await released;
-    return ask(address, ...more);
+  let held = null;
+  window.unanswered = 0;
+  window.hold = () => {
+    held = new Promise((resolve) => (window.release = resolve));
   };
-}"""
-"""Holds the page's questions about the library back until `release()`."""
+  window.fetch = async (address, ...more) => {
+    if (!String(address).startsWith("/api/library")) return ask(address, ...more);
+    await held;
+    unanswered += 1;
+    return ask(address, ...more).finally(() => (unanswered -= 1));
+  };
+})()"""
+"""Holds the page's questions about the library back between `hold()` and `release()`."""
 
 
 def shares(tab):
@@ -108,9 +112,12 @@ def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     tab.set_viewport_size({"width": 1000, "height": 620})
     address = tab.url.split("#")[0]
     stored.unlink(missing_ok=True)
+    tab.add_init_script(HELD)
+    tab.reload()
     frame = opened(tab, address)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
-    tab.evaluate(HELD)
+    tab.evaluate("hold()")
+    until(tab, tab, "unanswered === 0")  # an answer on its way would tell of the edits
     frame.get_by_role("button", name="save", exact=True).click()
     frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
     shares(tab)

@@ -18,7 +18,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import Work
 from gsplat_edu.scene.views import View
 from processes import Program
-from studio.pages import COMMAND, until
+from studio.pages import COMMAND, until, waiting
 from studio.test_page_doctor import examined
 from studio.test_page_watch import at
 
@@ -257,11 +257,11 @@ def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swa
     drag(tab, dialog.locator("svg").bounding_box(), (10, 10), (80, 60))
     saved(dialog)
     dialog.get_by_role("button", name="Close").click()
-    part.get_by_role("button", name="Train again with the masks").click()
-    tab.wait_for_url(re.compile("#/runs/wrong-run"))
-    job = library[0].queue.jobs()[-1]
-    try:
-        # its masks stay as they are while it runs
+    with waiting(library[0]):
+        part.get_by_role("button", name="Train again with the masks").click()
+        tab.wait_for_url(re.compile("#/runs/wrong-run"))
+        job = library[0].queue.jobs()[-1]
+        # its masks stay as they are until it has ended
         address = "/api/captures/wrong/mask"
         answer = tab.evaluate(
             """async (address) => {
@@ -272,8 +272,6 @@ def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swa
             }""",
             address,
         )
-    finally:
-        library[0].queue.cancel(job.id)
     assert answer[0] == 409 and "is used by job" in answer[1] and (swapped / DRAWN).exists()
     assert job.work.inputs == ("captures/wrong",)
 

@@ -1,7 +1,5 @@
 // The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives. Answers wait while a button is
-// pressed, because they change the page.
-
-import { released } from "./press.js";
+// pressed, because they change the page: `released` is of the viewer's press.js.
 
 export class ApiError extends Error {
   constructor(line, status) {

@@ -1,7 +1,6 @@
 // The page: which screen the address names, keys, and what every screen shares.
 
 import { announce, keptFocus, put } from "./dom.js";
-import { released } from "./press.js";
 import { Store } from "./store.js";
 import { library } from "./library.js";
 import { trash } from "./trash.js";

@@ -27,9 +27,13 @@ export function put(element, text) {
   element.hidden = !text;
 }
 
-// Makes the children of a container those of a list: `make(item)` for new keys, `update(child, item)` for all.
+// Makes the children of a container those of a list: `make(item)` for new keys, `update(child, item)` for all. The focus
+// stays where it is, although what is moved loses it.
 export function keyed(container, items, keyOf, make, update = () => {}) {
+  const focused = document.activeElement;
   const old = new Map([...container.children].map((child) => [child.dataset.key, child]));
+  const kept = new Set(items.map((item) => String(keyOf(item))));
+  for (const [key, child] of old) if (!kept.has(key)) child.remove(); // first, so that the others need not be moved
   items.forEach((item, index) => {
     const key = String(keyOf(item));
     let child = old.get(key);
@@ -41,7 +45,19 @@ export function keyed(container, items, keyOf, make, update = () => {}) {
     update(child, item);
     if (container.children[index] !== child) container.insertBefore(child, container.children[index] ?? null);
   });
-  for (const child of old.values()) child.remove();
+  if (document.activeElement !== focused && container.contains(focused)) focused.focus({ preventScroll: true });
+}
+
+// Replaces what is in a place. The control that takes the place of the one with the focus gets it, and what was unfolded
+// stays so.
+export function renew(place, ...children) {
+  const all = (kind) => [...place.querySelectorAll(kind)];
+  const controls = "button, a, summary";
+  const focused = all(controls).indexOf(document.activeElement);
+  const unfolded = all("details").map(({ open }) => open);
+  place.replaceChildren(...children);
+  all("details").forEach((one, index) => (one.open = Boolean(unfolded[index])));
+  all(controls)[focused]?.focus({ preventScroll: true });
 }
 
 export const count = (number, one, many = `${one}s`) => `${whole(number)} ${number === 1 ? one : many}`;

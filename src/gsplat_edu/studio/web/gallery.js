@@ -1,7 +1,7 @@
 // Previews of photos, and what the doctor says about them.
 
 import { at, get, post } from "./api.js";
-import { announce, attempt, bytes, button, count, errorLine, h, heading, keyed, put } from "./dom.js";
+import { announce, attempt, bytes, button, count, errorLine, h, heading, keyed, put, renew } from "./dom.js";
 import { drawMask } from "./mask.js";
 
 const FIRST = 60; // previews at once; more come by a button
@@ -185,6 +185,6 @@ export function showFindings(place, offer, { store, left, drawn }, { findings, f
     ? [h("details", {}, h("summary", {}, "Facts"), h("table", {}, h("tbody", {}, facts.map(([key, value]) => h("tr", {}, h("th", { scope: "row" }, key), h("td", {}, value))))), fine.length ? h("p", { class: "quiet" }, `Nothing wrong with: ${fine.join(", ")}.`) : null)]
     : [];
   const lead = advice.length > 1 ? [h("p", {}, "Most useful first:"), h("ol", {}, advice.map((one) => h("li", {}, one)))] : [];
-  place.replaceChildren(...old, ...said, line, h("ul", { class: "findings" }, items), ...lead, ...table);
+  renew(place, ...old, ...said, line, h("ul", { class: "findings" }, items), ...lead, ...table);
   return marks;
 }

@@ -19,7 +19,9 @@ export const badge = (state) => h("span", { class: `badge ${state}` }, STATES[st
 
 // Starts a job; its answer is in the store when this returns.
 export async function startJob(store, request) {
-  return store.answered(await post("/api/jobs", request), undefined);
+  const heard = new Map(store.heard); // of a removed job, whose id a new one may get, it is not empty
+  const job = await post("/api/jobs", request);
+  return store.answered(job, heard.get(job.id));
 }
 
 // A card of one job. `update()` shows its present state.

@@ -315,6 +315,10 @@ export async function drawMask(store, entry, photo, name, saved) {
     });
     questions += 1;
     [base, version] = [answer.shapes, answer.version];
+    if (newer?.version === version) { // it was looked at before this answer came
+      newer = null;
+      put(line, "");
+    }
     stored = answer.shapes.length ? "Saved. Trainings that begin from now on use it." : "Removed. The mask is as it was before.";
     printed.replaceChildren(h("p", { class: "quiet" }, "The same as a command"), commandLine(answer.command));
     saved(answer.shapes.length > 0);

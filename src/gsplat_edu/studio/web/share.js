@@ -6,7 +6,6 @@ import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
 import { meshes, newestOf } from "./mesh.js";
-import { released } from "./press.js";
 
 const FORMATS = [
   ["html", "HTML page", "one file that shows the scene in any browser, also offline"],

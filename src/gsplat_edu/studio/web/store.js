@@ -186,14 +186,17 @@ export class Store extends EventTarget {
 
   async readJobs() {
     const heard = new Map(this.heard);
-    const { jobs, damaged } = await get("/api/jobs");
+    const { jobs: found, damaged } = await get("/api/jobs");
+    const isNews = ({ id }) => this.heard.get(id) === heard.get(id); // else the stream has told what came later
     this.damaged = new Map(damaged.map((found) => [found.id, found]));
-    const ids = new Set(jobs.map(({ id }) => id));
-    for (const id of this.jobs.keys()) if (!ids.has(id) && this.heard.get(id) === heard.get(id)) this.jobs.delete(id);
-    for (const job of jobs) if (!this.jobs.has(job.id)) this.jobs.set(job.id, new JobView(job));
-    for (const job of jobs) if (this.heard.get(job.id) === heard.get(job.id)) this.jobs.get(job.id).job = job;
+    const ids = new Set(found.map(({ id }) => id));
+    for (const id of this.jobs.keys()) if (!ids.has(id) && isNews({ id })) this.jobs.delete(id);
+    for (const job of found.filter(isNews)) {
+      if (this.jobs.has(job.id)) this.jobs.get(job.id).job = job;
+      else this.jobs.set(job.id, new JobView(job));
+    }
     this.read = true;
-    await Promise.all(jobs.slice(-20).map(({ id }) => this.catchUp(id)));
+    await Promise.all(found.slice(-20).map(({ id }) => this.catchUp(id)));
     this.changed();
   }
 
@@ -212,7 +215,7 @@ export class Store extends EventTarget {
     });
     source.addEventListener("job", ({ data }) => {
       const job = JSON.parse(data);
-      this.heard.set(job.id, (this.heard.get(job.id) ?? 0) + 1);
+      this.hears(job.id);
       this.put(job);
     });
     source.addEventListener("event", ({ data }) => {
@@ -227,6 +230,7 @@ export class Store extends EventTarget {
     source.addEventListener("library", () => this.refreshSoon());
     source.addEventListener("removed", ({ data }) => {
       const { id } = JSON.parse(data);
+      this.hears(id);
       this.jobs.delete(id);
       if (this.damaged.delete(id)) this.refreshSoon(); // its line is in the library's list of troubles
       this.changed();
@@ -236,6 +240,10 @@ export class Store extends EventTarget {
       source.close();
       this.changed();
     });
+  }
+
+  hears(id) {
+    this.heard.set(id, (this.heard.get(id) ?? 0) + 1);
   }
 
   setConnected(connected) {

@@ -16,8 +16,11 @@ export function trash({ main, store }) {
     }),
   );
 
+  let questions = 0;
   async function read() {
+    const asked = ++questions;
     const { trash: found } = await get("/api/trash");
+    if (asked !== questions) return; // the answer is older than that to a later question
     empty.hidden = found.length > 0;
     clear.hidden = !found.length;
     keyed(list, found, ({ id }) => id, ({ id, kind, name, removed }) => {

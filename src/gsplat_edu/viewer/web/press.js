@@ -1,15 +1,16 @@
 // What arrives by itself waits while something is pressed: a button that moves or is replaced between press and release is
-// not clicked. The studio's web/press.js does the same for its own screens, which are modules.
+// not clicked. The studio's page has this script too.
 "use strict";
 
+const CONTROL = "button, a, summary, label, input, select, textarea";
 const PRESSABLE = "button, a, summary, label, [type=checkbox], [type=radio]"; // not what is dragged, or opens a list
 const RELEASES = ["pointerup", "pointercancel", "pointermove", "keyup", "blur"];
+const TAP = 100; // milliseconds; the click of a finger comes after its release, that of a mouse together with it
 
 let pressing = null; // resolves once what is pressed is released
 
 function holdChanges({ target }) {
-  const control = target.closest?.("button, a, summary, label, input, select, textarea");
-  if (pressing || !control?.matches(PRESSABLE)) return;
+  if (pressing || !target.closest?.(CONTROL)?.matches(PRESSABLE)) return;
   let end;
   pressing = new Promise((resolve) => (end = resolve));
   const release = () => {
@@ -17,10 +18,10 @@ function holdChanges({ target }) {
     end();
   };
   // A release outside the window is noticed when the pointer comes back, or when the window loses the focus.
-  const look = ({ type, buttons, target: at }) => {
+  const look = ({ type, buttons, pointerType, target: at }) => {
     if ((type === "pointermove" && buttons) || (type === "blur" && at !== window)) return;
     for (const one of RELEASES) removeEventListener(one, look, true);
-    setTimeout(release); // the click comes in between
+    setTimeout(release, pointerType === "touch" ? TAP : 0);
   };
   for (const one of RELEASES) addEventListener(one, look, true);
 }
