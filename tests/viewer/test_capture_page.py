@@ -388,11 +388,7 @@ def ask(server, path, data=None, token=True, **headers):
         address += f"{'&' if '?' in path else '?'}token={server.guard.token}"
     request = urllib.request.Request(address, data, headers)
     try:
-<<<<<<< HEAD
-        with urllib.request.urlopen(request, timeout=60) as answer:
-=======
         with urllib.request.urlopen(request, timeout=180) as answer:
->>>>>>> w/flakec
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()

@@ -195,11 +195,7 @@ def test_only_the_page_may_start_a_judgement(served):
     }
 
     def ask(method, path=FLOATERS, **headers):
-<<<<<<< HEAD
-        connection = http.client.HTTPConnection(*served.server_address[:2], timeout=60)
-=======
         connection = http.client.HTTPConnection(*served.server_address[:2], timeout=180)
->>>>>>> w/flakec
         connection.request(method, path, headers=headers)
         answer = connection.getresponse()
         return answer.status, answer.read()

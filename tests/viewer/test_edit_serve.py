@@ -40,11 +40,7 @@ def server(tmp_path):
 
 def ask(server, method, path, body=None, **headers):
     """Return status, headers and body of the answer to one request."""
-<<<<<<< HEAD
-    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=60)
-=======
     connection = http.client.HTTPConnection(*server.server_address[:2], timeout=180)
->>>>>>> w/flakec
     try:
         connection.putrequest(method, path, skip_host="Host" in headers)
         for name, value in headers.items():
