@@ -5,7 +5,7 @@
 const CONTROL = "button, a, summary, label, input, select, textarea";
 const PRESSABLE = "button, a, summary, label, [type=checkbox], [type=radio]"; // not what is dragged, or opens a list
 const RELEASES = ["pointerup", "pointercancel", "pointermove", "keyup", "blur"];
-const TAP = 100; // milliseconds; the click of a finger comes after its release, that of a mouse together with it
+const FINGER = 100; // milliseconds; the click of a finger comes after its release, that of a mouse together with it
 
 let pressing = null; // resolves once what is pressed is released
 
@@ -21,7 +21,7 @@ function holdChanges({ target }) {
   const look = ({ type, buttons, pointerType, target: at }) => {
     if ((type === "pointermove" && buttons) || (type === "blur" && at !== window)) return;
     for (const one of RELEASES) removeEventListener(one, look, true);
-    setTimeout(release, pointerType === "touch" ? TAP : 0);
+    setTimeout(release, pointerType === "touch" ? FINGER : 0);
   };
   for (const one of RELEASES) addEventListener(one, look, true);
 }
