@@ -64,6 +64,16 @@ def test_a_scene_that_goes_while_its_frame_opens_is_shown_once_it_is_back(visito
     assert refused == [404]
 
 
+@pytest.mark.parametrize(("tab_name", "address"), [("judge", "views"), ("share", "exports")])
+def test_what_the_studio_did_not_answer_is_asked_for_again(visitor, library, runs, tab_name, address):
+    person = visitor()
+    person.tab.route(f"**/api/runs/egg/{address}", lambda route: route.abort(), times=1)
+    line = at(person, f"runs/egg/{tab_name}").locator("main .error", has_text="The studio does not answer")
+    line.wait_for()
+    library[0].stream.library_changed()
+    line.wait_for(state="hidden")
+
+
 @pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
 def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     person = visitor()

@@ -1,7 +1,7 @@
 // The part of a screen that asks the doctor.
 
 import { at, get } from "./api.js";
-import { attempt, button, errorLine, h, heading, link } from "./dom.js";
+import { attempt, button, errorLine, h, heading, link, versioned } from "./dom.js";
 import { showFindings } from "./gallery.js";
 import { jobPlace, startJob } from "./jobs.js";
 
@@ -16,7 +16,7 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
     attempt(ask, line, () => startJob(store, { command: "doctor", subject: entry })),
   );
   const again = h("p", { class: "row", hidden: true });
-  let [read, request] = ["", null];
+  let request = null;
 
   // After photos were left out or masked, a run is trained again without them.
   const kinds = new Set();
@@ -50,6 +50,11 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
     return begin;
   }
 
+  const findings = versioned(line, () => get(at(entry, "findings")), (answer) => {
+    request = answer.again;
+    marked(showFindings(found, offer, heard, answer));
+  });
+
   return {
     element: h("section", { "aria-label": "doctor" }, heading(2, "Doctor"), h("p", { class: "quiet" }, hint), ask, line, job.element, again, found),
     update(now) {
@@ -59,16 +64,7 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
       ask.textContent = view ? "Examine again" : "Examine";
       ask.hidden = Boolean(view?.active);
       const version = `${view?.job.id} ${view?.job.state} ${now.modified}`;
-      if (!view || version === read) return;
-      read = version;
-      get(at(entry, "findings")).then(
-        (answer) => {
-          if (version !== read) return;
-          request = answer.again;
-          marked(showFindings(found, offer, heard, answer));
-        },
-        (error) => (line.hidden = !(line.textContent = error.message)),
-      );
+      if (view) findings.read(version);
     },
   };
 }

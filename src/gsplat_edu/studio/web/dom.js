@@ -124,6 +124,35 @@ export async function attempt(pressed, line, act) {
   }
 }
 
+// Asks for what a version of the page shows, once for each version; an answer that comes after the question of a newer
+// version is dropped. If the studio did not answer, the next change asks again. after() comes after the answer or its error.
+export function versioned(line, ask, show, after = () => {}) {
+  let [asked, failed] = [null, false];
+  return {
+    forget: () => (asked = null),
+    read(version) {
+      if (version === asked) return;
+      asked = version;
+      ask().then(
+        (answer) => {
+          if (version !== asked) return;
+          if (failed) put(line, "");
+          failed = false;
+          show(answer);
+          after();
+        },
+        (error) => {
+          if (version !== asked) return;
+          if (error.status === 0) asked = null;
+          failed = true;
+          put(line, error.message);
+          after();
+        },
+      );
+    },
+  };
+}
+
 // Keeps the keyboard's place: returns a function to call after each change of the page. If what had the focus is gone or
 // hidden by then, what is nearest to it gets the focus.
 export function keptFocus() {

@@ -1,7 +1,7 @@
 // Judges a run by the photos that it was not trained on, and compares two runs.
 
 import { at, get } from "./api.js";
-import { decibels, errorLine, h, heading, keyed, link, put } from "./dom.js";
+import { decibels, errorLine, h, heading, keyed, link, put, versioned } from "./dom.js";
 import { doctor } from "./doctor.js";
 
 const PICTURES = ["photo", "render", "difference"];
@@ -47,14 +47,14 @@ export function judge({ place, store, entry, where }) {
   const report = h("p", { hidden: true }, link("Open the report", at(entry.entry, "report"), { class: "button", target: "_blank" }));
   list.after(report);
   choice.hidden = checked.element.hidden = true; // until what is above them is there
-  let [views, read, opened] = [[], "", where.query.get("view")];
+  let [views, version, now, opened] = [[], "", entry, where.query.get("view")];
   const base = `#/runs/${encodeURIComponent(entry.name)}/judge`;
 
   function show() {
     const ordered = [...views];
     if (order.value === "best") ordered.reverse();
     if (order.value === "name") ordered.sort((a, b) => a.name.localeCompare(b.name));
-    keyed(list, ordered, ({ index }) => `${index} ${read}`, ({ index, name, psnr, ssim }) => {
+    keyed(list, ordered, ({ index }) => `${index} ${version}`, ({ index, name, psnr, ssim }) => {
       const pictures = PICTURES.map((what) => {
         return h("figure", {}, h("img", { src: previewOf(entry.entry, index, what), alt: `${what} of ${name}`, loading: "lazy" }), h("figcaption", {}, what));
       });
@@ -74,6 +74,20 @@ export function judge({ place, store, entry, where }) {
     large.append(heading(3, view.name), slider(...pictures, ["photo", "render"], view.name, view), link("Close", base, { class: "button" }));
   }
 
+  function reveal() {
+    choice.hidden = checked.element.hidden = false;
+    report.hidden = !now.finished; // a training writes it at its end
+  }
+
+  function showViews({ views: found }) {
+    views = found;
+    const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
+    facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";
+    show();
+  }
+
+  const held = versioned(line, () => get(at(entry.entry, "views")), showViews, reveal);
+
   return {
     follows(next) {
       opened = next.query.get("view");
@@ -81,35 +95,17 @@ export function judge({ place, store, entry, where }) {
       if (opened) large.scrollIntoView({ block: "nearest" });
       return true;
     },
-    update(now) {
+    update(found) {
+      now = found;
       checked.update(now);
-      const reveal = () => {
-        choice.hidden = checked.element.hidden = false;
-        report.hidden = !now.finished; // a training writes it at its end
-      };
       const runs = store.entries("runs").filter(({ name }) => name !== entry.name);
       const names = runs.map(({ name }) => name).join("\n");
       if (others.dataset.names !== names) {
         others.dataset.names = names;
         others.replaceChildren(h("option", { value: "" }, runs.length ? "another run" : "no other run"), ...runs.map(({ name }) => h("option", { value: name }, name)));
       }
-      const version = `${now.finished} ${now.psnr} ${now.iterations}`;
-      if (version === read) return;
-      read = version;
-      get(at(entry.entry, "views")).then(
-        ({ views: found }) => {
-          if (version !== read) return; // a newer answer was there first
-          views = found;
-          const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
-          facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";
-          show();
-          reveal();
-        },
-        (error) => {
-          put(line, error.message);
-          reveal();
-        },
-      );
+      version = `${now.finished} ${now.psnr} ${now.iterations}`;
+      held.read(version);
     },
   };
 }

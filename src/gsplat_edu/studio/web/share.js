@@ -1,7 +1,7 @@
 // Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
 
 import { at, get, remove } from "./api.js";
-import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put } from "./dom.js";
+import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put, versioned } from "./dom.js";
 import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
@@ -41,7 +41,7 @@ export function share({ place, store, entry }) {
   const list = h("ul", { class: "plain exports", "aria-label": "exported files" });
   const none = h("p", { class: "quiet" }, "Nothing is exported yet.");
   const mesh = meshes(store, entry);
-  let [read, now] = ["", entry];
+  let now = entry;
   let shown = {}; // the newest surface and collider, which a page can show
 
   const start = async (more) => {
@@ -87,7 +87,7 @@ export function share({ place, store, entry }) {
     const away = button("Remove", () =>
       attempt(away, line, async () => {
         await remove(at(entry.entry, "exports", file));
-        read = "";
+        exported.forget();
         store.refresh();
       }),
     );
@@ -115,6 +115,8 @@ export function share({ place, store, entry }) {
     });
   }
 
+  const exported = versioned(line, () => get(at(entry.entry, "exports")), ({ exports }) => show(exports));
+
   return {
     close: () => mesh.close(),
     update(found) {
@@ -125,11 +127,7 @@ export function share({ place, store, entry }) {
       mesh.update(now);
       make.disabled = film.disabled = entry.kind === "runs" && !now.files;
       const states = store.jobsOf(entry.entry, "convert", "render", "mesh").map(({ job: { id, state } }) => `${id} ${state}`);
-      const version = `${states} ${now.modified} ${now.files}`;
-      if (version === read) return;
-      read = version;
-      // an answer that comes after that to a newer question is dropped
-      get(at(entry.entry, "exports")).then(({ exports }) => version === read && show(exports), (error) => put(line, error.message));
+      exported.read(`${states} ${now.modified} ${now.files}`);
     },
   };
 }
