@@ -12,6 +12,7 @@ from PIL import Image
 from chapters import ROOT, tool
 from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, drag, read_data, state, swipe, tap, told
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
+from viewer.handles import until
 
 
 def test_a_splat_is_computed_like_the_chapter(opened):
@@ -156,8 +157,10 @@ def test_sliders_follow_keys_and_touch(opened, name, key):
     stepped = state(page, name)[key]
     assert stepped > before and told(page, name) != words
     assert slider.get_attribute("aria-valuetext") == told(page, name)
-    box = slider.bounding_box()
-    tap(page, (box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2))
+    box, moved = slider.bounding_box(), f"Number(document.querySelector('[data-play={name}] input').value)"
+    place = page.evaluate(moved)
+    page.touchscreen.tap(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2)
+    until(page, f"{moved} > {place}")
     assert state(page, name)[key] > stepped
     drag(page, (box["x"] + 0.9 * box["width"], box["y"] + 5), (box["x"] + 2, box["y"] + 5))
     assert state(page, name)[key] < before or state(page, name)[key] == 0
