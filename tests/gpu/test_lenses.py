@@ -70,6 +70,7 @@ def test_gradients_match_the_native_kernels_in_float64(check, name, antialiased)
     check(around(60, seed=3), lens_camera(name), dataclasses.replace(SETTINGS, antialiased=antialiased))
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", CLAMPED)
 def test_clamped_gradients_match_the_native_kernels(check, name, monkeypatch):
     scene, camera = around(60, seed=3), lens_camera(name)
@@ -110,6 +111,7 @@ def test_a_fisheye_near_its_axis_and_past_90_degrees(check, angle):
     check(dataclasses.replace(scene, means=rounded), camera, bound=1e-4, but=but)
 
 
+@pytest.mark.sliced(1, by="name")
 @pytest.mark.parametrize("latitude", [70.0, 79.9, 80.1, 88.9, 89.1, 89.9])
 @pytest.mark.parametrize("name", PANORAMAS)
 def test_a_panorama_near_its_poles(check, name, latitude):
@@ -122,6 +124,7 @@ def test_a_panorama_near_its_poles(check, name, latitude):
     check(dataclasses.replace(scene, means=CENTRE + apart * direction @ camera.R), camera)
 
 
+@pytest.mark.sliced(1, by="name")
 @pytest.mark.parametrize("W", [45, 64])
 @pytest.mark.parametrize("name", PANORAMAS)
 def test_the_seam(check, device, name, W):
@@ -166,6 +169,7 @@ def test_coefficients_of_zero_have_a_gradient(device, kind):
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=BOUND * float(found[1].abs().max()))
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("readout", ["down", "up", "left", "right"])
 def test_every_readout(check, readout):
     projection = LENSES["opencv"][0]
@@ -218,6 +222,7 @@ def test_one_bad_gaussian_does_not_affect_others(device, lens, name, value):
         assert torch.equal(torch.cat([tensor.grad[:7], tensor.grad[8:]]), without.tensors()[key].grad), key
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize("place", ["at the centre", "at the pole"])
 @pytest.mark.parametrize("lens", ["fisheye", "equidistant", "panorama", "panorama, moving"])
 def test_where_a_lens_has_no_direction(device, lens, place):

@@ -16,6 +16,7 @@ def capture(tmp_path_factory):
     return folder
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize(
     ("words", "says"),
