@@ -13,6 +13,8 @@ from PIL import Image
 
 from accessibility import grave_faults_in_all_styles
 from gsplat_edu.data.left_out import read_left_out
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.viewer import capture_page
 from gsplat_edu.viewer.capture_serve import CaptureServer, Examination
@@ -25,9 +27,12 @@ REFUSED = "the server responded with a status of 400"
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """A ring of cameras with a gap, and one photo that EXIF turns."""
+def folder(tmp_path, request):
+    """A ring of cameras with a gap; if asked for, one without a gap that has no points."""
     folder = tmp_path / "egg & spoon"
+    if getattr(request, "param", "") == "no points":
+        write_transforms(folder, procedural_capture(size=48, count=12)[0], [])
+        return folder
     ring(folder, skipped=(4, 5, 6))
     measured(folder)
     return folder
@@ -122,6 +127,17 @@ def alone(tab):
         if 310 < x < 560 and tab.evaluate("([x, y]) => viewer.at(x, y)", [x, y]) == i:
             return i
     raise AssertionError("every outline overlaps another")
+
+
+@pytest.mark.parametrize("folder", ["no points"], indirect=True)
+def test_a_capture_without_points_shows_its_cameras(opened):
+    tab = opened()
+    assert tab.evaluate("[viewer.facts.count, viewer.cameras.list.length]") == [0, 12]
+    x, y = middle_of(tab, alone(tab))
+    before = pixels(tab)
+    tab.mouse.click(x, y)
+    tab.wait_for_selector("#photo:not([hidden])")
+    assert np.ptp(before.reshape(-1, 3), axis=0).max() > 100  # outlines on the backdrop
 
 
 def test_outlines_are_drawn_where_the_cameras_project_them(opened):

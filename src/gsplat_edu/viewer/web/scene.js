@@ -41,6 +41,7 @@ async function inflated(elements, total) {
   if (typeof DecompressionStream === "undefined") {
     throw new Error("This browser cannot unpack the scene: it lacks DecompressionStream; use a newer version.");
   }
+  if (!total) return new Uint8Array(0); // nothing is packed
   const waiting = [...elements];
   const packed = new ReadableStream({
     pull(controller) {
