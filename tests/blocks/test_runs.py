@@ -17,6 +17,7 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.train.length import planned_iterations
+from systems import needs_posix
 
 
 def scene(folder):
@@ -42,6 +43,23 @@ def test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all(city, r
     assert main(words) == 0 and "is finished, 4 blocks; nothing to do" in capsys.readouterr().out
     assert [BlocksFolder(run).record(number).read_bytes() for number in range(4)] == before
     assert main([*words[:-1]]) == 2 and "already holds a run; add --resume" in capsys.readouterr().err
+
+
+@needs_posix
+@pytest.mark.parametrize("part", ["blocks", "point_cloud", "coarse"])
+def test_nothing_is_trained_or_merged_through_a_link(city, run, tmp_path, capsys, part):
+    mine, link = tmp_path / "mine", run / part
+    if link.exists():
+        link.rename(mine)
+    mine.mkdir(exist_ok=True)
+    link.symlink_to(mine)
+    before = {path: path.read_bytes() for path in mine.rglob("*") if path.is_file()}
+    words = ["train", str(city), "--out", str(run), "--blocks", "4", *RECIPE, "--resume"]
+    for command in (["block", str(run), "0"], ["merge", str(run)], words):
+        assert main(command) == 2
+        error = capsys.readouterr().err
+        assert f"{link} is a link that leads out of {run}" in error and error.count("\n") == 1
+    assert {path: path.read_bytes() for path in mine.rglob("*") if path.is_file()} == before
 
 
 def test_coarse_model_and_blocks_get_their_own_recipes(split):

@@ -21,6 +21,7 @@ from gsplat_edu.runs.evaluation import ScoredViews, evaluate_run
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.views import View
 from splat_ball import ball
+from systems import needs_posix
 
 COUNT, SIZE = 16, 96
 RENDER = functools.partial(render, settings=RenderSettings(jacobian_limit=1.3, depth=False), backend="cpu")
@@ -90,6 +91,17 @@ def test_the_record_says_what_is_printed(run, capsys):
     page = run.report.read_text("utf-8")
     for row in ("area seen by 3 views or more", "none: it is closed", "after 7 iterations", "<th>F1</th>"):
         assert page.count(row) == 1, row
+
+
+@needs_posix
+def test_nothing_is_recorded_through_a_link(run, tmp_path, capsys):
+    shutil.rmtree(run.renders)
+    (tmp_path / "mine").mkdir()
+    run.renders.symlink_to(tmp_path / "mine")
+    mesh(run)
+    said = capsys.readouterr().out
+    assert f"not added to the run's report: RUN: {run.renders} is a link that leads out of {run.path}" in said
+    assert list((tmp_path / "mine").iterdir()) == [] and not run.meshes.exists()
 
 
 def test_pictures_show_the_photo_the_mesh_and_the_evidence(run):

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.json_fields import checked_text, checked_whole, number_within
-from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.runs.folder import RunFolder, write_json
 
 PLAN = "plan.json"
@@ -164,5 +164,5 @@ def file_digest(path: Path) -> str:
     Raises:
         OSError: the file cannot be read.
     """
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

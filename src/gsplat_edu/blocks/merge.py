@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.links import check_links
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
@@ -118,10 +119,12 @@ def merge_blocks(
         export: As for `CaptureRun.finish`.
 
     Raises:
+        ArgumentError: a link leads out of the folder.
         CheckpointError: a block is not finished, or a file is damaged.
         DatasetError: the capture cannot be read.
         OSError: a file cannot be written.
     """
+    check_links("RUN", path)
     folder, plan = BlocksFolder(path), BlockPlan.read(path)
     records = finished_blocks(folder, plan)
     if len(kinds := sorted({(done.instructions, done.version) for done in records})) > 1:

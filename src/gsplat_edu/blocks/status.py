@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.reading import open_file, parse_json
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 
@@ -57,7 +57,7 @@ def statuses(folder: BlocksFolder, plan: BlockPlan, digest: str) -> list[BlockSt
 def _last(folder: BlocksFolder, number: int, wanted: int) -> tuple[int, int, float | None, int | None]:
     """Return iteration, iterations, loss and number of Gaussians by the last line of a block's log that has them."""
     try:
-        with folder.run(number).log_file.open("rb") as file:
+        with open_file(folder.run(number).log_file) as file:
             file.seek(max(file.seek(0, 2) - TAIL, 0))
             lines = file.read().split(b"\n")
     except OSError:

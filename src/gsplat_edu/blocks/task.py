@@ -13,6 +13,7 @@ from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.json_fields import checked_choice
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.blocks.counted import Counted, counted_views
@@ -100,7 +101,7 @@ def train_block(
         The record; None if `stop` ended the training.
 
     Raises:
-        ArgumentError: there is no such block, or another process is training it.
+        ArgumentError: there is no such block, another process is training it, or a link leads out of the folder.
         CheckpointError: plan, start or run are damaged.
         DatasetError: a photo is missing, cannot be read here, or was changed since the capture was split.
         OSError: a file cannot be written, for example because the disk is full.
@@ -108,6 +109,7 @@ def train_block(
     folder = BlocksFolder(path)
     plan = BlockPlan.read(path)
     options = block_options(folder, plan, number, None if reader is None else reader.path)
+    check_links("RUN", path)
     if (done := folder.read_done(number, plan.digest())) is not None:
         return done
     with locked(f"block {number}", options.out, "a training of this block", say, patience):

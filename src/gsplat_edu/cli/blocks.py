@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.blocks.cluster import AGAIN, ClusterOptions, run_on_cluster
@@ -58,6 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
     cluster = None
     if arguments.scheduler is not None or (arguments.workers or 1) > 1:
         cluster = ClusterOptions(arguments.scheduler, arguments.workers or 1)
+    check_links("--out", arguments.out)
     with locked("--out", arguments.out, "gsplat-edu train --blocks", say):
         planned, reader = _prepared(arguments, console, say)
         folder = BlocksFolder(arguments.out)

@@ -10,6 +10,8 @@ from pathlib import Path
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked_file
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import write_text
@@ -35,6 +37,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Check the outputs, and clean while no other command writes them."""
     console = Terminal()
     scene = open_source(arguments.source).path
+    if arguments.out is None and arguments.source.is_dir():
+        check_links("SCENE", arguments.source)
     out = arguments.out or default_target(scene)
     if not arguments.dry_run:
         export.check_target("--out", out)
@@ -96,7 +100,8 @@ def _clean(arguments: argparse.Namespace, out: Path, console: Terminal) -> None:
         written = open_source(out)
         part = identity_of(written.scene.gaussians, written.origin)
         text = for_part(carried, str(arguments.edits), edited.scene.gaussians, cleaning.kept, part)
-        write_text(out.with_name(EDITS), text)
+        with written_aside(out.with_name(EDITS)) as aside:
+            write_text(aside, text)
         console.print(f"wrote {out.with_name(EDITS)}: the edits for this scene", soft_wrap=True)
 
 

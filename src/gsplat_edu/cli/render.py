@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE, lens_choice
 from gsplat_edu.cli.shot import PLAN, Shot, check_lens, median_depth, plan_asked_for, through_lens
@@ -67,6 +68,8 @@ def run(arguments: argparse.Namespace) -> None:
     name = PLAN if planned else _output_name(has_path, orbit, bool(maps))
     if folder.exists():
         shot = _run_shot(arguments, folder, orbit, edits)
+        if arguments.out is None:
+            check_links("RUN", folder.path)
         out = arguments.out or folder.renders / name
     elif file_in(arguments.source).is_file():
         shot = _file_shot(arguments, orbit, edits)

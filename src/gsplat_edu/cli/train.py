@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.text import Told, option_flag
 from gsplat_edu.budget.choice import Prospect, choose_backend, resumed_backend
@@ -247,6 +248,7 @@ def with_poses(
         return options
     if options.points is not None:
         read_points_ply(options.points)  # report errors in the file before the long computation
+    check_links("--out", options.folder.path)
     found = options.folder.path / "capture"
     if options.folder.exists():
         if not options.resume:

@@ -25,6 +25,7 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable, written_aside
+from gsplat_edu.base.links import is_inside
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import PHOTO_FOLDERS, is_file, is_folder
@@ -228,7 +229,7 @@ class _Target:
         """
         mask, drawn = self.frame.mask, self.drawing
         path = self._new_name() if mask is None else mask
-        inside = path.parent.resolve().is_relative_to(self.folder.resolve()) and not path.is_symlink()
+        inside = is_inside(path.parent, [self.folder]) and not path.is_symlink()
         if not inside or not path.is_relative_to(self.folder):
             raise DatasetError(
                 f"{path}: this mask lies outside the capture, and is not changed; copy it to {MASKS}/"

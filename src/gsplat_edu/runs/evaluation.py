@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.loading_notes import LoadingNote
 from gsplat_edu.evaluate.comparison import save_comparison
@@ -90,11 +91,14 @@ def evaluate_run(
         The scores and the metrics.
 
     Raises:
+        ArgumentError: a link leads out of the folder that is written to.
         CheckpointError: a file of the folder is damaged.
         DatasetError: a photo cannot be read.
         OSError: a file cannot be written.
     """
-    config, log, into = folder.read_config(), folder.log(), into or folder
+    into = into or folder
+    check_links("RUN" if into.path == folder.path else "--out", into.path)
+    config, log = folder.read_config(), folder.log()
     before = into.read_metrics()
     earlier = before if into.path == folder.path else {}
     gallery = _Gallery(into, judged.test, progress)
@@ -115,15 +119,19 @@ def evaluate_run(
         "test_views": [dataclasses.asdict(score) for score in test],
     }
     masked = masked_pictures(folder, metrics, judged.train, gaussians, render, judged.background)
-    title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
-    notes = [str(note) for note in judged.notes]
-    if trials := RefineTrials.of(config):
-        notes.append(trials.note(config.get("train")))
+    title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", _notes(judged, config)
     report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, mesh_entries(folder))
     write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated
     return Evaluation(test, train, metrics)
+
+
+def _notes(judged: ScoredViews, config: Mapping[str, Any]) -> list[str]:
+    """Return the notes of the report: those of the capture, and which refinements were tried."""
+    trials = RefineTrials.of(config)
+    tried = [trials.note(config.get("train"))] if trials else []
+    return [*map(str, judged.notes), *tried]
 
 
 def _appearance(config: Mapping[str, Any]) -> dict[str, Any]:

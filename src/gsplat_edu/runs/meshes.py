@@ -13,6 +13,7 @@ from jaxtyping import Float64, UInt8
 
 from gsplat_edu.base.errors import CheckpointError, DatasetError
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.dataset import Dataset
@@ -120,9 +121,11 @@ def write_mesh_record(
         Whether there is a report, which has the section now. `evaluate_run` puts it into a new one.
 
     Raises:
+        ArgumentError: a link leads out of the run.
         CheckpointError: the record of an earlier mesh is damaged.
         OSError: a file cannot be written.
     """
+    check_links("RUN", folder.path)
     figures = list(_figures(made, dataset, background))
     record = record_of(made)
     record["pictures"] = [figure.name for figure in figures]

@@ -17,6 +17,7 @@ from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.files import check_folder, remove_leftovers
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.left_out import read_left_out
@@ -105,6 +106,7 @@ def _checked_folder(options: RunOptions) -> RunOptions:
     """Check the folder against the options; return them with what config.json adds of a resumed run filled in."""
     options = _with_own_files(options)
     folder = options.folder
+    check_links("--out", folder.path)
     if folder.exists():
         if not options.resume:
             raise CheckpointError(
@@ -148,6 +150,7 @@ def is_finished(options: RunOptions) -> bool:
     """Return whether the folder contains this run, trained to the end and evaluated.
 
     Raises:
+        ArgumentError: a link leads out of the folder.
         CheckpointError: the folder contains a different run, or one that the options do not resume.
         OSError: the folder cannot be written to.
     """
@@ -178,7 +181,7 @@ class CaptureRun:
     Raises:
         CheckpointError: the folder contains a different run, or one that the options do not resume.
         DatasetError: the capture cannot be read.
-        ArgumentError: options contradict each other.
+        ArgumentError: options contradict each other, or a link leads out of the folder.
         OSError: the folder cannot be written to.
 
     Attributes:

@@ -18,6 +18,7 @@ from PIL import ExifTags, Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable, written_aside
+from gsplat_edu.base.reading import open_file
 from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, is_file
 from gsplat_edu.data.colors import conversion_of
 from gsplat_edu.data.images import (
@@ -204,7 +205,7 @@ def fingerprint(files: Sequence[Path], source: Path) -> str:
     for path in files:
         try:
             size = path.stat().st_size
-            with path.open("rb") as file:
+            with open_file(path) as file:
                 ends = file.read(PEEK)
                 file.seek(max(0, size - PEEK))
                 ends += file.read(PEEK)

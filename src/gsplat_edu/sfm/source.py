@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import check_folder
+from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import entries, is_file, is_folder
@@ -64,6 +65,7 @@ def check_source(source: Path, out: Path) -> list[Path]:
         DatasetError: the source cannot be used.
     """
     check_folder("OUT", out)
+    check_links("OUT", out, ("sfm",))
     here, there = source.resolve(), out.resolve()
     if here == there or any(here.is_relative_to(there / part) for part in (*PARTS, "sfm")):
         raise ArgumentError(f"OUT: {out} is the folder of the photos; choose another folder")

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.links import is_inside, links_in
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import as_file_name, legible, shortened, whole_of
 from gsplat_edu.data.capture import PHOTO_ENDINGS
@@ -96,7 +97,7 @@ class Library:
             self.hidden(part).mkdir(parents=True, exist_ok=True)
         # cached pages may be from an older version
         pages = [self.hidden("cache") / part for part in ("pages", "live")]
-        for left in (*self.hidden("uploads").iterdir(), *pages, *_links(self.hidden("cache"))):
+        for left in (*self.hidden("uploads").iterdir(), *pages, *links_in(self.hidden("cache"))):
             _delete(left)
 
     def hidden(self, part: str) -> Path:
@@ -130,11 +131,7 @@ class Library:
 
     def is_within(self, path: Path) -> bool:
         """Return whether a path, with all its links followed, lies in the library or in what it has adopted."""
-        try:
-            path = path.resolve()
-        except (OSError, RuntimeError):  # a circle of links, before and since Python 3.13
-            return False
-        return any(path.is_relative_to(place) for place in (self.root, *self._adopted))
+        return is_inside(path, [self.root, *self._adopted])
 
     def check_within(self, path: Path) -> None:
         """Check that a path lies in the library or in what it has adopted.
@@ -151,7 +148,7 @@ class Library:
         Raises:
             RefusedError: one does.
         """
-        for link in _links(folder):
+        for link in links_in(folder):
             self.check_within(link)
 
     def _strange(self, path: Path) -> str:
@@ -408,14 +405,6 @@ def _removed_from(path: Path) -> str | None:
     except OSError:
         return None
     return kind if kind in KINDS and not path.is_symlink() else None
-
-
-def _links(folder: Path) -> list[Path]:
-    """Return the links below a folder, without following them."""
-    found = []
-    for place, folders, files in os.walk(folder):
-        found += [path for name in (*folders, *files) if (path := Path(place, name)).is_symlink()]
-    return found
 
 
 def extent_of(folder: Path) -> Extent:

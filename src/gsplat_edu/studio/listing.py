@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.errors import CheckpointError
-from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.library import KINDS, Library, extent_of, scene_file
@@ -165,7 +165,7 @@ def run_facts(path: Path) -> dict[str, Any]:
 def last_logged(path: Path) -> dict[str, Any]:
     """Return the figures from the last complete line of a run's log that contains them."""
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             file.seek(max(os.fstat(file.fileno()).st_size - 2048, 0))
             tail = file.read().decode("utf-8", errors="replace")
     except OSError:

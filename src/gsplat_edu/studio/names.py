@@ -9,6 +9,7 @@ from __future__ import annotations
 import unicodedata
 from pathlib import Path
 
+from gsplat_edu.base.links import is_inside
 from gsplat_edu.base.text import as_file_name, printable
 from gsplat_edu.studio.refusal import RefusedError
 
@@ -95,6 +96,6 @@ def below(root: Path, path: Path, what: str) -> Path:
     Raises:
         RefusedError: it leads out of the folder.
     """
-    if not (root / path).resolve().is_relative_to(root.resolve()):
+    if not is_inside(root / path, [root]):
         raise RefusedError(f"{what}: leads out of its folder")
     return root / path

@@ -20,6 +20,7 @@ from torch import Tensor
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.headroom import shortage
+from gsplat_edu.base.reading import open_file
 from gsplat_edu.train.trainer import Trainer
 
 KEPT = 2
@@ -111,6 +112,8 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], Any]:
 def _opened(path: Path) -> Iterator[Any]:
     """Open a checkpoint; errors about its contents raised in the block name the file."""
     try:
+        with open_file(path):  # only a regular file: a pipe would block
+            pass
         with safe_open(path, framework="pt") as file:
             if (file.metadata() or {}).get("format") != FORMAT:
                 raise CheckpointError(
