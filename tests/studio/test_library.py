@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import pytest
 
-from gsplat_edu.studio import library as library_module
+from gsplat_edu.studio import contents as contents_module, library as library_module
 from gsplat_edu.studio.library import scene_file
 from gsplat_edu.studio.projects import newest_export
 from gsplat_edu.studio.refusal import RefusedError
@@ -318,7 +318,7 @@ def test_what_vanishes_while_it_is_listed_is_left_out(page, studio, jpeg, monkey
     """Jobs replace and remove files, and other tabs rename entries, while a page reads the list."""
     for name in ("a", "b"):
         entry(studio, "photos", name, x__jpg=jpeg, y__jpg=jpeg)
-    within = library_module.files_within
+    within = contents_module.files_within
 
     def vanishing(folder):
         for found in within(folder):
@@ -327,7 +327,7 @@ def test_what_vanishes_while_it_is_listed_is_left_out(page, studio, jpeg, monkey
                 path.unlink()
             yield found
 
-    monkeypatch.setattr(library_module, "files_within", vanishing)
+    monkeypatch.setattr(contents_module, "files_within", vanishing)
     (first, _) = page.get("/api/library").json()["photos"]
     assert (first["name"], first["files"], first["bytes"]) == ("a", 1, len(jpeg))
 
@@ -336,7 +336,7 @@ def test_what_vanishes_while_it_is_listed_is_left_out(page, studio, jpeg, monkey
             folder.rename(folder.with_name("c"))
         yield from within(folder)
 
-    monkeypatch.setattr(library_module, "files_within", renamed)
+    monkeypatch.setattr(contents_module, "files_within", renamed)
     answer = page.get("/api/library")
     assert answer.status_code == 200, answer.text
     assert [found["name"] for found in answer.json()["photos"]] == ["a"]

@@ -9,6 +9,18 @@ from pathlib import Path
 from gsplat_edu.base.errors import ArgumentError
 
 
+def resolved(path: Path) -> Path | None:
+    """Return a path with all its links followed; None if they lead in a circle, or the name is none.
+
+    Args:
+        path: The path; it need not exist.
+    """
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError, ValueError):  # a circle is a RuntimeError until Python 3.13
+        return None
+
+
 def is_inside(path: Path, roots: Iterable[Path]) -> bool:
     """Return whether a path, with all its links followed, lies in one of some folders; false for a circle of links.
 
@@ -16,20 +28,24 @@ def is_inside(path: Path, roots: Iterable[Path]) -> bool:
         path: The path; it need not exist.
         roots: The folders.
     """
-    try:
-        real = path.resolve()
-        return any(real.is_relative_to(root.resolve()) for root in roots)
-    except (OSError, RuntimeError, ValueError):  # a circle of links (until Python 3.13 a RuntimeError), a NUL
-        return False
+    real = resolved(path)
+    return real is not None and any(real.is_relative_to(root.resolve()) for root in roots)
 
 
 def links_in(folder: Path) -> Iterator[Path]:
     """Yield the links in a folder, at any depth, without following them."""
-    for place, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            path = Path(place, name)
-            if path.is_symlink():
-                yield path
+    waiting = [str(folder)]
+    while waiting:
+        try:
+            with os.scandir(waiting.pop()) as found:
+                entries = list(found)
+        except OSError:  # it is no folder, may not be read, or has just been removed
+            continue
+        for entry in entries:
+            if entry.is_symlink():
+                yield Path(entry.path)
+            elif entry.is_dir(follow_symlinks=False):
+                waiting.append(entry.path)
 
 
 def check_links(name: str, folder: Path, parts: Iterable[str] = (".",)) -> None:
@@ -48,7 +64,7 @@ def check_links(name: str, folder: Path, parts: Iterable[str] = (".",)) -> None:
     """
     for part in parts:
         place = folder / part
-        for path in [place, *links_in(place)]:
+        for path in (place, *(() if place.is_symlink() else links_in(place))):
             if not is_inside(path, [folder]):
                 raise ArgumentError(
                     f"{name}: {path} is a link that leads out of {folder}; nothing was written: remove the link, or put"

@@ -10,8 +10,9 @@ import json
 import os
 import stat
 from collections.abc import Callable
+from io import BufferedReader
 from pathlib import Path, PureWindowsPath
-from typing import Any, BinaryIO
+from typing import Any
 
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.text import names_a_file
@@ -29,7 +30,7 @@ KINDS = {
 """File types that are not read, by the system's mode."""
 
 
-def open_file(path: str | Path) -> BinaryIO:
+def open_file(path: str | Path) -> BufferedReader:
     """Open a regular file for reading bytes.
 
     A pipe would block until somebody writes to it, and a device may never end.

@@ -24,7 +24,8 @@ from gsplat_edu.studio.command_options import (
     Option,
     Words,
 )
-from gsplat_edu.studio.library import Library, files_within, scene_file
+from gsplat_edu.studio.contents import files_within
+from gsplat_edu.studio.library import Library, scene_file
 from gsplat_edu.studio.listing import is_unfinished
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict

@@ -13,22 +13,20 @@ Removing it removes the link. A link that was not adopted by this user on this c
 
 from __future__ import annotations
 
-import contextlib
 import os
 import secrets
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.links import is_inside, links_in
+from gsplat_edu.base.files import unreadable, written_aside
+from gsplat_edu.base.links import is_inside, links_in, resolved
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import as_file_name, legible, shortened, whole_of
-from gsplat_edu.data.capture import PHOTO_ENDINGS
+from gsplat_edu.data.capture import is_folder
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.adopted import adopted, note_adopted
 from gsplat_edu.studio.names import checked_name, name_after
@@ -45,26 +43,6 @@ PARTS = ("jobs", "trash", "uploads", "cache")
 
 SCENE_ENDINGS = (".ply", ".splat", ".spz", ".sog", ".glb")
 """Endings of scene files that can be taken in."""
-
-NOT_PHOTOS = frozenset(("masks", "renders", "sfm", "exports", "checkpoints", "point_cloud", "transients"))
-"""Folders whose images are not photos of an entry."""
-
-
-@dataclass(frozen=True)
-class Extent:
-    """What a folder holds.
-
-    Args:
-        files: Number of files.
-        num_bytes: Their size.
-        photos: Number of files with a photo's ending.
-        videos: Number of files with a video's ending.
-    """
-
-    files: int
-    num_bytes: int
-    photos: int
-    videos: int
 
 
 class Library:
@@ -114,20 +92,33 @@ class Library:
         try:
             facts = path.stat()
         except OSError:
-            return str(path.resolve())
+            return str(resolved(path) or path)
         return facts.st_dev, facts.st_ino
 
     def entries(self, kind: str) -> list[Path]:
-        """Return the entries of a kind, by name."""
+        """Return the entries of a kind, by name; links that cannot be followed are none."""
         found = (self.root / kind).iterdir()
         return sorted(
-            path for path in found if path.name[0] != "." and path.is_dir() and self.is_within(path)
+            path for path in found if path.name[0] != "." and is_folder(path) and self.is_within(path)
         )
 
     def strange_links(self) -> list[str]:
-        """Return a line for each entry that is a link which was not adopted here."""
+        """Return a line for each entry that is a link which was not adopted here, or leads nowhere."""
         links = [path for kind in KINDS for path in (self.root / kind).iterdir() if path.is_symlink()]
-        return [self._strange(path) for path in sorted(links) if not self.is_within(path)]
+        lines = []
+        for path in sorted(links):
+            try:
+                path.stat()
+            except OSError as error:
+                name = legible(shortened(self.name(path), 300))
+                reason = (error.strerror or "it cannot be followed").lower()
+                lines.append(
+                    f"{name}: is a link that leads nowhere ({reason}); remove it, or restore its place"
+                )
+                continue
+            if not self.is_within(path):
+                lines.append(self._strange(path))
+        return lines
 
     def is_within(self, path: Path) -> bool:
         """Return whether a path, with all its links followed, lies in the library or in what it has adopted."""
@@ -165,7 +156,7 @@ class Library:
             RefusedError: there is none of this kind and name, or it is a link that was not adopted here.
         """
         path = self.place(kind, name)
-        if not path.is_dir():
+        if not is_folder(path):
             raise not_found(f"{kind}/{path.name}")
         self.check_within(path)
         return path
@@ -241,7 +232,7 @@ class Library:
         name = name_after(source.stem if source.is_file() else source.name, kind)
         link = self.place(kind, name)
         link = link / source.name if source.is_file() else link
-        strange = link.is_symlink() and not self.is_within(link) and link.resolve() == source
+        strange = link.is_symlink() and not self.is_within(link) and resolved(link) == source
         return name if strange else self.free_name(kind, name, others=KINDS)
 
     def _is_taken(self, path: Path) -> bool:
@@ -272,17 +263,12 @@ class Library:
             name: Its name; None for a free one after the source.
 
         Raises:
-            RefusedError: the source does not exist, is not of that kind, or lies in the library; or the name is taken.
+            RefusedError: the source does not exist, cannot be read, is not of that kind, or lies in the library; or the
+                name is taken.
         """
         if not source.is_absolute():
             raise RefusedError(f"path: {source} is relative; give the whole path, from the root")
-        try:
-            source = source.resolve()
-            exists = source.exists()
-        except (OSError, ValueError, RuntimeError):  # too long, with a NUL, a circle of links
-            exists = False
-        if not exists:
-            raise RefusedError(f"path: {source} does not exist; correct it")
+        source = _existing(source)
         if source.is_relative_to(self.root) or self.root.is_relative_to(source):
             raise RefusedError(f"path: {source} overlaps the library; give a place outside of it")
         endings = {"scenes": SCENE_ENDINGS, "photos": VIDEO_ENDINGS}.get(kind, ())
@@ -294,7 +280,7 @@ class Library:
             path = self.place(kind, name)
             link = path / source.name if source.is_file() else path
             if (
-                self.is_within(link) or link.resolve() != source
+                self.is_within(link) or resolved(link) != source
             ):  # else the link was made by hand, or elsewhere
                 self.fresh(kind, name)
                 link.parent.mkdir(exist_ok=True)
@@ -397,6 +383,31 @@ def check_own_folders(root: Path) -> None:
             raise RefusedError(f"FOLDER: {place} is a link or a file, but has to be a folder; move it away")
 
 
+def _existing(source: Path) -> Path:
+    """Return a place that is to be adopted, with its links followed.
+
+    Raises:
+        RefusedError: it does not exist, or cannot be read.
+    """
+    place = resolved(source)
+    try:
+        exists = place is not None and place.exists()
+    except (OSError, ValueError):  # too long
+        exists = False
+    if place is None or not exists:
+        raise RefusedError(f"path: {source} does not exist; correct it")
+    source = place
+    try:
+        if source.is_dir():
+            with os.scandir(source) as found:
+                next(found, None)
+        else:
+            open_file(source).close()
+    except OSError as error:
+        raise RefusedError(f"path: {unreadable(source, error)}") from None
+    return source
+
+
 def _removed_from(path: Path) -> str | None:
     """Return the kind that a file of the trash names; None if it names none."""
     try:
@@ -405,69 +416,6 @@ def _removed_from(path: Path) -> str | None:
     except OSError:
         return None
     return kind if kind in KINDS and not path.is_symlink() else None
-
-
-def extent_of(folder: Path) -> Extent:
-    """Count what a folder holds, without following links inside."""
-    files = num_bytes = photos = videos = 0
-    for _, entry, is_photo in files_within(folder):
-        with contextlib.suppress(OSError):  # it has just been removed
-            num_bytes += entry.stat().st_size
-            files += 1
-            ending = os.path.splitext(entry.name)[1].lower()  # noqa: PTH122 - a name, thousands of times
-            photos += is_photo and ending in PHOTO_ENDINGS
-            videos += ending in VIDEO_ENDINGS
-    return Extent(files, num_bytes, photos, videos)
-
-
-def photo_names(folder: Path) -> list[str]:
-    """Return the photos below an entry by their endings, as paths with slashes, sorted."""
-    found = []
-    for name, entry, is_photo in files_within(folder):
-        if is_photo and os.path.splitext(entry.name)[1].lower() in PHOTO_ENDINGS:  # noqa: PTH122
-            found.append(name)
-    return sorted(found)
-
-
-def files_within(folder: Path) -> Iterator[tuple[str, os.DirEntry[str], bool]]:
-    """Yield the files below a folder: their path with slashes, their entry, and whether photos may lie there."""
-    waiting = [(str(folder), "", True)]
-    while waiting:
-        place, prefix, photos = waiting.pop()
-        try:
-            with os.scandir(place) as found:
-                entries = [entry for entry in found if not entry.name.startswith(".")]
-        except OSError:
-            continue
-        for entry in entries:
-            if entry.is_dir(follow_symlinks=False):
-                inside = photos and entry.name not in NOT_PHOTOS
-                waiting.append((entry.path, f"{prefix}{entry.name}/", inside))
-            elif entry.is_file():
-                yield f"{prefix}{entry.name}", entry, photos
-
-
-def size_of(folder: Path, without: Path | None = None) -> int:
-    """Return the bytes of all files below a folder, hidden ones too; links are not followed.
-
-    Args:
-        folder: The folder.
-        without: A folder below it that does not count.
-    """
-    size, waiting = 0, [str(folder)]
-    while waiting:
-        try:
-            with os.scandir(waiting.pop()) as found:
-                entries = list(found)
-        except OSError:
-            continue
-        for entry in entries:
-            with contextlib.suppress(OSError):  # it has just been removed
-                if not entry.is_dir(follow_symlinks=False):
-                    size += entry.stat(follow_symlinks=False).st_size if not entry.is_symlink() else 0
-                elif without is None or entry.path != str(without):
-                    waiting.append(entry.path)
-    return size
 
 
 def scene_file(folder: Path) -> Path | None:

@@ -47,7 +47,8 @@ def routes() -> list[BaseRoute]:
 
 def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     library = studio.library
-    lists = summaries(library)
+    unreadable: list[str] = []
+    lists = summaries(library, unreadable)
     grouped = projects(library, lists, studio.queue.jobs(), studio.former)
     return {
         "folder": str(library.root),
@@ -62,7 +63,8 @@ def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
                 list(studio.queue.damaged.values()),
                 "records of jobs are damaged; the page of jobs lists them",
             ),
-            *_few(library.strange_links(), "entries are links that were not adopted here"),
+            *_few(library.strange_links(), "entries are links that were not adopted here, or lead nowhere"),
+            *_few(unreadable, "entries cannot be read"),
             *([studio.queue.trouble] if studio.queue.trouble else []),
         ],
         "projects": grouped,
@@ -76,13 +78,13 @@ def _few(lines: list[str], summary: str) -> list[str]:
 
 
 def _entry(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    return summary(*entry_of(studio, request))
+    return summary(studio.library, *entry_of(studio, request))
 
 
 def _adopt(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     given = fields(body, kind=str, path=str, **({"name": str} if body and "name" in body else {}))
     path = studio.library.adopt(given["kind"], Path(given["path"]), given.get("name"))
-    return summary(given["kind"], path)
+    return summary(studio.library, given["kind"], path)
 
 
 def _promise(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -102,11 +104,11 @@ def _rename(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
     along = isinstance(body, dict) and "along" in body
     given = fields(body, to=str, **({"along": bool} if along else {}))
     if not given.get("along"):
-        return summary(kind, studio.rename(kind, name, given["to"]))
+        return summary(studio.library, kind, studio.rename(kind, name, given["to"]))
     parents = origins(studio.library, summaries(studio.library), makers(studio.queue.jobs()), studio.former)
     places = studio.rename_along(kind, name, given["to"], parents)
     made = studio.library.entry(kind, given["to"])
-    return summary(kind, made) | {"renamed": places}
+    return summary(studio.library, kind, made) | {"renamed": places}
 
 
 def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -116,7 +118,7 @@ def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
 
 def _restore(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     path = studio.library.restore(request.path_params["id"])
-    return summary(path.parent.name, path)
+    return summary(studio.library, path.parent.name, path)
 
 
 def _empty_trash(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
 import os
@@ -11,31 +10,46 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.files import described
 from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.studio.library import KINDS, Library, extent_of, scene_file
+from gsplat_edu.studio.contents import extent_of
+from gsplat_edu.studio.library import KINDS, Library, scene_file
+from gsplat_edu.studio.refusal import RefusedError
 
 
-def summaries(library: Library) -> dict[str, list[dict[str, Any]]]:
-    """Return the facts of all entries, by kind; those that have just been renamed or removed are left out."""
+def summaries(library: Library, trouble: list[str] | None = None) -> dict[str, list[dict[str, Any]]]:
+    """Return the facts of all entries, by kind; those that have just been renamed or removed are left out.
+
+    Args:
+        library: The library.
+        trouble: Gets a line for each entry that cannot be read. It is left out, too.
+    """
     found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     for kind, facts in found.items():
         for path in library.entries(kind):
-            with contextlib.suppress(FileNotFoundError):
-                facts.append(summary(kind, path))
+            try:
+                facts.append(summary(library, kind, path))
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                if trouble is not None:
+                    trouble.append(legible(described(error)))
     return found
 
 
-def summary(kind: str, path: Path) -> dict[str, Any]:
+def summary(library: Library, kind: str, path: Path) -> dict[str, Any]:
     """Return an entry's facts.
 
     Args:
+        library: Its library.
         kind: Its kind.
         path: Its folder.
 
     Raises:
         FileNotFoundError: it has just been renamed or removed.
+        OSError: it cannot be read.
     """
     size = extent_of(path)
     facts: dict[str, Any] = {
@@ -55,7 +69,7 @@ def summary(kind: str, path: Path) -> dict[str, Any]:
         facts["search"] = search_facts(path)
         facts["unfinished"] = is_unfinished(path)
     if kind == "runs":
-        facts |= run_facts(path)
+        facts |= run_facts(library, path)
     if kind == "scenes":
         file = scene_file(path)
         facts |= {"file": None if file is None else legible(file.name), "scene_bytes": scene_bytes(file)}
@@ -125,8 +139,8 @@ def scene_bytes(file: Path | None) -> int:
         return 0
 
 
-def run_facts(path: Path) -> dict[str, Any]:
-    """Return a run's progress and scores; if a file is damaged, `problem` says so in one line."""
+def run_facts(library: Library, path: Path) -> dict[str, Any]:
+    """Return a run's progress and scores; `problem` is one line if a file is damaged, or a link leads elsewhere."""
     folder = RunFolder(path)
     facts: dict[str, Any] = {
         "planned": None,
@@ -142,8 +156,9 @@ def run_facts(path: Path) -> dict[str, Any]:
     if not any(not child.name.startswith(".") for child in path.iterdir()):
         return facts  # a training that has not begun
     try:
+        library.check_tree(path)
         config, metrics = folder.read_config(), folder.read_metrics()
-    except (CheckpointError, OSError) as error:
+    except (CheckpointError, RefusedError, OSError) as error:
         return {**facts, "problem": str(error)}
     train, data = config.get("train"), config.get("data")
     planned = train.get("iterations") if isinstance(train, dict) else None

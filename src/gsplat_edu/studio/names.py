@@ -90,6 +90,18 @@ def checked_path(what: str, path: object) -> Path:
     return Path(*(checked_name(what, part, LONGEST_FILE) for part in parts))
 
 
+def listed_path(what: str, path: str) -> Path:
+    """Return the path of an existing file below an entry; unlike new files, it may have any characters.
+
+    Raises:
+        RefusedError: it leads elsewhere.
+    """
+    parts = path.split("/")
+    if any(part.startswith(".") or not part or "\0" in part for part in parts):
+        raise RefusedError(f"{what}: the name {printable(path)[:60]!r} is not that of a listed file")
+    return Path(*map(as_file_name, parts))
+
+
 def below(root: Path, path: Path, what: str) -> Path:
     """Return a path below a folder; links inside may not lead out of it.
 

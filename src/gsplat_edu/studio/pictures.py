@@ -11,8 +11,9 @@ from typing import Any
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.text import legible
-from gsplat_edu.studio.library import Library, photo_names
-from gsplat_edu.studio.names import below, checked_path
+from gsplat_edu.studio.contents import photo_names
+from gsplat_edu.studio.library import Library
+from gsplat_edu.studio.names import below, listed_path
 from gsplat_edu.studio.photo_masks import masked
 from gsplat_edu.studio.refusal import RefusedError, not_found
 from gsplat_edu.studio.workers import Worker
@@ -121,7 +122,7 @@ def thumbnail(decoder: Worker, library: Library, entry: Path, name: str, side: s
     """
     if side not in map(str, SIDES):
         raise RefusedError(f"side: is {side[:20]!r}, but has to be one of {', '.join(map(str, SIDES))}")
-    photo = below(entry, checked_path("photo", name), "photo")
+    photo = below(entry, listed_path("photo", name), "photo")
     try:
         facts = photo.stat()
     except OSError:

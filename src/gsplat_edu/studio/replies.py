@@ -7,6 +7,7 @@ import contextlib
 import email.utils
 import json
 import math
+import os
 from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
 from pathlib import Path
@@ -18,10 +19,10 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from gsplat_edu.base.errors import SplatError
-from gsplat_edu.base.files import described
-from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.files import described, unreadable
+from gsplat_edu.base.reading import open_file, parse_json
 from gsplat_edu.base.text import bounded, legible, shortened, whole_of
-from gsplat_edu.studio.refusal import RefusedError, not_found, too_large
+from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
 from gsplat_edu.studio.state import Studio
 
 MOST_JSON = 16 << 20
@@ -197,8 +198,11 @@ def file_answer(
         version: Text that its ETag is computed from; its size and time if empty.
     """
     try:
-        facts = path.stat()
-    except OSError:
+        with open_file(path) as file:  # only a regular file
+            facts = os.fstat(file.fileno())
+    except OSError as error:
+        if path.exists():
+            raise conflict(unreadable(path, error)) from None
         raise not_found(path.name) from None
     etag = f'"{version or f"{facts.st_mtime_ns:x}-{facts.st_size:x}"}"'
     headers = {"ETag": etag, "Cache-Control": "no-cache"}

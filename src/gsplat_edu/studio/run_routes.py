@@ -16,7 +16,7 @@ from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.studio.library import photo_names
+from gsplat_edu.studio.contents import photo_names
 from gsplat_edu.studio.origins import renamed_capture
 from gsplat_edu.studio.photo_masks import masked
 from gsplat_edu.studio.pictures import left_out
@@ -51,7 +51,14 @@ def routes() -> list[BaseRoute]:
 
 
 def _run(studio: Studio, request: Request) -> RunFolder:
-    return RunFolder(studio.library.entry("runs", request.path_params["name"]))
+    return _run_named(studio, request.path_params["name"])
+
+
+def _run_named(studio: Studio, name: str) -> RunFolder:
+    """Return a run; a link in it may not lead out of the library."""
+    entry = studio.library.entry("runs", name)
+    studio.library.check_tree(entry)
+    return RunFolder(entry)
 
 
 def _curves(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -78,7 +85,7 @@ def _report(studio: Studio, request: Request, body: Any) -> Response:  # noqa: A
 
 
 def _compare(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    a, b = (RunFolder(studio.library.entry("runs", request.query_params.get(name, ""))) for name in "ab")
+    a, b = (_run_named(studio, request.query_params.get(name, "")) for name in "ab")
     return compared(a, b)
 
 

@@ -18,7 +18,8 @@ from starlette.concurrency import run_in_threadpool
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.photos.image_files import is_image
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
-from gsplat_edu.studio.library import SCENE_ENDINGS, Library, size_of
+from gsplat_edu.studio.contents import size_of
+from gsplat_edu.studio.library import SCENE_ENDINGS, Library
 from gsplat_edu.studio.names import below, checked_path
 from gsplat_edu.studio.refusal import RefusedError, conflict, too_large
 from gsplat_edu.studio.unpack import ZipLimits, unpack
