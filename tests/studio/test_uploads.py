@@ -9,7 +9,8 @@ import zipfile
 
 import pytest
 
-from gsplat_edu.studio import unpack as unpacking, uploads
+from gsplat_edu.base.zip_directory import TAIL
+from gsplat_edu.studio import uploads
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.unpack import ZipLimits, _check_directory, unpack
 from gsplat_edu.studio.uploads import Limits
@@ -382,7 +383,7 @@ def test_damaged_zip_files_end_in_one_line(tmp_path, seed):
         assert str(error).startswith("zip: ") and "\n" not in str(error)
     else:
         assert count <= 2
-    assert unpacking.TAIL == 65_557
+    assert TAIL == 65_557
 
 
 def test_a_count_that_is_forgotten_meanwhile_is_still_a_number(studio, monkeypatch):

@@ -5,9 +5,12 @@ Values keep the file's unit. NaN, infinity, zero and negative values mean that a
 
 from __future__ import annotations
 
+import os
 import re
+import warnings
 import zipfile
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE, open_file, read_bytes
 from gsplat_edu.base.text import install_command
+from gsplat_edu.base.zip_directory import check_directory
 from gsplat_edu.photos.image_files import UNDECODABLE, opened_image, require_room
 
 Map = Float32[np.ndarray, "h w"]
@@ -40,6 +44,25 @@ LARGEST_HEADER = 10_000
 
 LARGEST_LZFSE = 16 * 2**20
 """Bytes of a compressed map of Record3D, whose 256x192 floats take less than 200,000."""
+
+HEADER = (
+    r"""['"]descr['"]\s*:\s*['"]([<>|=]?[a-zA-Z]\d{1,3})['"]""",
+    r"""['"]fortran_order['"]\s*:\s*(True|False)""",
+    r"""['"]shape['"]\s*:\s*\(([\d\s,]{1,200})\)""",
+)
+"""Type, order and shape in an NPY's header."""
+
+PIECE = 1 << 20
+"""Bytes that are read at a time."""
+
+MOST_MEMBERS = 1_000
+"""Most arrays in an NPZ."""
+
+MOST_EXR = 96_000_000
+"""Most numbers of an EXR, all parts and channels together: 4096 x 2304 px with ten channels."""
+
+EXR_BYTES = 8
+"""Peak bytes for each number of an EXR while it is decoded."""
 
 RECORD3D = ((256, 192), (192, 256), (640, 480), (480, 640), (320, 240), (240, 320))
 """Sizes of Record3D's maps, width and height, px; the files have no header."""
@@ -66,12 +89,18 @@ def read_depth(path: Path) -> Map:
         if reader is None:
             raise ValueError(f"has none of the suffixes {', '.join(ENDINGS)}")
         values = reader(path)
-    except (*UNDECODABLE, zipfile.BadZipFile) as error:
+    except (*UNDECODABLE, zipfile.BadZipFile, zlib.error) as error:
         said = "it is no image" if isinstance(error, UnidentifiedImageError) else str(error)
         reason = getattr(error, "strerror", None) or said.replace("\n", " ")[:200]
         raise DatasetError(f"{path}: is no depth map: {reason}; export it again", reason) from None
-    found = np.where(np.isfinite(values) & (values > 0), values, np.nan).astype(np.float32)
-    if not np.isfinite(found).any():
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is no depth
+        found = np.ascontiguousarray(values, np.float32)
+    del values
+    found = found if found.flags.writeable else found.copy()
+    unknown = ~(found > 0)
+    unknown |= np.isinf(found)
+    found[unknown] = np.nan
+    if unknown.all():
         reason = "no pixel has a depth above 0"
         raise DatasetError(f"{path}: {reason}; export it again, or remove the file", reason)
     return found
@@ -98,41 +127,81 @@ def _image(path: Path) -> Shaped[np.ndarray, "h w"]:
         if file.mode not in ("I;16", "I;16B", "I;16L", "I", "F", "L"):
             raise ValueError(f"it is a picture ({file.mode}), not one channel of 8, 16 or 32 bits")
         require_room(path, file)
-        return np.asarray(file).astype(np.float64)
+        return np.asarray(file)
 
 
-def _header(file: Any, path: Path) -> tuple[int, int]:  # noqa: ANN401 - also a member of an archive
-    """Read an NPY's header, and return height and width."""
-    major, minor = np.lib.format.read_magic(file)
-    if (major, minor) not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {major}.{minor} of NPY is unknown")
-    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file, max_header_size=LARGEST_HEADER)
+def _numbers(file: Any, size: int, path: Path) -> Shaped[np.ndarray, "h w"]:  # noqa: ANN401 - also a member of an archive
+    """Read an NPY with one number for each pixel. The header is matched, not evaluated.
+
+    Args:
+        file: The NPY at its first byte; also a member of an archive, which is unpacked as it is read.
+        size: Its bytes.
+        path: The file, for messages.
+    """
+    start = file.read(10)
+    if not start.startswith(b"\x93NUMPY") or len(start) < 10:
+        raise ValueError("it does not begin as an NPY")
+    if start[6:8] not in (b"\1\0", b"\2\0"):
+        raise ValueError(f"version {start[6]}.{start[7]} of NPY is unknown")
+    length = start[8:10] if start[6] == 1 else start[8:10] + file.read(2)
+    header_bytes = int.from_bytes(length, "little")
+    if header_bytes > LARGEST_HEADER:
+        raise ValueError(f"a header of {header_bytes:,} bytes is no plausible one")
+    header = file.read(header_bytes).decode("latin-1")
+    found = [re.search(pattern, header) for pattern in HEADER]
+    if len(header) < header_bytes or None in found:
+        raise ValueError("its header is damaged, or it holds no plain array")
+    kind, order, axes = (match[1] for match in found if match is not None)
+    dtype = np.dtype(kind)
     if dtype.kind not in "fui" or dtype.itemsize > 8:
         raise ValueError(f"its values are {dtype}, not numbers")
+    shape = tuple(int(axis) for axis in axes.replace(",", " ").split())
     h, w = _plane(shape)
-    require_memory(str(path), (dtype.itemsize + 12) * h * w, TOO_LARGE)
-    return h, w
+    there, wanted = size - len(start) - len(length[2:]) - header_bytes, dtype.itemsize * h * w
+    if there < wanted:
+        raise ValueError(f"its header names {wanted:,} bytes of numbers, but it has {max(there, 0):,}")
+    require_memory(str(path), (dtype.itemsize + 6) * h * w, TOO_LARGE)
+    values = np.empty(h * w, dtype)
+    _fill(file, values.data.cast("B"))
+    if order == "True":
+        return values.reshape(w, h).T
+    return values.reshape(h, w)
+
+
+def _fill(file: Any, room: memoryview) -> None:  # noqa: ANN401
+    """Read bytes, a piece at a time, because an archive may hold fewer than it claims."""
+    done = 0
+    while done < len(room):
+        piece = file.read(min(PIECE, len(room) - done))
+        if not piece:
+            raise ValueError(f"it ends after {done:,} of {len(room):,} bytes of numbers")
+        room[done : done + len(piece)] = piece
+        done += len(piece)
 
 
 def _npy(path: Path) -> Shaped[np.ndarray, "h w"]:
     with open_file(path) as file:
-        size = _header(file, path)
-        file.seek(0)
-        return np.lib.format.read_array(file, allow_pickle=False).reshape(size).astype(np.float64)
+        return _numbers(file, os.fstat(file.fileno()).st_size, path)
 
 
 def _npz(path: Path) -> Shaped[np.ndarray, "h w"]:
     """Read the array `depth` of an NPZ, or its only array."""
-    with open_file(path) as file, zipfile.ZipFile(file) as archive:
-        names = archive.namelist()
-        name = names[0] if len(names) == 1 else "depth.npy"
-        if name not in names:
-            raise ValueError(f"it holds {len(names)} arrays, none of which is called depth")
-        with archive.open(name) as member:
-            size = _header(member, path)
-        with archive.open(name) as member:
-            return np.lib.format.read_array(member, allow_pickle=False).reshape(size).astype(np.float64)
+    with open_file(path) as file:
+        check_directory(file, MOST_MEMBERS)
+        file.seek(0)
+        with warnings.catch_warnings():  # about unusual fields in the directory
+            warnings.simplefilter("ignore")
+            archive = zipfile.ZipFile(file)
+        with archive:
+            names = archive.namelist()
+            name = names[0] if len(names) == 1 else "depth.npy"
+            if name not in names:
+                raise ValueError(f"it holds {len(names)} arrays, none of which is called depth")
+            entry = archive.getinfo(name)
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("it is compressed in a way that NumPy does not write")
+            with archive.open(entry) as member:
+                return _numbers(member, entry.file_size, path)
 
 
 def _exr(path: Path) -> Shaped[np.ndarray, "h w"]:
@@ -142,10 +211,8 @@ def _exr(path: Path) -> Shaped[np.ndarray, "h w"]:
         reason = f"EXR needs OpenEXR: {install_command('depth')}"
         raise DatasetError(f"{path}: cannot be read; {reason}", reason) from None
     with open_file(path):  # only a regular file
-        low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
-    w, h = (int(high[i]) - int(low[i]) + 1 for i in (0, 1))
-    _checked_size(w, h)
-    require_memory(str(path), 40 * w * h, TOO_LARGE)
+        file = OpenEXR.File(str(path), header_only=True)
+    _check_parts([part.header for part in file.parts], path)
     channels = OpenEXR.File(str(path), separate_channels=True).channels()
     names = {name.rpartition(".")[2]: name for name in channels}
     name = next((names[name] for name in CHANNELS if name in names), None)
@@ -153,8 +220,24 @@ def _exr(path: Path) -> Shaped[np.ndarray, "h w"]:
         raise ValueError(
             f"its channels are {', '.join(sorted(channels)) or 'none'}; depth is {' or '.join(CHANNELS)}"
         )
-    values = np.asarray(channels[name].pixels, np.float64)
+    values: Shaped[np.ndarray, "h w"] = np.asarray(channels[name].pixels)
     return values.reshape(_plane(values.shape))
+
+
+def _check_parts(headers: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Check the size of all parts and channels of an EXR, because all of them are decoded."""
+    total = 0
+    for header in headers:
+        low, high = header["dataWindow"]
+        w, h = (int(high[i]) - int(low[i]) + 1 for i in (0, 1))
+        _checked_size(w, h)
+        total += w * h * len(header["channels"])
+    if total > MOST_EXR:
+        raise ValueError(
+            f"its {len(headers)} parts have {total:,} numbers in all channels, and at most {MOST_EXR:,} are read;"
+            " keep the channel of the depth only"
+        )
+    require_memory(str(path), EXR_BYTES * total, TOO_LARGE)
 
 
 def _colmap(path: Path) -> Shaped[np.ndarray, "h w"]:
@@ -172,7 +255,7 @@ def _colmap(path: Path) -> Shaped[np.ndarray, "h w"]:
         data = file.read(4 * w * h + 1)
     if len(data) != 4 * w * h:
         raise ValueError(f"it does not hold the {w}x{h} floats of its header")
-    return np.frombuffer(data, "<f4").reshape(h, w).astype(np.float64)
+    return np.frombuffer(data, "<f4").reshape(h, w)
 
 
 def _record3d(path: Path) -> Shaped[np.ndarray, "h w"]:
@@ -194,7 +277,7 @@ def _record3d(path: Path) -> Shaped[np.ndarray, "h w"]:
         known = ", ".join(f"{w}x{h}" for w, h in RECORD3D[::2])
         raise ValueError(f"its {len(data) // 4:,} floats are no map of {known}")
     w, h = sizes[0]
-    return np.frombuffer(data, "<f4").reshape(h, w).astype(np.float64)
+    return np.frombuffer(data, "<f4").reshape(h, w)
 
 
 READERS: dict[str, Callable[[Path], Shaped[np.ndarray, "h w"]]] = {

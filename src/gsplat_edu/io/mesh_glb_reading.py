@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
-from gsplat_edu.base.reading import read_bytes
+from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.base.reading import TOO_LARGE, read_bytes
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.glb_container import container, refuse
 from gsplat_edu.io.mesh_glb import GENERATOR, TRIANGLES, UNLIT
@@ -23,8 +24,23 @@ MOST_JSON = 1 << 24
 REPEATS = 64
 """A file may show its own size at most so many times, by nodes that share a mesh."""
 
+MOST_NODES = 1 << 18
+"""Most nodes of a file."""
+
+MOST_PARTS = 100_000
+"""Most primitives at nodes. Each takes time and memory, even one without triangles; nodes may share them."""
+
+ARRAY_BYTES = 3
+"""Peak memory for a byte of vertices and corners: the parts, and the arrays that they are joined to."""
+
 NUMBERS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 """NumPy types of accessors."""
+
+TYPES = {"POSITION": ("VEC3",), "COLOR_0": ("VEC3", "VEC4"), "TEXCOORD_0": ("VEC2",)}
+"""Attributes that are read, and their types."""
+
+ATTRIBUTE_BYTES = 36
+"""Most bytes of a vertex's attribute as it is converted."""
 
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 """Numbers of each accessor type that meshes need."""
@@ -149,10 +165,13 @@ class _File:
     def __init__(self, path: Path, document: dict[str, Any], body: memoryview) -> None:
         self._path, self._document, self._body = path, document, body
         self._room = max(REPEATS * len(body), 1 << 20)
+        self._taken = self._parts = 0
 
     def parts(self) -> Iterator[_Part]:
         """Yield the primitives of the scene's nodes; of all nodes if there is no scene."""
         nodes = self._document.get("nodes", [])
+        if len(nodes) > MOST_NODES:
+            refuse(self._path, f"has {len(nodes):,} nodes, and at most {MOST_NODES:,} are read")
         scenes = self._document.get("scenes", [])
         if scenes:
             roots = scenes[self._document.get("scene", 0)].get("nodes", [])
@@ -160,7 +179,8 @@ class _File:
             children = {child for node in nodes for child in node.get("children", [])}
             roots = [index for index in range(len(nodes)) if index not in children]
         seen: set[int] = set()
-        waiting = [(root, np.eye(4)) for root in reversed(roots)]
+        waiting: list[tuple[Any, Float64[np.ndarray, "4 4"]]] = []
+        self._add(waiting, roots, np.eye(4), len(nodes))
         while waiting:
             index, outer = waiting.pop()
             if type(index) is not int or not 0 <= index < len(nodes) or index in seen:
@@ -170,7 +190,19 @@ class _File:
             if "mesh" in nodes[index]:
                 for primitive in self._item("meshes", nodes[index]["mesh"])["primitives"]:
                     yield self._part(primitive, matrix)
-            waiting += [(child, matrix) for child in reversed(nodes[index].get("children", []))]
+            self._add(waiting, nodes[index].get("children", []), matrix, len(nodes) - len(seen))
+
+    def _add(
+        self,
+        waiting: list[tuple[Any, Float64[np.ndarray, "4 4"]]],
+        children: list[Any],
+        matrix: Float64[np.ndarray, "4 4"],
+        most: int,
+    ) -> None:
+        """Add nodes to those that wait, at most as many as there are; more would have two parents."""
+        if len(waiting) + len(children) > most:
+            refuse(self._path, "has a node that does not exist, or has two parents")
+        waiting += [(child, matrix) for child in reversed(children)]
 
     def _item(self, kind: str, index: Any) -> dict[str, Any]:  # noqa: ANN401 - of a stranger's JSON
         """Return an entry of one of the document's lists."""
@@ -183,16 +215,17 @@ class _File:
         if primitive.get("mode", TRIANGLES) != TRIANGLES:
             refuse(self._path, f"has a primitive of mode {str(primitive['mode'])[:9]}, not of triangles")
         attributes = primitive["attributes"]
+        self._parts += 1
+        if self._parts > MOST_PARTS:
+            refuse(self._path, f"shows its meshes in more than {MOST_PARTS:,} parts")
+        self._reserve(primitive, attributes)
         with np.errstate(invalid="ignore"):  # signalling NaN; the caller looks for NaN
-            points = self._array(attributes["POSITION"], "VEC3").astype(np.float64)
+            points = self._array(attributes["POSITION"], *TYPES["POSITION"]).astype(np.float64)
         if "indices" in primitive:
-            corners = self._array(primitive["indices"], "SCALAR", whole=True)[:, 0].astype(np.int64)
+            corners = self._view(primitive["indices"], "SCALAR", whole=True)[:, 0].astype(np.int64)
         else:
             corners = np.arange(len(points))
         corners = corners[: len(corners) // 3 * 3]
-        self._room -= 24 * len(points) + 8 * len(corners)
-        if self._room < 0:
-            refuse(self._path, f"shows its meshes more than {REPEATS} times")
         with np.errstate(over="ignore", invalid="ignore"):  # the caller checks the result
             moved = points @ matrix[:3, :3].T + matrix[:3, 3]
             mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0.0)
@@ -200,13 +233,34 @@ class _File:
             corners = corners.reshape(-1, 3)[:, ::-1].ravel()
         colors = uvs = None
         if "COLOR_0" in attributes:
-            shades = self._array(attributes["COLOR_0"], "VEC3", "VEC4")[:, :3]
+            shades = self._array(attributes["COLOR_0"], *TYPES["COLOR_0"])[:, :3]
             colors = srgb(np.nan_to_num(shades)).astype(np.float32)
         if "TEXCOORD_0" in attributes:
-            uvs = np.nan_to_num(self._array(attributes["TEXCOORD_0"], "VEC2"))
-        if any(array is not None and len(array) != len(points) for array in (colors, uvs)):
-            refuse(self._path, "has attributes of different numbers of vertices")
+            uvs = np.nan_to_num(self._array(attributes["TEXCOORD_0"], *TYPES["TEXCOORD_0"]))
         return _Part(moved, corners, colors, uvs, self._image(primitive))
+
+    def _reserve(self, primitive: dict[str, Any], attributes: dict[str, Any]) -> None:
+        """Check, before the arrays of a primitive are made, that they are not too many.
+
+        Raises:
+            SceneFormatError: the file shows its own contents too often.
+            NotEnoughMemoryError: the arrays do not fit into the free memory.
+        """
+        counts = {
+            name: len(self._view(attributes[name], *TYPES[name])) for name in TYPES if name in attributes
+        }
+        points = counts["POSITION"]
+        corners = (
+            len(self._view(primitive["indices"], "SCALAR", whole=True)) if "indices" in primitive else points
+        )
+        if any(count != points for count in counts.values()):
+            refuse(self._path, "has attributes of different numbers of vertices")
+        size = ATTRIBUTE_BYTES * len(counts) * points + 8 * corners
+        self._room -= 24 * points + 8 * corners
+        if self._room < 0:
+            refuse(self._path, f"shows its meshes more than {REPEATS} times")
+        self._taken += size
+        require_memory(str(self._path), ARRAY_BYTES * self._taken, TOO_LARGE)
 
     def _image(self, primitive: dict[str, Any]) -> int | None:
         """Return the image of a primitive's base colour; None if it has none, or not with the first coordinates."""
@@ -221,8 +275,15 @@ class _File:
             self._item("images", source)
         return source
 
-    def _array(self, index: Any, *types: str, whole: bool = False) -> np.ndarray:  # noqa: ANN401
-        """Return the values of an accessor: (count, width), float32, or integers as they are if `whole`."""
+    def _array(self, index: Any, *types: str) -> np.ndarray:  # noqa: ANN401
+        """Return the values of an accessor: (count, width) float32."""
+        values = self._view(index, *types)
+        if values.dtype.kind == "f":
+            return values.astype(np.float32)
+        return np.maximum(values / np.float64(np.iinfo(values.dtype).max), -1.0).astype(np.float32)
+
+    def _view(self, index: Any, *types: str, whole: bool = False) -> np.ndarray:  # noqa: ANN401
+        """Return the stored values of an accessor: (count, width); floats or normalised integers unless `whole`."""
         accessor = self._item("accessors", index)
         name = f"(accessor {index})"
         number, kind = NUMBERS.get(accessor["componentType"]), accessor["type"]
@@ -245,12 +306,7 @@ class _File:
         ):
             refuse(self._path, f"has values that extend beyond the file's end {name}")
         steps = (stride, dtype.itemsize)
-        values: np.ndarray = np.ndarray((count, width), dtype, self._body, start, steps)
-        if whole:
-            return values
-        if number == "f4":
-            return values.astype(np.float32)
-        return np.maximum(values / np.float64(np.iinfo(dtype).max), -1.0).astype(np.float32)
+        return np.ndarray((count, width), dtype, self._body, start, steps)
 
 
 def _matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:

@@ -12,6 +12,7 @@ Source: Turk 1994, "The PLY Polygon File Format".
 
 from __future__ import annotations
 
+from array import array
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,8 +21,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.ply_table import FORMATS, Element, read_elements
-from gsplat_edu.base.reading import read_bytes
+from gsplat_edu.base.reading import TOO_LARGE, read_bytes
 from gsplat_edu.io.mesh_parts import (
     Polygons,
     StoredMesh,
@@ -41,6 +43,9 @@ CHANNELS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_
 
 INDEX_LISTS = ("vertex_indices", "vertex_index")
 """Names of the list of a face's vertices; programs use either."""
+
+TEXT_BYTES = 24
+"""Peak memory for a byte of text: a line of one digit is an object, and so is its number."""
 
 LARGEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
 """Value of white by number type. Other types hold no colours."""
@@ -170,8 +175,8 @@ class _Binary:
                 if length.kind == "f" or at + length.itemsize > len(self._data):
                     return None
                 count = int(np.frombuffer(self._data, length, 1, at)[0])
-                if not 0 < count <= len(self._data):
-                    return None
+                if count <= 0 or at + length.itemsize + count * np.dtype(item).itemsize > len(self._data):
+                    return None  # checked before NumPy is asked for a row of that size
                 fields += [(f"#{name}", length), (name, f"{self._order}{item}", (count,))]
             at = self._at + np.dtype(fields).itemsize
         dtype = np.dtype(fields)
@@ -190,8 +195,8 @@ class _Binary:
         """Return the columns row by row; slower, for faces with different numbers of corners."""
         lists = {name: (np.dtype(self._order + s), np.dtype(self._order + i)) for name, s, i in element.lists}
         plain = {name: np.dtype(self._order + kind) for name, kind in element.properties if kind is not None}
-        sizes: dict[str, list[int]] = {name: [] for name in lists}
-        items: dict[str, list[Any]] = {name: [] for name in lists}
+        sizes = {name: array("q") for name in lists}
+        items = {name: bytearray() for name in lists}
         data, at, end = self._data, self._at, len(self._data)
         for row in range(element.count):
             for name in element.names:
@@ -208,14 +213,14 @@ class _Binary:
                 if at + count * item.itemsize > end:
                     self._truncated(element, row)
                 sizes[name].append(int(count))
-                items[name].append(np.frombuffer(data, item, int(count), at))
-                at += int(count) * item.itemsize
+                end_of_list = at + int(count) * item.itemsize
+                items[name] += data[at:end_of_list]
+                at = end_of_list
             if at > end:
                 self._truncated(element, row)
         self._at = at
-        empty = np.empty(0, np.int64)
         return {
-            name: _list(np.array(sizes[name], np.int64), np.concatenate(items[name] or [empty]))
+            name: _list(np.array(sizes[name], np.int64), np.frombuffer(items[name], lists[name][1]))
             for name in lists
         }
 
@@ -238,6 +243,7 @@ class _Text:
 
     def __init__(self, path: Path, data: bytes, start: int) -> None:
         self._path = path
+        require_memory(str(path), TEXT_BYTES * len(data), TOO_LARGE)
         first = 1 + data.count(b"\n", 0, start)
         lines = data[start:].decode("latin-1").splitlines()
         self._lines = ((first + index, line) for index, line in enumerate(lines) if line.strip())

@@ -3,10 +3,6 @@
 A few kilobytes can claim petabytes, name files outside of the folder, be links, or list so many entries that reading
 the list takes all memory. So the directory of the file is measured before it is read, every name is checked before
 anything is written, and bytes are counted while they are written.
-
-Readers of zip files find the directory in different ways: from the end, by an offset, or past data before or after it.
-A file in which these ways lead to different places is refused, so that every version of `zipfile` reads the directory
-that was measured. The format: PKWARE, APPNOTE.TXT 6.3.10, sections 4.3.12 to 4.3.16.
 """
 
 from __future__ import annotations
@@ -19,33 +15,14 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.reading import open_file
+from gsplat_edu.base.zip_directory import TooManyEntriesError, check_directory
 from gsplat_edu.studio.names import checked_path
 from gsplat_edu.studio.refusal import RefusedError, too_large
 
 CHUNK = 1 << 20
-
-END = struct.Struct("<4sHHHHIIH")
-"""End record: signature, two disk numbers, entries on this disk and in all, size and offset of the directory, and the
-length of the comment that follows."""
-
-LOCATOR = struct.Struct("<4sIQI")
-"""zip64, before the end record: signature, a disk number, offset of the zip64 end record, number of disks."""
-
-END64 = struct.Struct("<4sQHHIIQQQQ")
-"""zip64 end record, before the locator: signature, bytes that follow, two versions, and the fields of `END`."""
-
-HEADER = struct.Struct("<4s24xHHH12x")
-"""Entry of the directory: signature, and lengths of the name, the extra field and the comment that follow."""
-
-TAIL = END.size + 65_535
-"""Bytes at the end of a zip file in which its end record starts: the record and its comment."""
-
-BYTES_PER_ENTRY = 1_000
-"""Bytes of the directory per entry, on average at most."""
 
 IGNORED = ("__MACOSX", "Thumbs.db", "desktop.ini")
 """Names of what operating systems add."""
@@ -117,81 +94,18 @@ def unpack(
 
 
 def _check_directory(path: Path, limits: ZipLimits) -> None:
-    """Measure the directory of a zip file, and check that it can be found in one place only.
+    """Measure the directory of a zip file before it is read; see `gsplat_edu.base.zip_directory`.
 
     Raises:
-        RefusedError: there is none, it is damaged or ambiguous, or it lists too much.
+        RefusedError: it is damaged or ambiguous, or lists too much.
     """
-    size = path.stat().st_size
     with open_file(path) as file:
-        file.seek(max(size - TAIL, 0))
-        tail = file.read()
-        at = tail.rfind(b"PK\x05\x06")
-        if at < 0 or len(tail) < at + END.size:
-            raise RefusedError("zip: is not a zip file; pack the photos as zip")
-        _, disk, first, here, count, length, begin, comment = END.unpack_from(tail, at)
-        if at + END.size + comment != len(tail):
-            raise RefusedError("zip: its end is damaged, or something follows it; pack it again")
-        end = size - len(tail) + at
-        if (wide := _wide_end(file, end)) is not None:
-            narrow = ((disk, 16), (first, 16), (here, 16), (count, 16), (length, 32), (begin, 32))
-            if any(
-                value not in (other, (1 << bits) - 1)
-                for (value, bits), other in zip(narrow, wide, strict=True)
-            ):
-                raise RefusedError("zip: has two ends that disagree; pack it again")
-            disk, first, here, count, length, begin = wide
-            end -= LOCATOR.size + END64.size
-        if count > limits.entries or length > limits.entries * BYTES_PER_ENTRY:
-            raise too_large(
-                f"zip: lists {count:,} entries in {length:,} bytes; {limits.entries:,} entries may be in it"
-            )
-        if (disk, first) != (0, 0) or here != count or begin + length != end:
-            raise RefusedError("zip: its directory is not where it claims to be; pack it again, in one part")
-        file.seek(begin)
-        _count_entries(file.read(length), count)
-
-
-def _wide_end(file: BinaryIO, end: int) -> tuple[int, ...] | None:
-    """Return the fields of the zip64 end record, as those of `END` without the comment; None if there is none.
-
-    Args:
-        file: The zip file.
-        end: Where its end record starts.
-
-    Raises:
-        RefusedError: the record is not directly before its locator, where `zipfile` looks for it.
-    """
-    if end < LOCATOR.size:
-        return None
-    file.seek(end - LOCATOR.size)
-    signature, disk, offset, disks = LOCATOR.unpack(file.read(LOCATOR.size))
-    if signature != b"PK\x06\x07":
-        return None
-    at = end - LOCATOR.size - END64.size
-    if at < 0 or offset != at or disk != 0 or disks > 1:
-        raise RefusedError("zip: its end is not where it claims to be; pack it again, in one part")
-    file.seek(at)
-    signature, following, _, _, *fields = END64.unpack(file.read(END64.size))
-    if signature != b"PK\x06\x06" or following != END64.size - 12:  # without signature and this number
-        raise RefusedError("zip: its end is damaged; pack it again")
-    return tuple(fields)
-
-
-def _count_entries(directory: bytes, count: int) -> None:
-    """Check that a directory holds as many entries as it claims, and nothing else.
-
-    Raises:
-        RefusedError: it does not.
-    """
-    at = found = 0
-    while at + HEADER.size <= len(directory) and found < count:
-        signature, *lengths = HEADER.unpack_from(directory, at)
-        if signature != b"PK\x01\x02":
-            break
-        at, found = at + HEADER.size + sum(lengths), found + 1
-    if at != len(directory) or found != count:
-        raise RefusedError("zip: its directory is damaged; pack it again")
+        try:
+            check_directory(file, limits.entries)
+        except TooManyEntriesError as error:
+            raise too_large(f"zip: {error}") from None
+        except ValueError as error:
+            raise RefusedError(f"zip: {error}; pack it again") from None
 
 
 def _checked(archive: zipfile.ZipFile, packed: int, limits: ZipLimits) -> dict[Path, zipfile.ZipInfo]:
