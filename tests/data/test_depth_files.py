@@ -169,3 +169,18 @@ def test_confidence_beside_the_maps_becomes_weights(tmp_path, largest):
     Image.fromarray(levels[:-1]).save(tmp_path / "confidence" / "a.png")
     with pytest.raises(DatasetError, match="is 4x2 but its depth map 4x3"):
         read_map(file)
+
+
+def test_damaged_pixels_of_an_exr_are_no_depth(tmp_path, capsys):
+    """OpenEXR prints that a block is damaged, and returns memory that it has not filled."""
+    exr = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed (extra depth)")
+    values = np.random.default_rng(0).uniform(1, 60_000, (40, 50)).astype(np.float32)
+    how = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    exr.File(how, {"Z": values}).write(str(tmp_path / "a.exr"))
+    data = bytearray((tmp_path / "a.exr").read_bytes())
+    middle = len(data) * 2 // 3
+    data[middle : middle + 64] = bytes(64)  # in the packed pixels
+    (tmp_path / "a.exr").write_bytes(data)
+    with pytest.raises(DatasetError, match="its pixels are damaged; export it again"):
+        read_depth(tmp_path / "a.exr")
+    assert capsys.readouterr().out == ""

@@ -9,9 +9,7 @@ import pytest
 from PIL import Image
 
 import slices
-from damage import damaged_bytes
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
-from gsplat_edu.io import mesh_files
 from gsplat_edu.io.mesh_files import MESH_FORMATS, mesh_format_of, mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.mesh_glb import linear
 from gsplat_edu.scene.mesh import Mesh, Texture
@@ -386,31 +384,3 @@ def test_wrong_calls_are_named(tmp_path, words, call):
     with pytest.raises(ArgumentError, match=re.escape(words)):
         call(tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-def ascii_ply(path, mesh):
-    rows = "".join(" ".join(map(repr, row)) + "\n" for row in mesh.vertices.tolist())
-    faces = "".join(f"3 {a} {b} {c}\n" for a, b, c in mesh.faces.tolist())
-    path.write_text(PLY.format(len(mesh.vertices)) + FACES.format(len(mesh.faces)) + rows + faces)
-
-
-@pytest.mark.sliced
-@pytest.mark.parametrize("kind", [*SUFFIXES, "textured.glb", "textured.obj", "ascii.ply"])
-def test_damaged_files_end_in_a_mesh_or_one_line(tmp_path, kind):
-    path = tmp_path / f"whole{kind}" if kind[0] == "." else tmp_path / kind
-    if kind == "ascii.ply":
-        ascii_ply(path, some_mesh(count=12))
-    else:
-        write_mesh(path, some_mesh(colors="textured" not in kind, texture="textured" in kind, count=12))
-    data = path.read_bytes()
-    read = 0
-    for seed in SEEDS:
-        path.write_bytes(damaged_bytes(data, np.random.default_rng(seed)))
-        try:
-            mesh = mesh_files.read_mesh(path)
-        except SceneFormatError as error:
-            assert str(path) in str(error) and "\n" not in str(error), seed
-        else:
-            assert np.isfinite(mesh.vertices).all() and len(mesh.faces), seed
-            read += 1
-    assert read < len(SEEDS)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import re
+import sys
+import threading
 import warnings
 import zipfile
 import zlib
@@ -88,7 +90,9 @@ def read_depth(path: Path) -> Map:
     try:
         if reader is None:
             raise ValueError(f"has none of the suffixes {', '.join(ENDINGS)}")
-        values = reader(path)
+        with warnings.catch_warnings():  # of decoders, about what the user cannot fix
+            warnings.simplefilter("ignore")
+            values = reader(path)
     except (*UNDECODABLE, zipfile.BadZipFile, zlib.error) as error:
         said = "it is no image" if isinstance(error, UnidentifiedImageError) else str(error)
         reason = getattr(error, "strerror", None) or said.replace("\n", " ")[:200]
@@ -189,10 +193,7 @@ def _npz(path: Path) -> Shaped[np.ndarray, "h w"]:
     with open_file(path) as file:
         check_directory(file, MOST_MEMBERS)
         file.seek(0)
-        with warnings.catch_warnings():  # about unusual fields in the directory
-            warnings.simplefilter("ignore")
-            archive = zipfile.ZipFile(file)
-        with archive:
+        with zipfile.ZipFile(file) as archive:
             names = archive.namelist()
             name = names[0] if len(names) == 1 else "depth.npy"
             if name not in names:
@@ -213,7 +214,10 @@ def _exr(path: Path) -> Shaped[np.ndarray, "h w"]:
     with open_file(path):  # only a regular file
         file = OpenEXR.File(str(path), header_only=True)
     _check_parts([part.header for part in file.parts], path)
-    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    with _exr_turn, _Listener(sys.stdout) as said:
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    if said.found:
+        raise ValueError("its pixels are damaged")
     names = {name.rpartition(".")[2]: name for name in channels}
     name = next((names[name] for name in CHANNELS if name in names), None)
     if name is None:
@@ -222,6 +226,38 @@ def _exr(path: Path) -> Shaped[np.ndarray, "h w"]:
         )
     values: Shaped[np.ndarray, "h w"] = np.asarray(channels[name].pixels)
     return values.reshape(_plane(values.shape))
+
+
+class _Listener:
+    """Stands for sys.stdout while OpenEXR reads, which prints that pixels are damaged and returns what it has.
+
+    Args:
+        out: Gets what other threads print meanwhile.
+    """
+
+    def __init__(self, out: Any) -> None:  # noqa: ANN401 - sys.stdout, which others replace too
+        self._out = out
+        self._thread = threading.get_ident()
+        self.found = False
+
+    def write(self, text: str) -> int:
+        if threading.get_ident() != self._thread:
+            return int(self._out.write(text))
+        self.found = True
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401
+        return getattr(self._out, name)
+
+    def __enter__(self) -> _Listener:
+        sys.stdout = self
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        sys.stdout = self._out
+
+
+_exr_turn = threading.Lock()
 
 
 def _check_parts(headers: Sequence[Mapping[str, Any]], path: Path) -> None:
