@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from argparse import ArgumentTypeError
 
 import pytest
 from PIL import Image
@@ -167,6 +168,30 @@ def test_mcmc_leaves_its_cap_to_the_plan_if_there_is_one(limit):
 )
 def test_sizes(text, size):
     assert bytes_text(text) == size
+
+
+@pytest.mark.parametrize(
+    "text", ["1e999GiB", "1e300T", "2000000000G", "-1", "nan", "inf", f"{'9' * 400}", "4 apples"]
+)
+def test_sizes_that_no_machine_has_are_refused(text):
+    with pytest.raises(ArgumentTypeError, match="is not a size"):
+        bytes_text(text)
+
+
+@pytest.mark.parametrize("text", [f"{'9' * 400}s", f"{'9' * 400}h1s", "1e9", "inf", "nan", "0", "3000000h"])
+def test_durations_that_no_training_has_are_refused(text):
+    with pytest.raises(ArgumentTypeError, match="is not a duration"):
+        seconds_text(text)
+
+
+@pytest.mark.parametrize("number", ["inf", "nan", "1e999", "-inf"])
+@pytest.mark.parametrize(
+    "words", ["train x --out y --resolution", "mesh x y.ply --voxel", "clean x --max-loss"]
+)
+def test_numbers_are_finite(words, number, capsys):
+    with pytest.raises(SystemExit):
+        parsed(f"{words}={number}".split())
+    assert f"{number!r} is not a number" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

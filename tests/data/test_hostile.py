@@ -18,7 +18,8 @@ from gsplat_edu.data.colmap import read_images, read_points
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import ImageHeader, decode, decode_mask, image_size
 from gsplat_edu.data.points import read_points_ply
-from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.io.formats import read_scene
 from systems import needs_posix
 
@@ -125,8 +126,27 @@ def test_a_pipe_among_the_files_of_a_capture(one_photo, no_hang):
         load_dataset(folder)
     (folder / "images" / "a.png").unlink()
     special(folder, "a pipe", "images/a.png")
-    with pytest.raises(DatasetError, match="none of its 1 photos has a file"):
+    with pytest.raises(
+        DatasetError, match=r"none of its 1 photos has a file, first .*a\.png \(it is a pipe, not a file\)"
+    ):
         load_dataset(folder)
+
+
+@needs_posix
+@pytest.mark.parametrize("kind", ["a pipe", "a socket", "a device", "a folder"])
+def test_a_photo_that_is_no_file_is_named_as_what_it_is(tmp_path, no_hang, kind):
+    """In both layouts, with a photo that is there, so that the capture is read."""
+    views, points, colors = procedural_capture(24, 3)
+    for write in (write_colmap, write_transforms):
+        folder = tmp_path / write.__name__
+        write(folder, views, points, colors)
+        photos = sorted((folder / "images").iterdir())
+        photos[0].unlink()
+        special(photos[0].parent, kind, photos[0].name)
+        said = [str(note) for note in load_dataset(folder, DataSettings(test_every=0)).notes]
+        assert any(
+            "1 of 3 photos have no file" in line and f"(it is {kind}, not a file)" in line for line in said
+        ), said
 
 
 def ply(folder: Path, *lines: str) -> Path:

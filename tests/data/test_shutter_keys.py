@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.lens_captures import LENS_SCENES, lens_capture
@@ -211,3 +211,33 @@ def test_bad_values_are_refused_in_one_line(moving, key, value, message):
     with pytest.raises(DatasetError, match=f"transforms.json, frame .*: .*{message}") as caught:
         load_dataset(moving(KEYS, {key: value}))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("place", ["of_file", "of_frame"])
+@pytest.mark.parametrize(
+    ("keys", "named"),
+    [
+        (
+            {"rolling_shutter_time": 1e300, "camera_angular_velocity": [1e300, 0, 0]},
+            "rolling_shutter_time is 1e[+]300",
+        ),
+        (
+            {"rolling_shutter_time": 5e-324, "exposure_time": 1.0, "camera_linear_velocity": [1, 0, 0]},
+            "5e-324|4.94",
+        ),
+        ({"rolling_shutter_time": 0.02, "exposure_time": 1e300, **KEYS}, "exposure_time is 1e[+]300"),
+        ({"rolling_shutter_time": 1.0, "camera_linear_velocity": [1e300] * 3}, "camera_linear_velocity is"),
+        ({"rolling_shutter_time": 1.0, "camera_angular_velocity": [1e200] * 3}, "camera_angular_velocity is"),
+    ],
+)
+def test_huge_values_are_named_before_they_overflow(moving, place, keys, named):
+    with pytest.raises(DatasetError, match=named):
+        load_dataset(moving(**{place: keys}), NATIVE)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_huge_turn_is_compared_before_it_is_squared():
+    for turn in ([1e200, 1e200, 0.0], [0.9, 0.9, 0.0]):
+        with pytest.raises(ArgumentError, match="more than a radian"):
+            RollingShutter(turn, [0.0, 0.0, 0.0])

@@ -154,3 +154,23 @@ def test_photos_with_any_name_have_thumbnails(page, studio, jpeg):
     for name in ("../trip/a.jpg", "%2e%2e/secret.jpg", "day 1: sea?//12:30.jpg", ".hidden.jpg", "a%00.jpg"):
         answer = page.get(f"/api/photos/trip/thumbs/{quote(name, safe='%/')}?side=256")
         assert answer.status_code in (400, 404), name
+
+
+@pytest.mark.parametrize("number", ["9" * 400, "1.2.3", "1e999", "Infinity", "-1", "NaN"])
+def test_impossible_numbers_in_a_log_hide_nothing(page, run, number):
+    line = (
+        f'{{"iteration": {number}, "loss": 0.5, "num_gaussians": {number}, "ms": 1.0, "seconds": {number}}}\n'
+    )
+    (run / "log.jsonl").write_text(line)
+    (run / "metrics.json").unlink()
+    answer = page.get("/api/library")
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["runs"][0]["iterations"] is None
+    assert page.get("/api/runs/r/curves").status_code == 200
+
+
+@pytest.mark.parametrize("number", ["1e999", "nan", "-inf", "two"])
+def test_a_forecast_is_asked_for_at_a_finite_resolution(page, studio, number):
+    (studio.library.root / "captures" / "c").mkdir()
+    answer = page.get(f"/api/captures/c/forecast?resolution={number}")
+    assert answer.status_code == 400 and "has to be a number or auto" in answer.json()["error"]

@@ -108,6 +108,18 @@ def stored_path(value: object) -> Path | None:
     return None if PureWindowsPath(value).drive.startswith("\\\\") else Path(value)
 
 
+def kind_of(path: str | Path) -> str | None:
+    """Return what a path is instead of a file, such as "is a pipe"; None for a file, and for what does not exist.
+
+    Args:
+        path: The path; its links are followed.
+    """
+    try:
+        return KINDS.get(stat.S_IFMT(Path(path).stat().st_mode))
+    except (OSError, ValueError):
+        return None
+
+
 def _check_regular(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
         kind = KINDS.get(stat.S_IFMT(mode), "is of an unknown type")

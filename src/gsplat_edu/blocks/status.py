@@ -66,6 +66,6 @@ def _last(folder: BlocksFolder, number: int, wanted: int) -> tuple[int, int, flo
         try:
             entry = parse_json(line.decode())
             return int(entry["iteration"]), wanted, float(entry["loss"]), int(entry["num_gaussians"])
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError):
             continue  # cut off, or of another kind
     return 0, wanted, None, None

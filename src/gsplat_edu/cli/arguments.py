@@ -6,7 +6,6 @@ import argparse
 import difflib
 import itertools
 import math
-import re
 import signal
 import sys
 import threading
@@ -16,18 +15,21 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn, TextIO, TypeVar
 
 from gsplat_edu.base.constants import AUTO, LOOPBACK
-from gsplat_edu.base.errors import BackendWarning, SplatError
+from gsplat_edu.base.errors import ArgumentError, BackendWarning, SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.headroom import shortage
+from gsplat_edu.base.quantities import bytes_of, seconds_of
 from gsplat_edu.base.text import bounded, plain_of, printable
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.cli.ranks import is_first, speaks_for_all
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Failed, Interrupted
 from gsplat_edu.render.settings import BACKENDS
+
+Quantity = TypeVar("Quantity", int, float)
 
 EXIT_BUG = 1
 """Exit code of Python for a traceback."""
@@ -202,29 +204,32 @@ def numbers_text(count: int) -> Callable[[str], tuple[float, ...]]:
     return read
 
 
-def seconds_text(text: str) -> float:
-    """Parse a duration such as 90, 90s, 1.5m, 2h or 1h30m; return seconds."""
-    match = re.fullmatch(r"(?:([\d.]+)h)?(?:([\d.]+)m)?(?:([\d.]+)s?)?", text.strip())
+def number_text(text: str) -> float:
+    """Parse a finite number."""
     try:
-        hours, minutes, seconds = (float(part or 0) for part in match.groups()) if match else (0.0, 0.0, 0.0)
+        number = float(text)
     except ValueError:
-        hours = minutes = seconds = 0.0
-    total = 3600 * hours + 60 * minutes + seconds
-    if total <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a duration; examples: 90s, 20m, 1h30m")
-    return total
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
+    return number
+
+
+def seconds_text(text: str) -> float:
+    """Parse a duration; see `gsplat_edu.base.quantities.seconds_of`."""
+    return _quantity(seconds_of, text)
 
 
 def bytes_text(text: str) -> int:
-    """Parse a size such as 4GiB, 500MB or 1e9; return bytes."""
-    match = re.fullmatch(r"([\d.]+(?:e\d+)?)\s*([kmgt]?)(i?)b?", text.strip().lower())
+    """Parse a size; see `gsplat_edu.base.quantities.bytes_of`."""
+    return _quantity(bytes_of, text)
+
+
+def _quantity(read: Callable[[str], Quantity], text: str) -> Quantity:
     try:
-        number = float(match[1]) if match else -1.0
-    except ValueError:
-        number = -1.0
-    if match is None or not 0 <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size; examples: 4GiB, 500MB")
-    return int(number * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
+        return read(text)
+    except ArgumentError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def run_command(program: str, command: Callable[[], None], debug: bool) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable
+from gsplat_edu.base.reading import kind_of
 from gsplat_edu.data.images import UPRIGHT, PhotoFile, PhotoHeaders, upright_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.native_lens import WIDEST_PANORAMA, is_native, native_intrinsics
@@ -191,6 +192,17 @@ def entries(folder: Path) -> list[Path]:
         return sorted(folder.iterdir())
     except OSError as error:
         raise DatasetError(unreadable(folder, error)) from None
+
+
+def missing_photo(name: str, places: Iterable[Path]) -> str:
+    """Return how messages name a photo that has no file: with what is in its place, if that is a pipe or a device.
+
+    Args:
+        name: Its name.
+        places: Where it should be.
+    """
+    kind = next((kind for place in places if (kind := kind_of(place)) is not None), None)
+    return name if kind is None else f"{name} (it {kind}, not a file)"
 
 
 def find_photo(path: Path) -> Path | None:

@@ -30,6 +30,7 @@ from gsplat_edu.data.capture import (
     is_file,
     is_folder,
     is_outside,
+    missing_photo,
     unit_colors,
 )
 from gsplat_edu.data.colmap_files import (
@@ -99,7 +100,12 @@ def read_colmap(folder: Path, model: Path) -> Capture:
         raise DatasetError(f"{listed}: lists no images; run COLMAP's mapper, or choose another model")
     photos, masks, notes = _files(folder, model, [pose.name for pose in poses])
     there = [pose for pose in poses if pose.name in photos]
-    missing = [legible(pose.name) for pose in poses if pose.name not in photos]
+    folders, _ = _photo_folders(folder, model)
+    missing = [
+        missing_photo(legible(pose.name), (place / pose.name for place in folders))
+        for pose in poses
+        if pose.name not in photos
+    ]
     if not there:
         raise DatasetError(
             f"{folder}: none of the {len(poses)} photos listed in {listed.name} has a file, first {missing[0]}; put "

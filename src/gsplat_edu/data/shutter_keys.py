@@ -41,6 +41,12 @@ SHUTTER_KEYS = frozenset((TIME, EXPOSURE, LINEAR, ANGULAR, READOUT))
 WRITTEN_TIME = 2.0**-6
 """Readout time of the files that are written, s: near that of a phone, and a power of two, so that no digit is lost."""
 
+LEAST_TIME, MOST_TIME = 1e-9, 1e6
+"""Plausible times of a shutter, s; others would overflow where they are multiplied."""
+
+MOST_VELOCITY = 1e15
+"""Largest plausible velocity, world units or radians per second."""
+
 FLIP = np.array([1.0, -1.0, -1.0])
 """The diagonal of F."""
 
@@ -66,7 +72,13 @@ def shutter_from_keys(
     for key, seconds in times.items():
         if seconds < 0:
             raise DatasetError(f"{where}: {key} is {seconds:g}, but must be at least 0 seconds")
+        if seconds and not LEAST_TIME <= seconds <= MOST_TIME:
+            between = f"0, or from {LEAST_TIME:g} to {MOST_TIME:g} seconds"
+            raise DatasetError(f"{where}: {key} is {seconds:g}, but must be {between}")
     linear, angular = (_finite(where, values, key, (3,)) for key in (LINEAR, ANGULAR))
+    for key, velocity in ((LINEAR, linear), (ANGULAR, angular)):
+        if np.abs(velocity).max() > MOST_VELOCITY:
+            raise DatasetError(f"{where}: {key} is {velocity.tolist()}, but no camera is that fast")
     readout = values.get(READOUT, READOUTS[0])
     if readout not in READOUTS:
         raise DatasetError(

@@ -32,6 +32,7 @@ from gsplat_edu.data.capture import (
     find_photo,
     is_file,
     is_outside,
+    missing_photo,
 )
 from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
@@ -158,7 +159,7 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
         name = _tidy(frame["file_path"])
         image = _photo(path.parent / as_file_name(name), listings)
         if image is None:
-            missing.append(legible(name))
+            missing.append(missing_photo(legible(name), [path.parent / as_file_name(name)]))
             continue
         where = f"{path}, frame {legible(name)}"
         if common is not None and frame.keys().isdisjoint(INTRINSICS):

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+LARGEST_SCORE = 1e6
+"""Scores below this are plausible, dB; NaN and infinities are not."""
+
 KEY = "refine_trials"
 """Key of config.json."""
 
@@ -75,8 +78,12 @@ class RefineTrials:
         )
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and abs(value) < LARGEST_SCORE
+
+
 def _scores(entry: object) -> Mapping[str, float] | None:
     """Return the scores of an entry; None if they are not numbers by name."""
-    if not isinstance(entry, Mapping) or not all(isinstance(value, int | float) for value in entry.values()):
+    if not isinstance(entry, Mapping) or not all(map(_is_number, entry.values())):
         return None
     return {str(name): float(value) for name, value in entry.items()}

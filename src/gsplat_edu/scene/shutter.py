@@ -68,7 +68,8 @@ class RollingShutter:
             name: float64_array(name, value, (3,)).copy()
             for name, value in (("turn", turn), ("shift", shift))
         }
-        if np.linalg.norm(values["turn"]) > LARGEST_TURN:
+        largest = np.abs(values["turn"]).max()  # compared first: the square of a huge number overflows
+        if largest > LARGEST_TURN or np.linalg.norm(values["turn"]) > LARGEST_TURN:
             raise ArgumentError(
                 "turn: is more than a radian in one readout; give radians per readout, not per second"
             )

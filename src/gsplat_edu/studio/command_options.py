@@ -6,10 +6,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from gsplat_edu.base.constants import AUTO
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.quantities import bytes_of, seconds_of
 from gsplat_edu.base.text import option_flag, shortened
 from gsplat_edu.data.settings import LENS_MODES
 from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
+from gsplat_edu.sfm.scale_text import check_scale
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SETTABLE, SKIES, STRATEGIES
 from gsplat_edu.train.length import QUALITIES
@@ -80,6 +83,22 @@ def _text(name: str, value: Any) -> Words:  # noqa: ANN401
     return [option_flag(name), value]
 
 
+def _parsed(check: Callable[[str], object]) -> Option:
+    """Return an option whose text the command's own parser accepts."""
+
+    def words(name: str, value: Any) -> Words:  # noqa: ANN401
+        found = _text(name, value)
+        try:
+            check(value)
+        except RefusedError:
+            raise
+        except ArgumentError as error:
+            raise RefusedError(f"{name}: {error}") from None
+        return found
+
+    return words
+
+
 def _set(name: str, value: Any) -> Words:  # noqa: ANN401
     """Pass settings of the recipe on, given as an object of names and numbers or words."""
     if not isinstance(value, dict):
@@ -106,7 +125,7 @@ SFM_OPTIONS: Mapping[str, Option] = {
     "mapper": _choice(*MAPPERS),
     "camera_model": _choice(*CAMERA_MODELS),
     "panorama": _choice(*PANORAMA),
-    "scale": _text,
+    "scale": _parsed(check_scale),
     "max_features": _whole(100, 100_000),
     "max_image_size": _whole(64, 20_000),
     "threads": _whole(0, 1_024),
@@ -115,8 +134,8 @@ SFM_OPTIONS: Mapping[str, Option] = {
 TRAIN_OPTIONS: Mapping[str, Option] = {
     "quality": _choice(*QUALITIES),
     "iterations": _whole(1, 1_000_000),
-    "time_limit": _text,
-    "max_memory": _text,
+    "time_limit": _parsed(seconds_of),
+    "max_memory": _parsed(bytes_of),
     "max_gaussians": _whole(1, 100_000_000),
     "strategy": _choice(*STRATEGIES),
     "resolution": _word_or(AUTO, _number(0.1, 100_000.0)),
@@ -128,7 +147,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "lens": _choice(*LENS_MODES),
     "outside_masks": _choice("auto", *OUTSIDE_MASKS),
     "panorama": _choice(*PANORAMA),
-    "scale": _text,
+    "scale": _parsed(check_scale),
     "seed": _whole(0, 2**31 - 1),
     "batch": _whole(1, 1_024),
     "sh_degree": _whole(0, 3),
@@ -152,7 +171,7 @@ MESH_OPTIONS: Mapping[str, Option] = {
     "voxel": _number(1e-6, 1e6),
     "faces": _whole(4, 10_000_000),
     "keep": _choice("large", "largest", "all"),
-    "max_memory": _text,
+    "max_memory": _parsed(bytes_of),
     "texture": _switch,
 }
 

@@ -190,7 +190,7 @@ def last_logged(path: Path) -> dict[str, Any]:
         if '"ms"' not in line:
             continue
         for name in ("iteration", "num_gaussians", "seconds"):
-            if match := re.search(rf'"{name}": ([0-9.]+)', line):
+            if match := re.search(rf'"{name}": ([0-9]{{1,15}}(?:\.[0-9]*)?)[,}}]', line):
                 found[name] = float(match[1]) if name == "seconds" else int(float(match[1]))
         return found
     return found

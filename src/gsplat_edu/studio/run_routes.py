@@ -11,6 +11,8 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute
 
 from gsplat_edu.base.constants import AUTO
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.json_fields import checked_number
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
@@ -93,8 +95,8 @@ def _forecast(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     entry = studio.library.entry("captures", request.path_params["name"])
     text = request.query_params.get("resolution")
     try:
-        resolution = text if text in (None, AUTO) else float(text)
-    except ValueError:
+        resolution = text if text in (None, AUTO) else checked_number("resolution", float(text))
+    except (ArgumentError, ValueError):
         raise RefusedError(f"resolution: is {str(text)[:20]!r}, but has to be a number or auto") from None
     return {"qualities": studio.prober.ask("forecast", capture=str(entry), resolution=resolution)}
 

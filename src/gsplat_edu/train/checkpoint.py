@@ -20,6 +20,7 @@ from torch import Tensor
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.headroom import shortage
+from gsplat_edu.base.quantities import MOST_SECONDS
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.train.trainer import Trainer
 
@@ -31,9 +32,6 @@ FORMAT = "1"
 
 LONGEST = 1 << 24
 """Largest number of characters of JSON in the header: the view order takes nine for each photo."""
-
-MOST_SECONDS = 1e9
-"""Largest plausible training time, s: thirty years."""
 
 _NAME = re.compile(r"iteration_(\d+)\.safetensors")
 

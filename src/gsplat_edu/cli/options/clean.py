@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range
+from gsplat_edu.cli.arguments import number_text
 
 EXAMPLE = "example: gsplat-edu clean runs/plush --preview removed.html"
 
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--max-loss",
-        type=float,
+        type=number_text,
         default=MAX_LOSS,
         metavar="DB",
         help="largest loss of the held-out views' mean PSNR; less is removed to stay within it (default: %(default)s)",

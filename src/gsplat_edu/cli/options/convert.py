@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, DatasetError
-from gsplat_edu.cli.arguments import add_backend, add_meshes, numbers_text, whole_number_text
+from gsplat_edu.cli.arguments import add_backend, add_meshes, number_text, numbers_text, whole_number_text
 from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--min-opacity",
-        type=float,
+        type=number_text,
         default=0.0,
         metavar="A",
         help="drop Gaussians with a lower opacity (default: 0)",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.cli.arguments import add_backend, number_text, whole_number_text
 from gsplat_edu.cli.options.depth import add_depth
 from gsplat_edu.train.length import DEFAULT_QUALITY
 
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     before.add_argument(
         "--resolution",
-        type=float,
+        type=number_text,
         metavar="R",
         help="resolution of the forecast training: a divisor below 32, or the longest side in px",
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.cli.arguments import add_backend, bytes_text, numbers_text, whole_number_text
+from gsplat_edu.cli.arguments import add_backend, bytes_text, number_text, numbers_text, whole_number_text
 
 EXAMPLE = "example: gsplat-edu mesh runs/plush plush.glb --faces 50000"
 
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--voxel",
-        type=float,
+        type=number_text,
         metavar="SIZE",
         help="edge of a voxel, world units; details below about two voxels are lost (default: 1.5 px of the photos at"
         " their median depth)",
@@ -111,7 +111,7 @@ def _add_truth(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--tau",
-        type=float,
+        type=number_text,
         metavar="SIZE",
         help="distance below which a point counts as correct for --truth, world units (default: one voxel)",
     )

@@ -10,7 +10,7 @@ from gsplat_edu.base.constants import AUTO as AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import one_of
-from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
+from gsplat_edu.cli.arguments import add_backend, bytes_text, number_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.cli.options.depth import add_depth, check_depth
 from gsplat_edu.cli.options.length import length_of, strategy_of
@@ -310,7 +310,7 @@ def _add_background(group: argparse._ArgumentGroup) -> None:
     behind = group.add_mutually_exclusive_group()
     behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
     behind.add_argument(
-        "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="background colour, 0 to 1"
+        "--background", type=number_text, nargs=3, metavar=("R", "G", "B"), help="background colour, 0 to 1"
     )
     group.add_argument(
         "--random-background",
@@ -338,14 +338,7 @@ def _add_recipe(group: argparse._ArgumentGroup) -> None:
 
 
 def _number_or_auto(text: str) -> float | str:
-    return text if text == AUTO else _number(text)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    return text if text == AUTO else number_text(text)
 
 
 def check(arguments: argparse.Namespace) -> None:
