@@ -2,6 +2,7 @@ import errno
 import os
 import shutil
 import stat
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from gsplat_edu.base.files import (
     unreadable,
     written_aside,
 )
-from gsplat_edu.base.reading import stored_path
+from gsplat_edu.base.reading import open_file, stored_path
 from gsplat_edu.cli.arguments import run_command
 from systems import needs_posix
 
@@ -167,3 +168,15 @@ def test_unreadable_files_have_one_wording(number, advice):
 def test_paths_in_files_have_only_characters_that_names_can_have(value, names):
     """A byte that is not UTF-8 is a lone surrogate from U+DC80 on in a name; no file has other surrogates."""
     assert (stored_path(value) is not None) == names
+
+
+def test_a_read_allocates_no_more_than_the_file_holds(tmp_path):
+    """As a decoder does for a PNG whose first piece claims 4 GiB."""
+    (tmp_path / "a").write_bytes(b"abc" * 100)
+    with open_file(tmp_path / "a") as file:
+        file.seek(290)
+        tracemalloc.start()
+        found = file.read(2**32 - 1)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert found == (b"abc" * 100)[290:] and peak < 1 << 20 and file.read(1 << 30) == b""

@@ -10,7 +10,7 @@ import json
 import os
 import stat
 from collections.abc import Callable
-from io import BufferedReader
+from io import BufferedReader, FileIO
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -20,6 +20,9 @@ from gsplat_edu.base.text import names_a_file
 TOO_LARGE = "close other programs, or read it on a machine with more memory"
 """Advice for a file that does not fit into memory."""
 
+MOST_TRUSTED = 1 << 20
+"""Bytes that are asked for without a look at the file's size."""
+
 KINDS = {
     stat.S_IFIFO: "is a pipe",
     stat.S_IFSOCK: "is a socket",
@@ -28,6 +31,16 @@ KINDS = {
     stat.S_IFDIR: "is a folder",
 }
 """File types that are not read, by the system's mode."""
+
+
+class _Reader(BufferedReader):
+    """A file that allocates no more than it holds, however many bytes a header claims."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read bytes; see `io.BufferedReader.read`."""
+        if size is not None and size > MOST_TRUSTED:
+            size = min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0))
+        return super().read(size)
 
 
 def open_file(path: str | Path) -> BufferedReader:
@@ -43,7 +56,7 @@ def open_file(path: str | Path) -> BufferedReader:
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     try:
         _check_regular(path, os.fstat(descriptor).st_mode)  # the file may have been replaced in between
-        return os.fdopen(descriptor, "rb")
+        return _Reader(FileIO(descriptor, "rb"))
     except BaseException:
         os.close(descriptor)
         raise

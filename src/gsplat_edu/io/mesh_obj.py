@@ -271,4 +271,7 @@ def _neighbour(path: Path, name: str) -> Path | None:
     if name in ("", ".", "..") or "/" in name or "\\" in name or ":" in name or "\0" in name:
         return None
     file = path.with_name(name)
-    return file if file.is_file() else None
+    try:
+        return file if file.is_file() else None
+    except (OSError, ValueError):  # too long
+        return None
