@@ -278,6 +278,19 @@ def test_transforms_that_splats_cannot_follow_are_refused_by_name(tmp_path, node
     assert "\n" not in str(caught.value)
 
 
+def test_transforms_that_overflow_together_are_refused_without_a_warning(tmp_path):
+    file = Builder()
+    file.mesh(file.splats(values()))
+    huge = {"scale": [1e200] * 3, "rotation": [1e200] * 4}
+    file.document["nodes"] = [
+        {**huge, "children": [1]},
+        {**huge, "children": [2]},
+        {"mesh": 0, "scale": [0, 0, 0]},
+    ]
+    with pytest.raises(SceneFormatError, match="NaN, infinite or absurdly large"):
+        read_scene(file.save(tmp_path / "a.glb"))
+
+
 @pytest.mark.parametrize(
     ("change", "fault"),
     [

@@ -142,6 +142,8 @@ def node_matrix(node: Mapping[str, Any]) -> Float64[np.ndarray, "4 4"]:
 def node_matrices(path: Path, document: Mapping[str, Any]) -> dict[int, Float64[np.ndarray, "4 4"]]:
     """Return the transforms to world coordinates of the nodes of the scene; of all nodes if there is no scene.
 
+    A hostile file's may be NaN or infinite.
+
     Args:
         path: The file, for messages.
         document: Its JSON.
@@ -161,6 +163,7 @@ def node_matrices(path: Path, document: Mapping[str, Any]) -> dict[int, Float64[
         index, outer = waiting.pop()
         if type(index) is not int or not 0 <= index < len(nodes) or index in matrices:
             refuse(path, f"has a node {str(index)[:20]} that does not exist, or has two parents")
-        matrices[index] = outer @ node_matrix(nodes[index])
+        with np.errstate(all="ignore"):  # the caller looks for NaN and infinity
+            matrices[index] = outer @ node_matrix(nodes[index])
         waiting += [(child, matrices[index]) for child in reversed(nodes[index].get("children", []))]
     return matrices
