@@ -63,7 +63,7 @@ def test_other_indices_are_refused(index):
 
 def test_a_camera_from_matrices():
     camera = Camera.from_viewmat(
-        torch.tensor(CAMERA.viewmat), CAMERA.intrinsics.K.tolist(), CAMERA.W, CAMERA.H
+        torch.tensor(CAMERA.viewmat), CAMERA.intrinsics.K.tolist(), CAMERA.W, CAMERA.H, first_pixel=0
     )
     np.testing.assert_allclose(camera.eye, CAMERA.eye, atol=1e-12)
     np.testing.assert_allclose(camera.R, CAMERA.R)
@@ -86,7 +86,20 @@ def test_a_camera_from_matrices():
 )
 def test_matrices_that_are_no_camera_are_refused(viewmat, K, names):
     with pytest.raises((ArgumentError, ShapeError), match=f"^{names}: "):
-        Camera.from_viewmat(viewmat, K, 24, 20)
+        Camera.from_viewmat(viewmat, K, 24, 20, first_pixel=0.0)
+
+
+def test_the_callers_of_from_viewmat_say_where_the_first_pixel_is():
+    """A K of gsplat or COLMAP, whose first pixel's centre is (0.5, 0.5), maps the same ray to its pixel plus a half."""
+    with pytest.raises(TypeError, match="first_pixel"):
+        Camera.from_viewmat(np.eye(4), np.diag([20.0, 20.0, 1.0]), 24, 20)
+    K = np.array([[20.0, 0, 12.0], [0, 20.0, 10.0], [0, 0, 1]])
+    ours, theirs = (Camera.from_viewmat(np.eye(4), K, 24, 20, first_pixel=first) for first in (0.0, 0.5))
+    u, v, _ = ours.project(np.array([[0.1, -0.2, 1.0]]))
+    expected = K[:2, :2] @ (0.1, -0.2) + K[:2, 2]
+    np.testing.assert_allclose((u[0], v[0]), expected, atol=1e-12)
+    u, v, _ = theirs.project(np.array([[0.1, -0.2, 1.0]]))
+    np.testing.assert_allclose((u[0] + 0.5, v[0] + 0.5), expected, atol=1e-12)
 
 
 def test_backgrounds_and_features_are_numbers_arrays_or_tensors():

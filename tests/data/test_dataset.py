@@ -80,7 +80,10 @@ def test_both_kinds_of_poses(written, small):
 def test_several_models_are_reported(written):
     folder = written("colmap")
     (folder / "sparse" / "1").mkdir()
-    assert any("2 models: 0 is read, 1 not" in note for note in map(str, load_dataset(folder).notes))
+    assert any(
+        "2 models: 0 (9 photos) is read, 1 (unreadable) not" in note
+        for note in map(str, load_dataset(folder).notes)
+    )
 
 
 def test_every_eighth_view_by_name_is_held_out(written, small):
@@ -201,9 +204,14 @@ def test_invalid_poses_name_the_frame(tmp_path, small):
     for what, matrix in bad.items():
         contents["frames"][4]["transform_matrix"] = matrix.tolist()
         path.write_text(json.dumps(contents))
-        with pytest.raises(DatasetError, match=what) as caught:
-            load_dataset(tmp_path)
-        assert "view_004" in str(caught.value)
+        dataset = load_dataset(tmp_path, DataSettings(test_every=0))
+        assert len(dataset.train) == 8 and "images/view_004.png" not in {view.name for view in dataset.train}
+        note = str(dataset.notes[0])
+        assert (
+            note.startswith("1 of 9 photos has an unusable pose")
+            and "images/view_004.png (" in note
+            and what in note
+        )
 
 
 def test_a_rotation_with_few_digits_is_made_orthonormal(tmp_path, small):

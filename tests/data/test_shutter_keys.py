@@ -1,6 +1,7 @@
 """Rolling shutters in transforms.json: the convention, the round trip, the lens modes and bad values."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.lens_captures import LENS_SCENES, lens_capture
 from gsplat_edu.data.loading_notes import IgnoredShutters, MotionBlurs, RollingShutters
+from gsplat_edu.data.notes import UnusablePhotos
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.shutter_keys import keys_of_shutter, shutter_from_keys
@@ -208,8 +210,11 @@ def _lens(frame):
     ],
 )
 def test_bad_values_are_refused_in_one_line(moving, key, value, message):
+    """Of one frame, which is left out; of all frames, which is an error."""
+    (note,) = notes_of(load_dataset(moving(KEYS, {key: value})), UnusablePhotos)
+    assert len(note.problems) == 1 and re.search(message, str(note))
     with pytest.raises(DatasetError, match=f"transforms.json, frame .*: .*{message}") as caught:
-        load_dataset(moving(KEYS, {key: value}))
+        load_dataset(moving({**KEYS, key: value}))
     assert "\n" not in str(caught.value)
 
 

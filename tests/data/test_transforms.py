@@ -1,6 +1,7 @@
 """transforms.json and Blender's files: dialects, missing values, and the source of the points."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -108,19 +109,37 @@ def test_an_invalid_transforms_json_is_refused(tmp_path, content):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
+        ("transform_matrix", None, r"view_004\.png \(has no transform_matrix"),
+        ("transform_matrix", [[1, 2], [3, 4]], r"view_004\.png \(transform_matrix is not a 3x4 or 4x4"),
+        ("transform_matrix", [[1], [3, 4]], r"view_004\.png \(transform_matrix is not a 3x4 or 4x4"),
+        ("transform_matrix", "x", r"view_004\.png \(transform_matrix is not a 3x4 or 4x4"),
+        ("fl_x", -3.0, r"view_004\.png \(focal length fx is -3"),
+        ("fl_x", "abc", r"view_004\.png \(fl_x is abc"),
+        ("fl_x", float("nan"), r"view_004\.png \(fl_x is nan"),
+        ("cy", float("inf"), r"view_004\.png \(cy is inf"),
+        ("w", 0, r"view_004\.png \(w is 0"),
+        ("h", 17.5, r"view_004\.png \(h is 17.5"),
+        ("k1", [1], r"view_004\.png \(k1 is "),
+    ],
+)
+def test_a_frame_with_invalid_values_is_left_out_and_named(edited, key, value, message):
+    def change(contents):
+        contents["frames"][4][key] = value
+        if value is None:
+            del contents["frames"][4][key]
+
+    dataset = load_dataset(edited(change), DataSettings(test_every=0))
+    assert len(dataset.train) == 8 and "images/view_004.png" not in {view.name for view in dataset.train}
+    note = str(dataset.notes[0])
+    assert note.startswith("1 of 9 photos has an unusable pose or camera and is left out: images/")
+    assert re.search(message, note)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
         ("file_path", None, "frame 4: has no file_path"),
         ("file_path", 7, "frame 4: has no file_path"),
-        ("transform_matrix", None, r"view_004\.png: has no transform_matrix"),
-        ("transform_matrix", [[1, 2], [3, 4]], r"view_004\.png: transform_matrix is not a 3x4 or 4x4"),
-        ("transform_matrix", [[1], [3, 4]], r"view_004\.png: transform_matrix is not a 3x4 or 4x4"),
-        ("transform_matrix", "x", r"view_004\.png: transform_matrix is not a 3x4 or 4x4"),
-        ("fl_x", -3.0, r"view_004\.png: focal length fx is -3"),
-        ("fl_x", "abc", r"view_004\.png: fl_x is abc"),
-        ("fl_x", float("nan"), r"view_004\.png: fl_x is nan"),
-        ("cy", float("inf"), r"view_004\.png: cy is inf"),
-        ("w", 0, r"view_004\.png: w is 0"),
-        ("h", 17.5, r"view_004\.png: h is 17.5"),
-        ("k1", [1], r"view_004\.png: k1 is "),
         ("camera_model", "EQUIRECTANGULAR", r"view_004\.png: camera_model 'EQUIRECTANGULAR' is not"),
         ("camera_model", ["x"], r"view_004\.png: camera_model"),
         ("mask_path", "no.png", r"view_004\.png: its mask .*no\.png does not exist"),

@@ -219,13 +219,12 @@ def edited(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["nodes"][0].update(rotation=[1, 0, 0, 0]), "by a node"),
-        (lambda d: d["accessors"][1].update(componentType=5121), "not float32"),
+        (lambda d: d["accessors"][1].update(componentType=5121), "not supported"),
         (lambda d: d["accessors"][1].update(count=10**15), "beyond the file's end"),
-        (lambda d: d["accessors"][1].update(count=7.0), "beyond the file's end"),
+        (lambda d: d["accessors"][1].update(count=7.0), "impossible"),
         (lambda d: d["accessors"][1].update(count=4), "different numbers of splats"),
-        (lambda d: d["bufferViews"][1].update(byteStride=32), "interleaved"),
-        (lambda d: d["bufferViews"][1].update(byteOffset=-4), "beyond the file's end"),
+        (lambda d: d["bufferViews"][1].update(byteStride=32), "beyond the file's end"),
+        (lambda d: d["bufferViews"][1].update(byteOffset=-4), "impossible"),
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SCALE"), "without KHR"),
         (
             lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SH_DEGREE_0_COEF_0"),
@@ -236,7 +235,6 @@ def edited(path, change):
             "without KHR",
         ),
         (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no splats"),
-        (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives"),
         (lambda d: d["asset"].update(extras={"antialiased": "yes"}), "antialiased is"),
         (lambda d: d["asset"].update(extras={"up": [0, 0, 0]}), "not a direction"),
         (lambda d: d["asset"].update(extras={"up": [0, 0]}), "does not describe"),

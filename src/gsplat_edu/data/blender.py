@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsplat_edu.data.capture import Capture, Frame, is_file
+from gsplat_edu.data.capture import Capture, Frame, Problem, is_file, problem_notes
 from gsplat_edu.data.masks import with_masks
-from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, UnusedSplit
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, UnusedSplit
 from gsplat_edu.data.points import BLENDER_CUBE
-from gsplat_edu.data.transforms import nothing_found, read_frames, read_json
+from gsplat_edu.data.transforms import each_once, nothing_found, read_frames, read_json
 
 TRAIN_FILE = "transforms_train.json"
 
@@ -25,7 +25,7 @@ def read_blender(folder: Path) -> Capture:
     Raises:
         DatasetError: as for `read_transforms`.
     """
-    frames, missing, outside = list[Frame](), list[str](), list[Path]()
+    read, missing, outside, problems = list[Frame](), list[str](), list[Path](), list[Problem]()
     held_out = next((p for part in ("test", "val") if is_file(p := folder / f"transforms_{part}.json")), None)
     for part, path in (("train", folder / TRAIN_FILE), ("test", held_out)):
         if path is None:
@@ -33,12 +33,14 @@ def read_blender(folder: Path) -> Capture:
         contents = read_json(path)
         found = read_frames(path, contents, part)
         if part == "train" and not found.frames:
+            problem_notes(found.problems, len(found.problems))  # raises the first problem, if there is one
             raise nothing_found(path, found.missing)
-        frames += found.frames
+        read += found.frames
+        problems += found.problems
         missing += found.missing
         outside += found.outside
     val = folder / "transforms_val.json"
-    notes = list[Note]()
+    frames, notes = each_once(folder / TRAIN_FILE, read, problems)
     if held_out is not None and held_out != val and is_file(val):
         notes.append(UnusedSplit(val.name, held_out.name))
     notes += [MissingPhotos(len(missing), len(frames) + len(missing), missing[0])] if missing else []

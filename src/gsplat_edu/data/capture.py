@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,7 +19,7 @@ from gsplat_edu.base.reading import kind_of
 from gsplat_edu.data.images import UPRIGHT, PhotoFile, PhotoHeaders, upright_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.native_lens import WIDEST_PANORAMA, is_native, native_intrinsics
-from gsplat_edu.data.notes import Note
+from gsplat_edu.data.notes import Note, UnusablePhotos
 from gsplat_edu.data.panorama import FaceLens, face_rotations
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import FACTOR_BELOW, DataSettings
@@ -217,6 +218,43 @@ def find_photo(path: Path) -> Path | None:
     return next((copy for copy in copies if copy is not None), None)
 
 
+class Problem(NamedTuple):
+    """A photo whose pose or camera cannot be used."""
+
+    name: str
+    message: str  # names file, photo and problem
+    reason: str  # the problem alone
+
+    @classmethod
+    def of(cls, name: str, where: str, error: DatasetError) -> Problem:
+        """Return the problem that an error describes.
+
+        Args:
+            name: The photo's name.
+            where: File and photo, with which the error's message begins.
+            error: What is wrong.
+        """
+        return cls(name, str(error), error.reason.removeprefix(f"{where}: "))
+
+
+def problem_notes(problems: Sequence[Problem], total: int) -> list[Note]:
+    """Return the note about photos whose pose or camera cannot be used; empty if there are none.
+
+    Args:
+        problems: What is wrong with them.
+        total: Number of photos with a file.
+
+    Raises:
+        DatasetError: no photo is usable.
+    """
+    if not problems:
+        return []
+    if len(problems) < total:
+        return [UnusablePhotos(tuple((name, reason) for name, _, reason in problems), total)]
+    rest = f"; none of the other {total - 1} photos has a usable pose and camera either" if total > 1 else ""
+    raise DatasetError(f"{problems[0].message}{rest}; repair the file, or find the poses again")
+
+
 def checked_frame(where: str, frame: Frame) -> Frame:
     """Check a pose, and restore the orthogonality of a rotation written with few digits.
 
@@ -230,9 +268,7 @@ def checked_frame(where: str, frame: Frame) -> Frame:
         DatasetError: a number is NaN, infinite or absurd, or R is not a rotation.
     """
     if not (np.all(np.abs(frame.eye) < MAX_COORDINATE) and np.all(np.isfinite(frame.R))):
-        raise DatasetError(
-            f"{where}: its pose is NaN, infinite or absurdly far away; remove the image from the capture"
-        )
+        raise DatasetError(f"{where}: its pose is NaN, infinite or absurdly far away")
     if np.abs(frame.R).max() > 1e3:
         raise DatasetError(f"{where}: its pose is not a rotation; entries up to {np.abs(frame.R).max():g}")
     error = np.abs(frame.R @ frame.R.T - np.eye(3)).max()

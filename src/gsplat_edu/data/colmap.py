@@ -23,6 +23,7 @@ from gsplat_edu.data.capture import (
     Cloud,
     Frame,
     Listings,
+    Problem,
     checked_frame,
     entries,
     faces_of,
@@ -31,6 +32,7 @@ from gsplat_edu.data.capture import (
     is_folder,
     is_outside,
     missing_photo,
+    problem_notes,
     unit_colors,
 )
 from gsplat_edu.data.colmap_files import (
@@ -38,6 +40,7 @@ from gsplat_edu.data.colmap_files import (
     Pose,
     cameras_bin,
     cameras_txt,
+    count_bin,
     images_bin,
     images_txt,
     points_bin,
@@ -70,7 +73,9 @@ SUFFIXES = (".bin", ".txt")
 
 
 def find_model(folder: Path) -> Path | None:
-    """Find the folder of a model, by its cameras or images file.
+    """Find the folder of a model, by its cameras or images file; of numbered ones the one with the most images.
+
+    A mapper writes a numbered model for each group of photos that it could connect. Of equal ones, the first is found.
 
     Args:
         folder: The capture, its folder of models, or the model.
@@ -78,8 +83,16 @@ def find_model(folder: Path) -> Path | None:
     places = [folder / place for place in PLACES]
     for parent in (folder / "sparse", folder / "colmap" / "sparse", folder):
         places += _numbered(parent)
+    found = next(filter(_is_model, places), None)
+    if found is None or found == folder or not found.name.isdecimal():
+        return found
+    beside = [place for place in _numbered(found.parent) if _is_model(place)]
+    return found if beside == [found] else max(beside, key=lambda place: _image_count(place) or 0)
+
+
+def _is_model(place: Path) -> bool:
     names = [f"{part}{suffix}" for part in ("cameras", "images") for suffix in SUFFIXES]
-    return next((place for place in places if any(is_file(place / name) for name in names)), None)
+    return any(is_file(place / name) for name in names)
 
 
 def read_colmap(folder: Path, model: Path) -> Capture:
@@ -89,9 +102,11 @@ def read_colmap(folder: Path, model: Path) -> Capture:
         folder: The capture, with the photos in images/ or next to the model.
         model: The folder with cameras, images and optionally points3D.
 
+    Images whose pose or camera is NaN, infinite or absurd are left out, and named in a note.
+
     Raises:
-        DatasetError: a file is missing, truncated or malformed; a camera model is unsupported; a pose is invalid; two
-            images share one file; or no image has a file.
+        DatasetError: a file is missing, truncated or malformed; a camera model is unsupported; two images share one
+            file; or no image has a file and a usable pose and camera.
     """
     suffix = _suffix(model)
     listed = model / f"images{suffix}"
@@ -111,24 +126,54 @@ def read_colmap(folder: Path, model: Path) -> Capture:
             f"{folder}: none of the {len(poses)} photos listed in {listed.name} has a file, first {missing[0]}; put "
             "them into images/"
         )
-    lenses = read_cameras(model / f"cameras{suffix}", {pose.camera for pose in there})
-    frames = []
-    for pose in there:
+    frames, problems = _frames(model, suffix, there, photos, masks)
+    notes += problem_notes(problems, len(there)) + _other_models(folder, model)
+    if missing:
+        notes.append(MissingPhotos(len(missing), len(poses), missing[0]))
+    return Capture("COLMAP", tuple(frames), read_points(model), tuple(notes))
+
+
+def _frames(
+    model: Path, suffix: str, poses: Sequence[Pose], photos: Mapping[str, Path], masks: Mapping[str, Path]
+) -> tuple[list[Frame], list[Problem]]:
+    """Return the frames of the images that have photos, and what is wrong with the others."""
+    lenses = _lenses(model / f"cameras{suffix}", {pose.camera for pose in poses})
+    frames, problems = list[Frame](), list[Problem]()
+    for pose in poses:
         name = legible(pose.name)
-        where = f"{listed}, image {name}"
+        where = f"{model / f'images{suffix}'}, image {name}"
         if pose.camera not in lenses:
             raise DatasetError(
                 f"{where}: its camera {pose.camera} is not in cameras{suffix}; the two files do not belong together"
             )
-        R, eye = _placed(where, pose)
-        frame = Frame(name, photos[pose.name], lenses[pose.camera], R, eye, masks.get(pose.name))
-        frames += faces_of(checked_frame(where, frame))
-    if missing:
-        notes.append(MissingPhotos(len(missing), len(poses), missing[0]))
-    others = [place.name for place in _numbered(model.parent) if place != model]
-    if model.name.isdecimal() and others and (model.parent == folder or model.parent.name == "sparse"):
-        notes.append(OtherModels(model.parent, model.name, tuple(others)))
-    return Capture("COLMAP", tuple(frames), read_points(model), tuple(notes))
+        try:
+            lens = lenses[pose.camera]
+            if isinstance(lens, DatasetError):
+                raise lens
+            R, eye = _placed(where, pose)
+            frame = Frame(name, photos[pose.name], lens, R, eye, masks.get(pose.name))
+            frames += faces_of(checked_frame(where, frame))
+        except DatasetError as error:
+            problems.append(Problem.of(name, where, error))
+    return frames, problems
+
+
+def _other_models(folder: Path, model: Path) -> list[Note]:
+    """Report the models beside the one that is read."""
+    others = [place for place in _numbered(model.parent) if place != model]
+    if not (model.name.isdecimal() and others and (model.parent == folder or model.parent.name == "sparse")):
+        return []
+    counts = tuple((place.name, _image_count(place)) for place in others)
+    return [OtherModels(model.parent, model.name, _image_count(model), counts)]
+
+
+def _image_count(model: Path) -> int | None:
+    """Return the number of images that a model lists; None if it cannot be read."""
+    try:
+        path = model / f"images{_suffix(model)}"
+        return count_bin(path) if path.suffix == ".bin" else len(images_txt(path))
+    except DatasetError:
+        return None
 
 
 def points_file(model: Path) -> Path | None:
@@ -161,18 +206,32 @@ def read_cameras(path: Path, used: Container[int] | None = None) -> dict[int, Le
         used: Numbers of the required cameras; None for all. Other cameras may be unsupported.
 
     Raises:
-        DatasetError: the file is truncated or malformed, or a required camera model is unsupported.
+        DatasetError: the file is truncated or malformed, or a required camera is unsupported or invalid.
     """
     lenses = {}
+    for camera, lens in _lenses(path, used).items():
+        if isinstance(lens, DatasetError):
+            raise lens
+        lenses[camera] = lens
+    return lenses
+
+
+def _lenses(path: Path, used: Container[int] | None) -> dict[int, Lens | DatasetError]:
+    """Read the lenses of a model; the error of a required camera whose numbers are no camera takes its place."""
+    lenses: dict[int, Lens | DatasetError] = {}
     for where, camera, model, W, H, values in (
         cameras_bin(path) if path.suffix == ".bin" else cameras_txt(path)
     ):
         if used is not None and camera not in used:
             continue
         try:
-            lenses[camera] = _lens(model, W, H, values)
+            named = _parameters(model, values)
         except DatasetError as error:
             raise DatasetError(f"{where}: {error}") from None
+        try:
+            lenses[camera] = _lens(model, W, H, named)
+        except DatasetError as error:
+            lenses[camera] = DatasetError(f"{where}: {error}", f"camera {camera}: {error}")
     return lenses
 
 
@@ -276,16 +335,15 @@ def _candidates(folders: Sequence[Path], name: str, alone: Sequence[str]) -> Ite
 def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
     shift = np.array(pose.shift)
     if not np.all(np.abs(shift) < 1e100):  # the rest is checked by checked_frame
-        raise DatasetError(f"{where}: its pose is NaN or infinite; remove the image from the model")
+        raise DatasetError(f"{where}: its pose is NaN or infinite")
     if not np.all(np.isfinite(pose.quat)) or not np.any(pose.quat):
-        raise DatasetError(
-            f"{where}: its quaternion {pose.quat} is not a rotation; remove the image from the model"
-        )
+        raise DatasetError(f"{where}: its quaternion {pose.quat} is not a rotation")
     R = quat_to_R(pose.quat)
     return R, -R.T @ shift
 
 
-def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
+def _parameters(model: str, values: Sequence[float]) -> dict[str, float]:
+    """Return the parameters of a camera by name."""
     names = dict(MODELS).get(model, "").split()
     if not names:
         raise DatasetError(
@@ -293,9 +351,12 @@ def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
         )
     if len(values) != len(names):
         raise DatasetError(f"{model} has {len(names)} parameters ({', '.join(names)}), got {len(values)}")
+    return dict(zip(names, values, strict=True))
+
+
+def _lens(model: str, W: int, H: int, named: dict[str, float]) -> Lens:
     if model == SPHERE:
         return FaceLens.of(W, H, 0)
-    named = dict(zip(names, values, strict=True))
     if "f" in named:
         named["fx"] = named["fy"] = named.pop("f")
     plain = FISHEYE if model.endswith("FISHEYE") else PINHOLE_LIKE

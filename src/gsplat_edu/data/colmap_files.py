@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import array
 import io
+import math
 import os
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -49,6 +51,12 @@ LONGEST_LINE = 2**26
 
 LONGEST_NAME = 2**16
 """Bytes of an image's name beyond which the file is damaged; no system has longer paths."""
+
+UNIT_SLACK = 1e-3
+"""Largest distance from 1 of the length of a quaternion that marks a line of images.txt as an image."""
+
+NOT_A_NUMBER = re.compile(r"[+-]?(nan(\([\w]*\))?|1\.#\w+)", re.IGNORECASE)
+"""NaN and infinity as C++ libraries spell them and Python does not read them."""
 
 
 class Pose(NamedTuple):
@@ -173,6 +181,12 @@ def cameras_bin(path: Path) -> Iterator[CameraRow]:
             yield where, camera, model, W, H, values
 
 
+def count_bin(path: Path) -> int:
+    """Return the number of images that the header of images.bin declares."""
+    with _binary(path, _IMAGE.size + 1 + _COUNT.size) as file:
+        return int(file.count)
+
+
 def images_bin(path: Path) -> list[Pose]:
     """Read images.bin, without the points seen in the images."""
     poses = []
@@ -234,7 +248,7 @@ def _point_table(path: Path) -> np.ndarray:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the lines of a text file with their numbers, one at a time."""
     try:
-        with open_file(path) as file, io.TextIOWrapper(file, "utf-8", "surrogateescape") as text:
+        with open_file(path) as file, io.TextIOWrapper(file, "utf-8-sig", "surrogateescape") as text:
             number = 0
             while line := text.readline(LONGEST_LINE):
                 number += 1
@@ -263,7 +277,7 @@ def cameras_txt(path: Path) -> Iterator[CameraRow]:
                 model,
                 int(W),
                 int(H),
-                tuple(float(v) for v in values),
+                tuple(_float(v) for v in values),
             )
         except ValueError:
             raise _malformed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from None
@@ -271,41 +285,88 @@ def cameras_txt(path: Path) -> Iterator[CameraRow]:
 
 def images_txt(path: Path) -> list[Pose]:
     """Read images.txt, without the points seen in the images."""
-    poses, lines = list[Pose](), _lines(path)
-    for number, line in lines:
-        words = line.split(maxsplit=9)
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            _, *pose, camera, name = words
-            values = [float(v) for v in pose]
-            if len(values) != 7:
-                raise ValueError
-            file = _name(name.strip().encode("utf-8", "surrogateescape"))
-            poses.append(Pose(file, int(camera), tuple(values[:4]), tuple(values[4:])))
-        except ValueError:
-            raise _malformed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
-        # The image's 2D points follow on their own line, which may be empty but is always present.
-        _, observed = next(lines, (number + 1, ""))
-        if len(observed.split()) % 3:
-            raise _malformed(path, number + 1, "the image's points as X Y POINT3D_ID, or an empty line")
-    return poses
+    return [pose for pose, _ in _images_and_points(path)]
 
 
 def observations_txt(path: Path) -> Iterator[Observed]:
     """Read images.txt; see `observations_bin`."""
-    lines = _lines(path)
-    for _, line in lines:
-        words = line.split(maxsplit=9)
+    for pose, points in _images_and_points(path):
+        yield Observed(pose.name, points[points >= 0])
+
+
+def _images_and_points(path: Path) -> Iterator[tuple[Pose, Int64[np.ndarray, " n"]]]:
+    """Yield the images of images.txt with the numbers of their points, -1 for marks without a point.
+
+    COLMAP writes a line of points after each image, empty if it has none. Some programs leave the line out, so a line
+    after an image is one of points only if it reads as such.
+    """
+    pose: Pose | None = None
+    nothing = np.zeros(0, np.int64)
+    for number, line in _lines(path):
+        words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        number, observed = next(lines, (0, ""))
-        try:
-            points = np.array(observed.split()[2::3], np.int64)
-            name = _name(words[9].strip().encode("utf-8", "surrogateescape"))
-        except (ValueError, OverflowError, IndexError):
-            raise _malformed(path, number, "the image's points as X Y POINT3D_ID, or an empty line") from None
-        yield Observed(name, points[points >= 0])
+        points = None if pose is None or _names_an_image(words) else _point_numbers(words)
+        if pose is not None:
+            yield pose, nothing if points is None else points
+        expected = "" if pose is None else "the image's points as X Y POINT3D_ID, or the next image as "
+        pose = _image(path, number, line, expected) if points is None else None
+    if pose is not None:
+        yield pose, nothing
+
+
+def _image(path: Path, number: int, line: str, expected: str) -> Pose:
+    """Read the line of an image."""
+    try:
+        _, *pose, camera, name = line.split(maxsplit=9)
+        values = [_float(word) for word in pose]
+        if len(values) != 7:
+            raise ValueError
+        file = _name(name.strip().encode("utf-8", "surrogateescape"))
+        return Pose(file, int(camera), tuple(values[:4]), tuple(values[4:]))
+    except ValueError:
+        layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+        raise _malformed(path, number, f"{expected}{layout}") from None
+
+
+def _names_an_image(words: Sequence[str]) -> bool:
+    """Return whether a line that may also read as points is an image: an id, a unit quaternion and a camera's id.
+
+    A name may consist of numbers. Marks in an image have no such quaternion, unless two lie in its corner pixel.
+    """
+    try:
+        _, camera, quat = int(words[0]), int(words[8]), [float(word) for word in words[1:5]]
+    except (ValueError, IndexError):
+        return False
+    return len(words) > 9 and camera >= 0 and abs(math.hypot(*quat) - 1.0) < UNIT_SLACK
+
+
+def _point_numbers(words: Sequence[str]) -> Int64[np.ndarray, " n"] | None:
+    """Return the point of each mark of a line X Y POINT3D_ID ..., -1 for none; None if the line is no such line."""
+    if len(words) % 3:
+        return None
+    try:
+        values = np.array([_float(word) for word in words]).reshape(-1, 3)
+    except ValueError:
+        return None
+    numbers = values[:, 2]
+    if not np.array_equal(numbers, np.floor(numbers)):  # false for NaN
+        return None
+    return np.where((numbers >= 0) & (numbers < 2.0**53), numbers, -1).astype(np.int64)
+
+
+def _float(word: str) -> float:
+    """Return a number; those that C++ cannot represent are spelled in many ways, such as -nan(ind) and 1.#QNAN.
+
+    Raises:
+        ValueError: the word is no number.
+    """
+    try:
+        return float(word)
+    except ValueError:
+        if not NOT_A_NUMBER.fullmatch(word):
+            raise
+        return math.nan
 
 
 def tracked_txt(path: Path) -> Tracked:
@@ -318,7 +379,7 @@ def tracked_txt(path: Path) -> Tracked:
         try:
             if len(words) < 8:
                 raise ValueError
-            values.extend([float(words[i]) for i in (0, 1, 2, 3, 7)])
+            values.extend([_float(words[i]) for i in (0, 1, 2, 3, 7)])
         except ValueError:
             raise _malformed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from None
     table = np.frombuffer(values, np.float64).reshape(-1, 5)
@@ -335,7 +396,7 @@ def points_txt(path: Path) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarr
         try:
             if len(words) < 8:
                 raise ValueError
-            values.extend([float(v) for v in words[1:7]])
+            values.extend([_float(v) for v in words[1:7]])
         except ValueError:
             raise _malformed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from None
     table = np.frombuffer(values, np.float64).reshape(-1, 6)

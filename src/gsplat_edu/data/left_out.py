@@ -36,7 +36,7 @@ def read_left_out(capture: Path) -> tuple[str, ...]:
     if not is_file(path):
         return ()
     try:
-        lines = [line.strip() for line in read_text(path).splitlines()]
+        lines = [line.strip() for line in read_text(path, "utf-8-sig").splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         reason = "is not text in UTF-8" if isinstance(error, UnicodeDecodeError) else error.strerror
         raise DatasetError(f"{path}: {reason}; write one photo in each line, or delete the file") from None

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+NAMED_PROBLEMS = 10
+"""Number of unusable photos that a note names; the others are counted."""
+
 
 @dataclass(frozen=True)
 class MissingPhotos:
@@ -119,17 +122,68 @@ class OtherModels:
     Args:
         folder: The folder that holds them.
         read: Name of the one that is read.
-        others: Names of the others; at least one.
+        photos: Number of photos that it lists.
+        others: Names of the others, with the number of photos that each lists; None if it cannot be read. At least one.
     """
 
     folder: Path
     read: str
-    others: tuple[str, ...]
+    photos: int | None
+    others: tuple[tuple[str, int | None], ...]
 
     def __str__(self) -> str:
         """Return the sentence."""
-        others = ", ".join(self.others)
-        return f"{self.folder} holds {len(self.others) + 1} models: {self.read} is read, {others} not"
+        others = ", ".join(f"{name} ({_photos(count)})" for name, count in self.others)
+        read = f"{self.read} ({_photos(self.photos)})"
+        return f"{self.folder} holds {len(self.others) + 1} models: {read} is read, {others} not"
+
+
+def _photos(count: int | None) -> str:
+    return "unreadable" if count is None else f"{count} photo{'' if count == 1 else 's'}"
+
+
+@dataclass(frozen=True)
+class UnusablePhotos:
+    """Photos whose pose or camera cannot be used.
+
+    Args:
+        problems: Name of each such photo, and what is wrong with it.
+        total: Number of photos listed by the capture that have a file.
+    """
+
+    problems: tuple[tuple[str, str], ...]
+    total: int
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        count, shown = len(self.problems), self.problems[:NAMED_PROBLEMS]
+        named = ", ".join(f"{name} ({reason})" for name, reason in shown)
+        more = f" and {count - len(shown)} more" if count > len(shown) else ""
+        has, is_ = ("has", "is") if count == 1 else ("have", "are")
+        counted = f"{count} of {self.total} photos {has} an unusable pose or camera and {is_} left out"
+        return f"{counted}: {named}{more}"
+
+
+@dataclass(frozen=True)
+class RepeatedPhotos:
+    """Photos that the capture lists more than once with the same pose, and that are used once.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos.
+        first: Name of the first such photo.
+    """
+
+    photos: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        if self.photos == 1:
+            return f"1 of {self.total} photos is listed more than once: only its first entry counts ({self.first})"
+        counted = f"{self.photos} of {self.total} photos are listed more than once"
+        return f"{counted}: only their first entries count, first {self.first}"
 
 
 @dataclass(frozen=True)
@@ -261,6 +315,8 @@ Note = (
     | PhotosWithoutMask
     | LossyMasks
     | OtherModels
+    | UnusablePhotos
+    | RepeatedPhotos
     | UnusedSplit
     | TwoLayouts
     | UnreadColors

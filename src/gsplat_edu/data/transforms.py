@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -28,17 +29,19 @@ from gsplat_edu.data.capture import (
     Cloud,
     Frame,
     Listings,
+    Problem,
     checked_frame,
     find_photo,
     is_file,
     is_outside,
     missing_photo,
+    problem_notes,
 )
 from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.masks import with_masks
-from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, RepeatedPhotos
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.shutter_keys import SHUTTER_KEYS, shutter_from_keys
 
@@ -58,6 +61,10 @@ INTRINSICS = frozenset(
 )
 """Keys that determine a lens."""
 
+SAME_POSE = 1e-6
+"""Largest difference of entries of one pose, written with different numbers of digits; of centres relative to their
+size."""
+
 
 class Found(NamedTuple):
     """Contents of a file."""
@@ -67,6 +74,8 @@ class Found(NamedTuple):
     """Names of photos without a file."""
     outside: list[Path]
     """Photos, masks and depth maps outside the file's folder."""
+    problems: list[Problem]
+    """Photos whose pose or camera cannot be used."""
 
 
 def read_transforms(path: Path) -> Capture:
@@ -75,15 +84,18 @@ def read_transforms(path: Path) -> Capture:
     Args:
         path: The file; its paths are relative to its folder.
 
+    Frames whose pose or camera is NaN, infinite or absurd are left out, and named in a note. A photo that is listed
+    more than once is used once; see `each_once`.
+
     Raises:
-        DatasetError: the file is not JSON or incomplete, a camera model or pose is unsupported, or no frame has a
-            photo.
+        DatasetError: the file is not JSON or incomplete, a camera model is unsupported, or no frame has a photo and a
+            usable pose and camera.
     """
     contents = read_json(path)
-    frames, missing, outside = read_frames(path, contents)
-    if not frames:
+    frames, missing, outside, problems = read_frames(path, contents)
+    if not frames and not problems:
         raise nothing_found(path, missing)
-    notes = list[Note]()
+    frames, notes = each_once(path, frames, problems)
     if missing:
         notes.append(MissingPhotos(len(missing), len(frames) + len(missing), missing[0]))
     cloud, no_cloud = _cloud(path, contents)
@@ -146,9 +158,9 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
         part: The part of the dataset for all frames; "" uses the file's own lists.
 
     Raises:
-        DatasetError: names the frame, and the missing or invalid key.
+        DatasetError: a frame has no file_path, an unsupported camera model, or an invalid mask or depth map.
     """
-    frames, missing, outside = list[Frame](), list[str](), list[Path]()
+    found = Found([], [], [], [])
     parts, listings = _parts(path, contents), Listings()
     shared = {key: value for key, value in contents.items() if key in INTRINSICS}
     moving = {key: value for key, value in contents.items() if key in SHUTTER_KEYS}
@@ -159,24 +171,71 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
         name = _tidy(frame["file_path"])
         image = _photo(path.parent / as_file_name(name), listings)
         if image is None:
-            missing.append(missing_photo(legible(name), [path.parent / as_file_name(name)]))
+            found.missing.append(missing_photo(legible(name), [path.parent / as_file_name(name)]))
             continue
         where = f"{path}, frame {legible(name)}"
-        if common is not None and frame.keys().isdisjoint(INTRINSICS):
-            lens = common
-        else:
-            lens = _lens(where, _merged(shared, frame), image)
-            if frame.keys().isdisjoint(INTRINSICS) and {"w", "h"} <= shared.keys():
+        values = _merged(shared, frame)
+        fisheye = _is_fisheye(where, values)
+        mask, depth = _mask(where, path.parent, frame), _depth(where, path.parent, frame)
+        found.outside.extend([image] if is_outside(path.parent, name) else [])
+        found.outside.extend(
+            [mask] if mask and is_outside(path.parent, _tidy(str(frame["mask_path"]))) else []
+        )
+        found.outside.extend(
+            [depth] if depth and is_outside(path.parent, _tidy(frame["depth_file_path"])) else []
+        )
+        own = not frame.keys().isdisjoint(INTRINSICS)
+        try:
+            lens = common if common is not None and not own else _lens(where, values, image, fisheye)
+            if not own and {"w", "h"} <= shared.keys():
                 common = lens
-        R, eye = _pose(where, frame)
-        mask, its_part = _mask(where, path.parent, frame), part or parts.get(name, parts[""])
-        outside += [image] if is_outside(path.parent, name) else []
-        outside += [mask] if mask and is_outside(path.parent, _tidy(str(frame["mask_path"]))) else []
-        depth = _depth(where, path.parent, frame)
-        outside += [depth] if depth and is_outside(path.parent, _tidy(frame["depth_file_path"])) else []
-        given = checked_frame(where, Frame(legible(name), image, lens, R, eye, mask, its_part, depth=depth))
-        frames.append(replace(given, shutter=shutter_from_keys(where, {**moving, **frame}, given.R)))
-    return Found(frames, missing, outside)
+            R, eye = _pose(where, frame)
+            its_part = part or parts.get(name, parts[""])
+            given = checked_frame(
+                where, Frame(legible(name), image, lens, R, eye, mask, its_part, depth=depth)
+            )
+            shutter = shutter_from_keys(where, {**moving, **frame}, given.R)
+        except DatasetError as error:
+            found.problems.append(Problem.of(legible(name), where, error))
+            continue
+        found.frames.append(replace(given, shutter=shutter))
+    return found
+
+
+def each_once(path: Path, frames: Sequence[Frame], problems: list[Problem]) -> tuple[list[Frame], list[Note]]:
+    """Return frames with each photo once, and notes about those that are left out.
+
+    Of several entries of a photo with the same pose and camera, the first counts. Entries that differ are left out,
+    because it is unknown which of them is right.
+
+    Args:
+        path: The file, for messages.
+        frames: The frames as read.
+        problems: Photos that cannot be used; those with different entries are added.
+
+    Raises:
+        DatasetError: no photo remains.
+    """
+    entries = dict[str, list[Frame]]()
+    for frame in frames:
+        entries.setdefault(os.path.normpath(frame.image), []).append(frame)
+    once, repeated = list[Frame](), list[str]()
+    for first, *others in entries.values():
+        if all(_same_camera(first, other) for other in others):
+            once.append(first)
+            repeated += [first.name] if others else []
+        else:
+            reason = f"is listed {1 + len(others)} times, with different poses or cameras"
+            problems.append(Problem(first.name, f"{path}, frame {first.name}: {reason}", reason))
+    total = len(once) + len(problems)
+    notes: list[Note] = [RepeatedPhotos(len(repeated), total, repeated[0])] if repeated else []
+    return once, notes + problem_notes(problems, total)
+
+
+def _same_camera(one: Frame, other: Frame) -> bool:
+    size = max(1.0, float(np.abs(one.eye).max()))
+    near = np.allclose(one.eye, other.eye, rtol=0, atol=SAME_POSE * size)
+    return near and np.allclose(one.R, other.R, rtol=0, atol=SAME_POSE) and one.lens == other.lens
 
 
 def _photo(path: Path, listings: Listings) -> Path | None:
@@ -222,14 +281,23 @@ def _merged(contents: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, 
     return {**{key: value for key, value in contents.items() if key not in dropped}, **frame}
 
 
-def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
-    """Read the intrinsics of one frame."""
+def _is_fisheye(where: str, values: Mapping[str, Any]) -> bool:
+    """Return whether a frame's camera model is a fisheye.
+
+    Raises:
+        DatasetError: the model is unsupported.
+    """
     model = FISHEYE_MODEL if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
     if model not in CAMERA_MODELS:
         raise DatasetError(
             f"{where}: camera_model {model!r} is not supported, only {', '.join(CAMERA_MODELS)}; undistort the "
             "capture first"
         )
+    return bool(model == FISHEYE_MODEL)
+
+
+def _lens(where: str, values: Mapping[str, Any], image: Path, fisheye: bool) -> Lens:
+    """Read the intrinsics of one frame."""
     W, H = (
         (_whole(where, values, "w"), _whole(where, values, "h"))
         if "w" in values and "h" in values
@@ -245,7 +313,7 @@ def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
         if key in values:
             named[key] = _number(where, values, key)
     try:
-        return lens_of(named, W, H, FISHEYE if model == FISHEYE_MODEL else PINHOLE_LIKE)
+        return lens_of(named, W, H, FISHEYE if fisheye else PINHOLE_LIKE)
     except DatasetError as error:
         raise DatasetError(f"{where}: {error}") from None
 

@@ -8,15 +8,17 @@ because glTF has no empty meshes.
 
 glTF's y points up. Scenes are converted by a half turn about x (`gsplat_edu.io.axes.half_turned`), as in SPZ: what
 faced a camera that looks along our z then faces glTF's +z, its front. Means, rotations and harmonics are converted, not
-the node's transform: not all viewers rotate harmonics with it. Some programs turn about z instead; their files differ
-from ours by a half turn about y.
+the node's transform: not all viewers rotate harmonics with it. splat-transform turns about z instead, so its files
+differ from ours by a half turn about y; they are recognised by their generator and turned back.
 
-Files of any program are read if they store the data in the same plain way: one mesh primitive with the extension,
-float32 attributes packed tightly in the file's own buffer, and no transform on the node. Anything else is rejected with
-an error that names it.
+Files of any program are read as the extension says: splats of all nodes of the scene, with the nodes' transforms, as
+float32 or the integers that the extension (and KHR_mesh_quantization for positions) allows, interleaved or not, and SPZ
+of version 2 in the file (our tiles). Other primitives, other attributes and meshes outside the scene are ignored.
+Transforms that splats cannot follow (shear, mirror, uneven scale), other kernels, linear colours and other required
+extensions are refused by name.
 
 Source: Khronos, "glTF 2.0 Specification" and the extension KHR_gaussian_splatting, in which scales are linear; drafts
-before April 2026 had logarithms.
+before April 2026 had logarithms, which are refused where one is negative.
 """
 
 from __future__ import annotations
@@ -28,15 +30,12 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsplat_edu.base.constants import SH_MAX_DEGREE
-from gsplat_edu.base.reading import read_bytes
+from gsplat_edu.io import glb_reading
 from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
-from gsplat_edu.io.glb_container import container, refuse, write_container
+from gsplat_edu.io.glb_container import EXTENSION, write_container
 from gsplat_edu.io.quantize import unit_quats
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
-
-EXTENSION = "KHR_gaussian_splatting"
 
 POINTS, FLOAT, ARRAY_BUFFER = 0, 5126, 34962
 """Mode of a primitive; component type of an accessor; target of a buffer view."""
@@ -46,11 +45,6 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 LARGEST_LOG_SCALE = 88.0
 """exp of this is just below the largest float32."""
-
-OPAQUE = 2.0**-24
-"""Opacities are kept this far from 0 and 1 (half a float32 step at 1), so that their logits are finite."""
-
-TRANSFORMS = ("matrix", "rotation", "scale", "translation")
 
 
 def write(path: Path, scene: Scene) -> None:
@@ -139,95 +133,4 @@ def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]
 
 def read(path: Path) -> Scene:
     """Read a binary glTF; see `gsplat_edu.io.formats.read_scene`."""
-    data = read_bytes(path)
-    document, body = container(path, data)
-    try:
-        return _scene(path, document, body)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
-        refuse(path, "its JSON does not describe splats as glTF does")
-
-
-def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
-    extras = document["asset"].get("extras", {})
-    antialiased, up = extras.get("antialiased"), extras.get("up")
-    if antialiased not in (None, True, False):
-        refuse(path, f"says antialiased is {antialiased!r}"[:80])
-    if up is not None:
-        x, y, z = (float(sign) * float(value) for sign, value in zip(POSITION_SIGNS, up, strict=True))
-        if not np.isfinite([x, y, z]).all() or not any((x, y, z)):
-            refuse(path, "has an up that is not a direction")
-        up = (x, y, z)
-    found = [
-        primitive
-        for mesh in document.get("meshes", [])
-        for primitive in mesh["primitives"]
-        if EXTENSION in primitive.get("extensions", {})
-    ]
-    if not found and (body or document.get("meshes")):
-        refuse(path, f"has no splats: no primitive with {EXTENSION}")
-    if len(found) > 1:
-        refuse(path, f"has {len(found)} primitives of splats, but only one is supported")
-    if any(name in node for node in document.get("nodes", []) for name in TRANSFORMS):
-        refuse(path, "transforms its splats by a node; apply the transform first")
-    attributes = found[0]["attributes"] if found else {}
-    arrays = {
-        name: _array(path, document, body, index) for name, index in attributes.items() if index is not None
-    }
-    return Scene(half_turned(_gaussians(path, arrays)), antialiased, up)
-
-
-def _array(path: Path, document: dict[str, Any], body: memoryview, index: int) -> Float32[np.ndarray, "N C"]:
-    """Return the values of an accessor."""
-    accessor = document["accessors"][index]
-    view = document["bufferViews"][accessor["bufferView"]]
-    widths = [width for width, name in TYPES.items() if name == accessor["type"]]
-    if accessor["componentType"] != FLOAT or not widths or "sparse" in accessor:
-        refuse(path, f"has attributes that are not float32 (accessor {index})")
-    count, size = accessor["count"], 4 * widths[0]
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    if view.get("byteStride", size) != size or view.get("buffer", 0) != 0:
-        refuse(path, f"has attributes that are interleaved or in another file (accessor {index})")
-    if not (
-        type(count) is type(start) is int and count >= 0 and 0 <= start <= start + count * size <= len(body)
-    ):
-        refuse(path, f"has an attribute that extends beyond the file's end (accessor {index})")
-    numbers = np.frombuffer(body, "<f4", count * widths[0], start)
-    if not np.isfinite(numbers).all():
-        refuse(path, f"has NaN or infinite values (accessor {index})")
-    return numbers.reshape(count, widths[0])
-
-
-def _gaussians(path: Path, arrays: dict[str, Float32[np.ndarray, "N C"]]) -> Gaussians:
-    """Return the Gaussians in glTF's axes."""
-    degree = -1
-    while degree < SH_MAX_DEGREE and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in arrays:
-        degree += 1
-    harmonics = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{k}" for d in range(degree + 1) for k in range(2 * d + 1)]
-    names = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")), *harmonics]
-    widths = [3, 4, 3, 1, *[3] * len(harmonics)]
-    if not arrays:
-        arrays = {name: np.empty((0, width), np.float32) for name, width in zip(names, widths, strict=True)}
-    elif not harmonics:
-        refuse(path, "has splats without colour")
-    missing = [name for name in names if name not in arrays]
-    if missing:
-        refuse(path, f"has splats without {missing[0]}")
-    values = [arrays[name] for name in names]
-    count = len(values[0])
-    if [value.shape for value in values] != [(count, width) for width in widths]:
-        refuse(path, "has attributes of different numbers of splats")
-    means, quats, scales, opacities = (value.astype(np.float64) for value in values[:4])
-    if not ((scales >= 0).all() and ((opacities >= 0) & (opacities <= 1)).all()):
-        refuse(path, "has a negative scale or an opacity outside 0 to 1")
-    tiny = np.finfo(np.float32).smallest_subnormal
-    inside = np.clip(opacities[:, 0], OPAQUE, 1.0 - OPAQUE)
-    sh = np.stack(values[4:], axis=1) if harmonics else np.empty((count, 1, 3))
-    tensors = (
-        means,
-        quats[:, [3, 0, 1, 2]],
-        np.log(np.maximum(scales, tiny)),
-        sh[:, :1],
-        sh[:, 1:],
-        np.log(inside / (1.0 - inside)),
-    )
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in tensors))
+    return glb_reading.read(path)

@@ -1,22 +1,31 @@
 """The container of binary glTF 2.0: a header, a chunk of JSON and a chunk of bytes, in a file of at most 4 GiB.
 
-Source: Khronos, "glTF 2.0 Specification", section 4.
+The nodes of a file form trees; each node moves what it and its children show.
+
+Source: Khronos, "glTF 2.0 Specification", sections 3.5 and 4.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.ply_table import LFS_POINTER
 from gsplat_edu.base.reading import parse_json
+
+EXTENSION = "KHR_gaussian_splatting"
+"""Name of the extension that makes a primitive's points splats."""
+
+SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
+"""Name of the extension whose splats are an SPZ of version 2."""
 
 FILE_HEADER = struct.Struct("<4sII")
 """glTF, version 2, length of the file."""
@@ -106,3 +115,55 @@ def container(path: Path, data: bytes, most_json: int = MOST_JSON) -> tuple[dict
     if kind != b"BIN\0" or start + size != len(data):
         refuse(path, "has a second chunk that is not its buffer")
     return document, memoryview(data)[start:]
+
+
+def node_matrix(node: Mapping[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    """Return the transform of a node, from its own coordinates to its parent's.
+
+    Args:
+        node: Its JSON: a matrix, column by column, or any of translation, rotation (x, y, z, w) and scale.
+    """
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
+    matrix[:3, 3] = np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3)
+    return matrix
+
+
+def node_matrices(path: Path, document: Mapping[str, Any]) -> dict[int, Float64[np.ndarray, "4 4"]]:
+    """Return the transforms to world coordinates of the nodes of the scene; of all nodes if there is no scene.
+
+    A hostile file's may be NaN or infinite.
+
+    Args:
+        path: The file, for messages.
+        document: Its JSON.
+
+    Raises:
+        SceneFormatError: a node does not exist, or has two parents.
+    """
+    nodes, scenes = document.get("nodes", []), document.get("scenes", [])
+    if scenes:
+        roots = scenes[document.get("scene", 0)].get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [index for index in range(len(nodes)) if index not in children]
+    matrices: dict[int, Float64[np.ndarray, "4 4"]] = {}
+    waiting = [(root, np.eye(4)) for root in reversed(roots)]
+    while waiting:
+        index, outer = waiting.pop()
+        if type(index) is not int or not 0 <= index < len(nodes) or index in matrices:
+            refuse(path, f"has a node {str(index)[:20]} that does not exist, or has two parents")
+        with np.errstate(all="ignore"):  # the caller looks for NaN and infinity
+            matrices[index] = outer @ node_matrix(nodes[index])
+        waiting += [(child, matrices[index]) for child in reversed(nodes[index].get("children", []))]
+    return matrices

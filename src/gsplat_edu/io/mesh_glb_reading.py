@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE, read_bytes
 from gsplat_edu.io.axes import POSITION_SIGNS
-from gsplat_edu.io.glb_container import container, refuse
+from gsplat_edu.io.glb_container import container, node_matrix, refuse
 from gsplat_edu.io.mesh_glb import GENERATOR, TRIANGLES, UNLIT
 from gsplat_edu.io.mesh_image import decoded
 from gsplat_edu.io.mesh_parts import METRES, Polygons, StoredMesh, check_vertices, distinct_rows, triangles_in
@@ -186,7 +186,7 @@ class _File:
             if type(index) is not int or not 0 <= index < len(nodes) or index in seen:
                 refuse(self._path, f"has a node {str(index)[:20]} that does not exist, or has two parents")
             seen.add(index)
-            matrix = outer @ _matrix(nodes[index])
+            matrix = outer @ node_matrix(nodes[index])
             if "mesh" in nodes[index]:
                 for primitive in self._item("meshes", nodes[index]["mesh"])["primitives"]:
                     yield self._part(primitive, matrix)
@@ -307,21 +307,3 @@ class _File:
             refuse(self._path, f"has values that extend beyond the file's end {name}")
         steps = (stride, dtype.itemsize)
         return np.ndarray((count, width), dtype, self._body, start, steps)
-
-
-def _matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
-    """Return the transform of a node."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64)
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation * np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
-    matrix[:3, 3] = np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3)
-    return matrix

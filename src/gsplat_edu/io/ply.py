@@ -4,13 +4,15 @@ Written as binary little-endian float32 with one vertex per Gaussian and raw val
 z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opacity, scale_0..2, rot_0..3 as (w, x, y, z). A scene of SH
 degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
 
-Properties are read by name, in any order and of any number type; other properties and elements are ignored. The file
-may be binary of either byte order or ASCII. An infinite logit means an opacity of 0 or 1. SuperSplat's packed files are
-also read.
+Properties are read by name, in any order and of any number type. The file may be binary of either byte order or ASCII.
+An infinite logit means an opacity of 0 or 1. SuperSplat's packed files are also read. Of other properties, the 3D
+filter of Mip-Splatting is applied (`FILTERS`), those of other kinds of splats are refused (`OTHER_KINDS`), and the rest
+is ignored, as are other elements.
 
 Metadata without a property is stored in comments: see `gsplat_edu.io.ply_comments`.
 
-Source: the point_cloud.ply of Kerbl et al. 2023's code; Turk 1994, "The PLY Polygon File Format".
+Source: the point_cloud.ply of Kerbl et al. 2023's code; Turk 1994, "The PLY Polygon File Format"; Yu et al. 2024,
+"Mip-Splatting", eq. 8.
 
 Chapter: 07_a_trained_scene.
 """
@@ -43,6 +45,23 @@ QUATS = tuple(f"rot_{i}" for i in range(4))
 
 SH_REST_COUNTS = (0, 9, 24, 45)
 """Possible numbers of f_rest properties: three channels of the coefficients up to degrees 0 to 3."""
+
+FILTERS = ("filter_3D", "filter_3d")
+"""Names of the property with the standard deviation of a splat's 3D filter, world units: Mip-Splatting and its heirs,
+such as Gaussian Opacity Fields, write scales and opacities without it and apply it when they render."""
+
+OTHER_KINDS = {
+    "trbf_": "move and fade in time (Spacetime Gaussians)",
+    "motion_": "move in time",
+    "omega_": "turn in time",
+    "shape": "have an exponent of their own (GES)",
+    "beta": "have another kernel (Deformable Beta Splatting)",
+    "sb_params_": "have lobes of colour beside harmonics (Deformable Beta Splatting)",
+    "sg_axis_": "have lobes of colour beside harmonics (spherical Gaussians)",
+    "f_offset_": "are anchors of a neural scene (Scaffold-GS)",
+}
+"""Properties, by the beginnings of their names, of splats that are no 3D Gaussians with harmonics: drawn as those, they
+would show another picture."""
 
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -149,7 +168,8 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
         header = read_elements(path, file)
         vertex = _splat_vertex(path, header.elements)
         rest = sum(name.startswith("f_rest_") for name in vertex.names)
-        groups = (MEANS, SH0, _rest_names(rest), OPACITY, SCALES, QUATS)
+        filters = tuple(name for name in FILTERS if name in vertex.names)
+        groups = (MEANS, SH0, _rest_names(rest), OPACITY, SCALES, QUATS, filters)
         columns = [name for group in groups for name in group]
         found, start, spoiled = None, 0, _Spoiled(path, columns)
         for table in read_blocks(path, file, header, vertex):
@@ -161,7 +181,9 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
             if found is None:  # after the rows have been found to fit into the file and into memory
                 found = _empty(vertex.count, rest // 3)
             ends = np.cumsum([len(group) for group in groups])[:-1]
-            means, sh0, sh_rest, opacity, scales, quats = np.split(values, ends, axis=1)
+            means, sh0, sh_rest, opacity, scales, quats, widths = np.split(values, ends, axis=1)
+            for k in range(len(filters)):
+                _apply_filter(scales, opacity[:, 0], widths[:, k].astype(np.float64))
             if shift.any():
                 means = (means.astype(np.float64) - shift).astype(np.float32)
             rows = slice(start, start + len(values))
@@ -172,6 +194,27 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
     spoiled.check()
     assert found is not None  # there is at least one block, which may be empty
     return Gaussians(**{name: torch.from_numpy(values) for name, values in found.items()})
+
+
+def _apply_filter(
+    log_scales: Float32[np.ndarray, "N 3"],
+    logits: Float32[np.ndarray, " N"],
+    widths: Float64[np.ndarray, " N"],
+) -> None:
+    """Convolve splats with isotropic Gaussians of the same integral, in place.
+
+    With scales s and a filter of standard deviation f, both in world units, s becomes sqrt(s^2 + f^2) on each axis and
+    the opacity is multiplied by the ratio of the volumes, sqrt(prod s^2 / prod (s^2 + f^2)).
+    """
+    rows = widths != 0
+    if not rows.any():
+        return
+    with np.errstate(all="ignore"):  # NaN stays NaN; an opacity that rounds to 1 has an infinite logit
+        before = log_scales[rows].astype(np.float64)
+        after = 0.5 * np.logaddexp(2.0 * before, 2.0 * np.log(np.abs(widths[rows]))[:, None])
+        log_opacity = -np.logaddexp(0.0, -logits[rows].astype(np.float64)) + (before - after).sum(axis=1)
+        log_scales[rows] = after
+        logits[rows] = np.minimum(log_opacity - np.log(-np.expm1(log_opacity)), LARGEST_LOGIT)
 
 
 def _empty(count: int, rest: int) -> dict[str, Float32[np.ndarray, "N ..."]]:
@@ -208,6 +251,15 @@ def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
     if "packed_position" in vertex.names:
         raise SceneFormatError(
             f"{path}: is a compressed splat PLY (packed_position ...); export it as an uncompressed PLY"
+        )
+    for name in vertex.names:
+        if kind := next((kind for start, kind in OTHER_KINDS.items() if name.startswith(start)), None):
+            raise SceneFormatError(
+                f"{path}: its splats {kind}: property {name}; export them as 3D Gaussians with harmonics"
+            )
+    if SCALES[2] not in vertex.names and {*SH0, *OPACITY, *SCALES[:2], *QUATS} <= set(vertex.names):
+        raise SceneFormatError(
+            f"{path}: its splats are flat disks (2D Gaussian Splatting): lacks {SCALES[2]}; export them as 3D Gaussians"
         )
     missing = [name for name in (*MEANS, *SH0, *OPACITY, *SCALES, *QUATS) if name not in vertex.names]
     if missing:

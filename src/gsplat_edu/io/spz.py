@@ -115,7 +115,19 @@ def read(path: Path) -> Scene:
         SceneFormatError: the file is not an SPZ, is damaged, or is of an unsupported kind; the message says which.
         OSError: the file cannot be read.
     """
-    data = read_bytes(path)
+    return unpacked(path, read_bytes(path))
+
+
+def unpacked(path: Path, data: bytes) -> Scene:
+    """Read an SPZ from bytes; see `read`.
+
+    Args:
+        path: The file that holds them, for messages.
+        data: The bytes.
+
+    Raises:
+        SceneFormatError: as for `read`.
+    """
     if data.startswith(LFS_POINTER):
         raise SceneFormatError(f"{path}: is a Git LFS pointer, not the file; fetch it with: git lfs pull")
     if data.startswith(GZIP):

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape
@@ -129,7 +129,7 @@ class _DepthError(torch.autograd.Function):
             return (w * error).sum()
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("depth_error", "torch's own operations")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         (gradients,) = ctx.saved_tensors
         if grad.device.type != "cpu" or float(grad) != 1.0:

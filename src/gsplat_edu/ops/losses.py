@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, in_range
@@ -177,7 +177,7 @@ class _Masked(torch.autograd.Function):
         return torch.mul(image, counts, out=reusable_tensor(image.shape, image))
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("masked", "image * mask")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
         (counts,) = ctx.saved_tensors
         return torch.mul(grad, counts, out=reusable_tensor(grad.shape, grad)), None
@@ -201,7 +201,7 @@ class _L1Ssim(torch.autograd.Function):
         return x.new_tensor((1.0 - ssim_weight) * l1_mean + ssim_weight * (1.0 - ssim_mean))
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("l1_ssim", "l1_ssim_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         # Almost always 1: a needless pass over the image would wake torch's threads.

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, whole_number
@@ -339,7 +339,7 @@ class _PatchError(torch.autograd.Function):
         return normals.new_tensor(value)
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("patch_error", "patch_error_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         scaled = [g if float(grad) == 1.0 else g * grad for g in ctx.saved_tensors]
         return (*scaled, None, None, None, None)

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.constants import SRGB_OFFSET
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import native_threads
 from gsplat_edu.base.validation import check_shape
@@ -163,7 +163,7 @@ class _Recolored(torch.autograd.Function):
         return out
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("recolored", "recolored_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         given = ctx.saved_tensors
         image, matrix, through = given[:3]

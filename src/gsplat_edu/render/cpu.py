@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native, native_array
 from gsplat_edu.ops.lenses import native_camera
@@ -320,7 +320,7 @@ class _Rasterize(torch.autograd.Function):
         return tuple(images)
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("backend 'cpu'", 'backend="torch"')
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         features, *saved = ctx.saved_tensors
         drawn, kept = saved[:5], saved[5:]

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
@@ -144,7 +144,7 @@ class _Normals(torch.autograd.Function):
         return out
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("facing_normals", "facing_normals_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         given = ctx.saved_tensors
         gradient = reusable_tensor(given[1].shape, given[1])

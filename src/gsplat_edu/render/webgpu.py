@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError, BackendWarning
 from gsplat_edu.engine.adapters import AdapterName
 from gsplat_edu.engine.failures import DeviceLostError
@@ -169,7 +169,7 @@ class _Rasterize(torch.autograd.Function):
         return image, transmittance, depth, mixed, median
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("backend 'webgpu'", 'backend="torch"')
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         features, transmittance, *parameters = ctx.saved_tensors
         call: _Call = ctx.call

@@ -216,7 +216,7 @@ class Camera:
 
     @classmethod
     def from_viewmat(
-        cls, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, *, first_pixel: float = 0.0
+        cls, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, *, first_pixel: float
     ) -> Camera:
         """Make a camera from a world-to-camera matrix and an intrinsic matrix, as other libraries keep them.
 
@@ -227,7 +227,7 @@ class Camera:
             K: (3, 3) intrinsics, px.
             width: Image width, px.
             height: Image height, px.
-            first_pixel: Where K has the centre of the top-left pixel: 0 in this package, 0.5 in gsplat and COLMAP.
+            first_pixel: Where K has the centre of the top-left pixel: 0 here and in OpenCV, 0.5 in gsplat and COLMAP.
 
         Raises:
             ShapeError: viewmat is not (4, 4) or K not (3, 3).

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.losses import LossKernel, photo_loss
@@ -280,7 +280,7 @@ class _MeanOpacity(torch.autograd.Function):
             return value
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("the mean opacity", "weight * torch.sigmoid(logits).mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return _scaled(gradient, grad), None, None
@@ -298,7 +298,7 @@ class _EmptyOutside(torch.autograd.Function):
             return (transmittance * gradient).sum() - gradient.sum()
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("the alpha outside masks", "weight * (1 - transmittance)[outside].sum()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return _scaled(gradient, grad), None, None
@@ -318,7 +318,7 @@ class _MeanScale(torch.autograd.Function):
             return gradient.sum()
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("the mean scale", "weight * log_scales.exp().mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return _scaled(gradient, grad), None, None

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.surface import normal_error
@@ -115,7 +115,7 @@ class _MeanSmallest(torch.autograd.Function):
             return scaled.sum()
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("the mean smallest scale", "weight * log_scales.min(dim=1).values.exp().mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return gradient * grad, None, None

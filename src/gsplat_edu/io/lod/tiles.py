@@ -40,16 +40,14 @@ from scipy.spatial.transform import Rotation
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import named_failure, written_aside
 from gsplat_edu.io.axes import POSITION_SIGNS
-from gsplat_edu.io.glb import EXTENSION, FLOAT, POINTS
-from gsplat_edu.io.glb_container import CHUNK_HEADER, FILE_HEADER
+from gsplat_edu.io.glb import FLOAT, POINTS
+from gsplat_edu.io.glb_container import CHUNK_HEADER, EXTENSION, FILE_HEADER, SPZ_EXTENSION
 from gsplat_edu.io.lod.levels import Leaf, LodOptions, Node, build_levels, leaves_of, level_of
 from gsplat_edu.io.lod.meta import rounded
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.spz import packed_version_2
 from gsplat_edu.scene.camera import WORLD_UP
 from gsplat_edu.scene.gaussians import Gaussians
-
-SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
 
 CONTENT_EXTENSION = "3DTILES_content_gltf"
 

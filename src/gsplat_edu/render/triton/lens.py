@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.render.camera_tensors import (
     POSE,
     CameraTensors,
@@ -99,7 +99,7 @@ class _Sight(torch.autograd.Function):
         return seen
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("backend 'cuda'", 'backend="torch"')
     def backward(ctx: Any, grad_seen: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         means, row, seen = ctx.saved_tensors
         wanted = ctx.needs_input_grad[2 : 2 + POSE]

@@ -22,9 +22,9 @@ import triton
 import triton.language as tl
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base import constants
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import check_shape, in_range
 
@@ -228,7 +228,7 @@ class _L1Ssim(torch.autograd.Function):
         return _loss_and_gradient(x, y, gradient, ssim_weight)
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("l1_ssim", "l1_ssim_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         # Even if it is 1: checking would synchronise with the device.

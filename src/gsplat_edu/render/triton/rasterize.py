@@ -23,9 +23,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.base.constants import TILE
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.camera_tensors import POSE, CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
@@ -187,7 +187,7 @@ class _Rasterize(torch.autograd.Function):
         return image, transmittance, depth, mixed, median
 
     @staticmethod
-    @once_differentiable
+    @first_derivative_only("backend 'cuda'", 'backend="torch"')
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         features, seen, mixed, image, transmittance, depth, *kept = ctx.saved_tensors
         call: _Call = ctx.call

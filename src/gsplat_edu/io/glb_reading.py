@@ -1,0 +1,286 @@
+"""Read the splats of a binary glTF of any program; `gsplat_edu.io.glb` says what is read and what is not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+
+from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.reading import read_bytes
+from gsplat_edu.io import spz
+from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
+from gsplat_edu.io.edit import Similarity, joined
+from gsplat_edu.io.glb_container import EXTENSION, SPZ_EXTENSION, container, node_matrices, refuse
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.gaussians import Gaussians
+
+MOST_JSON = 1 << 24
+"""Most bytes of JSON to parse; files of other programs may describe thousands of meshes."""
+
+REPEATS = 64
+"""A file may show its own size at most so many times, by nodes that share a mesh."""
+
+MOST_ENTRY = 1e30
+"""Largest entry of a transform: the cube of a larger scale would overflow."""
+
+ABOUT_Z = ("splat-transform",)
+"""Beginnings of `asset.generator` of programs that turn scenes into glTF's axes by half a turn about z, not x."""
+
+PRIMITIVE = 256
+"""Bytes that a primitive counts as at least: a file may repeat empty ones, too."""
+
+SUPPORTED = frozenset((EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization"))
+"""Extensions that a file may require."""
+
+NUMBERS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5126: "f4"}
+"""NumPy types of accessors' components."""
+
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+"""Numbers of each accessor type."""
+
+COMPONENTS = {
+    "POSITION": ("f4", "i1", "u1", "i2", "u2"),
+    f"{EXTENSION}:ROTATION": ("f4", "i1n", "i2n"),
+    f"{EXTENSION}:SCALE": ("f4", "u1", "u1n", "u2", "u2n"),
+    f"{EXTENSION}:OPACITY": ("f4", "u1n", "u2n"),
+}
+"""Component types of the attributes, n for normalised; positions in integers, either way, are those of
+KHR_mesh_quantization. Harmonics are float32."""
+
+OPAQUE = 2.0**-24
+"""Opacities are kept this far from 0 and 1 (half a float32 step at 1), so that their logits are finite."""
+
+KNOWN = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+"""Properties of the extension with the only values that are drawn here; one that is missing has this value."""
+
+HALF_TURN_ABOUT_Y = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3))
+"""A half turn about x, then this one, is a half turn about z."""
+
+MISREAD = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
+"""What it raises to follow JSON that does not describe splats as glTF does."""
+
+
+class Placed(NamedTuple):
+    """A primitive of splats at a node."""
+
+    primitive: Mapping[str, Any]
+    matrix: Float64[np.ndarray, "4 4"]  # from the primitive's coordinates to glTF's world
+
+
+def read(path: Path) -> Scene:
+    """Read a binary glTF; see `gsplat_edu.io.formats.read_scene`."""
+    data = read_bytes(path)
+    document, body = container(path, data, MOST_JSON)
+    try:
+        return _File(path, document, body).scene()
+    except MISREAD:
+        refuse(path, "its JSON does not describe splats as glTF does")
+
+
+class _File:
+    """A file.
+
+    Args:
+        path: The file, for messages.
+        document: Its JSON.
+        body: Its buffer.
+    """
+
+    def __init__(self, path: Path, document: dict[str, Any], body: memoryview) -> None:
+        self._path, self._document, self._body = path, document, body
+        self._room = max(REPEATS * len(body), 1 << 20)
+
+    def scene(self) -> Scene:
+        """Return the splats of all nodes, and the metadata."""
+        needed = self._document.get("extensionsRequired", [])
+        if unknown := sorted({str(name) for name in needed} - SUPPORTED):
+            self._refuse(f"needs the extension {', '.join(unknown)[:80]}, which is not supported")
+        antialiased, up = self._facts()
+        placed = list(self._placed())
+        meshes = self._document.get("meshes", [])
+        if not placed and (self._body or meshes):
+            elsewhere = any(map(_is_splats, (p for mesh in meshes for p in mesh["primitives"])))
+            where = "no node of its scene shows its splats" if elsewhere else f"no primitive with {EXTENSION}"
+            self._refuse(f"has no splats: {where}")
+        parts = [self._moved(part) for part in placed]
+        try:
+            whole = joined(parts) if parts else Scene(_gaussians(self._path, {}))
+        except ArgumentError as error:
+            self._refuse(str(error).removeprefix("scenes: ").partition(";")[0])
+        said = antialiased if antialiased is not None else whole.antialiased
+        found = Scene(half_turned(whole.gaussians), said, up)
+        by = self._document["asset"].get("generator")
+        return HALF_TURN_ABOUT_Y.scene(found) if str(by).startswith(ABOUT_Z) else found
+
+    def _refuse(self, fault: str) -> NoReturn:
+        refuse(self._path, fault)
+
+    def _facts(self) -> tuple[bool | None, tuple[float, float, float] | None]:
+        """Return the metadata of our own files: whether to render antialiased, and up in this package's axes."""
+        extras = self._document["asset"].get("extras", {})
+        antialiased, up = extras.get("antialiased"), extras.get("up")
+        if antialiased not in (None, True, False):
+            self._refuse(f"says antialiased is {antialiased!r}"[:80])
+        if up is not None:
+            x, y, z = (float(sign) * float(value) for sign, value in zip(POSITION_SIGNS, up, strict=True))
+            if not np.isfinite([x, y, z]).all() or not any((x, y, z)):
+                self._refuse("has an up that is not a direction")
+            up = (x, y, z)
+        return antialiased, up
+
+    def _placed(self) -> Iterator[Placed]:
+        """Yield the primitives of splats with their transforms; other primitives are ignored."""
+        splats: dict[int, list[Mapping[str, Any]]] = {}
+        for index, matrix in node_matrices(self._path, self._document).items():
+            mesh = self._document["nodes"][index].get("mesh")
+            if mesh is None:
+                continue
+            if mesh not in splats:
+                splats[mesh] = list(filter(_is_splats, self._item("meshes", mesh)["primitives"]))
+            for primitive in splats[mesh]:
+                self._take(PRIMITIVE)
+                yield Placed(primitive, matrix)
+
+    def _moved(self, part: Placed) -> Scene:
+        """Return the splats of a primitive in glTF's world."""
+        kind = part.primitive["extensions"][EXTENSION]
+        for name, only in KNOWN.items():
+            if (value := kind.get(name, only)) != only:
+                self._refuse(f"has splats of {name} {str(value)[:40]}, but only {only} is supported")
+        if not np.abs(part.matrix).max() <= MOST_ENTRY:
+            self._refuse("has a node whose transform is NaN, infinite or absurdly large")
+        try:
+            move = Similarity.of_matrix(part.matrix)
+        except ArgumentError as error:
+            fault = str(error).removeprefix("matrix: ").partition(";")[0]
+            self._refuse(
+                f"has a node whose transform {fault}; splats can be turned, scaled evenly and shifted"
+            )
+        own = (
+            self._packed(kind["extensions"][SPZ_EXTENSION])
+            if _is_packed(kind)
+            else self._plain(part.primitive)
+        )
+        if np.array_equal(part.matrix, np.eye(4)):
+            return own
+        moved = move.scene(own)
+        if not all(bool(tensor.isfinite().all()) for tensor in moved.gaussians.tensors().values()):
+            self._refuse("has a node whose transform takes splats beyond float32")
+        return moved
+
+    def _packed(self, extension: Mapping[str, Any]) -> Scene:
+        """Return splats that are an SPZ, in glTF's axes: as CesiumJS does, its coordinates are taken as they are."""
+        view = self._item("bufferViews", extension["bufferView"])
+        start, size = view.get("byteOffset", 0), view["byteLength"]
+        if not (type(start) is type(size) is int and 0 <= start <= start + size <= len(self._body)):
+            self._refuse("has splats that extend beyond the file's end")
+        self._take(size)
+        packed = spz.unpacked(self._path, bytes(self._body[start : start + size]))
+        return Scene(half_turned(packed.gaussians), packed.antialiased)
+
+    def _plain(self, primitive: Mapping[str, Any]) -> Scene:
+        """Return splats that are attributes."""
+        arrays = {
+            name: self._array(name, index)
+            for name, index in primitive["attributes"].items()
+            if index is not None and (name == "POSITION" or name.startswith(f"{EXTENSION}:"))
+        }
+        return Scene(_gaussians(self._path, arrays))
+
+    def _take(self, size: int) -> None:
+        """Count bytes that are read, which nodes may repeat."""
+        self._room -= size
+        if self._room < 0:
+            self._refuse(f"shows its splats more than {REPEATS} times")
+
+    def _item(self, kind: str, index: Any) -> dict[str, Any]:  # noqa: ANN401 - of a stranger's JSON
+        """Return an entry of one of the document's lists."""
+        if type(index) is not int or not 0 <= index < len(self._document[kind]):
+            self._refuse(f"names {kind}[{str(index)[:20]}], which does not exist")
+        item: dict[str, Any] = self._document[kind][index]
+        return item
+
+    def _array(self, name: str, index: Any) -> Float32[np.ndarray, "N C"]:  # noqa: ANN401
+        """Return the values of an attribute."""
+        accessor, label = self._item("accessors", index), f"{name} (accessor {index})"
+        number, width = NUMBERS.get(accessor["componentType"], "?"), WIDTHS.get(accessor["type"])
+        normalized = accessor.get("normalized", False) is True
+        allowed = COMPONENTS.get(name, ("f4",))
+        fits = number in allowed if name == "POSITION" else number + "n" * normalized in allowed
+        if width is None or not fits or "sparse" in accessor or "bufferView" not in accessor:
+            self._refuse(f"has values of a type that is not supported in {label}")
+        view = self._item("bufferViews", accessor["bufferView"])
+        dtype, count = np.dtype("<" + number), accessor["count"]
+        start, row = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), dtype.itemsize * width
+        stride = view.get("byteStride", row)
+        if view.get("buffer", 0) != 0 or "uri" in self._document["buffers"][0]:
+            self._refuse(f"has values in another file in {label}; export it as one .glb")
+        if any(type(value) is not int or value < 0 for value in (count, start, stride)) or stride < row:
+            self._refuse(f"has a size or an offset that is impossible in {label}")
+        ends = accessor.get("byteOffset", 0) + (count - 1) * stride + row
+        if count and (ends > view["byteLength"] or view.get("byteOffset", 0) + ends > len(self._body)):
+            self._refuse(f"has values beyond the file's end in {label}")
+        self._take(count * row)
+        values: np.ndarray = (
+            np.ndarray((count, width), dtype, self._body, start, (stride, dtype.itemsize))
+            if count
+            else np.empty((0, width), dtype)
+        )
+        if number == "f4":
+            found = values.astype(np.float32)
+            if not np.isfinite(found).all():
+                self._refuse(f"has NaN or infinite values in {label}")
+            return found
+        if normalized:
+            return np.maximum(values / np.float64(np.iinfo(dtype).max), -1.0).astype(np.float32)
+        return values.astype(np.float32)
+
+
+def _is_splats(primitive: Mapping[str, Any]) -> bool:
+    return EXTENSION in primitive.get("extensions", {})
+
+
+def _is_packed(kind: Mapping[str, Any]) -> bool:
+    return SPZ_EXTENSION in kind.get("extensions", {})
+
+
+def _gaussians(path: Path, arrays: Mapping[str, Float32[np.ndarray, "N C"]]) -> Gaussians:
+    """Return the Gaussians in the coordinates of their primitive."""
+    degree = -1
+    while degree < SH_MAX_DEGREE and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in arrays:
+        degree += 1
+    harmonics = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{k}" for d in range(degree + 1) for k in range(2 * d + 1)]
+    names = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")), *harmonics]
+    widths = [3, 4, 3, 1, *[3] * len(harmonics)]
+    if not arrays:
+        arrays = {name: np.empty((0, width), np.float32) for name, width in zip(names, widths, strict=True)}
+    elif not harmonics:
+        refuse(path, "has splats without colour")
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        refuse(path, f"has splats without {missing[0]}")
+    values = [arrays[name] for name in names]
+    count = len(values[0])
+    if [value.shape for value in values] != [(count, width) for width in widths]:
+        refuse(path, "has attributes of different numbers of splats")
+    means, quats, scales, opacities = (value.astype(np.float64) for value in values[:4])
+    if not ((scales >= 0).all() and ((opacities >= 0) & (opacities <= 1)).all()):
+        refuse(path, "has a negative scale or an opacity outside 0 to 1")
+    tiny = np.finfo(np.float32).smallest_subnormal
+    inside = np.clip(opacities[:, 0], OPAQUE, 1.0 - OPAQUE)
+    sh = np.stack(values[4:], axis=1) if harmonics else np.empty((count, 1, 3))
+    tensors = (
+        means,
+        quats[:, [3, 0, 1, 2]],
+        np.log(np.maximum(scales, tiny)),
+        sh[:, :1],
+        sh[:, 1:],
+        np.log(inside / (1.0 - inside)),
+    )
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in tensors))
