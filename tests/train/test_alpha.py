@@ -13,6 +13,9 @@ from gsplat_edu import build_cov3d_batch, quat_to_R_batch, render_gaussians
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.clean.guard import clean
 from gsplat_edu.data import procedural
+from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.data.writers import write_blender, write_colmap, write_transforms
 from gsplat_edu.doctor.after import Trained, examine_run
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.evaluate.metrics import score_views
@@ -144,6 +147,27 @@ def test_colours_differ_between_the_places_of_a_batch_and_between_steps(capture)
     again.iteration = 4
     assert again._behind_alpha(3) == colors[7]
     assert trainer(capture, 40, alpha_background="fixed")._behind_alpha(0) == WHITE
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms", "blender"])
+def test_every_layout_keeps_the_alpha_unless_a_background_is_given(capture, tmp_path, layout):
+    """Training then draws colours; photos over a given background are opaque, and are trained over that."""
+    views, points, colors = capture
+    writes = {
+        "colmap": lambda: write_colmap(tmp_path, views, points, colors),
+        "transforms": lambda: write_transforms(tmp_path, views, points, colors),
+        "blender": lambda: write_blender(tmp_path, views[:12], views[12:]),
+    }
+    writes[layout]()
+    drawn = {}
+    for background in (None, WHITE):
+        dataset = load_dataset(tmp_path, DataSettings(background=background))
+        assert all((view.read().alpha is None) == (background is not None) for view in dataset.train)
+        run = trainer((dataset.train, points, colors), 10)
+        drawn[background] = [view.settings.background for _ in range(3) for view in run._views(run._draw())]
+    assert set(drawn[WHITE]) == {WHITE}
+    assert WHITE not in drawn[None]
+    assert load_dataset(tmp_path).train[0].read().alpha is not None
 
 
 def expected_score(view, gaussians, background):
