@@ -34,7 +34,7 @@ def test_without_options_the_recipe_is_fast_with_3000_iterations():
     assert chosen.config == recipe(3_000, strategy="fast")
     assert (chosen.config.strategy, chosen.config.iterations) == ("fast", 3_000)
     assert chosen.config.max_gaussians is None, "the cap is planned from the capture"
-    assert chosen.data_settings.background == (0.0, 0.0, 0.0)
+    assert chosen.data_settings.background is None, "photos keep their alpha"
     assert options("--iterations", "500").config == recipe(500, strategy="fast")
 
 
@@ -70,7 +70,12 @@ def test_set_takes_several_settings_and_the_last_value_counts():
 
 def test_the_other_strategies_and_colours():
     assert options("--strategy", "none").config.strategy == "none"
-    assert options("--background", "0.1", "0.2", "0.3").config.background == (0.1, 0.2, 0.3)
+    colored = options("--background", "0.1", "0.2", "0.3")
+    assert colored.config.background == colored.data_settings.background == (0.1, 0.2, 0.3)
+    assert colored.config.alpha_background == "fixed"
+    both = options("--white-background", "--set", "alpha_background=random")
+    assert both.config.background == (1.0, 1.0, 1.0)
+    assert both.data_settings.background is None
     window = ["--no-rescale", "--set", "densify_start=26000", "densify_stop=28000"]
     late = options("--strategy", "adc", *window).config
     assert late.adc.densify_stop == 28_000, "the window of a strategy that is not used is not checked"
@@ -124,6 +129,7 @@ def test_config_json_has_flat_names(tmp_path):
     words = "--iterations 700 --strategy mcmc --max-gaussians 90 --set mcmc_growth=1.1 --white-background"
     found = json.loads(json.dumps(document(options(*words.split()))))
     newer = {name for name in found["train"] if name.startswith("fast_")} | {
+        "alpha_background",
         "appearance",
         "batch",
         "sky",
@@ -146,7 +152,7 @@ def test_config_json_has_flat_names(tmp_path):
         check_options(folder, found)
     config = TrainConfig().changed(**flat | {"background": tuple(flat["background"])})
     now = options(*words.split()).config
-    newer = {"fast": now.fast, "surface_start": now.surface_start}
+    newer = {"fast": now.fast, "surface_start": now.surface_start, "alpha_background": "fixed"}
     assert dataclasses.replace(config, **newer) == now and config.mcmc.growth == 1.1
 
 

@@ -42,12 +42,19 @@ def test_the_chosen_and_the_usual_background_are_named(tmp_path, cut_out):
         return next(note for note in notes if "alpha channel" in note)
 
     black = said("blender", (0.0, 0.0, 0.0))
-    assert black.startswith("6 of 6 photos have an alpha channel: their background is black")
+    assert black.startswith(
+        "6 of 6 photos have an alpha channel: their background is black, which the scene learns"
+    )
     assert "on white, as with --white-background" in black
-    assert said("blender", WHITE).endswith("their background is white")
-    assert said("colmap", (0.0, 0.0, 0.0)).endswith("their background is black")
+    assert said("blender", WHITE).endswith(
+        "their background is white, which the scene learns as if it were there"
+    )
+    kept = "trained over changing colours, and scored over black and white"
+    assert said("colmap", None).endswith(kept)
+    usual = said("blender", None)
+    assert kept in usual and usual.endswith("on white, as with --white-background")
     facts = dict.fromkeys(value for _, value in examine(prepare(CaptureReader(tmp_path / "blender"))).facts)
-    assert black in facts
+    assert usual in facts
 
 
 def test_equal_photos_are_only_a_note_for_rendered_captures(tmp_path, cut_out):

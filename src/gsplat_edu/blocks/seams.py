@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float64
 
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.blocks.plan import Area, Cell
-from gsplat_edu.evaluate.metrics import MSE_FLOOR, Renderer
+from gsplat_edu.evaluate.metrics import MSE_FLOOR, Renderer, over_backgrounds
+from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.views import View
+from gsplat_edu.scene.views import Photo, View
 
 STRIP_SHARE = 0.05
 """Half the width of the strip along a cut, as a fraction of the mean side of the cells."""
@@ -98,10 +99,9 @@ def pooled_psnr(
         photo = view.read()
         counted = np.ones_like(mask) if photo.mask is None else photo.mask
         with torch.no_grad():
-            image = render(gaussians, view.camera).image.double().numpy(force=True)
-        truth = np.asarray(photo.over(background), dtype=np.float64)
-        truth = truth / 255.0 if photo.image.dtype == np.uint8 else truth
-        error = np.square(np.clip(image, 0.0, 1.0) - truth).mean(axis=2)
+            output = render(gaussians, view.camera)
+        pairs = over_backgrounds(photo, output, background)
+        error = np.mean([_squares(shown, behind, photo) for shown, behind in pairs], axis=0)
         for part, pixels in enumerate((mask & counted, ~mask & counted)):
             sums[part] += float(error[pixels].sum())
             counts[part] += int(pixels.sum())
@@ -110,6 +110,14 @@ def pooled_psnr(
         for total, count in zip(sums, counts, strict=True)
     )
     return inside, outside
+
+
+def _squares(output: RenderOutput, behind: ArrayLike, photo: Photo) -> Float64[np.ndarray, "H W"]:
+    """Return the squared error of each pixel, a mean over channels, over the background `behind`."""
+    truth = np.asarray(photo.over(behind))
+    truth = truth / 255.0 if truth.dtype == np.uint8 else truth.astype(np.float64)
+    image = np.clip(output.image.double().numpy(force=True), 0.0, 1.0)
+    return np.asarray(np.square(image - truth).mean(axis=2))
 
 
 def masks_of(

@@ -22,13 +22,14 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
 from gsplat_edu.clean.sight import largest_weights
+from gsplat_edu.evaluate.metrics import BEHIND_ALPHA
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.views import View
+from gsplat_edu.scene.views import Photo, View
 
 MOST_OPAQUE = 0.985
 """Upper bound of opacities during the measurement. It is below the clamp of alpha, so that every pixel has a
@@ -133,23 +134,35 @@ def peak_weights(
     return found
 
 
+def judged_over(photo: Photo, settings: RenderSettings, index: int) -> RenderSettings:
+    """Return the settings that a photo is judged with: if it has alpha, over black in some views, over white in others.
+
+    Over one colour, no photo would refute splats of that colour outside of what the photos cut out. The colour changes
+    after `REDRAWN_EVERY` views, so that each removed splat is rendered again over both.
+
+    Args:
+        photo: The photo.
+        settings: The scene's render settings.
+        index: Number of the view.
+    """
+    if photo.alpha is None:
+        return settings
+    return replace(settings, background=BEHIND_ALPHA[index // REDRAWN_EVERY % len(BEHIND_ALPHA)])
+
+
 def residual_of(
-    output: RenderOutput, view: View, settings: RenderSettings
+    output: RenderOutput, photo: Photo, settings: RenderSettings
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
     """Return the render minus the photo, and which pixels count.
 
     Args:
         output: A render of the view's camera.
-        view: The view; its photo is read.
-        settings: The scene's render settings; photos that are not opaque are seen over their background.
+        photo: The view's photo.
+        settings: The settings of the render; photos that are not opaque are seen over its background.
 
     Returns:
         (H, W, 3) the difference, 0 where the pixel does not count, and (H, W) 1 where it counts.
-
-    Raises:
-        DatasetError: the photo cannot be read.
     """
-    photo = view.read()
     image = output.image.detach().clamp(0.0, 1.0)
     counts = torch.ones_like(output.transmittance)
     if photo.mask is not None:
@@ -188,10 +201,12 @@ class _Sums:
         full = np.minimum(some.opacities.double().numpy(), MOST_OPAQUE)
         shown = np.where(gone[drawn], np.minimum(full, FAINT), full)
         logits = torch.from_numpy(np.log(shown / (1.0 - shown))).to(some.means).requires_grad_()
+        photo = view.read()
+        over = judged_over(photo, settings, index)
         output = render(
-            replace(some, logit_opacities=logits), view.camera, settings=settings, backend=self._backend
+            replace(some, logit_opacities=logits), view.camera, settings=over, backend=self._backend
         )
-        residual, counts = residual_of(output, view, settings)
+        residual, counts = residual_of(output, photo, over)
         self.error += float(np.square(residual.double().numpy()).sum())
         signs = np.random.default_rng(index).integers(0, 2, output.image.shape, dtype=np.int8)
         inverse = counts * _inverse_depth(output)

@@ -20,7 +20,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import in_range
 from gsplat_edu.clean.evidence import judging_backend
 from gsplat_edu.clean.judge import Progress, Reason, Verdict, judge
-from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.evaluate.metrics import photo_psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
@@ -154,6 +154,6 @@ def _score(
         if photo.mask is not None and not photo.mask.any():
             continue
         with torch.no_grad():
-            image = render(some, view.camera, settings=settings, backend=backend).image
-        scores.append(psnr(image, photo.over(settings.background), photo.mask))
+            output = render(some, view.camera, settings=settings, backend=backend)
+        scores.append(photo_psnr(photo, output, settings.background))
     return float(np.mean(scores)) if scores else None

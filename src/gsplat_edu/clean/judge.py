@@ -183,7 +183,7 @@ def judge(
     Args:
         gaussians: N Gaussians on the CPU, in the frame of the cameras.
         views: The views that the scene was trained on.
-        settings: The scene's render settings; photos that are not opaque are judged over their background.
+        settings: The scene's render settings; photos with alpha are judged over black and white.
         backend: What renders; None takes the backend cpu.
         progress: Called after every view.
 

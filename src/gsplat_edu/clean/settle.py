@@ -13,17 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from gsplat_edu.clean.evidence import MOST_OPAQUE, residual_of
+from gsplat_edu.clean.evidence import MOST_OPAQUE, judged_over, residual_of
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.views import View
+from gsplat_edu.scene.views import Photo, View
 
 RATE = 0.25
 """Adam's step, in logits of a factor."""
@@ -51,6 +53,14 @@ class Doubtful:
     ids: Int64[np.ndarray, " D"]
     start: Float64[np.ndarray, " D"]
     price: float
+
+
+class Judged(NamedTuple):
+    """A photo, its camera, and the settings of the render that it is compared with."""
+
+    camera: Camera
+    photo: Photo
+    settings: RenderSettings
 
 
 def settle(
@@ -88,7 +98,10 @@ def settle(
     order: list[int] = []
     for step in range(1, steps + 1):
         order = order or rng.permutation(len(views)).tolist()
-        slope = _slope(gaussians, doubtful, logits, views[order.pop()], settings, backend, unit)
+        index = order.pop()
+        photo = views[index].read()
+        shown = Judged(views[index].camera, photo, judged_over(photo, settings, index))
+        slope = _slope(gaussians, doubtful, logits, shown, backend, unit)
         first += (1.0 - BETAS[0]) * (slope - first)
         second += (1.0 - BETAS[1]) * (np.square(slope) - second)
         rate = RATE if step <= (1.0 - SLOW_PART) * steps else RATE / 3.0
@@ -102,8 +115,7 @@ def _slope(
     gaussians: Gaussians,
     doubtful: Doubtful,
     logits: Float64[np.ndarray, " D"],
-    view: View,
-    settings: RenderSettings,
+    view: Judged,
     backend: Backend,
     unit: float,
 ) -> Float64[np.ndarray, " D"]:
@@ -113,9 +125,9 @@ def _slope(
     opacity[doubtful.ids] *= factor
     shown = torch.from_numpy(np.log(opacity / (1.0 - opacity))).to(gaussians.means).requires_grad_()
     output = render(
-        replace(gaussians, logit_opacities=shown), view.camera, settings=settings, backend=backend
+        replace(gaussians, logit_opacities=shown), view.camera, settings=view.settings, backend=backend
     )
-    residual, _ = residual_of(output, view, settings)
+    residual, _ = residual_of(output, view.photo, view.settings)
     (found,) = torch.autograd.grad(output.image, shown, 2.0 * residual)
     # d logit(f o) = (1 - f) / (1 - f o) d logit(f)
     chain = (1.0 - factor) / (1.0 - opacity[doubtful.ids])

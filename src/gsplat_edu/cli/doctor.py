@@ -220,7 +220,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--appearance": (
             "vignetting" if appearance_of(config) == "vignetting" else None,
         ),  # never chosen by auto
-        "--background": background if any(background) else (None,),
+        "--background": background if train.get("alpha_background") == "fixed" else (None,),
     }
     words = []
     for flag, values in named.items():

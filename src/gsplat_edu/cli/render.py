@@ -36,6 +36,7 @@ from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
+from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend, resolve_backend
 from gsplat_edu.render.field import within_field
 from gsplat_edu.render.maps import render_maps
@@ -46,6 +47,7 @@ from gsplat_edu.runs.source import file_settings, relative_to, scene_up, up_and_
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.rig import through_lenses
+from gsplat_edu.scene.shells import far_shell
 
 MOST_FRAMES = 100_000
 """Largest number of frames of a path unless --frames gives more: an hour at 28 frames per second."""
@@ -287,12 +289,19 @@ def _chosen_maps(arguments: argparse.Namespace) -> list[str]:
 
 
 def _frames(shot: Shot, backend: str, out: Path) -> Iterator[Float[np.ndarray, "H W 3"]]:
-    """Yield the images; write the maps of each beside them."""
+    """Yield the images; write the maps of each beside them. A sky is part of the images, but of no map."""
     scales: dict[str, dict[str, float]] = {}
+    sky = torch.from_numpy(far_shell(shot.gaussians.means.numpy(force=True))) if shot.maps else None
+    surface = shot.gaussians if sky is None or not sky.any() else shot.gaussians[~sky]
     for index, camera in enumerate(shot.cameras):
         with torch.no_grad():
-            shown = within_field(shot.gaussians, camera) if shot.through_lenses else shot.gaussians
-            maps, view = render_maps(shown, camera, shot.maps, shot.settings, backend)
+            shown, solid = (
+                within_field(each, camera) if shot.through_lenses else each
+                for each in (shot.gaussians, surface)
+            )
+            maps, view = render_maps(solid, camera, shot.maps, shot.settings, backend)
+            if surface is not shot.gaussians:
+                view = render(shown, camera, settings=shot.settings, backend=backend)
         arrays = {name: tensor.numpy(force=True) for name, tensor in maps.items()}
         image, arrays = shot.within(view.image.numpy(force=True), arrays)
         if shot.maps:

@@ -32,6 +32,9 @@ ROTATION_SLACK = 1e-2
 MAX_COORDINATE = 1e12
 """Largest plausible coordinate, world units."""
 
+OPAQUE_BEHIND = (0.0, 0.0, 0.0)
+"""The background of photos without an alpha channel, which do not show it."""
+
 READY_MADE = (2, 4, 8)
 """Factors of the folders images_2, images_4 and images_8 that are searched."""
 
@@ -377,9 +380,9 @@ def photo_file(
             seen = seen.scaled(W, H)
         except DatasetError as error:
             raise DatasetError(f"{frame.name}: {error}", error.reason) from None
-    source = PhotoFile(
-        path, frame.mask, lens, W, H, settings.background, orientation, native=kept is not None
-    )
+    # an opaque file has no alpha to keep, so none is counted as needing memory
+    background = settings.background if headers.of(path).alpha else OPAQUE_BEHIND
+    source = PhotoFile(path, frame.mask, lens, W, H, background, orientation, native=kept is not None)
     shutter = frame.shutter if moving and not source.resampled else None
     camera = Camera.posed(frame.R, frame.eye, seen, shutter)
     return source, camera, rescaled

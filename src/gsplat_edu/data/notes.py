@@ -256,7 +256,7 @@ class Background:
     Args:
         photos: Number of photos with an alpha channel.
         total: Number of photos.
-        color: (r, g, b), 0 to 1; None if it may differ from iteration to iteration.
+        color: (r, g, b), 0 to 1, over which they are composited on loading; None if they keep their alpha.
         usually_white: Whether published scores of such captures are usually on white.
     """
 
@@ -267,12 +267,14 @@ class Background:
 
     def __str__(self) -> str:
         """Return the sentence."""
-        names = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
-        color = self.color or (0.0, 0.0, 0.0)
-        spelled = names.get(color, "RGB " + " ".join(f"{value:g}" for value in color))
-        background = "that of the training" if self.color is None else spelled
-        said = f"{self.photos} of {self.total} photos have an alpha channel: their background is {background}"
-        if not self.usually_white or self.color in (None, (1.0, 1.0, 1.0)):
+        said = f"{self.photos} of {self.total} photos have an alpha channel"
+        if self.color is not None:
+            names = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
+            spelled = names.get(self.color, "RGB " + " ".join(f"{value:g}" for value in self.color))
+            said += f": their background is {spelled}, which the scene learns as if it were there"
+        else:
+            said += ": what they cut out is trained over changing colours, and scored over black and white"
+        if not self.usually_white or self.color == (1.0, 1.0, 1.0):
             return said
         return f"{said}; published scores of Blender scenes are on white, as with --white-background"
 

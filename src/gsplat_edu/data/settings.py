@@ -25,8 +25,8 @@ class DataSettings:
             the longest side in px; photos are never enlarged.
         test_every: Hold out every n-th view by sorted name; 0 for none. This overrides the capture's own split. None
             uses the capture's split if it defines one, else every 8th view.
-        background: (r, g, b), 0 to 1, composited behind photos with alpha on loading. None keeps the alpha for a
-            background chosen later.
+        background: (r, g, b), 0 to 1, composited behind photos with alpha on loading, which are opaque then. None
+            keeps the alpha, which training and scores use.
         image_memory: Bytes of decoded photos to keep in memory; other photos are decoded again on each use.
         train_views: Names of the training views, at least one; only these and `test_views` are read, and no split is
             made. None uses every view.
@@ -43,7 +43,7 @@ class DataSettings:
 
     resolution: float | None = None
     test_every: int | None = None
-    background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] | None = None
     image_memory: int = 4 * 2**30
     train_views: tuple[str, ...] | None = None
     test_views: tuple[str, ...] = ()

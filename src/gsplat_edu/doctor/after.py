@@ -48,6 +48,10 @@ shadow stay below 0.2."""
 VEILED = 0.02
 """Warn if near splats cover more than this fraction of a view's pixels: a spot of a seventh of its width and height."""
 
+SPILLED = 0.05
+"""Warn if on average more than this fraction of a scene's solid pixels lies outside of what the photos cut out; coarse
+edges of a good scene stay below 0.01."""
+
 FAINT = 0.02
 """Splats below this opacity are hardly visible: they change a white 8-bit pixel by five levels."""
 
@@ -160,6 +164,7 @@ def examine_run(run: Trained) -> Diagnosis:
         ("test views", _gap),
         ("exposure", _exposure),
         ("floaters", _floaters),
+        *([("cut-outs", _spilled)] if _outsides(run) else []),
         ("splats", _splats),
     )
     findings, fine = list[Finding](), list[str]()
@@ -411,6 +416,29 @@ def _floaters(run: Trained) -> list[Finding]:
         f"remove them with Clean under Share; {fewer}",
     )
     return [Finding("floaters", Severity.WARNING, what, advice, names, shares)]
+
+
+def _outsides(run: Trained) -> list[tuple[Residual, float]]:
+    """Return the views whose photos have alpha, with their `Residual.outside`."""
+    return [(view, view.outside) for view in (*run.train, *run.test) if view.outside is not None]
+
+
+def _spilled(run: Trained) -> list[Finding]:
+    views = _outsides(run)
+    mean = float(np.mean([share for _, share in views]))
+    if mean <= SPILLED:
+        return []
+    most = sorted(views, key=lambda entry: -entry[1])[:NAMED]
+    names = tuple(view.name for view, _ in most)
+    shares = tuple(f"{100 * share:.0f} %" for _, share in most)
+    share = f"{100 * mean:.0f} % of the scene's solid area"
+    what = f"{share} lies outside of what the photos cut out, where their alpha is 0"
+    again = "train again over changing backgrounds, which is the default"
+    advice = Told(
+        f"remove it with gsplat-edu clean, or {again}: without --white-background and --background",
+        f"remove it with Clean under Share, or {again}",
+    )
+    return [Finding("outside cut-outs", Severity.WARNING, what, advice, names, shares)]
 
 
 def _splats(run: Trained) -> list[Finding]:

@@ -25,7 +25,6 @@ from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, 
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.remedies import check_sky
 from gsplat_edu.doctor.survey import Survey
-from gsplat_edu.train.config import TrainConfig
 
 Check = Callable[[Survey], list[Finding]]
 
@@ -103,7 +102,7 @@ def _notes(survey: Survey) -> tuple[Note, ...]:
     others = [note for note in survey.notes if not isinstance(note, MissingPhotos)]
     clear = sum(shot.stats.transparent for shot in survey.shots) if survey.layout == "Blender" else 0
     if clear:
-        others.insert(0, Background(clear, len(survey.shots), TrainConfig.background, True))
+        others.insert(0, Background(clear, len(survey.shots), None, True))
     return tuple(others)
 
 

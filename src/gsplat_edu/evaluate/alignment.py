@@ -21,7 +21,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gsplat_edu.base.validation import ArrayLike
-from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, transparency_of
+from gsplat_edu.evaluate.metrics import at_exposure_of, photo_psnr, transparency_of
 from gsplat_edu.ops.adam import adam_in_torch
 from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.ops.moments import AdamNumbers
@@ -88,11 +88,12 @@ def aligned_psnr(
     fixed = gaussians.map(lambda tensor: tensor.detach())
     target, mask = torch.from_numpy(truth), torch.from_numpy(fitted)
 
-    def shown(camera: Camera | CameraTensors) -> Tensor:
+    def shown(camera: Camera | CameraTensors) -> RenderOutput:
         output = render(fixed, camera)
         if not colors:
-            return output.image
-        return at_exposure_of(truth, output.image, fitted, transparency_of(photo, output, background))
+            return output
+        given = transparency_of(photo, output, background)
+        return dataclasses.replace(output, image=at_exposure_of(truth, output.image, fitted, given))
 
     start = CameraTensors.of(view.camera)
     units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
@@ -100,13 +101,13 @@ def aligned_psnr(
     first, second = torch.zeros_like(changes), torch.zeros_like(changes)
     for step in range(STEPS):
         leaf = changes.clone().requires_grad_()
-        image = shown(
-            _changed(start, leaf, units)
-        ).cpu()  # the native loss compares the renders of any backend
+        image = shown(_changed(start, leaf, units)).image
+        image = image.cpu()  # the native loss compares the renders of any backend
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
         adam_in_torch(changes, first, second, gradient, _numbers(step))
     with torch.no_grad():
-        return psnr(shown(_changed(start, changes, units).value()), truth, scored)
+        aligned = shown(_changed(start, changes, units).value())
+        return photo_psnr(photo, aligned, background, scored)
 
 
 def _changed(camera: CameraTensors, changes: Tensor, units: Tensor) -> CameraTensors:

@@ -12,13 +12,17 @@ number of threads. Renders are clamped to 0..1 first, as a screen would do. Defi
 
 A mean over images averages the images' values. It is not the PSNR of the mean error.
 
+A photo with alpha is scored over black and over white: over one colour, splats of that colour outside of what it cuts
+out would cost nothing. The mean squared error is the mean of both, and so are SSIM and L1. The render over another
+background than its own is  image + T (other - own),  with its transmittance T.
+
 Chapter: 14_photos_to_scene.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +41,9 @@ from gsplat_edu.scene.views import Photo, View
 
 MSE_FLOOR = 1e-10
 """Smallest mean squared error: identical images have 100 dB, a finite number to average, plot and store."""
+
+BEHIND_ALPHA = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+"""The backgrounds over which a photo with alpha is scored."""
 
 Renderer = Callable[[Gaussians, Camera], RenderOutput]
 """Renders Gaussians from a camera."""
@@ -246,6 +253,86 @@ def score_image(
     return ImageScore(name, pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1(), pair.psnr_fitted())
 
 
+def score_photo(name: str, photo: Photo, output: RenderOutput, background: ArrayLike) -> ImageScore:
+    """Score a render against a photo: over `background` if it is opaque, else over all of `BEHIND_ALPHA` together.
+
+    Args:
+        name: The view's name in the capture.
+        photo: The photo.
+        output: The render, over `background`.
+        background: (3,) colour behind the render.
+
+    Raises:
+        ShapeError, ArgumentError: as for `psnr`.
+        BackendUnavailableError: as for `ssim`.
+    """
+    scores = [
+        score_image(name, shown.image, photo.over(behind), photo.mask, transparency_of(photo, shown, behind))
+        for shown, behind in over_backgrounds(photo, output, background)
+    ]
+    if len(scores) == 1:
+        return scores[0]
+    fitted = [score.psnr_fitted for score in scores if score.psnr_fitted is not None]
+    return ImageScore(
+        name,
+        pooled_psnr([score.psnr for score in scores]),
+        pooled_psnr([score.psnr_8bit for score in scores]),
+        float(np.mean([score.ssim for score in scores])),
+        float(np.mean([score.l1 for score in scores])),
+        pooled_psnr(fitted) if fitted else None,
+    )
+
+
+def photo_psnr(
+    photo: Photo, output: RenderOutput, background: ArrayLike, mask: Bool[np.ndarray, "H W"] | None = None
+) -> float:
+    """Return the PSNR of `score_photo`, dB.
+
+    Args:
+        photo: The photo.
+        output: The render, over `background`.
+        background: (3,) colour behind the render.
+        mask: (H, W) true for the pixels that count; None for the photo's own mask.
+
+    Raises:
+        ShapeError, ArgumentError: as for `psnr`.
+    """
+    return pooled_psnr(
+        [
+            psnr(shown.image, photo.over(behind), photo.mask if mask is None else mask)
+            for shown, behind in over_backgrounds(photo, output, background)
+        ]
+    )
+
+
+def over_backgrounds(
+    photo: Photo, output: RenderOutput, background: ArrayLike
+) -> list[tuple[RenderOutput, tuple[float, float, float]]]:
+    """Return a render over each background that its photo is compared over, with that background.
+
+    Args:
+        photo: The photo.
+        output: The render, over `background`.
+        background: (3,) colour behind the render.
+    """
+    red, green, blue = float64_array("background", background, (3,)).tolist()
+    if photo.alpha is None:
+        return [(output, (red, green, blue))]
+    T = output.transmittance[..., None]
+    own = output.image.new_tensor((red, green, blue))
+    return [
+        (replace(output, image=output.image + T * (output.image.new_tensor(behind) - own)), behind)
+        for behind in BEHIND_ALPHA
+    ]
+
+
+def pooled_psnr(values: Sequence[float]) -> float:
+    """Return the PSNR of the mean of the squared errors that these PSNRs stand for, dB."""
+    if len(values) == 1:
+        return values[0]
+    return float(-10.0 * np.log10(np.mean([10.0 ** (-value / 10.0) for value in values])))
+
+
 def score_views(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -259,7 +346,7 @@ def score_views(
         gaussians: N Gaussians.
         views: Cameras and photos. Views whose mask excludes all pixels are skipped.
         render: Renders Gaussians from a camera, over `background`.
-        background: (3,) colour behind photos that are not opaque.
+        background: (3,) colour behind the renders; photos with alpha are scored as `score_photo` says.
         on_image: Called after each scored view.
 
     Returns:
@@ -273,7 +360,7 @@ def score_views(
         with torch.no_grad():
             output = render(gaussians, view.camera)
         image, truth = output.image, photo.over(background)
-        score = score_image(view.name, image, truth, photo.mask, transparency_of(photo, output, background))
+        score = score_photo(view.name, photo, output, background)
         scores.append(score)
         if on_image is not None:
             on_image(view, score, to_bytes(image), to_bytes(truth))

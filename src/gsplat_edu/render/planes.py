@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.render.torch_sight import seen_by
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
 
@@ -121,6 +122,42 @@ def distortion_features(gaussians: Gaussians, camera: CameraLike) -> Float[Tenso
     ahead = depths.detach()[depths.detach() > 0]
     offset = depths - (ahead.median() if len(ahead) else 0.0)
     return torch.stack([offset, offset * offset], dim=-1)
+
+
+def depth_features(gaussians: Gaussians, camera: Camera, counted: Bool[Tensor, " N"]) -> Float[Tensor, "N 2"]:
+    """Return (z, 1) for the Gaussians that count, and (0, 0) for the others, with the depths z of the means.
+
+    They composite to the depth and the alpha of those that count, behind whatever lies in front of them.
+
+    Args:
+        gaussians: N Gaussians.
+        camera: A camera of any projection, with or without a shutter.
+        counted: (N,) which count. One whose mean is not finite never does.
+
+    Differentiable in: means. The camera is a constant.
+    """
+    means = gaussians.means
+    counted = counted & means.detach().isfinite().all(dim=1)
+    if camera.motion is not None:
+        with torch.no_grad():
+            counted = counted & seen_by(means, camera, 0.0).valid
+    rows = torch.nonzero(counted)[:, 0]
+    some = means.index_select(0, rows)
+    depths = some.new_zeros(len(means)).index_put((rows,), _depths_of(some, camera))
+    return torch.stack([depths, counted.to(means)], dim=1)
+
+
+def _depths_of(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, " N"]:
+    """Return the depths of finite means that the camera sees; by one operation at a time, so that no thread matters."""
+    if camera.motion is not None:
+        seen: Tensor = seen_by(means, camera, 0.0).depth
+        return seen
+    x, y, z = (means - torch.tensor(camera.eye).to(means)).unbind(dim=1)
+    if camera.projection.along_ray:
+        return (x * x + y * y + z * z).sqrt()
+    forward = camera.R[2].tolist()
+    along: Tensor = x * forward[0] + y * forward[1] + z * forward[2]
+    return along
 
 
 def _camera_depths(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, " N"]:

@@ -14,7 +14,7 @@ from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.guard import Cleaning, clean
 from gsplat_edu.clean.judge import Reason
-from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
+from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
@@ -76,8 +76,7 @@ def open_subject(path: Path, dataset: Path | None, backend: Backend) -> Subject:
         )
     if run is None:
         assert dataset is not None
-        settings = DataSettings(background=source.settings.background)
-        capture = load_dataset(dataset, settings)
+        capture = load_dataset(dataset)
         gaussians = relative_to(source.scene.gaussians, capture.origin)
     else:
         capture = run_dataset(run.read_config(), dataset)

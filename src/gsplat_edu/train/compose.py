@@ -137,6 +137,7 @@ def training(
             transients=make_transients(config, dataset.train, features),
             fused=fused,
             team=team,
+            shell=shell,
         ),
     )
 

@@ -29,7 +29,14 @@ from gsplat_edu.train.checks import (
     accept_positive as _positive,
     accept_whole as _whole,
 )
-from gsplat_edu.train.setting import DEPTH_KINDS, OUTSIDE_MASKS, REGIONS, TRANSIENTS, Setting as Setting
+from gsplat_edu.train.setting import (
+    ALPHA_BACKGROUNDS,
+    DEPTH_KINDS,
+    OUTSIDE_MASKS,
+    REGIONS,
+    TRANSIENTS,
+    Setting as Setting,
+)
 from gsplat_edu.train.strategy_config import AdcConfig, FastConfig, McmcConfig, documented, number
 from gsplat_edu.train.tempo import Tempo, accept_tempo as _tempo
 
@@ -187,6 +194,12 @@ class TrainConfig:
         (0.0, 0.0, 0.0), _color, "Background colour, RGB, 0 to 1.", "2023"
     )
     random_background: bool = number(False, _flag, "Draw a new background colour for every iteration.")
+    alpha_background: str = number(
+        "random",
+        _one_of(ALPHA_BACKGROUNDS),
+        'What lies behind photos with alpha. "random": a new colour for every iteration, so that the scene is as'
+        ' transparent as the photos; "fixed": the background.',
+    )
     antialiased: bool = number(
         False, _flag, "Train for antialiased rendering: Mip-Splatting's opacity factor.", "Yu et al. 2024"
     )

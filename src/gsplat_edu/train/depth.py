@@ -52,19 +52,19 @@ class DepthTerm:
         Raises:
             ArgumentError: the depth was not rendered.
         """
-        output, read = rendered.output, rendered.draw.view.depth
-        if not self.turns.due(rendered.iteration) or read is None:
-            return output.image.new_zeros(())
-        if output.depth is None:
+        if not self.turns.due(rendered.iteration) or rendered.draw.view.depth is None:
+            return rendered.output.image.new_zeros(())
+        surface = rendered.surface
+        if surface.depth is None:
             raise ArgumentError("depth: needs the depth, which was not rendered")
-        rays, depths, weights, sparse = self._samples(rendered, output.depth)
+        rays, depths, weights, sparse = self._samples(rendered, surface.depth)
         own = rendered.draw.view.camera
         camera = rendered.camera if own.pinhole and rendered.camera is not None else own
         focal, middle = (rays.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
         weight = (self.points_weight if bool(sparse) else self.weight) * self.turns.every
         rule = DepthRule(weight, extent=self.extent if bool(sparse) else None)
         pixels, wraps = rays * focal + middle, own.projection.wraps
-        return depth_error(output.depth, output.alpha, pixels, depths, weights, rule, wraps)
+        return depth_error(surface.depth, surface.alpha, pixels, depths, weights, rule, wraps)
 
     def _samples(self, rendered: Rendered, like: Tensor) -> tuple[Tensor, ...]:
         """Return rays, depths, weights and sparseness of the view's samples, from memory if there is room."""

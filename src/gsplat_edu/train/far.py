@@ -12,6 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from gsplat_edu.render.planes import depth_features
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+
 MOST_IN_SHELL = 0.4
 """Splits may raise the shell's Gaussians to at most this fraction of all. Without the limit, 62 % of the Gaussians of
 `benchmarks/sky.py` become sky with adc."""
@@ -58,3 +62,24 @@ class Shell:
         chosen = selected.clone()
         chosen[candidates[order[room:]]] = False
         return chosen
+
+
+def features_before(
+    shell: Shell, gaussians: Gaussians, camera: Camera, normals: Float[Tensor, "N 3"] | None
+) -> Float[Tensor, "N C"]:
+    """Return features that composite to the depth, alpha and normals of what lies before a shell.
+
+    Its splats get zeros. They still lie behind the others, whose weights they do not change.
+
+    Args:
+        shell: Where the far splats lie.
+        gaussians: N Gaussians.
+        camera: The camera that renders them.
+        normals: (N, 3) `facing_normals`; None to leave them out.
+
+    Returns:
+        (N, 2) as of `depth_features`, or (N, 5) with the normals after them; `surface_before` reads the composite.
+    """
+    near = ~shell.holds(gaussians.means)
+    depths = depth_features(gaussians, camera, near)
+    return depths if normals is None else torch.cat([depths, normals * near[:, None]], dim=1)

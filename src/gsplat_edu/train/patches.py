@@ -156,11 +156,12 @@ class PatchTerm:
         Raises:
             ArgumentError: the normals or the depth were not rendered.
         """
-        output, index = rendered.output, rendered.draw.index
+        index = rendered.draw.index
         neighbours = self._around.neighbours[index]
         if not neighbours or not self._turns.due(rendered.iteration):
-            return output.image.new_zeros(())
-        if output.features is None or output.depth is None:
+            return rendered.output.image.new_zeros(())
+        surface = rendered.surface
+        if surface.normals is None or surface.depth is None:
             raise ArgumentError(
                 "patches: needs the depth, and `facing_normals` composited as `output.features`"
             )
@@ -170,4 +171,4 @@ class PatchTerm:
         stride = max(1, math.isqrt(photo.pixels.size // PATCH_COUNT))
         grid = Grid(stride, *rng.integers(stride, size=2).tolist())
         weight = self.weight * self._turns.every
-        return patch_error(output.features, output.depth, output.alpha, photo, other, grid, weight).value
+        return patch_error(surface.normals, surface.depth, surface.alpha, photo, other, grid, weight).value

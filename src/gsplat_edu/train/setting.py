@@ -17,6 +17,9 @@ TRANSIENTS = ("none", "mask")
 OUTSIDE_MASKS = ("ignore", "empty")
 """What the scene shows where the capture's masks exclude pixels: anything, or nothing."""
 
+ALPHA_BACKGROUNDS = ("random", "fixed")
+"""Behind photos with alpha: a new colour for every iteration, or the background."""
+
 REGIONS = ("capture", "none")
 """Which pixels of the photos count: those that may show the box that the capture names, if it names one, or all."""
 

@@ -30,9 +30,11 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.batches import Batch
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Change, Terms as Terms
+from gsplat_edu.train.far import Shell, features_before
 from gsplat_edu.train.feed import Draw, Target
 from gsplat_edu.train.objective import Objective, Rendered
 from gsplat_edu.train.optimizer import MOMENTS, Adam, ParameterGroup
+from gsplat_edu.train.rendered import surface_before
 from gsplat_edu.train.saved import check_entries, check_tensor_kind
 from gsplat_edu.train.team import ALONE, SharedAdam, Team, places_of, share_results
 from gsplat_edu.train.transients import Transients
@@ -65,6 +67,7 @@ class StepParts:
         fused: Takes Adam's step for the Gaussians in the backward pass where that gives the same bits, so that their
             gradients need no memory; see `TensorStepper.fuses`.
         team: The processes that share each step.
+        shell: Where far splats lie, which terms of depth and normals leave out; None if there are none.
     """
 
     objective: Objective | None = None
@@ -74,6 +77,7 @@ class StepParts:
     transients: Transients | None = None
     fused: bool = True
     team: Team = ALONE
+    shell: Shell | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,17 +362,19 @@ class TensorStepper:
         index, target, model = view.draw.index, view.target, self.parts.view_model
         camera = model.camera(index, view.draw.view.camera)
         at, _ = split_camera(camera)
-        settings, normals = view.settings, None
-        if self.objective.needs_normals(iteration):
-            settings, normals = replace(settings, depth=True), facing_normals(self.gaussians, at)
-        elif self.objective.needs_depth_in(iteration):
+        needs_normals = self.objective.needs_normals(iteration)
+        settings, features = view.settings, facing_normals(self.gaussians, at) if needs_normals else None
+        if needs_normals or self.objective.needs_depth_in(iteration):
             settings = replace(settings, depth=True)
+        shell = self.parts.shell if settings.depth else None
+        if shell is not None:
+            features = features_before(shell, self.gaussians, at, features)
         counted_only = self.objective.counted_only and getattr(model, "counted_only", False)
         output = render(
             self.gaussians,
             camera,
             settings=settings,
-            features=normals,
+            features=features,
             needed=target.mask if counted_only else None,
             backend=self._backend,
         )
@@ -377,7 +383,8 @@ class TensorStepper:
         )
         rows = model.measure(index, given, target, iteration)
         image = model.correct(index, given, target, rows)
-        return Rendered(self.gaussians, view.draw, output, image, target, iteration, at), rows
+        surface = None if shell is None else surface_before(output)
+        return Rendered(self.gaussians, view.draw, output, image, target, iteration, at, surface), rows
 
     def _store(self, index: int, rows: Rows) -> None:
         """Write what was measured of a view into the view model's tensors."""

@@ -61,15 +61,15 @@ class NormalTerm:
         Raises:
             ArgumentError: the normals or the depth were not rendered.
         """
-        output = rendered.output
         if not self.turns.due(rendered.iteration):
-            return output.image.new_zeros(())
-        if output.features is None or output.depth is None:
+            return rendered.output.image.new_zeros(())
+        surface = rendered.surface
+        if surface.normals is None or surface.depth is None:
             raise ArgumentError(
                 "normal: needs the depth, and `facing_normals` composited as `output.features`"
             )
         camera, weight = rendered.camera or rendered.draw.view.camera, self.weight * self.turns.every
-        return normal_error(output.features, output.depth, output.alpha, camera, weight)
+        return normal_error(surface.normals, surface.depth, surface.alpha, camera, weight)
 
 
 @dataclass(frozen=True)

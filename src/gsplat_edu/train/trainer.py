@@ -113,7 +113,8 @@ class Trainer:
         self.config, self.extent, self.density = config, extent, density
         self.iteration = 0
         self._callbacks = tuple(callbacks)
-        behind, device = None if config.random_background else config.background, gaussians.means.device
+        drawn = config.random_background or config.alpha_background == "random"
+        behind, device = None if drawn else config.background, gaussians.means.device
         empty = config.outside_masks == "empty"
         around = neighbourhood_for(config, views, parts.view_model, extent)
         objective = parts.objective or make_objective(config, loss=backend.loss, extent=extent, around=around)
@@ -232,11 +233,26 @@ class Trainer:
         backgrounds = [self.config.background] * batch
         if self.config.random_background:
             backgrounds = [tuple(self._backgrounds.uniform(size=3).tolist()) for _ in range(batch)]
-        for draw, background in zip(draws, backgrounds[places.start : places.stop], strict=True):
+        for place, draw in zip(places, draws, strict=True):
+            background = backgrounds[place]
+            if draw.opaque is not None and not self.config.random_background:
+                background = self._behind_alpha(place)
             target = self._feed.target(draw, background)
             if self.transients is not None:
                 target = self.transients.applied(draw.index, target)
             yield StepView(draw, target, self._settings(background))
+
+    def _behind_alpha(self, place: int) -> tuple[float, float, float]:
+        """Return the colour behind a photo with alpha at a place of this step's batch.
+
+        A fixed colour would hide splats of that colour outside of what the photos cut out. The colour depends on
+        nothing but seed, iteration and place, so every process and every resumed run draws the same.
+        """
+        if self.config.alpha_background == "fixed":
+            return self.config.background
+        rng = np.random.default_rng((self.config.seed, BACKGROUND_STREAM, self.iteration + place))
+        red, green, blue = rng.uniform(size=3).tolist()
+        return red, green, blue
 
     def _settings(self, background: tuple[float, float, float]) -> RenderSettings:
         """Return the render settings of the iteration."""

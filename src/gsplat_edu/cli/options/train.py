@@ -308,9 +308,18 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
 
 def _add_background(group: argparse._ArgumentGroup) -> None:
     behind = group.add_mutually_exclusive_group()
-    behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
     behind.add_argument(
-        "--background", type=number_text, nargs=3, metavar=("R", "G", "B"), help="background colour, 0 to 1"
+        "--white-background",
+        action="store_true",
+        help="white background (default: black), behind photos with alpha too, which are opaque then: the scene learns"
+        " the white",
+    )
+    behind.add_argument(
+        "--background",
+        type=number_text,
+        nargs=3,
+        metavar=("R", "G", "B"),
+        help="background colour, 0 to 1; as --white-background",
     )
     group.add_argument(
         "--random-background",
@@ -379,10 +388,11 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
 
 def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
     config = _config(arguments)
+    flattened = config.alpha_background == "fixed" and not config.random_background
     settings = DataSettings(
         resolution=_resolution(arguments),
         test_every=arguments.test_every,
-        background=None if config.random_background else config.background,
+        background=config.background if flattened else None,
         image_memory=DataSettings.image_memory if arguments.image_memory is None else arguments.image_memory,
         lens=arguments.lens or DataSettings.lens,
     )
@@ -425,6 +435,7 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
     changes |= {name: _given_or_stored(arguments, name) for name in OPEN}
     if arguments.white_background or arguments.background:
         changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
+        changes = ({} if arguments.random_background else {"alpha_background": "fixed"}) | changes
     for only, names in ONLY_FOR.items():
         if only != strategy and (idle := [name for name in names if name in changes]):
             raise ArgumentError(
