@@ -45,8 +45,8 @@ def pixels(path):
     return np.array(Image.open(path)).astype(float)
 
 
-def picture(scene, camera, settings=SETTINGS, origin=(0.0, 0.0, 0.0)):
-    image = render(load_ply(scene, origin), camera, settings=settings).image
+def picture(scene, camera, settings=SETTINGS):
+    image = render(load_ply(scene), camera, settings=settings).image
     return 255.0 * image.clamp(0, 1).numpy()
 
 

@@ -3,13 +3,13 @@
 All values are float32 and activated: linear scales, opacities in 0..1, quaternions (x, y, z, w) of length 1. They are
 exact to float32, but logits above 17 and the length of a quaternion are lost. Scales above e^88, near the end of
 float32, are clamped. SH coefficients have glTF's signs, which equal ours, one attribute per coefficient. Further
-metadata is stored in the asset's extras, with up in glTF's axes. A scene without Gaussians is written without a mesh,
-because glTF has no empty meshes.
+metadata is stored in the asset's extras: up, unit and origin as in `gsplat_edu.io.scene.extras`. A scene without
+Gaussians is written without a mesh, because glTF has no empty meshes.
 
 glTF's y points up. Scenes are converted by a half turn about x (`gsplat_edu.io.axes.half_turned`), as in SPZ: what
-faced a camera that looks along our z then faces glTF's +z, its front. Means, rotations and harmonics are converted, not
-the node's transform: not all viewers rotate harmonics with it. Some programs turn about z instead; their files differ
-from ours by a half turn about y.
+faced a camera that looks along our z then faces glTF's +z, its front. The half turn changes means, rotations and
+harmonics. A scene with another up direction or an origin is turned and moved by its node's transform, in double, which
+keeps the bits of the splats. Some programs turn about z instead; their files differ from ours by a half turn about y.
 
 Files of any program are read if they store the data in the same plain way: one mesh primitive with the extension,
 float32 attributes packed tightly in the file's own buffer, and no transform on the node. Anything else is rejected with
@@ -30,10 +30,10 @@ from jaxtyping import Float32
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.reading import read_bytes
-from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
-from gsplat_edu.io.glb_container import container, refuse, write_container
+from gsplat_edu.io.axes import half_turned, root_transform
+from gsplat_edu.io.glb_container import container, refuse, root_node, write_container
 from gsplat_edu.io.quantize import unit_quats
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.scene import Scene, extras, read_extras
 from gsplat_edu.scene.gaussians import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -94,13 +94,11 @@ def _attributes(gaussians: Gaussians) -> dict[str, Float32[np.ndarray, "N C"]]:
 def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]) -> dict[str, Any]:
     """Return the JSON: a scene of one node, one mesh, one primitive; a buffer view and an accessor per attribute."""
     asset: dict[str, Any] = {"version": "2.0", "generator": "gsplat-edu"}
-    extras: dict[str, Any] = {}
+    known = extras(scene.up, scene.unit, scene.origin)
     if scene.antialiased is not None:
-        extras["antialiased"] = scene.antialiased
-    if scene.up is not None:
-        extras["up"] = [sign * x + 0.0 for sign, x in zip(POSITION_SIGNS, scene.up, strict=True)]  # no -0.0
-    if extras:
-        asset["extras"] = extras
+        known["antialiased"] = scene.antialiased
+    if known:
+        asset["extras"] = known
     if not attributes:
         return {"asset": asset, "scene": 0, "scenes": [{"name": "empty"}]}
     accessors: list[dict[str, Any]] = []
@@ -129,7 +127,7 @@ def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, **root_node(*root_transform(scene.up, scene.origin))}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -148,15 +146,11 @@ def read(path: Path) -> Scene:
 
 
 def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
-    extras = document["asset"].get("extras", {})
-    antialiased, up = extras.get("antialiased"), extras.get("up")
+    found_extras = document["asset"].get("extras", {})
+    antialiased = found_extras.get("antialiased")
+    up, unit, origin = read_extras(found_extras)
     if antialiased not in (None, True, False):
         refuse(path, f"says antialiased is {antialiased!r}"[:80])
-    if up is not None:
-        x, y, z = (float(sign) * float(value) for sign, value in zip(POSITION_SIGNS, up, strict=True))
-        if not np.isfinite([x, y, z]).all() or not any((x, y, z)):
-            refuse(path, "has an up that is not a direction")
-        up = (x, y, z)
     found = [
         primitive
         for mesh in document.get("meshes", [])
@@ -167,13 +161,16 @@ def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
         refuse(path, f"has no splats: no primitive with {EXTENSION}")
     if len(found) > 1:
         refuse(path, f"has {len(found)} primitives of splats, but only one is supported")
-    if any(name in node for node in document.get("nodes", []) for name in TRANSFORMS):
+    own = {**root_node(*root_transform(up, origin)), "mesh": 0}
+    if any(name in node for node in document.get("nodes", []) for name in TRANSFORMS) and document[
+        "nodes"
+    ] != [own]:
         refuse(path, "transforms its splats by a node; apply the transform first")
     attributes = found[0]["attributes"] if found else {}
     arrays = {
         name: _array(path, document, body, index) for name, index in attributes.items() if index is not None
     }
-    return Scene(half_turned(_gaussians(path, arrays)), antialiased, up)
+    return Scene(half_turned(_gaussians(path, arrays)), antialiased, up, unit, origin)
 
 
 def _array(path: Path, document: dict[str, Any], body: memoryview, index: int) -> Float32[np.ndarray, "N C"]:
