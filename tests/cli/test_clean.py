@@ -203,7 +203,7 @@ def test_the_edits_of_a_scene_are_carried_over(made, cli, capsys, tmp_path):
         "center": [float(x.max()), 0.0, 0.0],
         "radius": float(x.max()),
     }
-    identity = identity_of(source.scene.gaussians, source.origin).document()
+    identity = identity_of(source.scene).document()
     document = {
         "format": "gsplat_edu edits",
         "version": 1,

@@ -128,15 +128,18 @@ def test_scenes_are_joined_on_request(convert, plain, tmp_path):
 
 
 def test_a_page_gets_a_path_that_moves_with_the_scene(convert, tmp_path):
-    """The file has the run's coordinates. The page has those of its scene, and their origin unless the scene moved."""
+    """The file has the run's coordinates. The page has those of its scene relative to its origin, which moves along."""
     origin = (40000.0, 300.0, 7.0)
     folder, _, cameras = make_run(tmp_path / "run", origin)
     path = KeyframePath(tuple(map(Keyframe.of_camera, cameras[:3])), True, 4.0)
     write_path(tmp_path / "path.json", path, origin)
-    for moves, at in (([], origin), (["--transform", "scale=2", "--transform", "rotate=y:90"], (0, 0, 0))):
+    for moves, at in (
+        ([], origin),
+        (["--transform", "scale=2", "--transform", "rotate=y:90"], (14.0, 600.0, -80000.0)),
+    ):
         convert(folder.path, tmp_path / "a.html", "--path", tmp_path / "path.json", *moves)
         facts = json.loads(re.search(r'id="facts">(.*?)</script>', (tmp_path / "a.html").read_text())[1])
-        assert facts["origin"] == list(at)
+        np.testing.assert_allclose(facts["origin"], at, rtol=1e-12)
         assert (facts["path"]["loop"], facts["path"]["duration"]) == (True, 4.0)
         eyes = np.array([camera["eye"] for camera in facts["cameras"]])
         for keyframe in facts["path"]["keyframes"]:
@@ -155,14 +158,15 @@ def test_a_page_carries_a_mesh_that_moves_with_the_scene(convert, tmp_path):
     mesh = Mesh(corners + origin, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     write_mesh(tmp_path / "a.ply", mesh)
     out = tmp_path / "a.html"
-    for moves, expected in (
-        ([], corners),
-        (["--transform", "scale=2", "--transform", "move=1,0,0"], 2 * corners + [1, 0, 0]),
+    for moves, expected, at in (
+        ([], corners, origin),
+        (["--transform", "scale=2", "--transform", "move=1,0,0"], 2 * corners, (1025.0, -128.0, 16.0)),
     ):
         said = convert(folder.path, out, "--surface", tmp_path / "a.ply", *moves)
         assert f"mesh of 4 triangles; {out.stat().st_size:,} bytes" in said
         text = out.read_text()
         facts = json.loads(re.search(r'id="facts">(.*?)</script>', text)[1])
+        assert facts["origin"] == list(at)
         assert facts["meshes"] == [
             {"name": "surface", "vertices": 4, "faces": 4, "coloring": "none", "image": 0}
         ]

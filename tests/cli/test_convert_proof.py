@@ -116,7 +116,7 @@ def test_edits_move_the_page_its_counts_and_its_tour(made, tmp_path):
         {"op": "view", "name": "Front", **pose, "text": "Seen from the front.\nTwo lines."},
         {"op": "view", "name": "Plain", **pose},
     ]
-    identity = identity_of(source.scene.gaussians, source.origin).document()
+    identity = identity_of(source.scene).document()
     document = {"format": "gsplat_edu edits", "version": 1, "scene": identity, "operations": operations}
     edits.write_text(json.dumps(document))
     convert(folder.path, tmp_path / "a.html", "--edits", edits, "--verify", "photos=2")

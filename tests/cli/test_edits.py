@@ -33,7 +33,7 @@ def edits(tmp_path):
 
     def make(path, *operations):
         source = open_source(path)
-        scene = identity_of(source.scene.gaussians, source.origin).document()
+        scene = identity_of(source.scene).document()
         content = {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": operations}
         (tmp_path / "edits.json").write_text(json.dumps(content))
         return tmp_path / "edits.json"

@@ -45,8 +45,8 @@ def pixels(path):
     return np.array(Image.open(path)).astype(float)
 
 
-def picture(scene, camera, settings=SETTINGS, origin=(0.0, 0.0, 0.0)):
-    image = render(load_ply(scene, origin), camera, settings=settings).image
+def picture(scene, camera, settings=SETTINGS):
+    image = render(load_ply(scene), camera, settings=settings).image
     return 255.0 * image.clamp(0, 1).numpy()
 
 
@@ -59,9 +59,7 @@ def test_a_run_is_rendered_along_a_path_in_the_captures_coordinates(made, path, 
     curve = PathCurve(path)
     first = views[0].camera
     for i, camera in enumerate(curve.cameras(5, first.W, first.H)):
-        off = pixels(tmp_path / "frames" / f"frame_{i:04d}.png") - picture(
-            folder.scene(30), camera, origin=ORIGIN
-        )
+        off = pixels(tmp_path / "frames" / f"frame_{i:04d}.png") - picture(folder.scene(30), camera)
         assert np.abs(off).max() <= 0.51
     np.testing.assert_allclose(curve.cameras(5, 8, 8)[2].eye, views[1].camera.eye, atol=1e-9)
 

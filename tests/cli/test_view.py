@@ -108,7 +108,6 @@ def test_a_run_is_shown_with_its_cameras_path_and_settings_until_ctrl_c(made, tm
             source.held_out,
             page.Tour(
                 read_path(tmp_path / "path.json", ORIGIN),
-                ORIGIN,
                 meshes=open_meshes(tmp_path / "a.glb", None, source),
             ),
         )

@@ -26,7 +26,7 @@ MOVE = move((0.5, -1.2, 0.8), (0.3, -0.2, 0.1), (0.2, 0.4, -0.3))
 
 
 def scene_of(degree, n=40):
-    return Scene(Filter(sh_degree=degree).apply(native_scenes.random(n).gaussians()))
+    return Filter(sh_degree=degree).apply(Scene(native_scenes.random(n).gaussians()))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -29,7 +29,7 @@ def image(gaussians, camera, **changes):
 @pytest.mark.parametrize("s", [0.5, 1.0, 3.0])
 def test_moving_scene_and_camera_together_keeps_the_image(degree, s):
     made = native_scenes.random(40)
-    scene = Scene(Filter(sh_degree=degree).apply(made.gaussians()))
+    scene = Filter(sh_degree=degree).apply(Scene(made.gaussians()))
     move = similarity(degree, s)
     before = image(scene.gaussians, made.camera, jacobian_limit=1.3)
     after = image(move.scene(scene).gaussians, move.camera(made.camera), jacobian_limit=1.3)
@@ -95,8 +95,12 @@ def test_a_matrix_of_columns_or_another_shape_is_refused():
 
 def test_filters_keep_the_matching_splats_in_order():
     gaussians = native_scenes.random(200).gaussians(torch.float32)
-    assert Filter().apply(gaussians).means is gaussians.means
-    kept = Filter(min_opacity=0.4, box=(-0.5, -0.4, -0.3, 0.5, 0.4, 0.3), sh_degree=1).apply(gaussians)
+    assert Filter().apply(Scene(gaussians)).gaussians.means is gaussians.means
+    kept = (
+        Filter(min_opacity=0.4, box=(-0.5, -0.4, -0.3, 0.5, 0.4, 0.3), sh_degree=1)
+        .apply(Scene(gaussians))
+        .gaussians
+    )
     opacities, means = gaussians.opacities.numpy(), gaussians.means.numpy()
     stays = (opacities >= 0.4) & (np.abs(means) <= (0.5, 0.4, 0.3)).all(axis=1)
     assert 0 < stays.sum() < 200
@@ -115,7 +119,7 @@ def test_filters_out_of_range_are_refused(wrong):
 
 def test_joining_keeps_the_order_and_pads_harmonics():
     first = Scene(native_scenes.random(5).gaussians(), True, (0.0, -1.0, 0.0))
-    low = Filter(sh_degree=1).apply(native_scenes.random(7, seed=1).gaussians())
+    low = Filter(sh_degree=1).apply(Scene(native_scenes.random(7, seed=1).gaussians())).gaussians
     both = joined([first, Scene(low, None, (0.0, -1.0, 0.0))])
     assert len(both.gaussians) == 12 and both.gaussians.sh_degree == 3
     assert both.antialiased is True and both.up == (0.0, -1.0, 0.0)

@@ -91,19 +91,20 @@ def test_what_is_written_is_read_back(tmp_path, suffix, extra):
     assert not [file for file in path.parent.iterdir() if file.name.startswith(".")]
 
 
-def test_text_and_ply_keep_doubles_and_gltf_says_what_it_rounds(tmp_path):
+def test_text_and_ply_keep_doubles_and_gltf_keeps_float32_relative_to_an_origin(tmp_path):
     far = some_mesh(float32=False)
     far = Mesh(far.vertices + 4e6, far.faces)
     for suffix in (".ply", ".obj"):
         write_mesh(tmp_path / f"far{suffix}", far)
         assert np.array_equal(read_mesh(tmp_path / f"far{suffix}").vertices, far.vertices)
         assert mesh_losses(f"far{suffix}", far) == []
-    (said,) = mesh_losses("far.glb", far)
-    assert "float32, by up to 0.12 of 7.1; write a .ply" in said  # steps of 0.25 at 4e6
+    write_mesh(tmp_path / "far.glb", far, up=(0.0, 0.6, 0.8))
+    found = read_mesh(tmp_path / "far.glb").vertices
+    # float32 rounds coordinates below 8 to 2^-22; double rounds the turned sum with 4e6 to 2^-30, a few times
+    assert np.abs(found - far.vertices).max() < 2**-21
+    assert not np.array_equal(far.vertices.astype(np.float32), far.vertices), "float32 alone rounds to 0.25"
     both = some_mesh(colors=True, texture=True)
     assert "multiply" in mesh_losses("x.glb", both)[0] and mesh_losses("x.obj", both) == []
-    near = some_mesh(float32=False)
-    assert mesh_losses("x.glb", near) == []
 
 
 def test_gltf_is_turned_and_in_metres(tmp_path):

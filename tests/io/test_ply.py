@@ -110,22 +110,27 @@ def test_a_round_trip_is_exact_to_the_bit(tmp_path, rest, count):
     assert_equal(gaussians, load_ply(str(tmp_path / "a.ply")))
 
 
-def test_an_origin_moves_the_means_in_float64(tmp_path):
+def test_an_origin_is_stored_in_a_comment(tmp_path):
     gaussians = random_gaussians(5, 0)
     save_ply(tmp_path / "plain.ply", gaussians)
     save_ply(tmp_path / "zero.ply", gaussians, (0, 0, 0))
     assert (tmp_path / "plain.ply").read_bytes() == (tmp_path / "zero.ply").read_bytes()
 
-    origin = np.array([1234.5678, -0.1, 3e5])
+    origin = (1234.5678, -0.1, 3e5)
     save_ply(tmp_path / "moved.ply", gaussians, origin)
-    moved = load_ply(tmp_path / "moved.ply")
-    exact = gaussians.means.numpy().astype(np.float64) + origin
-    np.testing.assert_array_equal(moved.means.numpy(), exact.astype(np.float32))
-    back = load_ply(tmp_path / "moved.ply", origin)
-    # The file holds float32: half a unit in the last place of 3e5 is 2^-6. The subtraction adds far less.
-    np.testing.assert_allclose(back.means.numpy(), gaussians.means.numpy(), atol=2**-6 + 1e-6)
+    assert b"comment gsplat_edu origin 1234.5678 -0.1 300000.0\n" in (tmp_path / "moved.ply").read_bytes()
+    scene = read(tmp_path / "moved.ply")
+    assert scene.origin == origin and torch.equal(scene.gaussians.means, gaussians.means)
     with pytest.raises(ShapeError, match="origin"):
-        load_ply(tmp_path / "moved.ply", (1, 2))
+        save_ply(tmp_path / "moved.ply", gaussians, (1, 2))
+
+
+@pytest.mark.parametrize("words", ["1 2", "a b c", "nan 0 0", "1e31 0 0", "0 0 0 0"])
+def test_a_malformed_origin_is_refused(tmp_path, words):
+    save_ply(tmp_path / "a.ply", random_gaussians(2, 0), (7.0, 0.0, 0.0))
+    data = (tmp_path / "a.ply").read_bytes().replace(b"origin 7.0 0.0 0.0", f"origin {words}".encode())
+    (tmp_path / "a.ply").write_bytes(data)
+    assert "is not an origin" in refused(tmp_path / "a.ply")
 
 
 def written(path, table, form="binary_little_endian", newline="\n", before=b"", extra_header=()):
@@ -300,7 +305,6 @@ def test_a_trained_scene_from_another_program():
         ("formats/ply_beetle/beetle.ascii.ply", "is a mesh, not a splat scene: lacks f_dc_0"),
         ("formats/ply_beetle/beetle.binary.ply", "is a mesh, not a splat scene: lacks f_dc_0"),
         ("fox/points3D_aligned_derived.ply", "is a point cloud, not a splat scene: lacks f_dc_0"),
-        ("formats/biker.compressed.ply", "is a compressed splat PLY"),
     ],
 )
 def test_real_files_that_are_not_scenes_are_refused(name, message):
@@ -392,12 +396,12 @@ def test_infinite_logits_become_opaque_or_transparent(tmp_path):
 def test_writing_in_several_blocks_gives_the_same_file(tmp_path, monkeypatch, count):
     gaussians, origin = random_gaussians(count, 8), (1e6, -2.0, 0.1)
     save_ply(tmp_path / "one.ply", gaussians, origin)
-    one = load_ply(tmp_path / "one.ply", origin)
+    one = load_ply(tmp_path / "one.ply")
     monkeypatch.setattr(ply, "BLOCK", 3)
     monkeypatch.setattr(ply_table, "BLOCK", 3)
     save_ply(tmp_path / "many.ply", gaussians, origin)
     assert (tmp_path / "many.ply").read_bytes() == (tmp_path / "one.ply").read_bytes()
-    for name, tensor in load_ply(tmp_path / "one.ply", origin).tensors().items():
+    for name, tensor in load_ply(tmp_path / "one.ply").tensors().items():
         assert torch.equal(tensor, one.tensors()[name]), name
 
 

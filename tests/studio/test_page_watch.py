@@ -119,7 +119,7 @@ def test_a_photo_that_comes_late_is_not_laid_over_another_view(visitor, runs):
 
 def test_clean_says_what_it_removed_and_carries_the_edits_over(visitor, runs):
     source = open_source(runs / "egg-2")
-    identity = identity_of(source.scene.gaussians, source.origin)
+    identity = identity_of(source.scene)
     mine = json.loads(empty_document(identity)) | {
         "operations": [{"op": "measure", "points": [[0, 0, 0], [1, 0, 0]], "note": "a"}]
     }

@@ -192,7 +192,7 @@ def test_a_file_that_is_no_scene_ends_in_one_line(page, studio):
 
 def document(run, *operations):
     source = open_source(run.path)
-    scene = identity_of(source.scene.gaussians, source.origin).document()
+    scene = identity_of(source.scene).document()
     return json.dumps(
         {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": list(operations)}
     )

@@ -48,7 +48,7 @@ def served(tmp_path):
     write_scene(scene, Scene(wall()))
     source = open_source(scene)
     with EditServer("127.0.0.1", 0, page_parts.policy(page_parts.EDITOR), file) as server:
-        server.prepare(identity_of(source.scene.gaussians), scene)
+        server.prepare(identity_of(source.scene), scene)
         editing = editing_of(source, scene, file, ADDRESS)
         server.page = page.html(source.scene, (), source.settings, "wall", editing=editing)
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})

@@ -51,11 +51,9 @@ def edit(visit, tmp_path):
     """Return a function that writes a scene and its page with the editor, and opens the page in front of it."""
 
     def make(gaussians, width=640, height=400, **options):
-        source = Source(
-            tmp_path / "scene.ply", Scene(gaussians), (), RenderSettings(depth=False), (0.0, 0.0, 0.0)
-        )
+        source = Source(tmp_path / "scene.ply", Scene(gaussians), (), RenderSettings(depth=False))
         editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
-        html = page.html(source.scene, (), source.settings, "scene", (), page.Tour(None, (0.0,) * 3), editing)
+        html = page.html(source.scene, (), source.settings, "scene", (), None, editing)
         (tmp_path / "edit.html").write_bytes(html)
         write_scene(tmp_path / "scene.ply", source.scene)
         shown = visit(width=width, height=height, **options).open(tmp_path / "edit.html").ready()

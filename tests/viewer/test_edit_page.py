@@ -60,7 +60,7 @@ STATE = """() => ({
 
 
 def source_of(gaussians, path="scene.ply", origin=(0.0, 0.0, 0.0)):
-    return Source(path, Scene(gaussians), (), RenderSettings(jacobian_limit=1.3, depth=False), origin)
+    return Source(path, Scene(gaussians, origin=origin), (), RenderSettings(jacobian_limit=1.3, depth=False))
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def edit(visit, tmp_path):
     def make(gaussians, origin=(0.0, 0.0, 0.0), width=SIZE[0], height=SIZE[1], **options):
         source = source_of(gaussians, tmp_path / "scene.ply", origin)
         editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
-        html = page.html(source.scene, (), source.settings, "scene", (), page.Tour(None, origin), editing)
+        html = page.html(source.scene, (), source.settings, "scene", (), None, editing)
         (tmp_path / "edit.html").write_bytes(html)
         write_scene(tmp_path / "scene.ply", source.scene)
         shown = visit(width=width, height=height, **options).open(tmp_path / "edit.html").ready()

@@ -441,7 +441,7 @@ def test_convert_moves_the_mesh_and_says_where_it_stays(tmp_path, random_gaussia
     for operations, line in ((WHOLE, False), (PART, True)):
         scene = {
             "count": 30,
-            "sha256": identity_of(source.scene.gaussians, source.origin).sha256,
+            "sha256": identity_of(source.scene).sha256,
             "origin": [0, 0, 0],
         }
         edits = {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": operations}

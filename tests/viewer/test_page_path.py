@@ -82,7 +82,7 @@ def opened(visit, tmp_path, random_gaussians, three_views):
     """Return a function that opens the page of a scene with an origin, with or without a path."""
 
     def make(path=None, **options):
-        scene, tour = Scene(random_gaussians(60)), page.Tour(path, ORIGIN)
+        scene, tour = Scene(random_gaussians(60), origin=ORIGIN), page.Tour(path)
         (tmp_path / "scene.html").write_bytes(page.html(scene, three_views, title="scene", tour=tour))
         return visit(width=640, height=480, **options).open(tmp_path / "scene.html").ready()
 

@@ -20,13 +20,13 @@ from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
 from gsplat_edu.blocks.task import block_options
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.io.ply import load_ply, save_ply
+from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import fingerprint
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.runs.source import open_source
+from gsplat_edu.runs.source import capture_scene, capture_up, open_source
 from gsplat_edu.runs.training import Export, document
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -70,7 +70,7 @@ def merged(folder: BlocksFolder, plan: BlockPlan, records: list[Done]) -> tuple[
     """
     parts = []
     for block, done in zip(plan.blocks, records, strict=True):
-        gaussians = load_ply(folder.scene(done.block, done.iterations), plan.origin)
+        gaussians = read_scene(folder.scene(done.block, done.iterations)).relative_to(plan.origin)
         places = plan.area.ground.coordinates(gaussians.means.numpy())
         stays = torch.from_numpy(np.flatnonzero(block.core.holds(places)))
         parts.append(gaussians.map(functools.partial(torch.index_select, dim=0, index=stays)))
@@ -137,7 +137,7 @@ def merge_blocks(
     run = folder.merged
     check_views(folder, plan, dataset)
     scene = run.scene(steps)
-    save_ply(scene, gaussians, plan.origin, options.config.antialiased)
+    write_scene(scene, capture_scene(gaussians, dataset, options.config.antialiased))
     run.write_config(_config(options, plan, dataset))
     say(f"wrote {scene}: {len(gaussians):,} Gaussians from {len(records)} blocks")
     settings = dataclasses.replace(options.render_settings, depth=True)
@@ -173,7 +173,8 @@ def _whole(folder: BlocksFolder, plan: BlockPlan, data: Path | None) -> RunOptio
 def _config(options: RunOptions, plan: BlockPlan, dataset: Dataset) -> dict[str, Any]:
     config = document(options)
     config["train"]["max_gaussians"] = plan.recipe["train"].get("max_gaussians")
-    facts = {"origin": list(plan.origin), "fingerprint": fingerprint(dataset), "blocks": len(plan.blocks)}
+    facts: dict[str, Any] = {"origin": list(plan.origin), "up": list(capture_up(dataset))}
+    facts |= {"fingerprint": fingerprint(dataset), "blocks": len(plan.blocks)}
     return config | facts | ({} if dataset.scale is None else {"scale": dataset.scale.json()})
 
 

@@ -24,7 +24,7 @@ from gsplat_edu.blocks.views import feature_renderer
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.io.ply import load_ply
+from gsplat_edu.io.formats import read_scene
 from gsplat_edu.ops.kernels import REASON, native
 from gsplat_edu.render.settings import BACKENDS
 from gsplat_edu.runs.options import RunOptions
@@ -137,7 +137,7 @@ def pixels_of_block(folder: BlocksFolder, plan: BlockPlan, number: int, options:
         number: The block.
         options: Those of `block_options`.
     """
-    start = load_ply(folder.start(number), plan.origin)
+    start = read_scene(folder.start(number)).relative_to(plan.origin)
     return Counted(plan.area, plan.blocks[number].core, start, feature_renderer(options))
 
 

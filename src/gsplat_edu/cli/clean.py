@@ -21,8 +21,6 @@ from gsplat_edu.edits.carry import for_part
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.edits.stored import MOST_BYTES
-from gsplat_edu.io.formats import format_of
-from gsplat_edu.io.ply import ORIGIN, save_ply
 from gsplat_edu.jobs import emitter
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import SIGNALS, default_target, open_subject, preview, report_lines
@@ -98,7 +96,7 @@ def _clean(arguments: argparse.Namespace, out: Path, console: Terminal) -> None:
     _write(out, replace(source, scene=replace(source.scene, gaussians=kept)), console)
     if carried is not None and edited is not None:
         written = open_source(out)
-        part = identity_of(written.scene.gaussians, written.origin)
+        part = identity_of(written.scene)
         text = for_part(carried, str(arguments.edits), edited.scene.gaussians, cleaning.kept, part)
         with written_aside(out.with_name(EDITS)) as aside:
             write_text(aside, text)
@@ -116,21 +114,14 @@ def _checked_edits(file: Path, source: Source, out: Path) -> bytes:
         raise ArgumentError(f"--out: there is an {EDITS} beside {out}; give a file in another folder")
     with open_file(file) as opened:
         data = opened.read(MOST_BYTES + 1)
-    parse_edits(data, str(file)).check_scene(identity_of(source.scene.gaussians, source.origin), str(file))
+    parse_edits(data, str(file)).check_scene(identity_of(source.scene), str(file))
     return data
 
 
 def _write(out: Path, source: Source, console: Terminal) -> None:
-    """Write the cleaned scene; a PLY keeps the coordinates of the original."""
-    ply = out.suffix.lower() != export.PAGE and format_of(out).suffix == ".ply"
-    if ply and source.origin != ORIGIN:
-        save_ply(out, source.scene.gaussians, source.origin, source.scene.antialiased)
-    else:
-        for note in export.losses(out, source):
-            console.print(note, soft_wrap=True)
-        if source.origin != ORIGIN:
-            where = ", ".join(f"{x:.6g}" for x in source.origin)
-            console.print(f"coordinates are relative to the capture's origin ({where})", soft_wrap=True)
-        export.write(out, source)
+    """Write the cleaned scene."""
+    for note in export.losses(out, source):
+        console.print(note, soft_wrap=True)
+    export.write(out, source)
     emitter.report_output(out)
     console.print(f"wrote {out}: {len(source.scene.gaussians):,} splats", soft_wrap=True)

@@ -30,6 +30,7 @@ from gsplat_edu.io.lod.tiles import tile_options
 from gsplat_edu.jobs import emitter
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.sfm.scale_text import points_of
 from gsplat_edu.viewer import export
 from gsplat_edu.viewer.edited import edited_meshes, edited_source, toured
@@ -73,23 +74,25 @@ def _convert(arguments: argparse.Namespace, console: Terminal) -> None:
         meshes: Meshes | None = None
         for path in arguments.sources:
             bar.update(steps, description=f"reading {path}")
-            source = open_source(path)
+            source = opened = open_source(path)
             meshes = open_meshes(arguments.surface, arguments.collider, source) if not sources else meshes
             if edits is not None:
                 meshes = meshes if sources else edited_meshes(meshes, source, edits)
                 source = edited_source(source, edits, str(arguments.edits), arguments.edits_anyway)
-            sources.append(_filtered(source, keep, move))
+            sources.append(_moved(_filtered(source, keep), move))
+            if len(sources) == 1:
+                along = None if along is None else along.shifted(-np.array(opened.origin))
+                total = move.local(source.origin, sources[0].origin).after(views.move)
             bar.advance(steps)
         source = _joined(sources)
         if arguments.scale is not None:
             source = replace(source, scene=replace(source.scene, unit=given.unit))
         say = functools.partial(console.print, soft_wrap=True)
-        for note in (*_origins(sources), *export.losses(arguments.out, source)):
+        for note in (*_origin(source, arguments.out), *export.losses(arguments.out, source)):
             say(note)
-        total = move if views.move is IDENTITY else move.after(views.move)
         for measure in views.measures:
             say(_measured(measure, total.s, source.scene.unit))
-        source, tour = toured(source, views, total, along)
+        tour = toured(source, views, total, along)
         tour = _proven(replace(tour, meshes=meshes and meshes.moved(total)), source, arguments, bar, say)
         bar.update(steps, description=f"writing {arguments.out}")
         if arguments.lod_refine is None:
@@ -196,37 +199,44 @@ def _check_refining(arguments: argparse.Namespace) -> None:
             )
 
 
-def _filtered(source: Source, keep: Filter, move: Similarity) -> Source:
-    kept = replace(source.scene, gaussians=keep.apply(source.scene.gaussians))
+def _filtered(source: Source, keep: Filter) -> Source:
+    kept = keep.apply(source.scene)
     if not len(kept.gaussians):
         raise ArgumentError(
             f"{source.path}: no splat is left ({len(source.scene.gaussians):,} before); relax the filters"
         )
+    return replace(source, scene=kept)
+
+
+def _moved(source: Source, move: Similarity) -> Source:
+    """Return a scene and its cameras after --transform, which acts on positions with their origin, in double."""
     if move is IDENTITY:
-        return replace(source, scene=kept)
-    cameras = tuple((name, move.camera(camera)) for name, camera in source.cameras)
-    return replace(source, scene=move.scene(kept), cameras=cameras)
+        return source
+    scene = move.scene(source.scene)
+    local = move.local(source.origin, scene.origin)
+    cameras = tuple((name, local.camera(camera)) for name, camera in source.cameras)
+    return replace(source, scene=scene, cameras=cameras)
 
 
 def _joined(sources: Sequence[Source]) -> Source:
     if len(sources) == 1:
         return sources[0]
     scene = joined([source.scene for source in sources])
-    cameras = tuple(camera for source in sources for camera in source.cameras)
+    cameras = tuple(
+        (name, IDENTITY.local(source.origin, scene.origin).camera(camera))
+        for source in sources
+        for name, camera in source.cameras
+    )
     settings = replace(sources[0].settings, antialiased=bool(scene.antialiased))
     return replace(sources[0], scene=scene, cameras=cameras, settings=settings)
 
 
-def _origins(sources: Sequence[Source]) -> list[str]:
-    """Report an offset between the written coordinates and the capture's; reject scenes with different origins."""
-    origins = {source.origin for source in sources}
-    if len(origins) > 1:
-        raise ArgumentError("IN: the scenes have different origins; convert and place them one at a time")
-    origin = origins.pop()
-    if not any(origin):
+def _origin(source: Source, out: Path) -> list[str]:
+    """Say where a file keeps the origin of its coordinates."""
+    if source.origin == ORIGIN or any("origin" in loss for loss in export.losses(out, source)):
         return []
-    where = ", ".join(f"{x:.6g}" for x in origin)
-    return [f"coordinates are relative to the run's origin ({where}), which keeps them precise in float32"]
+    where = ", ".join(f"{x:.15g}" for x in source.origin)
+    return [f"coordinates are relative to the origin ({where}), which {out.name} stores in double"]
 
 
 def _similarity(text: str) -> Similarity:

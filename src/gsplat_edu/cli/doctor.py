@@ -29,7 +29,7 @@ from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosi
 from gsplat_edu.doctor.moving import moved_parts
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
-from gsplat_edu.io.ply import load_ply
+from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed, Found
 from gsplat_edu.render.api import render
@@ -154,9 +154,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     scene, reached = folder.latest_scene()
     reader = run_reader(config, arguments.dataset)
     dataset = Dataset.of(reader, data_settings(config))
-    gaussians = load_ply(scene, dataset.origin).to(
-        device_of(backend)
-    )  # in the coordinate frame of the cameras
+    gaussians = read_scene(scene).relative_to(dataset.origin).to(device_of(backend))
     renderer = functools.partial(render, settings=settings, backend=backend)
     section = config.get("train")
     appearance = appearance_of(config)

@@ -14,7 +14,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.locks import LOCK, locked
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
-from gsplat_edu.io.ply import load_ply
+from gsplat_edu.io.formats import read_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
@@ -70,9 +70,7 @@ def _evaluate(
                 f"{what}; give the run's capture with --dataset, or add --out FOLDER to write the scores elsewhere"
             )
         say(f"{what}; the scores are written to {into.path}")
-    gaussians = load_ply(scene, dataset.origin).to(
-        device_of(backend)
-    )  # in the coordinate frame of the cameras
+    gaussians = read_scene(scene).relative_to(dataset.origin).to(device_of(backend))
     judged = ScoredViews(dataset.test, dataset.train, settings.background, dataset.notes)
     with Bar(
         TextColumn("{task.description}"),

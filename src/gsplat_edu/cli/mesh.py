@@ -24,7 +24,7 @@ from gsplat_edu.evaluate.topology import Topology
 from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.mesh_glb import write_parts
 from gsplat_edu.io.mesh_usd import require_usd
-from gsplat_edu.io.ply import ORIGIN
+from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.mesh.convex import convex_parts, farthest_outside
 from gsplat_edu.mesh.depths import render_depths
@@ -38,6 +38,7 @@ from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.meshes import KINDS, MadeMesh, write_mesh_record
 from gsplat_edu.runs.painting import painted
 from gsplat_edu.runs.source import NamedCamera, Source, open_source, run_of
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.mesh import Mesh
 
 ORBIT_VIEWS, ORBIT_SIZE = 48, 800
@@ -129,11 +130,11 @@ def _written(
     mesh = _moved(mesh, source.origin)
     facts: dict[str, Any] = {"file": str(arguments.out), "unit": unit}
     if arguments.collider == "convex":
-        facts |= _write_convex(arguments.out, mesh, unit, console)
+        facts |= _write_convex(arguments.out, mesh, source.scene, console)
     else:
-        for loss in mesh_losses(arguments.out, mesh, unit):
+        for loss in mesh_losses(arguments.out, mesh):
             console.print(loss, soft_wrap=True)
-        write_mesh(arguments.out, mesh, unit)
+        write_mesh(arguments.out, mesh, unit, up=source.scene.up)
         counted = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
         volume = _volume(result, unit or "world units")
         console.print(f"wrote {arguments.out}: {counted}; {volume}", soft_wrap=True)
@@ -170,10 +171,10 @@ def _volume(result: MeshResult, unit: str) -> str:
     return f"voxels of {short_number(result.voxel, 3)} {unit}, volume of {spelled_bytes(result.volume_bytes)}"
 
 
-def _write_convex(out: Path, mesh: Mesh, unit: str | None, console: Terminal) -> dict[str, Any]:
+def _write_convex(out: Path, mesh: Mesh, scene: Scene, console: Terminal) -> dict[str, Any]:
     """Write convex parts of the mesh, say how much of it they leave out, and return both for its record."""
-    parts = convex_parts(mesh)
-    write_parts(out, [(f"collider_{number}", part) for number, part in enumerate(parts)], unit)
+    parts, unit = convex_parts(mesh), scene.unit
+    write_parts(out, [(f"collider_{number}", part) for number, part in enumerate(parts)], unit, scene.up)
     farthest = farthest_outside(mesh.vertices, parts)
     outside = short_number(farthest, 2)
     triangles = sum(len(part.faces) for part in parts)

@@ -33,7 +33,6 @@ from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
 from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.io.formats import file_in, read_scene
-from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.render.api import render
@@ -43,7 +42,7 @@ from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import MAPS, RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
-from gsplat_edu.runs.source import file_settings, relative_to, scene_up, up_and_unit
+from gsplat_edu.runs.source import capture_up, file_settings, open_source
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.rig import through_lenses
@@ -159,20 +158,24 @@ def _save_path(arguments: argparse.Namespace, shot: Shot, orbit: bool) -> str:
 
 
 def _path_of(arguments: argparse.Namespace, origin: Sequence[float], views: Views) -> KeyframePath | None:
-    """Return the path of --path or of the edits, in the coordinates of the edited scene, minus its origin."""
+    """Return the path of --path or of the edits, relative to the origin of the edited scene.
+
+    Args:
+        arguments: The command line.
+        origin: That of the scene before its edits.
+        views: The views of the edits.
+    """
     path = views.path if arguments.path is None else read_path(arguments.path, origin)
     if path is None or views.move is IDENTITY:
         return path
     return path.placed(views.move.R, views.move.s, views.move.t)
 
 
-def _after_edits(
-    arguments: argparse.Namespace, scene: Scene, origin: Sequence[float], edits: Edits | None
-) -> tuple[Scene, Views]:
-    """Apply the edits of --edits to a scene whose origin was subtracted."""
+def _after_edits(arguments: argparse.Namespace, scene: Scene, edits: Edits | None) -> tuple[Scene, Views]:
+    """Apply the edits of --edits to a scene."""
     if edits is None:
         return scene, views_after(())
-    edits.check_scene(identity_of(scene.gaussians, origin), str(arguments.edits))
+    edits.check_scene(identity_of(scene), str(arguments.edits))
     views = views_after(edits.operations)
     left = edited(scene, edits.operations)
     if not len(left.gaussians):
@@ -198,13 +201,12 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool, edi
     settings = _settings(render_settings(config), arguments)
     scene, _ = folder.latest_scene()
     if arguments.dataset not in (None, RUNS_CAMERAS):
-        return _dataset_shot(arguments, load_ply(scene), settings, data_settings(config), orbit)
-    origin = config.get("origin") or ORIGIN
-    cameras = folder.read_cameras(origin)
-    up, unit = up_and_unit(config, [camera for _, _, camera in cameras])
-    left, views = _after_edits(arguments, Scene(load_ply(scene, origin), up=up, unit=unit), origin, edits)
+        return _dataset_shot(arguments, read_scene(scene), settings, data_settings(config), orbit)
+    whole = open_source(scene).scene
+    origin = whole.origin
+    left, views = _after_edits(arguments, whole, edits)
     gaussians, up = left.gaussians, left.up or WORLD_UP
-    named = [(name, camera) for name, _, camera in cameras]
+    named = [(name, camera) for name, _, camera in folder.read_cameras(origin)]
     if views.move is not IDENTITY:
         named = [(name, views.move.camera(camera)) for name, camera in named]
     if not named:
@@ -215,38 +217,41 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool, edi
         lenses = through_lenses(camera for _, camera in named)
         return Shot(gaussians, along, None, settings, up=up, through_lenses=lenses)
     shot = _shot(arguments, gaussians, named, settings, orbit)
-    return replace(shot, origin=origin, up=up, unit=left.unit)
+    return replace(shot, origin=left.origin, up=up, unit=left.unit)
 
 
 def _file_shot(arguments: argparse.Namespace, orbit: bool, edits: Edits | None) -> Shot:
     if arguments.dataset == RUNS_CAMERAS:
         raise ArgumentError("--dataset: a scene file has no cameras; give the dataset folder: --dataset PATH")
-    scene, views = _after_edits(arguments, read_scene(arguments.source), ORIGIN, edits)
+    whole = read_scene(arguments.source)
+    scene, views = _after_edits(arguments, whole, edits)
     settings = _settings(file_settings(scene), arguments)
     if arguments.dataset is not None:
-        return _dataset_shot(arguments, scene.gaussians, settings, DataSettings(), orbit)
+        return _dataset_shot(arguments, scene, settings, DataSettings(), orbit)
     side, up = arguments.size or SCENE_SIZE, scene.up or WORLD_UP
-    if (path := _path_of(arguments, ORIGIN, views)) is not None:
+    if (path := _path_of(arguments, whole.origin, views)) is not None:
         return Shot(scene.gaussians, _path_cameras(arguments, path, side, side), None, settings, up=up)
     cameras = orbit_of_scene(scene.gaussians, _orbit_frames(arguments), side, up)
     description = (
         "a scene file has no cameras: using a full circle; --dataset PATH follows a capture's cameras"
     )
-    return Shot(scene.gaussians, cameras, None, settings, description, up=up, unit=scene.unit)
+    return Shot(
+        scene.gaussians, cameras, None, settings, description, origin=scene.origin, up=up, unit=scene.unit
+    )
 
 
 def _dataset_shot(
     arguments: argparse.Namespace,
-    gaussians: Gaussians,
+    scene: Scene,
     settings: RenderSettings,
     data: DataSettings,
     orbit: bool,
 ) -> Shot:
     dataset = load_dataset(arguments.dataset, data)
-    gaussians = relative_to(gaussians, dataset.origin)  # in the coordinate frame of the cameras
+    gaussians = scene.relative_to(dataset.origin)
     named = [(view.name, view.camera) for view in (*dataset.train, *dataset.test)]
     shot = _shot(arguments, gaussians, named, settings, orbit)
-    return replace(shot, origin=tuple(dataset.origin.tolist()), up=scene_up([camera for _, camera in named]))
+    return replace(shot, origin=tuple(dataset.origin.tolist()), up=capture_up(dataset))
 
 
 def _shot(

@@ -22,9 +22,9 @@ from gsplat_edu.evaluate.lenses import (
     orthographic,
     panorama,
 )
-from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import WORLD_UP, Camera
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 
@@ -43,7 +43,7 @@ class Shot:
         settings: Render settings.
         path: The kind of camera path and the reason for it; "" for the dataset's cameras and for keyframes.
         maps: Names of the maps to write beside the images.
-        origin: Subtracted from the coordinates of the scene's file and of the cameras.
+        origin: Position of the zero of splats and cameras in the capture's coordinates.
         up: The scene's up direction.
         unit: What one unit of the coordinates is, "m", "cm" or "mm"; None if unknown.
         sphere: Whether the images are equirectangular.

@@ -128,11 +128,11 @@ def _prepare(server: PageServer, console: Terminal, arguments: argparse.Namespac
     if along is not None:
         along = along.shifted(-np.array(source.origin))
     meshes = open_meshes(arguments.surface, arguments.collider, source)
-    title, tour = _title(arguments.source), page.Tour(along, source.origin, meshes=meshes)
+    title, tour = _title(arguments.source), page.Tour(along, meshes=meshes)
     editing = None
     if isinstance(server, EditServer):
         editing = editing_of(source, arguments.source, server.file, ADDRESS)
-        server.prepare(identity_of(source.scene.gaussians, source.origin), arguments.source)
+        server.prepare(identity_of(source.scene), arguments.source)
         console.print(f"edits: {server.file}", soft_wrap=True)
     server.page = page.html(
         source.scene, source.cameras, source.settings, title, source.held_out, tour, editing

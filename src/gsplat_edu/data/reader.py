@@ -30,9 +30,7 @@ from gsplat_edu.data.points import finite_cloud, read_points_ply
 from gsplat_edu.data.scale import read_scale
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.data.watch import FileWatch
-
-FAR = 1e4
-"""Camera coordinates beyond which the origin is moved, world units; float32 would resolve them only to 1e-3."""
+from gsplat_edu.scene.frame import origin_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +139,13 @@ def _near_origin(
 ) -> PlacedCapture:
     """Sort frames by name, and move a scene whose coordinates are too large for float32, as on a map, to the origin."""
     frames, notes = sorted(found, key=lambda frame: frame.name), list(found_notes)
-    eyes = np.stack([frame.eye for frame in frames])
     if cloud is not None:
         cloud, note = finite_cloud(cloud)
         notes += [note] if note is not None else []
         cloud = cloud if len(cloud.points) else None
-    if np.abs(eyes).max() <= FAR:
-        return PlacedCapture(tuple(frames), cloud, np.zeros(3), tuple(notes))
-    origin = np.round(eyes.mean(axis=0))
+    origin = origin_of(np.stack([frame.eye for frame in frames]))
+    if not origin.any():
+        return PlacedCapture(tuple(frames), cloud, origin, tuple(notes))
     x, y, z = origin.tolist()
     notes.append(MovedOrigin((x, y, z)))
     moved = tuple(replace(frame, eye=frame.eye - origin) for frame in frames)

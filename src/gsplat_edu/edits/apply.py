@@ -18,13 +18,11 @@ from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.edit import IDENTITY, Similarity
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import WORLD_UP
+from gsplat_edu.scene.frame import ORIGIN, rotation_between
 from gsplat_edu.scene.gaussians import Gaussians
 
 SELECTED, HIDDEN, DELETED = 1, 2, 4
 """States of a splat, one at a time; 0 for none of these."""
-
-OPPOSITE = -1.0 + 1e-9
-"""Cosine below which the floor is upside down, so that its shortest turn has no definite axis."""
 
 Flags = UInt8[np.ndarray, " N"]
 
@@ -152,10 +150,14 @@ def views_after(operations: Sequence[ops.Operation]) -> Views:
 
 
 def placed(scene: Scene, views: Views) -> Scene:
-    """Return a scene turned and scaled; its up direction and unit are set if an operation sets them."""
+    """Return a scene turned and scaled; its up direction and unit are set if an operation sets them.
+
+    A scene that was levelled or scaled has coordinates of its own: its origin is zero.
+    """
     if views.move is IDENTITY:
         return scene
-    moved = views.move.scene(scene)
+    moved = views.move.scene(replace(scene, origin=ORIGIN))
+    moved = replace(moved, gaussians=moved.relative_to(ORIGIN), origin=ORIGIN)
     up = WORLD_UP if views.upright else moved.up
     return replace(moved, up=up, unit=views.unit or moved.unit)
 
@@ -166,24 +168,10 @@ def placed_view(view: Keyframe, move: Similarity) -> Keyframe:
 
 
 def upright_rotation(upright: ops.Upright) -> Float64[np.ndarray, "3 3"]:
-    """Return the shortest rotation that takes the floor's normal to the world's up direction.
-
-    R = I + [v]x + [v]x² / (1 + c),  v = n x up,  c = n . up
-
-    n is the normal (b - a) x (c - a) of length 1. A floor that is exactly upside down turns about the x axis.
-    """
+    """Return the shortest rotation that takes the floor's normal, (b - a) x (c - a), to the world's up direction."""
     a, b, c = np.array(upright.points, dtype=np.float64)
     first, second = (side / np.abs(side).max() for side in (b - a, c - a))
-    normal = np.cross(first, second)
-    normal /= np.linalg.norm(normal)
-    up = np.array(WORLD_UP)
-    cosine = float(normal @ up)
-    if cosine < OPPOSITE:
-        return np.diag([1.0, -1.0, -1.0])
-    x, y, z = np.cross(normal, up)
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn: Float64[np.ndarray, "3 3"] = np.eye(3) + across + across @ across / (1.0 + cosine)
-    return turn
+    return rotation_between(np.cross(first, second), WORLD_UP)
 
 
 def apply_operation(operation: ops.Operation, values: Values, flags: Flags, work: EditWork) -> Moved | None:

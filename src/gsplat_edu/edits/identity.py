@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,15 +10,13 @@ import torch
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.json_fields import as_json, check_keys, checked_object, checked_whole, numbers_within
-from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.frame import FARTHEST_ORIGIN, Vector
 
 ORDER = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Parameters in the order in which they are hashed."""
 
 MOST_SPLATS = 1 << 32
-
-FARTHEST_ORIGIN = 1e30
-"""World units, along each axis."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +26,12 @@ class Identity:
     Args:
         count: Number of splats.
         sha256: Digest of its parameters; see `identity_of`.
-        origin: Subtracted from the coordinates of the scene's file.
+        origin: That of the scene.
     """
 
     count: int
     sha256: str
-    origin: tuple[float, float, float]
+    origin: Vector
 
     def document(self) -> dict[str, Any]:
         """Return the entry "scene" of an edits file."""
@@ -66,16 +63,14 @@ class Identity:
         return None
 
 
-def identity_of(gaussians: Gaussians, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Identity:
+def identity_of(scene: Scene) -> Identity:
     """Return the identity of a scene: SHA-256 over its raw parameters as little-endian float32, one after the other.
 
     Args:
-        gaussians: The scene as opened.
-        origin: Subtracted from the coordinates of its file.
+        scene: The scene as opened.
     """
     digest = hashlib.sha256()
     for name in ORDER:
-        values = gaussians.tensors()[name].detach().to(torch.float32).cpu().contiguous().numpy()
+        values = scene.gaussians.tensors()[name].detach().to(torch.float32).cpu().contiguous().numpy()
         digest.update(values.astype("<f4", copy=False).tobytes())
-    x, y, z = (float(value) for value in origin)
-    return Identity(len(gaussians), digest.hexdigest(), (x, y, z))
+    return Identity(len(scene.gaussians), digest.hexdigest(), scene.origin)

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.io.edit import Similarity
-from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
 
 
@@ -83,7 +82,7 @@ def moved_gaussians(
         rows = torch.from_numpy(moved.rows).to(there.device)
         result.means[rows] = there[rows]
         R = similarity_of(moved.move).R
-        part = Scene(result.map(lambda tensor, rows=rows: tensor[rows]))  # type: ignore[misc]
-        turned = Similarity(R, 1.0, np.zeros(3)).scene(part).gaussians
+        part = result.map(lambda tensor, rows=rows: tensor[rows])  # type: ignore[misc]
+        turned = Similarity(R, 1.0, np.zeros(3)).gaussians(part)
         result.quats[rows], result.sh_rest[rows] = turned.quats, turned.sh_rest
     return result

@@ -35,7 +35,7 @@ from gsplat_edu.base.ply_table import Element, Header, read_elements, read_rows
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.scene import Scene, split_origin
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.morton import morton_codes
 from gsplat_edu.scene.shells import far_shell
@@ -89,7 +89,9 @@ def read(path: Path) -> Scene:
     colors = np.stack([words >> 24, words >> 16 & 255, words >> 8 & 255], axis=1) / 255.0
     if COLOR_BOUNDS[0] in chunk.names:
         colors = _between(_bounds(path, chunks, COLOR_BOUNDS), colors)
-    means = _between(_bounds(path, chunks, POSITION_BOUNDS), _unpacked(splats["packed_position"]))
+    positions = _between(_bounds(path, chunks, POSITION_BOUNDS), _unpacked(splats["packed_position"]))
+    antialiased, up, unit, origin = read_comments(path, header.comments)
+    means, origin = split_origin(positions) if origin is None else (positions, origin)
     log_scales = _between(_bounds(path, chunks, SCALE_BOUNDS), _unpacked(splats["packed_scale"]))
     with np.errstate(over="ignore"):  # damaged colour bounds: `read_scene` reports infinities
         sh0 = ((colors - SH_OFFSET) / C0).astype(np.float32)
@@ -101,7 +103,7 @@ def read(path: Path) -> Scene:
         sh_rest=torch.from_numpy(_sh_rest(sh_rows, len(splats))),
         logit_opacities=torch.from_numpy(byte_to_logit((words & 255).astype(np.uint8))),
     )
-    return Scene(gaussians, *read_comments(path, header.comments))
+    return Scene(gaussians, antialiased, up, unit, origin)
 
 
 def write(path: Path, scene: Scene) -> None:

@@ -17,6 +17,7 @@ from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import ArrayLike, float64_array, in_range, whole_number
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, as_camera
+from gsplat_edu.scene.frame import ORIGIN, Vector, as_origin, origin_of
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.sh import num_coefficients, sh_rotation
 from gsplat_edu.scene.shutter import RollingShutter
@@ -78,13 +79,17 @@ class Similarity:
             shutter = RollingShutter(own.shutter.turn, shift, own.shutter.readout, own.shutter.exposure)
         return Camera.posed(camera.R @ self.R.T, eye, own.intrinsics, shutter)
 
-    def scene(self, scene: Scene) -> Scene:
-        """Transform a scene: means, rotations, scales, SH coefficients and the up direction; scaling drops its unit.
+    def local(self, before: Vector, after: Vector) -> Similarity:
+        """Return the same transform for coordinates that are relative to an origin: x' + o' = s R (x + o) + t.
 
-        Returns:
-            The scene; its Gaussians are computed in float64 and rounded to their dtype.
+        Args:
+            before: The origin o of the coordinates x.
+            after: The origin o' of the results x'.
         """
-        gaussians = scene.gaussians
+        return Similarity(self.R, self.s, self.s * self.R @ np.array(before) + self.t - np.array(after))
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Transform Gaussians: means, rotations, scales and SH coefficients, in float64, rounded to their dtype."""
         dtype, degree = gaussians.means.dtype, gaussians.sh_degree
 
         def tensor(values: np.ndarray) -> Tensor:
@@ -97,7 +102,7 @@ class Similarity:
                 "jk,nkc->njc", tensor(sh_rotation(degree, self.R)), gaussians.sh_rest.double()
             )
             quats = gaussians.quats.double() @ tensor(_left_product(turn)).mT
-        moved = Gaussians(
+        return Gaussians(
             means=means.to(dtype),
             quats=quats.to(dtype),
             log_scales=(gaussians.log_scales.double() + float(np.log(self.s))).to(dtype),
@@ -105,12 +110,26 @@ class Similarity:
             sh_rest=rest.to(dtype),
             logit_opacities=gaussians.logit_opacities,
         )
-        x, y, z = self.R @ np.asarray(scene.up) if scene.up is not None else (0.0, 0.0, 0.0)
+
+    def scene(self, scene: Scene) -> Scene:
+        """Transform a scene: its Gaussians, origin and up direction; scaling drops its unit.
+
+        The new origin is that of the old zero if float32 needs one there (`gsplat_edu.scene.frame.origin_of`), else
+        zero. It is applied in double, before the means are rounded.
+        """
+        shift = self.local(scene.origin, ORIGIN).t
+        places = self.s * scene.gaussians.means.double().numpy(force=True) @ self.R.T + shift
+        origin = as_origin("origin", shift) if origin_of(places).any() else ORIGIN
+        up = None
+        if scene.up is not None:
+            x, y, z = self.R @ np.array(scene.up)
+            up = (float(x), float(y), float(z))
         return replace(
             scene,
-            gaussians=moved,
-            up=None if scene.up is None else (float(x), float(y), float(z)),
+            gaussians=self.local(scene.origin, origin).gaussians(scene.gaussians),
+            up=up,
             unit=scene.unit if self.s == 1.0 else None,
+            origin=origin,
         )
 
 
@@ -123,7 +142,8 @@ class Filter:
 
     Args:
         min_opacity: Smallest opacity to keep, 0 to 1.
-        box: Corners (x0, y0, z0, x1, y1, z1) that must enclose a Gaussian's mean, world units; None for no limit.
+        box: Corners (x0, y0, z0, x1, y1, z1) that must enclose a Gaussian's position, origin included, world units;
+            None for no limit.
         sh_degree: Highest SH degree to keep.
 
     Raises:
@@ -143,16 +163,17 @@ class Filter:
             if not np.all(low < high):
                 raise ArgumentError("box: x0, y0, z0 must be below x1, y1, z1")
 
-    def apply(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians to keep, in their order."""
+    def apply(self, scene: Scene) -> Scene:
+        """Return the scene with the Gaussians to keep, in their order."""
+        gaussians = scene.gaussians
         stays = gaussians.opacities >= self.min_opacity
         if self.box is not None:
             low, high = torch.tensor(self.box, dtype=torch.float64).to(gaussians.means.device).chunk(2)
-            means = gaussians.means.double()
+            means = gaussians.means.double() + torch.tensor(scene.origin, dtype=torch.float64).to(low.device)
             stays &= ((means >= low) & (means <= high)).all(dim=1)
         kept = gaussians if bool(stays.all()) else gaussians.map(lambda tensor: tensor[stays])
         most = num_coefficients(self.sh_degree) - 1
-        return replace(kept, sh_rest=kept.sh_rest[:, :most].contiguous())
+        return replace(scene, gaussians=replace(kept, sh_rest=kept.sh_rest[:, :most].contiguous()))
 
 
 def joined(scenes: Sequence[Scene]) -> Scene:
@@ -162,7 +183,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
         scenes: At least one.
 
     Returns:
-        One scene; metadata on which the scenes disagree is unknown.
+        One scene, relative to the origin of the first; metadata on which the scenes disagree is unknown.
 
     Raises:
         ArgumentError: only some scenes were trained for antialiased rendering, so no renderer suits all of them.
@@ -177,7 +198,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
     for scene in scenes:
         missing = most - scene.gaussians.sh_rest.shape[1]
         rest = torch.nn.functional.pad(scene.gaussians.sh_rest, (0, 0, 0, missing))
-        parts.append(replace(scene.gaussians, sh_rest=rest))
+        parts.append(replace(scene.relative_to(scenes[0].origin), sh_rest=rest))
     ups = {scene.up for scene in scenes}
     units = {scene.unit for scene in scenes}
     return Scene(
@@ -185,6 +206,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
         said.pop() if said else None,
         ups.pop() if len(ups) == 1 else None,
         units.pop() if len(units) == 1 else None,
+        scenes[0].origin,
     )
 
 

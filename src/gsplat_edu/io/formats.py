@@ -12,6 +12,7 @@ from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.validation import of_type
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.gaussians import Gaussians, is_finite
 
 
@@ -24,14 +25,14 @@ class Format:
         module: Module of `gsplat_edu.io` with `read(path) -> Scene` and `write(path, scene)`.
         name: Its common name.
         sh_degree: Highest SH degree that it stores.
-        says_antialiased: Whether it can store that flag.
+        metadata: Whether it can store the scene's origin, up direction, unit and antialiasing.
     """
 
     suffix: str
     module: str
     name: str
     sh_degree: int = SH_MAX_DEGREE
-    says_antialiased: bool = True
+    metadata: bool = True
 
     def read(self, path: Path) -> Scene:
         """Read a file of the format; see `read_scene`."""
@@ -46,7 +47,7 @@ class Format:
 FORMATS = (
     Format(".compressed.ply", "compressed_ply", "SuperSplat compressed PLY"),
     Format(".ply", "ply", "Inria PLY"),
-    Format(".splat", "splat", "antimatter splat", sh_degree=0, says_antialiased=False),
+    Format(".splat", "splat", "antimatter splat", sh_degree=0, metadata=False),
     Format(".spz", "spz", "Niantic SPZ"),
     Format(".sog", "sog.codec", "PlayCanvas SOG"),
     Format(".glb", "glb", "glTF with KHR_gaussian_splatting"),
@@ -110,8 +111,13 @@ def losses(path: str | Path, scene: Scene) -> list[str]:
         said.append(
             f"{path}: {found.name} stores SH up to degree {found.sh_degree}; degrees up to {degree} are dropped"
         )
-    if scene.antialiased and not found.says_antialiased:
+    if scene.antialiased and not found.metadata:
         said.append(f"{path}: {found.name} cannot store that the scene needs antialiased rendering")
+    if scene.origin != ORIGIN and not found.metadata:
+        where = ", ".join(f"{x:.15g}" for x in scene.origin)
+        said.append(
+            f"{path}: {found.name} cannot store the origin ({where}); add it, in double, to every coordinate"
+        )
     return said
 
 

@@ -3,13 +3,14 @@
 All values are float32 and activated: linear scales, opacities in 0..1, quaternions (x, y, z, w) of length 1. They are
 exact to float32, but logits above 17 and the length of a quaternion are lost. Scales above e^88, near the end of
 float32, are clamped. SH coefficients have glTF's signs, which equal ours, one attribute per coefficient. Further
-metadata is stored in the asset's extras, with up in glTF's axes. A scene without Gaussians is written without a mesh,
-because glTF has no empty meshes.
+metadata is stored in the asset's extras: up, unit and origin as in `gsplat_edu.io.scene.extras`. A scene without
+Gaussians is written without a mesh, because glTF has no empty meshes.
 
 glTF's y points up. Scenes are converted by a half turn about x (`gsplat_edu.io.axes.half_turned`), as in SPZ: what
-faced a camera that looks along our z then faces glTF's +z, its front. Means, rotations and harmonics are converted, not
-the node's transform: not all viewers rotate harmonics with it. splat-transform turns about z instead, so its files
-differ from ours by a half turn about y; they are recognised by their generator and turned back.
+faced a camera that looks along our z then faces glTF's +z, its front. The half turn changes means, rotations and
+harmonics. A scene with another up direction or an origin is turned and moved by its node's transform, in double, which
+keeps the bits of the splats; a file of ours is read back into the scene's own coordinates. splat-transform turns about
+z instead, so its files differ from ours by a half turn about y; they are recognised by their generator and turned back.
 
 Files of any program are read as the extension says: splats of all nodes of the scene, with the nodes' transforms, as
 float32 or the integers that the extension (and KHR_mesh_quantization for positions) allows, interleaved or not, and SPZ
@@ -31,10 +32,10 @@ import torch
 from jaxtyping import Float32
 
 from gsplat_edu.io import glb_reading
-from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
-from gsplat_edu.io.glb_container import EXTENSION, write_container
+from gsplat_edu.io.axes import half_turned, root_transform
+from gsplat_edu.io.glb_container import EXTENSION, GENERATOR, root_node, write_container
 from gsplat_edu.io.quantize import unit_quats
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.scene import Scene, extras
 from gsplat_edu.scene.gaussians import Gaussians
 
 POINTS, FLOAT, ARRAY_BUFFER = 0, 5126, 34962
@@ -87,14 +88,12 @@ def _attributes(gaussians: Gaussians) -> dict[str, Float32[np.ndarray, "N C"]]:
 
 def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]) -> dict[str, Any]:
     """Return the JSON: a scene of one node, one mesh, one primitive; a buffer view and an accessor per attribute."""
-    asset: dict[str, Any] = {"version": "2.0", "generator": "gsplat-edu"}
-    extras: dict[str, Any] = {}
+    asset: dict[str, Any] = {"version": "2.0", "generator": GENERATOR}
+    known = extras(scene.up, scene.unit, scene.origin)
     if scene.antialiased is not None:
-        extras["antialiased"] = scene.antialiased
-    if scene.up is not None:
-        extras["up"] = [sign * x + 0.0 for sign, x in zip(POSITION_SIGNS, scene.up, strict=True)]  # no -0.0
-    if extras:
-        asset["extras"] = extras
+        known["antialiased"] = scene.antialiased
+    if known:
+        asset["extras"] = known
     if not attributes:
         return {"asset": asset, "scene": 0, "scenes": [{"name": "empty"}]}
     accessors: list[dict[str, Any]] = []
@@ -123,7 +122,7 @@ def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, **root_node(*root_transform(scene.up, scene.origin))}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
@@ -32,6 +33,9 @@ FILE_HEADER = struct.Struct("<4sII")
 
 CHUNK_HEADER = struct.Struct("<I4s")
 """Length, kind."""
+
+GENERATOR = "gsplat-edu"
+"""Program named in the asset of our files."""
 
 LARGEST_FILE = (1 << 32) - 1
 """Largest file in bytes: its length is stored in 32 bits."""
@@ -68,6 +72,21 @@ def write_container(
             file.write(CHUNK_HEADER.pack(size, b"BIN\0"))
         for part in parts:
             file.write(part if isinstance(part, bytes) else part.tobytes())
+
+
+def root_node(turn: Float64[np.ndarray, "3 3"], shift: Float64[np.ndarray, "3"]) -> dict[str, list[float]]:
+    """Return the properties of a node that transforms what it holds: x' = R x + t; nothing for the identity.
+
+    Args:
+        turn: (3, 3) the rotation R.
+        shift: (3,) the translation t.
+    """
+    node = {}
+    if not np.array_equal(turn, np.eye(3)):
+        node["rotation"] = [float(number) for number in Rotation.from_matrix(turn).as_quat()]
+    if shift.any():
+        node["translation"] = [float(number) for number in shift]
+    return node
 
 
 def refuse(path: Path, fault: str) -> NoReturn:

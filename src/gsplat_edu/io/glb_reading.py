@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -14,10 +14,18 @@ from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io import spz
-from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
+from gsplat_edu.io.axes import POSITION_SIGNS, half_turned, root_transform
 from gsplat_edu.io.edit import Similarity, joined
-from gsplat_edu.io.glb_container import EXTENSION, SPZ_EXTENSION, container, node_matrices, refuse
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.glb_container import (
+    EXTENSION,
+    GENERATOR,
+    SPZ_EXTENSION,
+    container,
+    node_matrices,
+    refuse,
+)
+from gsplat_edu.io.scene import Scene, read_extras
+from gsplat_edu.scene.frame import ORIGIN, Vector, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 
 MOST_JSON = 1 << 24
@@ -58,6 +66,12 @@ OPAQUE = 2.0**-24
 
 KNOWN = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
 """Properties of the extension with the only values that are drawn here; one that is missing has this value."""
+
+SAME = 1e-12
+"""Transforms that differ by less, relative and absolute, are the same: a quaternion rounds its rotation."""
+
+SceneFrame = tuple[Vector | None, str | None, Vector]
+"""Up, unit and origin of a scene."""
 
 HALF_TURN_ABOUT_Y = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3))
 """A half turn about x, then this one, is a half turn about z."""
@@ -101,38 +115,44 @@ class _File:
         needed = self._document.get("extensionsRequired", [])
         if unknown := sorted({str(name) for name in needed} - SUPPORTED):
             self._refuse(f"needs the extension {', '.join(unknown)[:80]}, which is not supported")
-        antialiased, up = self._facts()
+        antialiased, frame = self._facts()
         placed = list(self._placed())
+        up, unit, origin = frame if self._is_ours(frame, placed) else (None, None, ORIGIN)
+        root = _matrix(up, origin)
         meshes = self._document.get("meshes", [])
         if not placed and (self._body or meshes):
             elsewhere = any(map(_is_splats, (p for mesh in meshes for p in mesh["primitives"])))
             where = "no node of its scene shows its splats" if elsewhere else f"no primitive with {EXTENSION}"
             self._refuse(f"has no splats: {where}")
-        parts = [self._moved(part) for part in placed]
+        parts = [self._moved(part, root) for part in placed]
         try:
             whole = joined(parts) if parts else Scene(_gaussians(self._path, {}))
         except ArgumentError as error:
             self._refuse(str(error).removeprefix("scenes: ").partition(";")[0])
         said = antialiased if antialiased is not None else whole.antialiased
-        found = Scene(half_turned(whole.gaussians), said, up)
+        if not any(origin):
+            origin = as_origin("origin", np.array(POSITION_SIGNS) * whole.origin + 0.0)
+        found = Scene(half_turned(whole.gaussians), said, up, unit, origin)
         by = self._document["asset"].get("generator")
         return HALF_TURN_ABOUT_Y.scene(found) if str(by).startswith(ABOUT_Z) else found
 
     def _refuse(self, fault: str) -> NoReturn:
         refuse(self._path, fault)
 
-    def _facts(self) -> tuple[bool | None, tuple[float, float, float] | None]:
-        """Return the metadata of our own files: whether to render antialiased, and up in this package's axes."""
+    def _facts(self) -> tuple[bool | None, SceneFrame]:
+        """Return the metadata of our own files: whether to render antialiased; up, unit and origin."""
         extras = self._document["asset"].get("extras", {})
-        antialiased, up = extras.get("antialiased"), extras.get("up")
+        antialiased = extras.get("antialiased")
         if antialiased not in (None, True, False):
             self._refuse(f"says antialiased is {antialiased!r}"[:80])
-        if up is not None:
-            x, y, z = (float(sign) * float(value) for sign, value in zip(POSITION_SIGNS, up, strict=True))
-            if not np.isfinite([x, y, z]).all() or not any((x, y, z)):
-                self._refuse("has an up that is not a direction")
-            up = (x, y, z)
-        return antialiased, up
+        return antialiased, read_extras(extras)
+
+    def _is_ours(self, frame: SceneFrame, placed: Sequence[Placed]) -> bool:
+        """Return whether the nodes still have the transform that we wrote for a frame."""
+        up, _, origin = frame
+        root = _matrix(up, origin)
+        ours = self._document["asset"].get("generator") == GENERATOR
+        return ours and all(np.allclose(part.matrix, root, rtol=SAME, atol=SAME) for part in placed)
 
     def _placed(self) -> Iterator[Placed]:
         """Yield the primitives of splats with their transforms; other primitives are ignored."""
@@ -147,8 +167,8 @@ class _File:
                 self._take(PRIMITIVE)
                 yield Placed(primitive, matrix)
 
-    def _moved(self, part: Placed) -> Scene:
-        """Return the splats of a primitive in glTF's world."""
+    def _moved(self, part: Placed, root: Float64[np.ndarray, "4 4"]) -> Scene:
+        """Return the splats of a primitive in glTF's world, or in the root's coordinates if it has its transform."""
         kind = part.primitive["extensions"][EXTENSION]
         for name, only in KNOWN.items():
             if (value := kind.get(name, only)) != only:
@@ -167,7 +187,7 @@ class _File:
             if _is_packed(kind)
             else self._plain(part.primitive)
         )
-        if np.array_equal(part.matrix, np.eye(4)):
+        if np.allclose(part.matrix, root, rtol=SAME, atol=SAME):
             return own
         moved = move.scene(own)
         if not all(bool(tensor.isfinite().all()) for tensor in moved.gaussians.tensors().values()):
@@ -240,6 +260,13 @@ class _File:
         if normalized:
             return np.maximum(values / np.float64(np.iinfo(dtype).max), -1.0).astype(np.float32)
         return values.astype(np.float32)
+
+
+def _matrix(up: Vector | None, origin: Vector) -> Float64[np.ndarray, "4 4"]:
+    """Return the transform of the root of a file of ours."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = root_transform(up, origin)
+    return matrix
 
 
 def _is_splats(primitive: Mapping[str, Any]) -> bool:

@@ -10,15 +10,11 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import of_type
 from gsplat_edu.io.mesh_parts import METRES, StoredMesh
+from gsplat_edu.scene.frame import Vector
 from gsplat_edu.scene.mesh import Mesh
-
-FLOAT32_STEPS = 1e-6
-"""A format with float32 loses precision if rounding moves a vertex by more than this share of the mesh's diagonal."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +28,6 @@ class MeshFormat:
         name: Its common name.
         texture: Whether it can store a texture.
         colors_with_texture: Whether it can store colours of vertices beside a texture.
-        doubles: Whether it stores coordinates as float64.
         jpeg: Whether it can store the texture as JPEG.
     """
 
@@ -42,7 +37,6 @@ class MeshFormat:
     name: str
     texture: bool = True
     colors_with_texture: bool = True
-    doubles: bool = True
     jpeg: bool = False
 
     def read(self, path: Path) -> StoredMesh:
@@ -60,12 +54,11 @@ MESH_FORMATS = (
         "mesh_glb",
         "binary glTF",
         colors_with_texture=False,
-        doubles=False,
         jpeg=True,
     ),
     MeshFormat(".ply", "mesh_ply", "mesh_ply", "PLY", texture=False),
     MeshFormat(".obj", "mesh_obj", "mesh_obj", "Wavefront OBJ"),
-    MeshFormat(".usdz", "", "mesh_usd", "USDZ", colors_with_texture=False, doubles=False, jpeg=True),
+    MeshFormat(".usdz", "", "mesh_usd", "USDZ", colors_with_texture=False, jpeg=True),
 )
 
 
@@ -85,13 +78,12 @@ def mesh_format_of(path: str | Path) -> MeshFormat:
     raise ArgumentError(f"{path}: unknown mesh format; known are {known}")
 
 
-def mesh_losses(path: str | Path, mesh: Mesh, unit: str | None = None) -> list[str]:
+def mesh_losses(path: str | Path, mesh: Mesh) -> list[str]:
     """List the parts of a mesh that the format of a path cannot store, one sentence each.
 
     Args:
         path: The file's name.
         mesh: The mesh.
-        unit: Unit of its coordinates, as for `write_mesh`.
 
     Raises:
         ArgumentError: the name has no suffix of a mesh format.
@@ -104,14 +96,6 @@ def mesh_losses(path: str | Path, mesh: Mesh, unit: str | None = None) -> list[s
         said.append(
             f"{path}: {found.name} would multiply the texture by the vertices' colours; they are dropped"
         )
-    if not found.doubles and len(mesh.vertices):
-        size = METRES.get(unit or "m", 1.0)
-        with np.errstate(over="ignore"):
-            moved = np.abs((size * mesh.vertices).astype(np.float32) - size * mesh.vertices).max()
-        diagonal = size * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-        if moved > FLOAT32_STEPS * diagonal:
-            kept = f"{moved:.2g} of {diagonal:.2g}"
-            said.append(f"{path}: {found.name} rounds coordinates to float32, by up to {kept}; write a .ply")
     return said
 
 
@@ -143,7 +127,13 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     return Mesh(mesh.vertices * factor, mesh.faces, mesh.colors, mesh.texture)
 
 
-def write_mesh(path: str | Path, mesh: Mesh, unit: str | None = None, jpeg: int | None = None) -> None:
+def write_mesh(
+    path: str | Path,
+    mesh: Mesh,
+    unit: str | None = None,
+    jpeg: int | None = None,
+    up: Vector | None = None,
+) -> None:
     """Write a mesh in the format that the file's name indicates; parent folders are created.
 
     An OBJ with a texture has two more files beside it, of the same name with .mtl and .png. The same mesh gives the
@@ -154,6 +144,7 @@ def write_mesh(path: str | Path, mesh: Mesh, unit: str | None = None, jpeg: int 
         mesh: The mesh, in this package's axes, with at least one face.
         unit: Unit of its coordinates, "m", "cm" or "mm"; None if unknown. glTF and USDZ get metres, others a comment.
         jpeg: Quality of the texture in a binary glTF or USDZ as JPEG, 1 to 95; None writes PNG, which loses nothing.
+        up: The scene's up direction, which a glTF or USDZ turns to y; None if unknown. Others keep the coordinates.
 
     Raises:
         ArgumentError: the name has no suffix of a mesh format, the mesh has no faces or does not fit into the format,
@@ -169,7 +160,7 @@ def write_mesh(path: str | Path, mesh: Mesh, unit: str | None = None, jpeg: int 
         raise ArgumentError(f"jpeg: is {jpeg}, but must be from 1 to 95")
     module = importlib.import_module(f"gsplat_edu.io.{found.writer}")
     if found.jpeg:
-        module.write(Path(path), mesh, unit, jpeg)
+        module.write(Path(path), mesh, unit, jpeg, up)
     else:
         module.write(Path(path), mesh, unit)
 

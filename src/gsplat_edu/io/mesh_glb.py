@@ -28,9 +28,10 @@ from jaxtyping import Float, Float32, Float64, Int64, UInt16
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.axes import POSITION_SIGNS
-from gsplat_edu.io.glb_container import write_container
+from gsplat_edu.io.glb_container import GENERATOR, root_node, write_container
 from gsplat_edu.io.mesh_image import encoded
-from gsplat_edu.io.mesh_parts import METRES, split_at_seams, turned_positions, vertex_normals
+from gsplat_edu.io.mesh_parts import METRES, Placement, split_at_seams, turned_positions, vertex_normals
+from gsplat_edu.scene.frame import Vector
 from gsplat_edu.scene.mesh import Mesh
 
 TRIANGLES, FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 4, 5126, 5123, 5125
@@ -41,9 +42,6 @@ ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 LINEAR, CLAMP_TO_EDGE = 9729, 33071
 """Filter and wrapping of a sampler."""
-
-GENERATOR = "gsplat-edu"
-"""Program named in the asset."""
 
 UNLIT = "KHR_materials_unlit"
 """Extension for materials that show their colour as it is."""
@@ -58,10 +56,11 @@ def linear(srgb: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
+def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None, up: Vector | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
     origin, faces, uvs = split_at_seams(mesh)
-    positions = turned_positions(path, mesh.vertices[origin], unit, "glTF")
+    placement = Placement.of(mesh.vertices, unit, up)
+    positions = turned_positions(path, mesh.vertices[origin], placement, "glTF")
     normals = vertex_normals(mesh)[origin] * np.array(POSITION_SIGNS) + 0.0
     file = _Document()
     attributes = {"POSITION": file.attribute(positions, bounds=True)}
@@ -81,13 +80,15 @@ def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
     primitive = {"attributes": attributes, "indices": file.indices(faces), "mode": TRIANGLES, "material": 0}
     if mesh.texture is not None:
         file.image(encoded(mesh.texture.image, jpeg), "image/png" if jpeg is None else "image/jpeg")
-    if unit is not None:
-        file.document["asset"]["extras"] = {"unit": "m"}
     file.document |= {"meshes": [{"primitives": [primitive]}], "materials": [material]}
+    file.document["nodes"] = [{"mesh": 0, **root_node(*placement.root)}]
+    file.place(placement)
     file.write(path, f"{len(mesh.faces):,} faces")
 
 
-def write_parts(path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str | None = None) -> None:
+def write_parts(
+    path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str | None = None, up: Vector | None = None
+) -> None:
     """Write several meshes as one binary glTF, a node for each; colours and textures are not written.
 
     The same meshes give the same bytes.
@@ -96,6 +97,7 @@ def write_parts(path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str |
         path: Output file; parent folders are created.
         parts: Name and mesh of each node, at least one, each with at least one face.
         unit: Unit of the coordinates, "m", "cm" or "mm", which become metres; None if unknown.
+        up: Up direction of the scene, which becomes y; None if unknown.
 
     Raises:
         ArgumentError: there are no parts, one has no faces or a coordinate beyond float32, or the unit is unknown.
@@ -109,16 +111,16 @@ def write_parts(path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str |
     file = _Document()
     meshes: list[dict[str, Any]] = []
     nodes: list[dict[str, Any]] = []
+    placement = Placement.of(np.concatenate([mesh.vertices for _, mesh in parts]), unit, up)
     for name, mesh in parts:
         attributes = {
-            "POSITION": file.attribute(turned_positions(path, mesh.vertices, unit, "glTF"), bounds=True)
+            "POSITION": file.attribute(turned_positions(path, mesh.vertices, placement, "glTF"), bounds=True)
         }
         primitive = {"attributes": attributes, "indices": file.indices(mesh.faces), "mode": TRIANGLES}
-        nodes.append({"name": name, "mesh": len(meshes)})
+        nodes.append({"name": name, "mesh": len(meshes), **root_node(*placement.root)})
         meshes.append({"name": name, "primitives": [primitive]})
     file.document |= {"meshes": meshes, "nodes": nodes, "scenes": [{"nodes": list(range(len(nodes)))}]}
-    if unit is not None:
-        file.document["asset"]["extras"] = {"unit": "m"}
+    file.place(placement)
     file.write(path, f"{len(parts):,} parts")
 
 
@@ -137,7 +139,6 @@ class _Document:
             "asset": {"version": "2.0", "generator": GENERATOR},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
             "accessors": [],
             "bufferViews": [],
         }
@@ -179,6 +180,14 @@ class _Document:
         sampler = {"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
         self.document["samplers"] = [sampler]
         self.document["textures"] = [{"source": 0, "sampler": 0}]
+
+    def place(self, placement: Placement) -> None:
+        """State unit and up direction, by which `mesh_glb_reading` finds the mesh's own coordinates again."""
+        known: dict[str, Any] = {} if placement.unit is None else {"unit": "m"}
+        if placement.up is not None:
+            known["up"] = list(placement.up)
+        if known:
+            self.document["asset"]["extras"] = known
 
     def write(self, path: Path, content: str) -> None:
         """Write the file."""

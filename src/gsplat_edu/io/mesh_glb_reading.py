@@ -11,11 +11,13 @@ from jaxtyping import Float, Float32, Float64, Int64
 
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE, read_bytes
-from gsplat_edu.io.axes import POSITION_SIGNS
-from gsplat_edu.io.glb_container import container, node_matrix, refuse
-from gsplat_edu.io.mesh_glb import GENERATOR, TRIANGLES, UNLIT
+from gsplat_edu.io.axes import POSITION_SIGNS, root_transform
+from gsplat_edu.io.glb_container import GENERATOR, container, node_matrix, refuse
+from gsplat_edu.io.mesh_glb import TRIANGLES, UNLIT
 from gsplat_edu.io.mesh_image import decoded
-from gsplat_edu.io.mesh_parts import METRES, Polygons, StoredMesh, check_vertices, distinct_rows, triangles_in
+from gsplat_edu.io.mesh_parts import Polygons, StoredMesh, check_vertices, distinct_rows, triangles_in
+from gsplat_edu.io.scene import read_extras
+from gsplat_edu.scene.frame import ORIGIN, Vector
 from gsplat_edu.scene.mesh import Mesh, Texture
 
 MOST_JSON = 1 << 24
@@ -65,13 +67,16 @@ def read(path: Path) -> StoredMesh:
         refuse(path, f"needs the extension {names[:80]}, which is not supported")
     try:
         parts = list(_File(path, document, body).parts())
-        unit = _unit(document["asset"])
+        unit, up = _frame(document["asset"])
     except MISREAD:
         refuse(path, "its JSON does not describe meshes as glTF does")
     if not parts:
         refuse(path, "has no mesh of triangles")
     starts = np.cumsum([0, *(len(part.points) for part in parts)])
-    points = np.concatenate([part.points for part in parts]) * np.array(POSITION_SIGNS) + 0.0
+    points = np.concatenate([part.points for part in parts])
+    if up is not None:  # the root turned up to y; the mesh gets its own coordinates back
+        points = points @ root_transform(up, ORIGIN)[0]
+    points = points * np.array(POSITION_SIGNS) + 0.0
     check_vertices(path, points, lambda row: f"vertex {row}")
     corners = np.concatenate([part.corners + start for part, start in zip(parts, starts[:-1], strict=True)])
     polygons = Polygons(np.full(len(corners) // 3, 3), corners, lambda row: f"triangle {row}")
@@ -83,12 +88,12 @@ def read(path: Path) -> StoredMesh:
     return StoredMesh(Mesh(points[kept], merged[faces], colors, texture), unit)
 
 
-def _unit(asset: dict[str, Any]) -> str | None:
-    """Return the unit: metres, except for our files of scenes whose unit is unknown."""
+def _frame(asset: dict[str, Any]) -> tuple[str | None, Vector | None]:
+    """Return the unit and the scene's up direction: metres and None, except for our files."""
     if asset.get("generator") != GENERATOR:
-        return "m"
-    unit = asset.get("extras", {}).get("unit")
-    return unit if unit in METRES else None
+        return "m", None
+    up, unit, _ = read_extras(asset.get("extras"))
+    return unit, up
 
 
 def _merged(points: Float64[np.ndarray, "N 3"]) -> tuple[Int64[np.ndarray, " V"], Int64[np.ndarray, " N"]]:

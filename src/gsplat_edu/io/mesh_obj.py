@@ -36,7 +36,8 @@ from gsplat_edu.io.mesh_parts import (
     refuse,
     triangles_in,
 )
-from gsplat_edu.io.ply_comments import OURS, UNITS
+from gsplat_edu.io.ply_comments import OURS
+from gsplat_edu.scene.frame import UNITS
 from gsplat_edu.scene.mesh import Mesh, Texture
 
 MATERIAL = "textured"

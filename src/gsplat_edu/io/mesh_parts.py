@@ -13,7 +13,8 @@ from jaxtyping import Float32, Float64, Int64
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE
-from gsplat_edu.io.axes import POSITION_SIGNS
+from gsplat_edu.io.axes import POSITION_SIGNS, root_transform
+from gsplat_edu.scene.frame import Vector, as_origin, origin_of
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.polygons import triangles_of
 
@@ -27,7 +28,7 @@ TRIANGLE_BYTES = 200
 """Peak memory for each corner of a polygon while it is cut."""
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Metres in one unit of a scene's coordinates; the keys are `ply_comments.UNITS`."""
+"""Metres in one unit of a scene's coordinates; the keys are `gsplat_edu.scene.frame.UNITS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,21 +210,53 @@ def split_at_seams(
     return corners[first], group.reshape(-1, 3), uvs[first]
 
 
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where a y-up file shows a mesh: in metres if its unit is known, with its up direction as y.
+
+    Args:
+        unit: Unit of the mesh's coordinates, "m", "cm" or "mm"; None if unknown, which leaves their size.
+        up: Its up direction, in this package's axes; None if unknown, which turns nothing.
+        origin: Subtracted from its vertices, in double, so that float32 resolves them.
+    """
+
+    unit: str | None
+    up: Vector | None
+    origin: Vector
+
+    @classmethod
+    def of(cls, vertices: Float64[np.ndarray, "V 3"], unit: str | None, up: Vector | None) -> Placement:
+        """Return the placement of vertices; their origin is `gsplat_edu.scene.frame.origin_of`."""
+        return cls(unit, up, as_origin("vertices", origin_of(vertices)))
+
+    @property
+    def metres(self) -> float:
+        """Metres in one unit of the coordinates; 1 if the unit is unknown."""
+        return METRES.get(self.unit or "m", 1.0)
+
+    @property
+    def root(self) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+        """Rotation and translation of the file's root, in its axes and its unit."""
+        turn, shift = root_transform(self.up, self.origin)
+        return turn, self.metres * shift
+
+
 def turned_positions(
-    path: Path, vertices: Float64[np.ndarray, "V 3"], unit: str | None, named: str
+    path: Path, vertices: Float64[np.ndarray, "V 3"], placement: Placement, named: str
 ) -> Float32[np.ndarray, "V 3"]:
-    """Return positions whose y points up, in metres if the unit is known.
+    """Return positions in y-up axes, relative to the root of the file.
 
     Args:
         path: The file to write, for messages.
         vertices: (V, 3) coordinates in this package's axes.
-        unit: Their unit, "m", "cm" or "mm"; None if unknown, which leaves their size.
+        placement: Where the file shows them.
         named: The format's name, for messages.
 
     Raises:
         ArgumentError: a coordinate is beyond float32.
     """
-    turned = vertices * np.array(POSITION_SIGNS) * METRES.get(unit or "m", 1.0) + 0.0  # no -0.0
+    near = vertices - np.array(placement.origin)
+    turned = near * np.array(POSITION_SIGNS) * placement.metres + 0.0  # no -0.0
     with np.errstate(over="ignore"):
         positions: Float32[np.ndarray, "V 3"] = turned.astype("<f4")
     if not np.isfinite(positions).all():

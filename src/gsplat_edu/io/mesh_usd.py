@@ -3,7 +3,8 @@
 A USDZ is a ZIP archive without compression, whose files begin at multiples of 64 bytes, so that programs map them into
 memory. The first file, a binary layer of USD (usd-core writes it), holds the mesh, and a texture lies beside it. The
 layer's axes and unit are those of glTF (`gsplat_edu.io.mesh_glb`): y points up, and a known unit becomes the metre.
-Points are float32, which is all that a mesh of USD has.
+Points are float32, which is all that a mesh of USD has; the transform of the root, in double, turns the scene's up
+direction to y and moves the mesh to its origin.
 
 Colours of vertices are linear in USD (displayColor), and left out beside a texture, as in glTF. A texture stays sRGB,
 as the diffuse colour of a UsdPreviewSurface. USD has no unlit material, so a viewer adds its own light to the photos'.
@@ -28,7 +29,8 @@ from gsplat_edu.base.text import install_command
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.mesh_glb import linear
 from gsplat_edu.io.mesh_image import encoded
-from gsplat_edu.io.mesh_parts import turned_positions, vertex_normals
+from gsplat_edu.io.mesh_parts import Placement, turned_positions, vertex_normals
+from gsplat_edu.scene.frame import Vector
 from gsplat_edu.scene.mesh import Mesh
 
 LAYER = "mesh.usdc"
@@ -66,14 +68,14 @@ def require_usd() -> None:
         ) from None
 
 
-def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None) -> None:
+def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None, up: Vector | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
     require_usd()
     files, image = [], ""
     if mesh.texture is not None:
         image = "texture.png" if jpeg is None else "texture.jpg"
         files.append((image, encoded(mesh.texture.image, jpeg)))
-    files.insert(0, (LAYER, _layer(path, mesh, unit, image)))
+    files.insert(0, (LAYER, _layer(path, mesh, Placement.of(mesh.vertices, unit, up), image)))
     size = sum(len(data) + 4 * ALIGNMENT for _, data in files)
     if size > LARGEST:
         raise ArgumentError(f"{path}: {len(mesh.faces):,} faces do not fit into USDZ's 4 GiB; write a .ply")
@@ -95,16 +97,21 @@ def _pack(path: Path, files: list[tuple[str, bytes]]) -> None:
             offset += zeros + len(data)
 
 
-def _layer(path: Path, mesh: Mesh, unit: str | None, image: str) -> bytes:
+def _layer(path: Path, mesh: Mesh, placement: Placement, image: str) -> bytes:
     """Return the layer; `image` is the name of the texture in the package, empty without one."""
-    from pxr import Usd, UsdGeom, Vt
+    from pxr import Gf, Usd, UsdGeom, Vt
 
-    points = turned_positions(path, mesh.vertices, unit, "USD")
+    points = turned_positions(path, mesh.vertices, placement, "USD")
     stage = Usd.Stage.CreateInMemory(LAYER)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     root = UsdGeom.Xform.Define(stage, "/scene")
     stage.SetDefaultPrim(root.GetPrim())
+    turn, shift = placement.root
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[3, :3] = turn.T, shift  # USD multiplies rows
+    if not np.array_equal(matrix, np.eye(4)):
+        root.AddTransformOp().Set(Gf.Matrix4d(matrix.tolist()))
     surface = UsdGeom.Mesh.Define(stage, "/scene/surface")
     surface.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     surface.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))

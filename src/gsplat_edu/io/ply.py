@@ -9,7 +9,9 @@ An infinite logit means an opacity of 0 or 1. SuperSplat's packed files are also
 filter of Mip-Splatting is applied (`FILTERS`), those of other kinds of splats are refused (`OTHER_KINDS`), and the rest
 is ignored, as are other elements.
 
-Metadata without a property is stored in comments: see `gsplat_edu.io.ply_comments`.
+Metadata without a property is stored in comments: see `gsplat_edu.io.ply_comments`. One of them is the scene's
+origin, to which the coordinates are relative. A file of another program has no origin: coordinates that float32 would
+blur, such as doubles on a map, are split into an origin and the rest before they are rounded.
 
 Source: the point_cloud.ply of Kerbl et al. 2023's code; Turk 1994, "The PLY Polygon File Format"; Yu et al. 2024,
 "Mip-Splatting", eq. 8.
@@ -20,6 +22,7 @@ Chapter: 07_a_trained_scene.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +34,11 @@ from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.ply_table import BLOCK, Element, read_blocks, read_elements
 from gsplat_edu.base.reading import open_file
-from gsplat_edu.base.validation import ArrayLike, float64_array
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.io import compressed_ply
 from gsplat_edu.io.ply_comments import comments, read_comments
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.scene import Scene, split_origin
+from gsplat_edu.scene.frame import ORIGIN, Vector, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 
 MEANS = ("x", "y", "z")
@@ -51,41 +55,49 @@ FILTERS = ("filter_3D", "filter_3d")
 such as Gaussian Opacity Fields, write scales and opacities without it and apply it when they render."""
 
 OTHER_KINDS = {
-    "trbf_": "move and fade in time (Spacetime Gaussians)",
-    "motion_": "move in time",
-    "omega_": "turn in time",
+    "trbf_*": "move and fade in time (Spacetime Gaussians)",
+    "motion_*": "move in time",
+    "omega_*": "turn in time",
     "shape": "have an exponent of their own (GES)",
     "beta": "have another kernel (Deformable Beta Splatting)",
-    "sb_params_": "have lobes of colour beside harmonics (Deformable Beta Splatting)",
-    "sg_axis_": "have lobes of colour beside harmonics (spherical Gaussians)",
-    "f_offset_": "are anchors of a neural scene (Scaffold-GS)",
+    "sb_params_*": "have lobes of colour beside harmonics (Deformable Beta Splatting)",
+    "sg_axis_*": "have lobes of colour beside harmonics (spherical Gaussians)",
+    "f_offset_*": "are anchors of a neural scene (Scaffold-GS)",
 }
-"""Properties, by the beginnings of their names, of splats that are no 3D Gaussians with harmonics: drawn as those, they
-would show another picture."""
-
-ORIGIN = (0.0, 0.0, 0.0)
+"""Properties, by patterns of their names, of splats that are no 3D Gaussians with harmonics: drawn as those, they would
+show another picture."""
 
 LARGEST_LOGIT = 100.0
 """Replacement for an infinite logit: opacity 1 (or 0) in float32. Programs with 8-bit opacities write infinity."""
 
 
 def read(path: Path, finite: bool = True) -> Scene:
-    """Read a scene PLY and the metadata in its comments; see `load_ply`.
+    """Read a scene PLY and the metadata in its comments.
 
     Args:
         path: The file.
         finite: Reject NaN and infinite values.
+
+    Returns:
+        N Gaussians, raw parameters, float32, of the file's SH degree, and their origin. What `write` wrote is restored
+        to the bit.
+
+    Raises:
+        SceneFormatError: not a scene PLY, or damaged: truncated, or with NaN or infinity (except for logits).
+        OSError: the file cannot be read.
     """
     with open_file(path) as file:
         header = read_elements(path, file)
     if any("packed_position" in element.names for element in header.elements):
         return compressed_ply.read(path)
-    return Scene(_load(path, ORIGIN, finite), *read_comments(path, header.comments))
+    antialiased, up, unit, origin = read_comments(path, header.comments)
+    gaussians, found = _load(path, finite, origin)
+    return Scene(gaussians, antialiased, up, unit, found)
 
 
 def write(path: Path, scene: Scene) -> None:
     """Write a scene PLY with its metadata in comments; see `save_ply`."""
-    _write(path, scene.gaussians, ORIGIN, comments(scene))
+    _write(path, scene.gaussians, comments(scene))
 
 
 def save_ply(
@@ -96,7 +108,7 @@ def save_ply(
     Args:
         path: Output file; parent folders are created.
         gaussians: N Gaussians, raw parameters; written as float32.
-        origin: (3,) added to the means in float64: the position of the scene's origin in the capture's coordinates.
+        origin: (3,) position of the means' zero in the capture's coordinates; stored in a comment if it is not zero.
         antialiased: Whether the Gaussians were trained for antialiased rendering, stored in a comment; None stores
             nothing.
 
@@ -106,11 +118,10 @@ def save_ply(
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     gaussians.check_finite()
-    _write(Path(path), gaussians, origin, comments(Scene(gaussians, antialiased)))
+    write(Path(path), Scene(gaussians, antialiased, origin=as_origin("origin", origin)))
 
 
-def _write(path: Path, gaussians: Gaussians, origin: ArrayLike, extra: list[str]) -> None:
-    shift = float64_array("origin", origin, (3,))
+def _write(path: Path, gaussians: Gaussians, extra: list[str]) -> None:
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
     names = [*MEANS, "nx", "ny", "nz", *SH0, *_rest_names(3 * tensors["sh_rest"].shape[1])]
@@ -121,19 +132,14 @@ def _write(path: Path, gaussians: Gaussians, origin: ArrayLike, extra: list[str]
         file.write("\n".join(header).encode("ascii"))
         for start in range(0, count, BLOCK):
             rows = {name: values[start : start + BLOCK] for name, values in tensors.items()}
-            file.write(_table(rows, shift).data)
+            file.write(_table(rows).data)
 
 
-def _table(
-    tensors: Mapping[str, Float[np.ndarray, "N ..."]], shift: Float64[np.ndarray, "3"]
-) -> Float32[np.ndarray, "N P"]:
+def _table(tensors: Mapping[str, Float[np.ndarray, "N ..."]]) -> Float32[np.ndarray, "N P"]:
     """Return the rows of the file for some Gaussians."""
-    means = tensors["means"]
-    if shift.any():  # skip zero, because -0.0 + 0.0 is 0.0
-        means = means.astype(np.float64) + shift
     columns = (
-        means,
-        np.zeros((len(means), 3)),  # normals
+        tensors["means"],
+        np.zeros((len(tensors["means"]), 3)),  # normals
         tensors["sh0"][:, 0],
         np.concatenate(np.moveaxis(tensors["sh_rest"], 2, 0), axis=1),  # channel-major
         tensors["logit_opacities"][:, None],
@@ -143,27 +149,13 @@ def _table(
     return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
 
 
-def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
-    """Read a scene PLY.
-
-    Args:
-        path: The file.
-        origin: (3,) subtracted from the means in float64; the value given to `save_ply`.
-
-    Returns:
-        N Gaussians, raw parameters, float32, of the file's SH degree. With an origin of zero, the result of `save_ply`
-        is restored to the bit.
-
-    Raises:
-        SceneFormatError: not a scene PLY, or damaged: truncated, or with NaN or infinity (except for logits).
-        ShapeError: the origin is not of shape (3,).
-        OSError: the file cannot be read.
-    """
-    return _load(Path(path), origin, finite=True)
+def load_ply(path: str | Path) -> Gaussians:
+    """Read the Gaussians of a scene PLY, relative to its origin, which `read` returns with them; see there."""
+    return read(Path(path)).gaussians
 
 
-def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
-    shift = float64_array("origin", origin, (3,))
+def _load(path: Path, finite: bool, origin: Vector | None) -> tuple[Gaussians, Vector]:
+    """Return the Gaussians and their origin: that of a comment, or else the one that the positions need."""
     with open_file(path) as file:
         header = read_elements(path, file)
         vertex = _splat_vertex(path, header.elements)
@@ -172,6 +164,8 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
         groups = (MEANS, SH0, _rest_names(rest), OPACITY, SCALES, QUATS, filters)
         columns = [name for group in groups for name in group]
         found, start, spoiled = None, 0, _Spoiled(path, columns)
+        kinds = dict(vertex.properties)
+        wide = any(kinds[name] != "f4" for name in MEANS)
         for table in read_blocks(path, file, header, vertex):
             values = _floats(table, columns)
             opacity = values[:, columns.index(OPACITY[0])]
@@ -180,20 +174,23 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
                 spoiled.look(values, start)
             if found is None:  # after the rows have been found to fit into the file and into memory
                 found = _empty(vertex.count, rest // 3)
+                positions = np.empty((vertex.count, 3), np.float64) if wide else found["means"]
             ends = np.cumsum([len(group) for group in groups])[:-1]
             means, sh0, sh_rest, opacity, scales, quats, widths = np.split(values, ends, axis=1)
             for k in range(len(filters)):
                 _apply_filter(scales, opacity[:, 0], widths[:, k].astype(np.float64))
-            if shift.any():
-                means = (means.astype(np.float64) - shift).astype(np.float32)
             rows = slice(start, start + len(values))
-            found["means"][rows], found["quats"][rows], found["log_scales"][rows] = means, quats, scales
+            positions[rows] = structured_to_unstructured(table[[*MEANS]], np.float64) if wide else means
+            found["quats"][rows], found["log_scales"][rows] = quats, scales
             found["sh0"][rows, 0], found["logit_opacities"][rows] = sh0, opacity[:, 0]
             found["sh_rest"][rows] = np.moveaxis(sh_rest.reshape(len(values), 3, rest // 3), 1, 2)
             start += len(values)
     spoiled.check()
     assert found is not None  # there is at least one block, which may be empty
-    return Gaussians(**{name: torch.from_numpy(values) for name, values in found.items()})
+    if origin is None:
+        positions, origin = split_origin(positions)
+    found["means"] = positions.astype(np.float32, copy=False)
+    return Gaussians(**{name: torch.from_numpy(values) for name, values in found.items()}), origin
 
 
 def _apply_filter(
@@ -248,12 +245,8 @@ def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
     vertex = by_name.get("vertex")
     if vertex is None:
         raise SceneFormatError(f"{path}: is a PLY without vertices, not a splat scene; give a scene PLY")
-    if "packed_position" in vertex.names:
-        raise SceneFormatError(
-            f"{path}: is a compressed splat PLY (packed_position ...); export it as an uncompressed PLY"
-        )
     for name in vertex.names:
-        if kind := next((kind for start, kind in OTHER_KINDS.items() if name.startswith(start)), None):
+        if kind := next((kind for pattern, kind in OTHER_KINDS.items() if fnmatchcase(name, pattern)), None):
             raise SceneFormatError(
                 f"{path}: its splats {kind}: property {name}; export them as 3D Gaussians with harmonics"
             )

@@ -4,6 +4,9 @@
     comment antialiased 1
     comment gsplat_edu up 0.0 -1.0 0.0
     comment gsplat_edu unit m
+    comment gsplat_edu origin 500000.0 4649776.0 120.0
+
+The origin has to be added, in double, to the coordinates of the vertices; other readers see the scene near zero.
 
 Each line is written if its value is known. There is no standard spelling for antialiasing: Brush writes and reads the
 first line ("default" without antialiasing), Postshot writes the second, PlayCanvas' splat-transform reads both since
@@ -13,18 +16,15 @@ one wins, as in Brush and splat-transform.
 
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 
-from gsplat_edu.base.errors import SceneFormatError
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.io.scene import Scene, direction
+from gsplat_edu.scene.frame import ORIGIN, UNITS, Vector, as_origin
 
 OURS = "gsplat_edu"
 """First word of comments that are specific to this package."""
-
-UNITS = ("m", "cm", "mm")
-"""Units that a scene's coordinates may have."""
 
 RENDER_MODES = {"mip": True, "default": False}
 """Brush's render modes, and whether each uses antialiasing."""
@@ -43,13 +43,15 @@ def comments(scene: Scene) -> list[str]:
         lines.append(f"comment {OURS} up {' '.join(repr(float(x)) for x in scene.up)}")
     if scene.unit is not None:
         lines.append(f"comment {OURS} unit {scene.unit}")
+    if scene.origin != ORIGIN:
+        lines.append(f"comment {OURS} origin {' '.join(repr(float(x)) for x in scene.origin)}")
     return lines
 
 
 def read_comments(
     path: Path, said: tuple[tuple[str, ...], ...]
-) -> tuple[bool | None, tuple[float, float, float] | None, str | None]:
-    """Parse the comments of a header: whether the scene is antialiased, its up direction, and its unit.
+) -> tuple[bool | None, Vector | None, str | None, Vector | None]:
+    """Parse the comments of a header: whether the scene is antialiased, its up direction, its unit, and its origin.
 
     Args:
         path: The file, for messages.
@@ -58,26 +60,31 @@ def read_comments(
     Raises:
         SceneFormatError: one of our comments is malformed.
     """
-    antialiased, up, unit = None, None, None
+    antialiased, up, unit, origin = None, None, None, None
     for words in said:
         if found := ANTIALIASED.fullmatch(" ".join(words).lower()):
             mode, number = found.groups()
             antialiased = RENDER_MODES[mode] if mode else number == "1"
         elif words[:2] == (OURS, "up"):
-            up = _direction(list(words[2:]))
+            up = direction(_numbers(words[2:]))
             if up is None:
-                raise SceneFormatError(
-                    f"{path}: comment {' '.join(words)[:60]!r} is not a direction; correct or remove it"
-                )
+                raise _malformed(path, words, "a direction")
+        elif words[:2] == (OURS, "origin"):
+            try:
+                origin = as_origin("origin", _numbers(words[2:]) or ())
+            except ArgumentError:
+                raise _malformed(path, words, "an origin") from None
         elif words[:2] == (OURS, "unit") and len(words) == 3 and words[2] in UNITS:
             unit = words[2]
-    return antialiased, up, unit
+    return antialiased, up, unit, origin
 
 
-def _direction(numbers: list[str]) -> tuple[float, float, float] | None:
+def _numbers(words: tuple[str, ...]) -> list[float] | None:
     try:
-        x, y, z = (float(number) for number in numbers)
+        return [float(word) for word in words]
     except ValueError:
         return None
-    length = math.hypot(x, y, z)
-    return (x / length, y / length, z / length) if 0.0 < length < math.inf else None
+
+
+def _malformed(path: Path, words: tuple[str, ...], what: str) -> SceneFormatError:
+    return SceneFormatError(f"{path}: comment {' '.join(words)[:60]!r} is not {what}; correct or remove it")

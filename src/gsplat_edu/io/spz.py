@@ -10,9 +10,13 @@ The writer uses the full precision of the format. Positions get the largest numb
 scene, up to 24; other programs always use 12. Coefficients of the higher degrees use all 8 bits; other programs round
 them to 5 and 4 by default. On a trained scene that rounding lowers the PSNR against the original from 56 dB to 40 dB,
 and the file from 49 to 29 bytes per splat: fidelity is preferred here. Scenes beyond +-8,388,607 units are rejected.
-Scales are clamped to e^-10 to e^5.94, the coefficient of degree 0 to +-3.33, the others to -1 to 0.992. The up
-direction is not stored: it is y by definition. The antialiasing flag is always stored, so an unknown value reads back
-as false. Degree 4 of the harmonics is dropped on reading.
+Scales are clamped to e^-10 to e^5.94, the coefficient of degree 0 to +-3.33, the others to -1 to 0.992. The
+antialiasing flag is always stored, so an unknown value reads back as false. Degree 4 of the harmonics is dropped on
+reading.
+
+An origin, a unit and an up direction other than y are stored in an extension of our own, whose content is the JSON of
+`gsplat_edu.io.scene.extras`; other programs skip extensions that they do not know, and show the scene near zero.
+Without it, up is y by definition.
 
 Axes are right, up, back; `gsplat_edu.io.axes.half_turned` converts them to ours. An extension may name other axes; of
 these, ours are supported and the rest are rejected.
@@ -25,9 +29,10 @@ Source: load-spz.cc, the README and extensions/README of Niantic's spz library.
 from __future__ import annotations
 
 import gzip
+import json
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,11 +43,11 @@ from jaxtyping import Float, UInt8
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.reading import read_bytes
+from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.io import spz_values as values
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.quantize import SMALL, byte_to_logit, check_expansion, logit_to_byte
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.scene import Scene, extras, read_extras
 from gsplat_edu.scene.camera import WORLD_UP
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -56,6 +61,9 @@ HEADER = struct.Struct("<4sIIBBBx")
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 """The same, then number of streams and offset of the table of contents."""
 
+RECORD = struct.Struct("<II")
+"""Kind and length of an extension's content, which follows."""
+
 TABLE_ROW = struct.Struct("<QQ")
 """Compressed and uncompressed size of a stream."""
 
@@ -64,6 +72,9 @@ ANTIALIASED, EXTENDED, LEVELS_OF_DETAIL = 0x01, 0x02, 0x80
 
 COORDINATES = 0xADBE0003
 """Extension that specifies the axes."""
+
+FRAME = 0x67730001
+"""Our extension, with the scene's up, unit and origin."""
 
 RIGHT_UP_BACK, RIGHT_DOWN_FORWARD = 4, 6
 """Axes by their number in that extension; 0 means unspecified."""
@@ -139,10 +150,14 @@ def unpacked(path: Path, data: bytes) -> Scene:
             streams, records = _read_streams(path, header, data)
         else:
             streams, records = _planes(path, header, memoryview(data)[HEADER.size :])
-    gaussians = _decoded(header, streams)
-    if _axes(path, records) != RIGHT_DOWN_FORWARD:
+    gaussians, extensions = _decoded(header, streams), dict(_extensions(records))
+    if _axes(path, extensions) != RIGHT_DOWN_FORWARD:
         gaussians = half_turned(gaussians)
-    return Scene(gaussians, antialiased=bool(header.flags & ANTIALIASED), up=WORLD_UP)
+    try:
+        up, unit, origin = read_extras(parse_json(extensions.get(FRAME, b"{}")))
+    except ValueError:
+        raise _damaged(path, "its extension with the origin cannot be read") from None
+    return Scene(gaussians, bool(header.flags & ANTIALIASED), up or WORLD_UP, unit, origin)
 
 
 def _read_header(path: Path, data: bytes) -> _Header:
@@ -245,19 +260,27 @@ def _unpacked(path: Path, name: str, packed: memoryview, size: int) -> bytes:
     raise _damaged(path, f"its {name} cannot be unpacked")
 
 
-def _axes(path: Path, records: memoryview) -> int:
-    """Return the axes named by the extension records; the format's own axes if they name none."""
+def _extensions(records: memoryview) -> Iterator[tuple[int, bytes]]:
+    """Yield the kind and the content of each extension record."""
     at = 0
-    while at + 12 <= len(records):
-        kind, length, axes = struct.unpack_from("<III", records, at)
-        if kind == COORDINATES:
-            if axes not in (0, RIGHT_UP_BACK, RIGHT_DOWN_FORWARD):
-                raise SceneFormatError(
-                    f"{path}: its axes (number {axes} in the axes extension) are not supported; export it without"
-                )
-            return int(axes)
-        at += 8 + length
-    return RIGHT_UP_BACK
+    while at + RECORD.size <= len(records):
+        kind, length = RECORD.unpack_from(records, at)
+        at += RECORD.size
+        yield kind, bytes(records[at : at + length])
+        at += length
+
+
+def _axes(path: Path, extensions: Mapping[int, bytes]) -> int:
+    """Return the axes named by the extensions; the format's own axes if they name none."""
+    content = extensions.get(COORDINATES, b"")
+    if len(content) < 4:
+        return RIGHT_UP_BACK
+    axes = int.from_bytes(content[:4], "little")
+    if axes not in (0, RIGHT_UP_BACK, RIGHT_DOWN_FORWARD):
+        raise SceneFormatError(
+            f"{path}: its axes (number {axes} in the axes extension) are not supported; export it without"
+        )
+    return axes
 
 
 def _decoded(header: _Header, streams: Streams) -> Gaussians:
@@ -292,11 +315,23 @@ def write(path: Path, scene: Scene) -> None:
     bits, streams = _encoded(scene.gaussians, values.write_smallest_three)
     contents = [stream.tobytes() for stream in streams if stream.size]
     packed = [zstandard.ZstdCompressor(level=LEVEL).compress(content) for content in contents]
-    flags = ANTIALIASED if scene.antialiased else 0
-    header = HEADER_4.pack(MAGIC, 4, len(scene.gaussians), degree, bits, flags, len(packed), HEADER_4.size)
+    records = _frame_record(scene)
+    flags = (ANTIALIASED if scene.antialiased else 0) | (EXTENDED if records else 0)
+    start = HEADER_4.size + len(records)
+    header = HEADER_4.pack(MAGIC, 4, len(scene.gaussians), degree, bits, flags, len(packed), start)
     table = [TABLE_ROW.pack(len(a), len(b)) for a, b in zip(packed, contents, strict=True)]
     with written_aside(path) as aside:
-        aside.write_bytes(b"".join([header, *table, *packed]))
+        aside.write_bytes(b"".join([header, records, *table, *packed]))
+
+
+def _frame_record(scene: Scene) -> bytes:
+    """Return the extension with the scene's frame; nothing if the frame is that of the format."""
+    found = extras(None if scene.up == WORLD_UP else scene.up, scene.unit, scene.origin)
+    if not found:
+        return b""
+    content = json.dumps(found, separators=(",", ":"), sort_keys=True).encode("ascii")
+    content += b" " * (-len(content) % 8)
+    return RECORD.pack(FRAME, len(content)) + content
 
 
 def packed_version_2(scene: Scene) -> bytes:

@@ -24,7 +24,8 @@ from gsplat_edu.runs.dataset import appearance_of, run_dataset
 from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
-from gsplat_edu.runs.source import NamedCamera, Source, open_source, relative_to, run_of, scene_up
+from gsplat_edu.runs.source import NamedCamera, Source, capture_up, open_source, run_of
+from gsplat_edu.scene.frame import as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 
 SIGNALS = {
@@ -77,7 +78,7 @@ def open_subject(path: Path, dataset: Path | None, backend: Backend) -> Subject:
     if run is None:
         assert dataset is not None
         capture = load_dataset(dataset)
-        gaussians = relative_to(source.scene.gaussians, capture.origin)
+        gaussians = source.scene.relative_to(capture.origin)
     else:
         capture = run_dataset(run.read_config(), dataset)
         if found := capture_difference(run, capture):
@@ -86,13 +87,11 @@ def open_subject(path: Path, dataset: Path | None, backend: Backend) -> Subject:
         appearance = appearance_of(run.read_config())
         capture = _at_exposure(capture, gaussians, source.settings, appearance, backend)
     cameras = _cameras(capture)
-    up = source.scene.up or scene_up([camera for _, camera in cameras])
-    x, y, z = capture.origin.tolist()
+    up = source.scene.up or capture_up(capture)
     held_out = frozenset(view.name for view in capture.test)
-    scene = replace(source.scene, gaussians=gaussians, up=up)
-    return Subject(
-        replace(source, scene=scene, cameras=cameras, origin=(x, y, z), held_out=held_out), capture
-    )
+    origin = as_origin("origin", capture.origin)
+    scene = replace(source.scene, gaussians=gaussians, up=up, origin=origin)
+    return Subject(replace(source, scene=scene, cameras=cameras, held_out=held_out), capture)
 
 
 def _at_exposure(

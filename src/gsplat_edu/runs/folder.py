@@ -36,10 +36,9 @@ from gsplat_edu.base.validation import ArrayLike, float64_array, quoted
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.fields import CONFIG, LOG, MESH, METRICS, checked
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.lens_record import lens_entry, with_lens
 from gsplat_edu.scene.views import View
-
-ORIGIN = (0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)

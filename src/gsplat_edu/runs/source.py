@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
+from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
-from gsplat_edu.base.validation import ArrayLike, float64_array
+from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.evaluate.paths import common_up, orbit_of_scene, resized
 from gsplat_edu.io.formats import file_in, read_scene
-from gsplat_edu.io.ply import ORIGIN, load_ply
-from gsplat_edu.io.ply_comments import UNITS
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.scene import Scene, direction
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.scene.camera import WORLD_UP, Camera
+from gsplat_edu.scene.frame import ORIGIN, UNITS, Vector, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 
-FARTHEST_ORIGIN = 1e30
-"""World units: the largest origin, so that float32 means stay finite after the subtraction."""
+COLMAP = "COLMAP"
+"""The layout whose axes are those of the first camera, or any."""
+
+VERTICAL = math.cos(math.radians(30.0))
+"""Least cosine between an axis of the coordinates and the cameras' up for the axis to be vertical."""
 
 SCENE_LEVELS = 3
 """Path levels from a scene up to its run: RUN/point_cloud/iteration_N/point_cloud.ply."""
@@ -40,11 +44,9 @@ class Source:
     Args:
         path: The scene's file.
         scene: The scene.
-        cameras: Name and camera of each view of its capture, in the scene's frame and sorted by name, as in the
-            capture; empty if unknown.
+        cameras: Name and camera of each view of its capture, relative to the scene's origin and sorted by name, as in
+            the capture; empty if unknown.
         settings: Settings to render it with.
-        origin: Origin subtracted from the coordinates of the file and the cameras: that of the run, non-zero if its
-            capture lies far from zero.
         held_out: Names of the views that were not used for training.
     """
 
@@ -52,8 +54,12 @@ class Source:
     scene: Scene
     cameras: tuple[NamedCamera, ...]
     settings: RenderSettings
-    origin: tuple[float, float, float] = ORIGIN
     held_out: frozenset[str] = frozenset()
+
+    @property
+    def origin(self) -> Vector:
+        """Position of the zero of the splats and the cameras in the capture's coordinates."""
+        return self.scene.origin
 
     def probes(self, most: int, longest: int) -> list[NamedCamera]:
         """Choose cameras to render the scene from: its own, spread evenly over the list, or an orbit if it has none.
@@ -120,48 +126,79 @@ def file_settings(scene: Scene) -> RenderSettings:
     )
 
 
-def relative_to(gaussians: Gaussians, origin: ArrayLike) -> Gaussians:
-    """Return Gaussians with (3,) `origin` subtracted from their means, in float64."""
-    shift = torch.from_numpy(float64_array("origin", origin, (3,)))
-    if not shift.any():
-        return gaussians
-    means = gaussians.means
-    return replace(gaussians, means=(means.double() - shift.to(means.device)).to(means.dtype))
-
-
 def _of_run(folder: RunFolder, path: Path) -> Source:
     config = folder.read_config()
     settings = replace(render_settings(config), depth=False)
-    x, y, z = float64_array("config.json: origin", config.get("origin") or ORIGIN, (3,)).tolist()
-    if max(abs(x), abs(y), abs(z)) > FARTHEST_ORIGIN:
-        raise CheckpointError(f"{folder.config}: origin: is beyond {FARTHEST_ORIGIN:g}; fix the file")
-    gaussians = load_ply(path, (x, y, z))
+    origin = run_origin(folder, config)
+    gaussians = read_scene(path).relative_to(origin)
     cameras: tuple[NamedCamera, ...] = ()
     held_out: frozenset[str] = frozenset()
     if folder.cameras.is_file():
-        known = sorted(folder.read_cameras((x, y, z)), key=lambda entry: entry[0])
+        known = sorted(folder.read_cameras(origin), key=lambda entry: entry[0])
         cameras = tuple((name, camera) for name, _, camera in known)
         held_out = frozenset(name for name, split, _ in known if split == "test")
     up, unit = up_and_unit(config, [camera for _, camera in cameras])
-    scene = Scene(gaussians, settings.antialiased, up, unit)
-    return Source(path, scene, cameras, settings, (x, y, z), held_out)
+    scene = Scene(gaussians, settings.antialiased, up, unit, origin)
+    return Source(path, scene, cameras, settings, held_out)
 
 
-def up_and_unit(
-    config: Mapping[str, Any], cameras: Sequence[Camera]
-) -> tuple[tuple[float, float, float], str | None]:
+def run_origin(folder: RunFolder, config: Mapping[str, Any]) -> Vector:
+    """Return the origin of a run's coordinates.
+
+    Args:
+        folder: The run.
+        config: The content of its config.json.
+
+    Raises:
+        CheckpointError: the file has no usable origin.
+    """
+    try:
+        return as_origin("origin", config.get("origin") or ORIGIN)
+    except ArgumentError as error:
+        raise CheckpointError(f"{folder.config}: {error}; fix the file") from None
+
+
+def up_and_unit(config: Mapping[str, Any], cameras: Sequence[Camera]) -> tuple[Vector, str | None]:
     """Return the up direction of a run, and the unit of its coordinates, "m", "cm" or "mm"; None if it is unknown.
 
     Args:
         config: The content of config.json.
         cameras: The run's cameras.
     """
-    scale = config.get("scale") or {}
-    up = WORLD_UP if scale.get("level") is True else scene_up(cameras)
-    return up, scale.get("unit") if scale.get("unit") in UNITS else None
+    unit = (config.get("scale") or {}).get("unit")
+    return direction(config.get("up")) or scene_up(cameras), unit if unit in UNITS else None
 
 
-def scene_up(cameras: Sequence[Camera]) -> tuple[float, float, float]:
+def scene_up(cameras: Sequence[Camera]) -> Vector:
     """Return the up direction of a capture's cameras; the world's, (0, -1, 0), if there are no cameras."""
     x, y, z = common_up(cameras) if cameras else WORLD_UP
+    return float(x), float(y), float(z)
+
+
+def capture_scene(gaussians: Gaussians, dataset: Dataset, antialiased: bool) -> Scene:
+    """Return the scene of a training: its Gaussians with the capture's origin, up direction and unit.
+
+    Args:
+        gaussians: Relative to the dataset's origin.
+        dataset: The capture.
+        antialiased: Whether they were trained for antialiased rendering.
+    """
+    unit = None if dataset.scale is None else dataset.scale.unit
+    origin = as_origin("origin", dataset.origin)
+    return Scene(gaussians.map(Tensor.detach), antialiased, capture_up(dataset), unit, origin)
+
+
+def capture_up(dataset: Dataset) -> Vector:
+    """Return the up direction of a capture.
+
+    It is (0, -1, 0) where GPS has levelled the capture. Otherwise it follows from the cameras, and in layouts whose
+    coordinates have a vertical axis (all but COLMAP's), it is the axis that lies near.
+    """
+    if dataset.scale is not None and dataset.scale.level:
+        return WORLD_UP
+    up = scene_up([view.camera for view in (*dataset.train, *dataset.test)])
+    axis = int(np.argmax(np.abs(up)))
+    if dataset.layout == COLMAP or abs(up[axis]) < VERTICAL:
+        return up
+    x, y, z = np.copysign(np.eye(3)[axis], up[axis]) + 0.0
     return float(x), float(y), float(z)

@@ -10,7 +10,7 @@ from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import file_in, format_of, read_scene
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.runs.source import relative_to, run_of
+from gsplat_edu.runs.source import run_of
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.initialize import from_gaussians
@@ -60,7 +60,7 @@ def scene_start(path: Path, config: TrainConfig, origin: ArrayLike) -> tuple[Gau
     scene = ply.read(file, finite=False) if format_of(file).suffix == ".ply" else read_scene(file)
     run = run_of(file)
     antialiased = scene.antialiased if run is None else render_settings(run.read_config()).antialiased
-    gaussians = relative_to(scene.gaussians, origin)
+    gaussians = scene.relative_to(origin)
     try:
         start, notes = from_gaussians(gaussians, config)
     except ArgumentError as error:

@@ -25,7 +25,7 @@ from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.region import read_region
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
-from gsplat_edu.io.ply import save_ply
+from gsplat_edu.io.formats import write_scene
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for
 from gsplat_edu.runs.depth import check_depth, depth_digest, depth_name, with_run_depth
@@ -36,7 +36,7 @@ from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of, with_points_of_first
 from gsplat_edu.runs.refined import aligned_score, with_refined_cameras, write_refined
 from gsplat_edu.runs.skies import shell_around, start_sky, with_room_for
-from gsplat_edu.runs.source import Source, open_source
+from gsplat_edu.runs.source import Source, capture_scene, capture_up, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
 from gsplat_edu.runs.transients import write_masks
 from gsplat_edu.runs.trials import KEY as TRIALS
@@ -277,6 +277,7 @@ class CaptureRun:
             folder.write_cameras(dataset.train, dataset.test, dataset.origin)
             folder.write_photos(photo_digests(dataset))
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
+            facts |= {"up": list(capture_up(dataset))}
             facts |= {} if dataset.scale is None else {"scale": dataset.scale.json()}
             facts |= {} if (depth := depth_digest(dataset)) is None else {"depth": depth}
             folder.write_config(document(options) | facts | ({"start": digest} if digest else {}))
@@ -435,7 +436,7 @@ class CaptureRun:
             sentence, facts["transients"] = write_masks(self.folder, dataset, trainer.transients)
             self._say(sentence)
         path = self.folder.scene(trainer.iteration)
-        save_ply(path, gaussians, dataset.origin, self.options.render_settings.antialiased)
+        write_scene(path, capture_scene(gaussians, dataset, self.options.render_settings.antialiased))
         if export is not None:
             facts["exports"] = export(open_source(path))
         if refined is not None:

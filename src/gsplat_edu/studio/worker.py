@@ -58,7 +58,7 @@ def make_page(
 
     found = open_source(source)
     meshes = open_meshes(Path(surface) if surface else None, Path(collider) if collider else None, found)
-    pictures, tour = "picture", page.Tour(origin=found.origin, meshes=meshes)
+    pictures, tour = "picture", page.Tour(meshes=meshes)
     if applied:
         pictures = "picture?edited=1"
         found, tour = _edited(found, applied, meshes)
@@ -84,7 +84,8 @@ def _edited(found: Any, applied: str, meshes: Any = None) -> tuple[Any, Any]:  #
     edits = read_edits(path)
     views = views_after(edits.operations)
     meshes = edited_meshes(meshes, found, edits)
-    found, tour = toured(edited_source(found, edits, path.name), views, views.move)
+    found = edited_source(found, edits, path.name)
+    tour = toured(found, views, views.move)
     return found, replace(tour, meshes=meshes and meshes.moved(views.move))
 
 
@@ -239,7 +240,7 @@ def check_edits(path: str, name: str, source: str) -> dict[str, Any]:
     if (key := _state_of(source)) not in _identities:
         found = open_source(source)
         _identities.clear()
-        _identities[key] = identity_of(found.scene.gaussians, found.origin)
+        _identities[key] = identity_of(found.scene)
     edits.check_scene(_identities[key], name)
     return {"operations": len(edits.operations)}
 

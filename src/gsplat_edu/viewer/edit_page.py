@@ -34,7 +34,7 @@ def editing_of(source: Source, named: Path, file: Path, url: str | None = None) 
         file: The edits file, as the user named it.
         url: Where the page reads and writes that file; None for a page without a server, which starts with no edits.
     """
-    identity = identity_of(source.scene.gaussians, source.origin)
+    identity = identity_of(source.scene)
     stem = named.resolve().name.split(".")[0] or "scene"
     scene, edits = shlex.quote(str(named)), shlex.quote(str(file))
     convert = f"gsplat-edu convert {scene} --edits {edits} {shlex.quote(stem + EXAMPLE_FORMAT)}"
@@ -79,7 +79,7 @@ def tour_of(source: Source, views: Views, move: Similarity, path: KeyframePath |
         camera = _camera(placed_view(views.start.view, move), W, H)
         start = Start(camera, pivot, up / np.linalg.norm(up), -1)
     texts = {view.name: view.text for view in views.named if view.text}
-    return Tour(path, source.origin, start, named, texts=texts)
+    return Tour(path, start, named, texts=texts)
 
 
 def _camera(view: Keyframe, W: int, H: int) -> Camera:

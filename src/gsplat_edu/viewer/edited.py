@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.edits.apply import Views, edited, moved_together, placed, views_after
 from gsplat_edu.edits.document import Edits
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.io.edit import IDENTITY, Similarity
-from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer.edit_page import tour_of
 from gsplat_edu.viewer.page import Tour
@@ -32,7 +29,7 @@ def edited_source(source: Source, edits: Edits, name: str, anyway: bool = False)
         ArgumentError: the edits belong to another scene, or leave no splat.
     """
     scene, views = source.scene, views_after(edits.operations)
-    edits.check_scene(identity_of(scene.gaussians, source.origin), name, anyway)
+    edits.check_scene(identity_of(scene), name, anyway)
     left = edited(scene, edits.operations)
     if not len(left.gaussians):
         raise ArgumentError(
@@ -58,20 +55,16 @@ def edited_meshes(meshes: Meshes | None, source: Source, edits: Edits) -> Meshes
     return replace(meshes if move is IDENTITY else meshes.moved(move), stays=some)
 
 
-def toured(
-    source: Source, views: Views, move: Similarity, along: KeyframePath | None = None
-) -> tuple[Source, Tour]:
-    """Return the scene with the origin of its coordinates after all moves, and the tour of its page.
+def toured(source: Source, views: Views, move: Similarity, along: KeyframePath | None = None) -> Tour:
+    """Return the tour of an edited scene's page.
 
     Args:
-        source: The edited scene.
+        source: The edited scene, after all moves.
         views: The views of its edits.
-        move: All moves, that of the edits included.
-        along: A camera path instead of that of the edits, in the coordinates of the file.
+        move: All moves, that of the edits included, from the coordinates of the opened scene to those of `source`.
+        along: A camera path instead of that of the edits, in the coordinates of the opened scene.
     """
-    path = views.path if along is None else along.shifted(-np.array(source.origin))
+    path = views.path if along is None else along
     if path is not None:
         path = path.placed(move.R, move.s, move.t)
-    if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
-        source = replace(source, origin=ORIGIN)
-    return source, tour_of(source, views, move, path)
+    return tour_of(source, views, move, path)

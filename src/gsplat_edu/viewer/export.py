@@ -126,7 +126,7 @@ def write(
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     if path.suffix.lower() == PAGE:
-        tour = tour or page.Tour(origin=source.origin)
+        tour = tour or page.Tour()
         if len(source.scene.gaussians):
             start = tour.start or page.usual_start(source.scene, source.cameras, source.held_out)
             tour = replace(tour, poster=poster_jpeg(source, start.camera))

@@ -25,14 +25,15 @@ from gsplat_edu.base import constants
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_bytes
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.io.quantize import check_expansion
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.scene import Scene, read_extras
 from gsplat_edu.render.field import BEYOND, LEAST_BEYOND
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.frame import ORIGIN, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.rig import stand_in, through_lenses
 from gsplat_edu.viewer import page_data, page_mesh
@@ -71,7 +72,6 @@ class Tour:
 
     Args:
         path: Keyframes that the page plays, in the coordinates of the page's scene; None for none.
-        origin: Origin subtracted from the coordinates of the scene's file; the page adds it to the views that it saves.
         start: The view in which the page opens; None lets the page choose one.
         views: Named views, listed before those of the capture.
         meshes: Meshes in the coordinates of the page's scene; None for none.
@@ -81,7 +81,6 @@ class Tour:
     """
 
     path: KeyframePath | None = None
-    origin: Sequence[float] = ORIGIN
     start: Start | None = None
     views: Sequence[NamedCamera] = ()
     meshes: Meshes | None = None
@@ -120,8 +119,7 @@ def write(
             and contains no names.
         settings: Render settings; None takes those of scene files (`gsplat_edu.runs.source.file_settings`).
         held_out: Names of the test views, which are marked in the list.
-        tour: The camera path to play, the origin of the coordinates, and meshes; None for no path, no meshes, and no
-            origin subtracted.
+        tour: The camera path to play, and meshes; None for neither.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
@@ -171,7 +169,7 @@ def live_facts(
     held_out: Collection[str],
     points: Float[np.ndarray, "N 3"],
     settings: RenderSettings,
-    origin: Sequence[float] = ORIGIN,
+    origin: ArrayLike = ORIGIN,
 ) -> dict[str, Any]:
     """Return the facts of a page whose splats come later and change.
 
@@ -181,10 +179,11 @@ def live_facts(
         held_out: As for `write`.
         points: (N, 3) points of the scene; may be empty.
         settings: Render settings of the finished scene.
-        origin: As for `Tour`.
+        origin: (3,) position of the page's zero in the capture's coordinates.
     """
-    nothing = Scene(Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (1, 3), (0, 3), ()))))
-    facts = _facts(title, nothing, views, settings, held_out, Tour(origin=origin))
+    none = Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (1, 3), (0, 3), ())))
+    nothing = Scene(none, origin=as_origin("origin", origin))
+    facts = _facts(title, nothing, views, settings, held_out, Tour())
     index = facts["start"]["index"]
     start = start_among([camera for _, camera in views], index, points)
     facts["start"] |= {"pivot": start.pivot.tolist(), "up": start.up.tolist()}
@@ -236,12 +235,11 @@ def read(path: Path) -> Scene:
     claimed = page_data.size(count, sh_degree)
     check_expansion(path, claimed, len(data))
     splats = _inflated(path, data, claimed)
-    up = facts["up"]
-    return Scene(
-        page_data.unpacked(path, splats, count, sh_degree),
-        facts["antialiased"],
-        None if up is None else tuple(up),
-    )
+    try:
+        up, unit, origin = read_extras(facts)
+    except ValueError as error:
+        raise SceneFormatError(f"{path}: {error}; the page is damaged, export it again") from None
+    return Scene(page_data.unpacked(path, splats, count, sh_degree), facts["antialiased"], up, unit, origin)
 
 
 def _pieces(
@@ -343,7 +341,8 @@ def _facts(
         },
         "near": constants.Z_NEAR,
         "start": _start(start) | {"index": start.index + (len(tour.views) if start.index >= 0 else 0)},
-        "origin": [float(x) for x in tour.origin],
+        "unit": scene.unit,
+        "origin": [float(x) for x in scene.origin],
         "path": None if tour.path is None else tour.path.document(),
         "cameras": [
             {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views

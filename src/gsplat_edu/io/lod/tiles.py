@@ -18,7 +18,8 @@ how Cesium knows splats. Accessors describe the unpacked values and have no buff
 Axes: SPZ and glTF right, up, back; tiles right, forward, up, because glTF's y becomes 3D Tiles' z. CesiumJS takes the
 coordinates of the SPZ as they are, and so do we. The draft of the extension would turn them by half a turn about y on
 unpacking; a program that does so shows the scene turned about the vertical. The root's transform turns the scene's up
-direction to +z. It does not place the scene on the globe: no capture here stores where on Earth it is.
+direction to +z and moves it to its origin, in double. It does not place the scene on the globe: no capture here stores
+where on Earth it is.
 
 Source: OGC, "3D Tiles 1.1"; Khronos, KHR_gaussian_splatting_compression_spz_2 (draft); CesiumJS' loader, for the axes
 and the accessors.
@@ -35,21 +36,22 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import named_failure, written_aside
-from gsplat_edu.io.axes import POSITION_SIGNS
+from gsplat_edu.io.axes import POSITION_SIGNS, root_transform
 from gsplat_edu.io.glb import FLOAT, POINTS
-from gsplat_edu.io.glb_container import CHUNK_HEADER, EXTENSION, FILE_HEADER, SPZ_EXTENSION
+from gsplat_edu.io.glb_container import CHUNK_HEADER, EXTENSION, FILE_HEADER, GENERATOR, SPZ_EXTENSION
 from gsplat_edu.io.lod.levels import Leaf, LodOptions, Node, build_levels, leaves_of, level_of
 from gsplat_edu.io.lod.meta import rounded
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.spz import packed_version_2
-from gsplat_edu.scene.camera import WORLD_UP
 from gsplat_edu.scene.gaussians import Gaussians
 
 CONTENT_EXTENSION = "3DTILES_content_gltf"
+
+FROM_Y_UP = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
+"""Takes glTF's axes to those of tiles, whose z is glTF's y."""
 
 PIXELS = 16.0
 """Screen-space error in px beyond which Cesium refines a tile, unless told otherwise."""
@@ -84,7 +86,7 @@ def write(path: Path, scene: Scene, options: LodOptions | None = None) -> None:
             tile = stack.enter_context(written_aside(place))
             with named_failure(place):
                 tile.write_bytes(glb(replace(scene, gaussians=gaussians)))
-        tree["transform"] = _upright(scene.up or WORLD_UP)
+        tree["transform"] = _root_matrix(scene)
         with named_failure(path):
             aside.write_bytes(_document(tree))
 
@@ -164,7 +166,7 @@ def _gltf(gaussians: Gaussians, packed: int, length: int) -> dict[str, Any]:
         "extensions": {EXTENSION: kind},
     }
     return {
-        "asset": {"version": "2.0", "generator": "gsplat-edu"},
+        "asset": {"version": "2.0", "generator": GENERATOR},
         "extensionsUsed": [EXTENSION, SPZ_EXTENSION],
         "extensionsRequired": [EXTENSION, SPZ_EXTENSION],
         "scene": 0,
@@ -215,13 +217,11 @@ def _box(low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]) -> list[
     return [rounded(float(number)) + 0.0 for number in numbers]
 
 
-def _upright(up: tuple[float, float, float]) -> list[float]:
-    """Return the rotation that turns an up direction, in our axes, to the z of tiles: 4 x 4, column by column."""
-    x, y, z = up
+def _root_matrix(scene: Scene) -> list[float]:
+    """Return the transform that turns up to the z of tiles and adds the origin: 4 x 4, column by column."""
+    turn, shift = root_transform(scene.up, scene.origin)
     matrix = np.eye(4)
-    rotation, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [[x, z, -y]])
-    if not np.allclose((x, y, z), WORLD_UP, atol=1e-12):
-        matrix[:3, :3] = rotation.as_matrix()
+    matrix[:3, :3], matrix[:3, 3] = FROM_Y_UP @ turn @ FROM_Y_UP.T, FROM_Y_UP @ shift
     return [float(number) + 0.0 for number in matrix.T.reshape(-1)]
 
 
@@ -229,7 +229,7 @@ def _document(tree: dict[str, Any]) -> bytes:
     used = [EXTENSION, SPZ_EXTENSION]
     *_, a, _, _, _, c, _, _, _, b = tree["boundingVolume"]["box"]
     document = {
-        "asset": {"version": "1.1", "generator": "gsplat-edu"},
+        "asset": {"version": "1.1", "generator": GENERATOR},
         "extensionsUsed": [CONTENT_EXTENSION],
         "extensionsRequired": [CONTENT_EXTENSION],
         "extensions": {CONTENT_EXTENSION: {"extensionsUsed": used, "extensionsRequired": used}},

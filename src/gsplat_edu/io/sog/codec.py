@@ -24,6 +24,7 @@ order of the files and codebooks that start with null.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,7 @@ def read(path: Path) -> Scene:
         sh_rest=torch.from_numpy(_read_harmonics(path, source, meta, pixels)),
         logit_opacities=torch.from_numpy(byte_to_logit(colors[:, 3])),
     )
-    return Scene(gaussians, meta.antialiased, meta.up)
+    return Scene(gaussians, meta.antialiased, meta.up, meta.unit, meta.origin)
 
 
 def read_meta(path: Path) -> Meta:
@@ -184,7 +185,7 @@ def packed(scene: Scene, *, sort: bool = True) -> dict[str, bytes]:
         raise ArgumentError(
             f"quats{first_index(zero)}: has zero length, so it is not a rotation; remove the splat"
         )
-    return _packed(Scene(gaussians, scene.antialiased, scene.up), sort)
+    return _packed(replace(scene, gaussians=gaussians), sort)
 
 
 def _packed(scene: Scene, sort: bool) -> dict[str, bytes]:
@@ -197,7 +198,9 @@ def _packed(scene: Scene, sort: bool) -> dict[str, bytes]:
     harmonics, palette_images = _packed_harmonics(
         values["sh_rest"], scene.gaussians.sh_degree, _weights(values)
     )
-    meta = Meta(len(order), span, scales, sh0, harmonics, scene.antialiased, scene.up)
+    meta = Meta(
+        len(order), span, scales, sh0, harmonics, scene.antialiased, scene.up, scene.unit, scene.origin
+    )
     opacities = logit_to_byte(values["logit_opacities"])[:, None]
     images = {
         meta.means[0]: (steps & 255).astype(np.uint8),

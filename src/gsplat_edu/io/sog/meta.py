@@ -16,8 +16,10 @@ from jaxtyping import Float32, Float64
 
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.reading import parse_json
+from gsplat_edu.io.scene import extras, read_extras
 from gsplat_edu.io.sog.palette import CODEBOOK, MOST_ENTRIES
 from gsplat_edu.io.sog.values import LARGEST_LOG, Range
+from gsplat_edu.scene.frame import ORIGIN, Vector
 
 VERSION = 2
 
@@ -80,6 +82,8 @@ class Meta:
         harmonics: The palette; None for a scene of degree 0.
         antialiased: Whether the scene was trained with antialiasing; None if unspecified.
         up: Up direction, of length 1; None if unspecified.
+        unit: Unit of the coordinates; None if unspecified.
+        origin: Position of the coordinates' zero.
         means: Names of the images with low and high bytes.
         quats: Name of the image of rotations.
         log_scales: Name of the image of scales.
@@ -92,7 +96,9 @@ class Meta:
     sh0: Float32[np.ndarray, "256"]
     harmonics: Harmonics | None
     antialiased: bool | None
-    up: tuple[float, float, float] | None
+    up: Vector | None
+    unit: str | None = None
+    origin: Vector = ORIGIN
     means: tuple[str, ...] = MEANS
     quats: tuple[str, ...] = QUATS
     log_scales: tuple[str, ...] = SCALES
@@ -118,14 +124,13 @@ class Meta:
 def to_json(meta: Meta) -> bytes:
     """Write a meta.json; equal scenes give equal bytes.
 
-    Codebook values are written with the fewest digits that restore the same float32. The up direction is stored in
-        asset.extras.up, which other readers ignore. Antialiasing is stored twice: as "antialias" from the
-        specification, and as "model", which PlayCanvas' splat-transform reads and writes since 3.2 and omits for the
-        default model.
+    Codebook values are written with the fewest digits that restore the same float32. Up, unit and origin are stored in
+    asset.extras, which other readers ignore. Antialiasing is stored twice: as "antialias" from the specification, and
+    as "model", which PlayCanvas' splat-transform reads and writes since 3.2 and omits for the default model.
     """
     asset: dict[str, object] = {"generator": GENERATOR}
-    if meta.up is not None:
-        asset["extras"] = {"up": list(meta.up)}
+    if frame := extras(meta.up, meta.unit, meta.origin):
+        asset["extras"] = frame
     document: dict[str, object] = {"version": VERSION, "asset": asset, "count": meta.count}
     if meta.antialiased is not None:
         document["antialias"] = meta.antialiased
@@ -194,6 +199,10 @@ def _checked(path: Path, document: dict[str, object]) -> Meta:
             codebook=_codebook(path, document, "shN.codebook"),
             files=_files(path, document, "shN.files", len(SHN)),
         )
+    try:
+        up, unit, origin = read_extras(_at(document, "asset.extras"))
+    except ValueError:
+        _refuse(path, "an origin that is not three numbers")
     return Meta(
         count=_whole(path, document, "count", 0, MOST_SPLATS),
         span=(low, high),
@@ -201,7 +210,9 @@ def _checked(path: Path, document: dict[str, object]) -> Meta:
         sh0=_codebook(path, document, "sh0.codebook"),
         harmonics=harmonics,
         antialiased=antialiased,
-        up=_up(document),
+        up=up,
+        unit=unit,
+        origin=origin,
         means=_files(path, document, "means.files", len(MEANS)),
         quats=_files(path, document, "quats.files", len(QUATS)),
         log_scales=_files(path, document, "scales.files", len(SCALES)),
@@ -267,13 +278,3 @@ def _files(path: Path, document: dict[str, object], key: str, length: int) -> tu
         if not isinstance(name, str) or not NAME.fullmatch(name):
             _refuse(path, f"an entry in {key} that is not a plain file name")
     return tuple(found)
-
-
-def _up(document: dict[str, object]) -> tuple[float, float, float] | None:
-    """Read the up direction from asset.extras.up; None if another program stores something else there."""
-    found = _at(document, "asset.extras.up")
-    if not (isinstance(found, list) and len(found) == 3 and all(_is_number(v, LARGEST_FLOAT) for v in found)):
-        return None
-    length = float(np.linalg.norm(np.array(found, dtype=np.float64)))
-    x, y, z = found
-    return (x / length, y / length, z / length) if length > 0 else None
