@@ -139,7 +139,7 @@ def test_a_page_gets_a_path_that_moves_with_the_scene(convert, tmp_path):
     ):
         convert(folder.path, tmp_path / "a.html", "--path", tmp_path / "path.json", *moves)
         facts = json.loads(re.search(r'id="facts">(.*?)</script>', (tmp_path / "a.html").read_text())[1])
-        np.testing.assert_allclose(facts["origin"], at, rtol=1e-12)
+        np.testing.assert_allclose(facts["origin"], at, atol=1e-9)
         assert (facts["path"]["loop"], facts["path"]["duration"]) == (True, 4.0)
         eyes = np.array([camera["eye"] for camera in facts["cameras"]])
         for keyframe in facts["path"]["keyframes"]:
