@@ -27,6 +27,7 @@ from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_s
 from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.render.backends import BACKENDS, gpu_of, unavailable
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
@@ -122,6 +123,9 @@ def _scene_facts(path: Path) -> list[Fact]:
         facts.append(("render", f"{'with' if scene.antialiased else 'without'} antialiasing"))
     if scene.unit is not None:
         facts.append(("units", f"1 unit = 1 {scene.unit}"))
+    if scene.origin != ORIGIN:
+        where = ", ".join(f"{x:.15g}" for x in scene.origin)
+        facts.append(("origin", f"{where}: added, in double, to the coordinates below"))
     if scene.up is not None:
         facts.append(("up", ", ".join(f"{x:.4g}" for x in scene.up)))
     finite = gaussians.finite_rows()

@@ -209,6 +209,8 @@ def check(
 ) -> Exported:
     """Compare renders of a written file with renders of its source from the same cameras.
 
+    A file that stores an origin is placed by it, so that one that lies elsewhere is seen to differ.
+
     Args:
         path: The file.
         source: The source, with its cameras and settings.
@@ -219,7 +221,9 @@ def check(
         ArgumentError: there is nothing to render.
         SceneFormatError: the file cannot be read.
     """
-    written = read_back(path).gaussians
+    scene = read_back(path)
+    kept = path.suffix.lower() == PAGE or format_of(path).metadata
+    written = scene.relative_to(source.origin) if kept else scene.gaussians
     device = device_of(backend)
     scores = compare_scenes(
         source.scene.gaussians.to(device),
