@@ -170,6 +170,7 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     config = run.read_config()
     data = config["data"] | {"path": str((place / "capture one").resolve()), "resolution": 40.0}
     train = {"iterations": 30, "background": [1.0, 1.0, 1.0], "strategy": "fast"}
+    train["alpha_background"] = "fixed"  # as --background sets it
     config |= {"data": data | {"test_every": 0}, "train": train}
     RunFolder(place / "run; one").write_config(config)
     said = [doctor(place / "capture one", "--no-forecast")[1], doctor(place / "run; one")[1]]

@@ -274,11 +274,12 @@ def _mask_of_another_size(folder):
     Image.new("L", (8, 6), 255).save(folder / "masks" / "view_001.png")
 
 
-def _nan_pose(folder):
+def _nan_poses(folder):
     write_transforms(folder, *CAPTURE)
     file = folder / "transforms.json"
     meta = json.loads(file.read_text())
-    meta["frames"][1]["transform_matrix"][0][3] = float("nan")
+    for frame in meta["frames"]:
+        frame["transform_matrix"][0][3] = float("nan")
     file.write_text(json.dumps(meta))
 
 
@@ -294,7 +295,7 @@ FAULTS = {
     _no_images: "view_000.png",
     _corrupt_jpeg: "view_002.png",
     _mask_of_another_size: "view_001.png",
-    _nan_pose: "view_001.png: its pose",
+    _nan_poses: "its pose",
     _syntax_error: "line 2",
 }
 

@@ -485,7 +485,7 @@ def test_far_coordinates_are_trained_near_the_origin_and_written_far(tmp_path):
         folder = RunFolder(tmp_path / f"run_{name}")
         scores.append(folder.read_metrics()["test"]["psnr"])
         scene = read_scene(folder.latest_scene()[0])
-        assert scene.origin == ((0.0, 0.0, 0.0) if name == "near" else tuple(np.round(shift)))
+        assert np.abs(scene.origin - shift * (name == "far")).max() <= 5.0, "among the cameras"
         means.append(scene.gaussians.means.double().median(dim=0).values.numpy() + scene.origin)
     assert scores[0] == pytest.approx(scores[1], abs=0.3)
     np.testing.assert_allclose(means[1] - shift, means[0], atol=0.1)
