@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 import struct
 from pathlib import Path
 
@@ -161,10 +162,11 @@ def test_notes_of_the_reader_are_shown(diagnosed, orbit):
     views, points = orbit
 
     def spoil(folder):
-        (folder / "sparse" / "1").mkdir()
+        shutil.copytree(folder / "sparse" / "0", folder / "sparse" / "1")
 
     facts = diagnosed(views, points, spoil).facts
-    assert any("sparse holds 2 models: 0 is read" in value for _, value in facts)
+    read, left = (f"{number} ({len(views)} photos)" for number in (0, 1))
+    assert any(f"sparse holds 2 models: {read} is read, {left} not" in value for _, value in facts)
 
 
 def with_tracks(folder, counts):
