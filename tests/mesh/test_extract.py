@@ -12,7 +12,8 @@ from gsplat_edu.base.threads import one_thread
 from gsplat_edu.evaluate.surface import Comparison, score_surface
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.mesh.depths import checked, neighbours_of, render_depths
-from gsplat_edu.mesh.extract import MeshSettings, default_voxel, extract_mesh, volume_room
+from gsplat_edu.mesh.extract import MeshSettings, extract_mesh
+from gsplat_edu.mesh.plan import PIXEL_BYTES, default_voxel
 from gsplat_edu.mesh.tidy import TidySettings
 from gsplat_edu.mesh.trust import seen_by
 from gsplat_edu.render.settings import RenderSettings
@@ -126,20 +127,36 @@ def test_voxels_grow_until_the_volume_fits_and_a_given_size_does_not(result):
         )
 
 
-def test_the_volume_gets_what_maps_and_mesh_leave():
-    cameras, least = orbit(), 450 * 2**20
-    maps = 10 * sum(camera.W * camera.H for _, camera in cameras)
-    room = volume_room(least + maps + 2**30, cameras)
-    assert 0.5 * 2**30 < room < 0.7 * 2**30
-    assert volume_room(least + maps + 2**29, cameras) == room // 2
-    with pytest.raises(NotEnoughMemoryError, match="depth maps need"):
-        volume_room(least + maps, cameras)
-    views = render_depths(ball(), cameras, SETTINGS, load_backend("cpu"))
-    kept, _ = checked(views)
+def test_depth_maps_have_the_planned_memory():
+    cameras = orbit()
+    kept, _ = checked(render_depths(ball(), cameras, SETTINGS, load_backend("cpu")))
     arrays = [
         getattr(view, name) for view in kept for name in ("rendered", "facing", "image", "clear", "kept")
     ]
-    assert 0.8 * maps < sum(array.nbytes for array in arrays) <= maps
+    planned = PIXEL_BYTES * sum(camera.W * camera.H for _, camera in cameras)
+    assert 0.8 * planned < sum(array.nbytes for array in arrays) <= planned
+
+
+def test_voxels_grow_until_the_surface_has_few_triangles(result):
+    most = len(result.mesh.faces) // 3
+    stages = []
+    small = extract_mesh(
+        ball(),
+        orbit(),
+        SETTINGS,
+        load_backend("cpu"),
+        MeshSettings(most_faces=most),
+        lambda what, done, total: stages.append(what),
+    )
+    assert 0.8 * most < len(small.mesh.faces) <= most
+    assert topology(small.mesh).boundary_edges == 0 and small.voxel == pytest.approx(
+        3**0.5 * result.voxel, rel=0.05
+    )
+    assert any(f"at most {most:,} triangles" in note for note in small.notes)
+    assert list(dict.fromkeys(stages)) == ["depth maps", "checks", "volume", "triangles", "tidying"]
+    with pytest.raises(NotEnoughMemoryError, match=f"the memory has room for {most:,}; take a --voxel of"):
+        settings = MeshSettings(voxel=result.voxel, most_faces=most)
+        extract_mesh(ball(), orbit(), SETTINGS, load_backend("cpu"), settings)
 
 
 def test_bounds_leave_a_hole_and_faces_are_reduced():
