@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+import known_surfaces as surfaces
 from gsplat_edu import ArgumentError, Camera, Gaussians, load_backend
 from gsplat_edu.base.errors import NotEnoughMemoryError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.evaluate.surface import Comparison, score_surface
 from gsplat_edu.evaluate.topology import topology
-from gsplat_edu.mesh.depths import checked, neighbours_of, render_depths
-from gsplat_edu.mesh.extract import MeshSettings, extract_mesh
+from gsplat_edu.mesh.depths import DepthView, checked, neighbours_of, render_depths
+from gsplat_edu.mesh.extract import MeshSettings, _cut, extract_mesh
 from gsplat_edu.mesh.plan import PIXEL_BYTES, default_voxel
 from gsplat_edu.mesh.tidy import TidySettings
 from gsplat_edu.mesh.trust import seen_by
@@ -186,3 +187,27 @@ def test_neighbours_look_at_the_same_from_elsewhere():
         nearest = sorted(distance for distance in apart if distance > 0)[:6]
         assert max(apart[i] for i in found) <= nearest[-1]
     assert default_voxel(render_depths(ball(), orbit(2, 32), SETTINGS, load_backend("cpu"))) > 0
+
+
+def noisy_sphere(deviation):
+    """Depth maps of the unit sphere with normal errors, as `render_depths` would give them."""
+    rng, views = np.random.default_rng(0), []
+    for number, camera in enumerate(surfaces.orbit(16, 480, 640, 600.0)):
+        depth, rays = surfaces.sphere_depth(camera), surfaces.rays(camera)
+        points = camera.eye + depth[..., None] * rays
+        cosines = -(points * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+        shown = (depth > 0) & (cosines > 0.17)
+        off = np.where(shown, depth + deviation * rng.normal(size=depth.shape), 0).astype(np.float32)
+        facing = np.rint(255 * np.where(shown, cosines, 0)).astype(np.uint8)
+        image, clear = np.zeros((*depth.shape, 3), np.uint8), np.zeros(depth.shape, bool)
+        views.append(DepthView(f"{number}", camera, off, facing, image, clear, 0))
+    return views
+
+
+@pytest.mark.parametrize("deviation", [0.0, 1.5])
+def test_noise_does_not_shrink_a_sphere(deviation):
+    """With a truncation of two deviations, errors of 1.5 voxels made it smaller by 0.23 voxel on average."""
+    voxel = 0.0085
+    cut = _cut(noisy_sphere(deviation * voxel), voxel, MeshSettings(voxel=voxel), lambda *step: None)
+    radii = np.linalg.norm(cut.raw.vertices, axis=1)
+    assert abs(radii.mean() - 1.0) < 0.12 * voxel
