@@ -1,5 +1,6 @@
 """`gsplat-edu mesh`: files of every format, what it says, and what it refuses."""
 
+import json
 import re
 
 import numpy as np
@@ -9,6 +10,7 @@ from gsplat_edu import write_scene
 from gsplat_edu.cli.main import main
 from gsplat_edu.cli.options.mesh import SUFFIXES
 from gsplat_edu.io.mesh_files import MESH_FORMATS, read_mesh, write_mesh
+from gsplat_edu.jobs import emitter
 from gsplat_edu.scene.mesh import Mesh
 from splat_ball import RADIUS, ball
 
@@ -58,8 +60,54 @@ def test_the_truth_is_compared_and_a_collider_is_coarse(scene, tmp_path, capsys)
     ]
     assert main([*words, "--collider", "--backend", "cpu"]) == 0
     said = capsys.readouterr().out
-    assert "against the truth: accuracy" in said and "F1" in said and "degrees" in said
+    assert (
+        "the cameras see 100 % of the truth" in said
+        and "against the truth: accuracy" in said
+        and "F1" in said
+        and "degrees" in said
+    )
     assert len(read_mesh(out).faces) <= 300
+
+
+@pytest.fixture
+def small_page(monkeypatch):
+    monkeypatch.setattr("gsplat_edu.cli.mesh.MOST_FACES", 2_000)
+
+
+def test_a_mesh_fits_a_page_unless_all_triangles_are_wanted(scene, tmp_path, capsys, small_page):
+    out = tmp_path / "ball.ply"
+    assert main(["mesh", str(scene), str(out), "--backend", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert said.splitlines()[1].startswith("planned: voxels of ") and "at most 2,000 triangles" in said
+    few = len(read_mesh(out).faces)
+    assert 1_200 < few <= 2_000
+    assert main(["mesh", str(scene), str(out), "--backend", "cpu", "--faces", "all"]) == 0
+    assert "instead of" not in capsys.readouterr().out
+    assert len(read_mesh(out).faces) > 3 * few
+    # a given voxel is kept, and the triangles are reduced
+    assert main(["mesh", str(scene), str(out), "--backend", "cpu", "--voxel", "0.03"]) == 0
+    assert "voxels of 0.03 world units" in capsys.readouterr().out
+    assert len(read_mesh(out).faces) <= 2_000
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_written(scene, tmp_path, capsys):
+    out = tmp_path / "ball.ply"
+    words = ["mesh", str(scene), str(out), "--backend", "cpu", "--max-memory", "600MiB"]
+    assert main([*words, "--voxel", "0.001"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "voxel: 0.001 needs about" in error and "600 MiB are allowed" in error and "\n" not in error
+    assert not out.exists()
+
+
+def test_a_job_shows_the_stage_that_runs(scene, tmp_path, monkeypatch, small_page):
+    events = tmp_path / "events"
+    monkeypatch.setattr(emitter, "_emitter", emitter.Emitter(events))
+    assert main(["mesh", str(scene), str(tmp_path / "ball.ply"), "--backend", "cpu", "--voxel", "0.05"]) == 0
+    found = [json.loads(line) for line in events.read_text().splitlines()]
+    stages = [event["name"] for event in found if event["event"] == "stage"]
+    tail = ["tidying", "simplifying", "writing", "trust", "intersections", "pictures"]
+    assert stages == ["survey", "depth maps", "checks", "volume", "triangles", *tail]
+    assert not [event for event in found if event["event"] == "progress" and event.get("seconds_left") == 0]
 
 
 def test_a_collider_of_convex_parts(scene, tmp_path, capsys):
@@ -69,6 +117,10 @@ def test_a_collider_of_convex_parts(scene, tmp_path, capsys):
     said = capsys.readouterr().out
     number = int(re.search(r"parts.glb: (\d+) convex part", said)[1])
     outside = float(re.search(r"at most (\S+) world units outside", said)[1])
+    filled, left = map(
+        float, re.search(r"(\S+) % of their volume is empty .* leave out (\S+) %", said).groups()
+    )
+    assert filled < 15 and left < 5  # a ball: hulls of its pieces are hardly larger
     assert outside < 0.1  # a voxel
     written = out.read_bytes()
     assert all(b'"collider_%d"' % part in written for part in range(number))

@@ -9,8 +9,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.cli.sfm import stage_bars
-from gsplat_edu.cli.terminal import LINE_SECONDS, Bar, clock
+from gsplat_edu.cli.terminal import LINE_SECONDS, Bar, clock, stage_bars
 from gsplat_edu.cli.train import progress_bar
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap

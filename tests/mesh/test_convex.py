@@ -16,7 +16,7 @@ from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.io.mesh_files import read_mesh
 from gsplat_edu.io.mesh_glb import write_parts
 from gsplat_edu.mesh.coacd_process import cut
-from gsplat_edu.mesh.convex import ConvexSettings, convex_parts, farthest_outside
+from gsplat_edu.mesh.convex import ConvexSettings, convex_parts, farthest_outside, fit_of
 from gsplat_edu.scene.mesh import Mesh
 from known_surfaces import torus
 
@@ -64,6 +64,36 @@ def test_the_distance_from_a_box():
     assert farthest_outside(points[:1], [box]) == 0
     assert farthest_outside(points, [box]) == pytest.approx(0.25)
     assert farthest_outside(np.array([[4.0, 5, 0.5]]), [box]) == pytest.approx(5)
+
+
+def box(low, high):
+    """A box between two corners."""
+    return Mesh(np.array(low) + CORNERS * (np.array(high, float) - low), BOX)
+
+
+def mug(wall=0.1):
+    """A unit box with a hollow in its middle that no hole leads to: walls of one thickness."""
+    inner = box([wall] * 3, [1 - wall] * 3)
+    return Mesh(np.concatenate([CORNERS, inner.vertices]), np.concatenate([BOX, 8 + BOX[:, ::-1]]))
+
+
+def test_what_parts_fill_and_leave_out():
+    whole = box([0, 0, 0], [1, 1, 1])
+    # one part fills the hollow, 0.8^3 of its volume
+    full = fit_of(mug(), [whole])
+    assert full.filled == pytest.approx(0.512, abs=0.01) and full.uncovered == full.outside == 0
+    # a quarter of the box is left out; nothing is filled
+    low = fit_of(whole, [box([0, 0, 0], [1, 1, 0.75])])
+    assert low.filled == 0 and low.uncovered == pytest.approx(0.25, abs=0.01)
+    assert low.outside == pytest.approx(0.25)
+    # two parts that overlap count once: 0.3 of 1.3 in all lies outside the box
+    both = fit_of(whole, [box([0, 0, 0], [1, 1, 0.7]), box([0, 0, 0.4], [1, 1, 1.3])])
+    assert both.filled == pytest.approx(0.3 / 1.3, abs=0.01) and both.uncovered == 0
+
+
+def test_what_fills_an_open_mesh_is_unknown():
+    room = Mesh(CORNERS, BOX[:-2, ::-1])
+    assert fit_of(room, [box([0, 0, 0], [1, 1, 1])])[1:] == (None, None)
 
 
 def test_holes_of_an_object_are_closed_and_those_of_a_room_are_not():

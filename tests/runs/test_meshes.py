@@ -82,7 +82,7 @@ def test_the_record_says_what_is_printed(run, capsys):
     assert record["file"].endswith("ball.obj") and record["iterations"] == 7 and record["unit"] is None
     assert f"{record['vertices']:,} vertices, {record['triangles']:,} triangles" in said
     assert f"{100 * record['certain']:.3g} % of the area" in said
-    assert f"{100 * record['held_out']['within']:.3g} % of the depths of 2 held-out views" in said
+    assert f"{100 * record['held_out']['within']:.3g} % of the splats' depths from 2 held-out views" in said
     assert record["held_out"]["views"] == 2 and record["parts"] == 1 and record["boundary_edges"] == 0
     assert f"F1 {record['truth']['f1']:.3f}" in said and record["truth"]["f1"] > 0.99
     np.testing.assert_allclose(record["size"], 1.65, atol=0.1)

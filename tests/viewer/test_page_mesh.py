@@ -457,7 +457,7 @@ def test_too_many_triangles_and_a_collider_alone_are_refused(tmp_path, random_ga
     source = Source(tmp_path / "a.ply", scene, (), file_settings(scene))
     with pytest.raises(ArgumentError, match="add --surface"):
         open_meshes(None, tmp_path / "a.glb", source)
-    monkeypatch.setattr(page_mesh, "MOST_FACES", 300)
+    monkeypatch.setattr(page_mesh, "PAGE_FACES", 300)
     with pytest.raises(ArgumentError, match="holds at most 300 triangles, but this makes"):
         open_meshes(tmp_path / "a.glb", tmp_path / "a.glb", source)
 

@@ -123,3 +123,7 @@ LOOPBACK: Final = "127.0.0.1"
 
 SRGB_OFFSET: Final = 0.055
 """Offset of the sRGB curve, of encoded colours: 1.055 l^(1/2.4) - 0.055. Source: IEC 61966-2-1."""
+
+PAGE_FACES: Final = 2_000_000
+"""Most triangles of all meshes of a page. They take about 60 MB before compression. `gsplat-edu mesh` keeps to it
+unless told otherwise. Source: ours."""

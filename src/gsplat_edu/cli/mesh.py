@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
+from gsplat_edu.base.headroom import available_memory
 from gsplat_edu.base.locks import locked, locked_file
 from gsplat_edu.base.text import short_number, spelled_bytes
-from gsplat_edu.cli.options.mesh import COLLIDER_FACES, COLLIDER_VOXELS, TEXTURE_FACES
-from gsplat_edu.cli.terminal import Bar, Field, Terminal
+from gsplat_edu.cli.options.mesh import ALL, COLLIDER_FACES, COLLIDER_VOXELS, MOST_FACES, TEXTURE_FACES
+from gsplat_edu.cli.terminal import Terminal, stage_bars
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.evaluate.intersections import Intersections
 from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_surface
@@ -26,11 +26,12 @@ from gsplat_edu.io.mesh_glb import write_parts
 from gsplat_edu.io.mesh_usd import require_usd
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
-from gsplat_edu.mesh.convex import convex_parts, farthest_outside
-from gsplat_edu.mesh.depths import render_depths
-from gsplat_edu.mesh.extract import MeshResult, MeshSettings, default_voxel, extract_mesh, volume_room
-from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings
-from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust, trust_of
+from gsplat_edu.mesh.convex import convex_parts, fit_of
+from gsplat_edu.mesh.depths import Progress, render_depths
+from gsplat_edu.mesh.extract import MeshResult, MeshSettings, extract_mesh
+from gsplat_edu.mesh.plan import Demand, plan_mesh, survey
+from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings, require_simplification
+from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust, seen_truth, trust_of
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import open_subject
@@ -60,11 +61,11 @@ def run(arguments: argparse.Namespace) -> None:
         console.print(sentence, soft_wrap=True)
 
     # the files beside an OBJ, its material and its image, are covered too
-    with locked_file("OUT", arguments.out, "gsplat-edu mesh", say):
-        _make(arguments, backend, console)
+    with locked_file("OUT", arguments.out, "gsplat-edu mesh", say), stage_bars(console) as progress:
+        _make(arguments, backend, console, progress)
 
 
-def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal) -> None:
+def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal, progress: Progress) -> None:
     if arguments.out.suffix.lower() == ".usdz":
         require_usd()  # before the work of minutes
     truth = None if arguments.truth is None else read_mesh(arguments.truth)
@@ -75,53 +76,52 @@ def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal) ->
         for note in dataset.notes:
             console.print(str(note), soft_wrap=True)
     cameras = _cameras(source, console)
-    settings = _settings(arguments, source, cameras, backend)
-    result = _extracted(source, cameras, backend, settings, console)
+    settings = _settings(arguments, source, cameras, backend, console, progress)
+    gaussians = source.scene.gaussians
+    result = extract_mesh(gaussians, cameras, source.settings, backend, settings, progress)
     for sentence in result.notes:
         console.print(sentence, soft_wrap=True)
     mesh = result.mesh
     if dataset is not None:
-        mesh = painted(mesh, dataset, result.views, run_of(source.path))
-    facts = _written(arguments, mesh, result, source, console)
+        mesh = painted(mesh, dataset, result.views, run_of(source.path), progress=progress)
+    facts = _written(arguments, mesh, result, source, console, progress)
     scores = None
     if truth is not None:
-        comparison = Comparison(arguments.tau or result.voxel)
-        scores = score_surface(_moved(mesh, source.origin), truth, comparison)
+        scores = _scored(arguments, mesh, truth, result, source, progress)
     held_out = [(name, camera) for name, camera in source.cameras if name in source.held_out]
-    others = render_depths(source.scene.gaussians, held_out[:MOST_HELD_OUT], source.settings, backend)
-    trust = trust_of(result, others, scores)
+    others = render_depths(gaussians, held_out[:MOST_HELD_OUT], source.settings, backend, progress)
+    trust = trust_of(result, others, scores, progress)
     console.print(*_trust(trust), sep="\n", soft_wrap=True)
     if scores is not None:
         console.print(*_compared(scores, source.scene.unit or "world units"), sep="\n", soft_wrap=True)
     kind = "collider" if arguments.collider else "mesh"
+    progress("pictures", 0, 1)
     _record(MadeMesh(kind, mesh, result, trust, facts), source, dataset, console)
+    progress("pictures", 1, 1)
 
 
-def _extracted(
+def _scored(
+    arguments: argparse.Namespace,
+    mesh: Mesh,
+    truth: Mesh,
+    result: MeshResult,
     source: Source,
-    cameras: Sequence[NamedCamera],
-    backend: Backend,
-    settings: MeshSettings,
-    console: Terminal,
-) -> MeshResult:
-    """Make the mesh, with a bar that shows its progress."""
-    columns = (
-        Field("{task.description}"),
-        BarColumn(bar_width=16),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("depth maps", total=None)
-
-        def progress(what: str, done: int, total: int) -> None:
-            bar.update(task, description=what, completed=done, total=total)
-
-        return extract_mesh(source.scene.gaussians, cameras, source.settings, backend, settings, progress)
+    progress: Progress,
+) -> SurfaceScores:
+    """Compare the mesh with what the cameras see of the true surface, inside the bounds."""
+    bounds = None if arguments.bounds is None else np.array(arguments.bounds).reshape(2, 3)
+    comparison = Comparison(arguments.tau or result.voxel, bounds=bounds)
+    seen = seen_truth(truth, result.views, result.voxel, source.origin, progress)
+    return score_surface(_moved(mesh, source.origin), truth, comparison, seen)
 
 
 def _written(
-    arguments: argparse.Namespace, mesh: Mesh, result: MeshResult, source: Source, console: Terminal
+    arguments: argparse.Namespace,
+    mesh: Mesh,
+    result: MeshResult,
+    source: Source,
+    console: Terminal,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Write the mesh in the coordinates of the capture, and return the facts of its record."""
     unit = source.scene.unit
@@ -129,6 +129,8 @@ def _written(
         mesh = replace(mesh, colors=None)  # the texture has a colour for every place
     mesh = _moved(mesh, source.origin)
     facts: dict[str, Any] = {"file": str(arguments.out), "unit": unit}
+    stage = "convex parts" if arguments.collider == "convex" else "writing"
+    progress(stage, 0, 1)
     if arguments.collider == "convex":
         facts |= _write_convex(arguments.out, mesh, source.scene, console)
     else:
@@ -138,6 +140,7 @@ def _written(
         counted = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
         volume = _volume(result, unit or "world units")
         console.print(f"wrote {arguments.out}: {counted}; {volume}", soft_wrap=True)
+    progress(stage, 1, 1)
     emitter.report_output(arguments.out)
     return facts
 
@@ -175,13 +178,21 @@ def _write_convex(out: Path, mesh: Mesh, scene: Scene, console: Terminal) -> dic
     """Write convex parts of the mesh, say how much of it they leave out, and return both for its record."""
     parts, unit = convex_parts(mesh), scene.unit
     write_parts(out, [(f"collider_{number}", part) for number, part in enumerate(parts)], unit, scene.up)
-    farthest = farthest_outside(mesh.vertices, parts)
-    outside = short_number(farthest, 2)
+    fit = fit_of(mesh, parts)
     triangles = sum(len(part.faces) for part in parts)
     counted = f"{len(parts)} convex part{'s' * (len(parts) != 1)}, {triangles:,} triangles"
-    left_out = f"a vertex of the coarse mesh lies at most {outside} {unit or 'world units'} outside of them"
-    console.print(f"wrote {out}: {counted}; {left_out}", soft_wrap=True)
-    return {"convex_parts": len(parts), "outside": farthest}
+    outside = f"{short_number(fit.outside, 2)} {unit or 'world units'}"
+    console.print(f"wrote {out}: {counted}", soft_wrap=True)
+    console.print(f"a vertex of the coarse mesh lies at most {outside} outside of them", soft_wrap=True)
+    if fit.filled is None or fit.uncovered is None:
+        console.print("the coarse mesh is open, so how much empty space they fill is unknown", soft_wrap=True)
+    else:
+        filled, uncovered = (short_number(100.0 * share, 2) for share in (fit.filled, fit.uncovered))
+        console.print(
+            f"{filled} % of their volume is empty in the coarse mesh; they leave out {uncovered} % of its volume",
+            soft_wrap=True,
+        )
+    return {"convex_parts": len(parts), **fit._asdict()}
 
 
 def _cameras(source: Source, console: Terminal) -> Sequence[NamedCamera]:
@@ -199,25 +210,45 @@ def _cameras(source: Source, console: Terminal) -> Sequence[NamedCamera]:
 
 
 def _settings(
-    arguments: argparse.Namespace, source: Source, cameras: Sequence[NamedCamera], backend: Backend
+    arguments: argparse.Namespace,
+    source: Source,
+    cameras: Sequence[NamedCamera],
+    backend: Backend,
+    console: Terminal,
+    progress: Progress,
 ) -> MeshSettings:
-    """Return the settings of the options; the bounds are relative to the run's origin, as the scene is."""
-    faces = arguments.faces
-    if faces is None and arguments.texture:
-        faces = TEXTURE_FACES
-    voxel = arguments.voxel
-    if arguments.collider:
-        faces = COLLIDER_FACES if faces is None else faces
-        if voxel is None:
-            some = cameras[:: max(len(cameras) // MOST_HELD_OUT, 1)]
-            views = render_depths(source.scene.gaussians, some, source.settings, backend)
-            voxel = COLLIDER_VOXELS * default_voxel(views)
-    share = 0.0 if arguments.keep == "all" else SMALLEST_SHARE
+    """Plan the mesh, say what it will take, and return its settings; bounds are relative to the run's origin.
+
+    Raises:
+        ArgumentError: the mesh has to be simplified, and fast-simplification is not installed.
+        NotEnoughMemoryError: the mesh does not fit.
+    """
     bounds = None
     if arguments.bounds is not None:
         bounds = np.array(arguments.bounds).reshape(2, 3) - np.array(source.origin)
-    tidy = TidySettings(share, arguments.keep == "largest", faces=faces)
-    return MeshSettings(voxel, bounds, volume_room(arguments.max_memory, cameras), tidy)
+    found = survey(source.scene.gaussians, cameras, source.settings, backend, bounds, progress)
+    usual = TEXTURE_FACES if arguments.texture else COLLIDER_FACES if arguments.collider else MOST_FACES
+    faces = None if arguments.faces == ALL else arguments.faces or usual
+    demand = Demand(
+        voxel=arguments.voxel,
+        coarse=COLLIDER_VOXELS if arguments.collider else 1.0,
+        faces=None if faces is None else max(faces, MOST_FACES),
+        memory=arguments.max_memory,
+        texture=arguments.texture,
+    )
+    plan = plan_mesh(found, demand, available_memory())
+    if faces is not None and plan.triangles > faces:
+        require_simplification()
+    console.print(plan.sentence, soft_wrap=True)
+    share = 0.0 if arguments.keep == "all" else SMALLEST_SHARE
+    return MeshSettings(
+        arguments.voxel,
+        plan.voxel if plan.reason or arguments.collider else 0.0,
+        plan.most_faces,
+        bounds,
+        plan.room,
+        TidySettings(share, arguments.keep == "largest", faces=faces),
+    )
 
 
 def _moved(mesh: Mesh, origin: tuple[float, float, float]) -> Mesh:
@@ -232,7 +263,10 @@ def _trust(trust: MeshTrust) -> list[str]:
     if trust.held_out is not None:
         within = short_number(100 * trust.held_out.within, 3)
         views = trust.held_out.views
-        said.append(f"{within} % of the depths of {views} held-out views lie within a voxel of the mesh")
+        said.append(
+            f"{within} % of the splats' depths from {views} held-out views lie within a voxel of the mesh;"
+            " no photo is compared: where the splats are wrong, as on glossy things, so is the mesh"
+        )
     return [*said, _shape(trust.shape), _intersecting(trust.intersections)]
 
 
@@ -263,7 +297,13 @@ def _compared(scores: SurfaceScores, unit: str) -> list[str]:
         raise ArgumentError("--truth: the mesh has no area to compare")
     distances = f"accuracy {short_number(found.accuracy, 3)}, completeness {short_number(found.completeness, 3)} {unit}"
     rates = f"precision {found.precision:.3f}, recall {found.recall:.3f}, F1 {found.f1:.3f}"
+    share = short_number(100.0 * found.counted, 3)
+    seen = f"the cameras see {share} % of the truth; completeness and recall are of that part"
     angle = (
         "" if scores.normal_degrees is None else f"; normals {short_number(scores.normal_degrees, 3)} degrees"
     )
-    return [f"against the truth: {distances}", f"within {short_number(found.tau, 3)} {unit}: {rates}{angle}"]
+    return [
+        seen,
+        f"against the truth: {distances}",
+        f"within {short_number(found.tau, 3)} {unit}: {rates}{angle}",
+    ]

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Column
 from rich.text import Text
 
@@ -18,6 +30,9 @@ LINE_SECONDS = 30.0
 
 LINE_SHARE = 0.05
 """Least fraction of a task's time between two lines, so that a long task does not fill a log."""
+
+UNSTEADY = "mapping"
+"""The stage of `sfm` without a forecast: each photo takes longer than the last, and it may start over."""
 
 SPEED_SECONDS = 300.0
 """Seconds over which a task's speed is averaged: some tasks take a minute per step."""
@@ -94,12 +109,17 @@ class Bar(Progress):
         task = self._tasks[task_id]
         if not task.visible:
             return
-        emitter.progress(printable(task.description), task.completed, task.total, lambda: task.time_remaining)
+        emitter.progress(printable(task.description), task.completed, task.total, lambda: _left(task))
         if not self.console.is_terminal and task.fields.get("lines", True) and self.due(task_id):
             total = "" if task.total is None else f" of {task.total:,.0f}"
             line = f"{task.description}: {task.completed:,.0f}{total}, {self.times(task_id)}"
             # not Terminal.print: a job reports this as progress already
             Console.print(self.console, printable(line), markup=False, emoji=False, soft_wrap=True)
+
+
+def _left(task: Task) -> float | None:
+    """Return a task's time left; None at its end, since the time of what follows is unknown."""
+    return None if task.finished else task.time_remaining
 
 
 class TimeLeft(TimeRemainingColumn):
@@ -130,3 +150,34 @@ class Field(TextColumn):
     def render(self, task: Task) -> Text:
         """Return a task's text, escaped."""
         return Text(printable(self.text_format.format(task=task)), no_wrap=True, overflow="ellipsis")
+
+
+@contextmanager
+def stage_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a progress bar of the stage that runs; without a terminal, lines about long stages.
+
+    Args:
+        console: Console to draw on.
+
+    Yields:
+        The progress callback: name of the stage, steps done, all steps. A stage that comes again starts anew.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeLeft(compact=True),
+    )
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        current: tuple[str, TaskID] | None = None
+
+        def show(stage: str, done: int, total: int) -> None:
+            nonlocal current
+            if current is None or current[0] != stage:
+                if current is not None:
+                    bar.update(current[1], visible=False)
+                current = stage, bar.add_task(stage, total=total, steady=stage != UNSTEADY)
+            bar.update(current[1], completed=done, total=total)
+
+        yield show

@@ -31,8 +31,7 @@ from gsplat_edu.cli.options.train import AUTO, left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.result import tell_result
-from gsplat_edu.cli.sfm import stage_bars
-from gsplat_edu.cli.terminal import Bar, Field, Terminal
+from gsplat_edu.cli.terminal import Bar, Field, Terminal, stage_bars
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.points import read_points_ply

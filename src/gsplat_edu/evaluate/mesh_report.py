@@ -136,13 +136,16 @@ def _facts(record: Mapping[str, Any]) -> dict[str, str]:
         "triangles": _count(record.get("triangles")),
         "vertices": _count(record.get("vertices")),
         "convex parts": _count(record.get("convex_parts")),
+        "empty space in the parts": _joined("", _percent(record.get("filled")), " of their volume"),
+        "volume that the parts leave out": _joined("", _percent(record.get("uncovered")), " of the mesh's"),
+        "farthest vertex outside of the parts": _joined("", _number(record.get("outside")), unit),
         "size": _joined("", _size(record.get("size")), unit),
         "area": _joined("", _number(record.get("area")), f"{unit}, squared"),
         "voxel": _joined("", _number(record.get("voxel")), unit),
         "memory of the volume": _memory(record.get("volume_bytes")),
         f"area seen by {few} views or more": _percent(record.get("certain")),
         "distance of its depth maps": _joined("", _number(record.get("spread")), f"{unit} on average"),
-        "held-out depths within a voxel": _held_out(record.get("held_out")),
+        "splats' depths from held-out views within a voxel": _held_out(record.get("held_out")),
         "connected parts": _count(record.get("parts")),
         "holes": _holes(record),
         "triangles that pass through others": _intersecting(record.get("intersections")),
@@ -154,7 +157,9 @@ def _facts(record: Mapping[str, Any]) -> dict[str, str]:
 def _held_out(found: object) -> str:
     if not isinstance(found, Mapping):
         return ""
-    return _joined("", _percent(found.get("within")), f", of {_count(found.get('views'))} views")
+    return _joined(
+        "", _percent(found.get("within")), f", of {_count(found.get('views'))} views; no photo is compared"
+    )
 
 
 def _holes(record: Mapping[str, Any]) -> str:
@@ -178,10 +183,13 @@ def _truth(found: object, unit: str) -> dict[str, str]:
         return {}
     within = _joined(" within ", _number(found.get("tau")), unit)
     return {
+        "truth that the cameras see": _joined("", _percent(found.get("counted")), ""),
         "accuracy (distance to the truth)": _joined("", _number(found.get("accuracy")), unit),
-        "completeness (distance from the truth)": _joined("", _number(found.get("completeness")), unit),
+        "completeness (distance from the truth that they see)": _joined(
+            "", _number(found.get("completeness")), unit
+        ),
         "precision": _joined("", _number(found.get("precision")), within),
-        "recall": _joined("", _number(found.get("recall")), within),
+        "recall (of the truth that they see)": _joined("", _number(found.get("recall")), within),
         "F1": _joined("", _number(found.get("f1")), within),
         "angle of normals to the truth's": _joined("", _number(found.get("normal_degrees")), " degrees"),
     }

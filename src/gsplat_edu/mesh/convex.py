@@ -14,9 +14,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from gsplat_edu.base.errors import ArgumentError
@@ -37,6 +38,16 @@ half), and the surface then encloses a positive volume."""
 
 SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2}
 """Effort of the search for each cut; CoACD's defaults took twice as long for as many parts of a torus."""
+
+PROBES = 16_384
+"""Points by which volumes are compared."""
+
+SPREAD = 1.0 / 1.2207440846057596 ** np.arange(1, 4)
+"""Steps of the points along the sides of their box: no plane holds many of them. The number is the root of
+x^4 = x + 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences")."""
+
+PAIRS = 1 << 18
+"""Pairs of a point and a face whose solid angles are computed at a time."""
 
 ROWS = 256
 """Points whose distances to all triangles of the parts are computed at a time."""
@@ -146,13 +157,7 @@ def farthest_outside(points: Float64[np.ndarray, "N 3"], parts: Sequence[Mesh]) 
         points: (N, 3) points.
         parts: Convex parts, at least one, their faces outward.
     """
-    outside = np.ones(len(points), dtype=bool)
-    for part in parts:
-        normals, corner = part.face_normals(), part.corners[:, 0]
-        rows = np.flatnonzero(outside)
-        heights = points[rows] @ normals.T - (normals * corner).sum(axis=1)
-        outside[rows] = (heights > 0.0).any(axis=1)
-    left = points[outside]
+    left = points[_outside(points, parts)]
     triangles = np.concatenate([part.corners for part in parts])
     farthest = 0.0
     for start in range(0, len(left), ROWS):
@@ -161,3 +166,73 @@ def farthest_outside(points: Float64[np.ndarray, "N 3"], parts: Sequence[Mesh]) 
         distances = triangle_distances(pairs, np.tile(triangles, (len(rows), 1, 1)))
         farthest = max(farthest, float(distances.reshape(len(rows), -1).min(axis=1).max()))
     return farthest
+
+
+class ConvexFit(NamedTuple):
+    """How convex parts differ from the mesh that they stand for.
+
+    Args:
+        outside: Distance by which a vertex of the mesh lies outside of all parts at most, world units.
+        filled: Volume inside the parts and outside of the mesh: empty space where things collide. A share of the
+            parts' volume, 0 to 1; None if the mesh is open and encloses nothing.
+        uncovered: Volume inside the mesh and outside of the parts, as a share of the mesh's; likewise None.
+    """
+
+    outside: float
+    filled: float | None
+    uncovered: float | None
+
+
+def fit_of(mesh: Mesh, parts: Sequence[Mesh]) -> ConvexFit:
+    """Compare convex parts with their mesh, whose holes are closed as `convex_parts` closes them.
+
+    Volumes are counts of `PROBES` points that fill the box around both evenly, the same for every call: their error is
+    less than 1 % of the box.
+
+    Args:
+        mesh: The mesh.
+        parts: Its convex parts, at least one, their faces outward.
+    """
+    outside = farthest_outside(mesh.vertices, parts)
+    solid, closed = _solid(separated(mesh))
+    if not closed:
+        return ConvexFit(outside, None, None)
+    corners = np.concatenate([solid.vertices, *(part.vertices for part in parts)])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    points = low + (high - low) * (np.arange(1, PROBES + 1)[:, None] * SPREAD % 1.0)
+    covered = ~_outside(points, parts)
+    within = _inside(points, solid)
+    filled = float((covered & ~within).sum()) / max(int(covered.sum()), 1)
+    uncovered = float((within & ~covered).sum()) / max(int(within.sum()), 1)
+    return ConvexFit(outside, filled, uncovered)
+
+
+def _outside(points: Float64[np.ndarray, "N 3"], parts: Sequence[Mesh]) -> Bool[np.ndarray, " N"]:
+    """Return which points lie outside of all parts."""
+    outside = np.ones(len(points), dtype=bool)
+    for part in parts:
+        normals, corner = part.face_normals(), part.corners[:, 0]
+        rows = np.flatnonzero(outside)
+        heights = points[rows] @ normals.T - (normals * corner).sum(axis=1)
+        outside[rows] = (heights > 0.0).any(axis=1)
+    return outside
+
+
+def _inside(points: Float64[np.ndarray, "N 3"], solid: Mesh) -> Bool[np.ndarray, " N"]:
+    """Return which points a closed mesh encloses, by the solid angle of its faces: 4 pi inside, 0 outside.
+
+    tan(angle / 2) = a · (b x c) / (|a| |b| |c| + (a · b) |c| + (b · c) |a| + (c · a) |b|) with the corners a, b, c seen
+    from the point (van Oosterom and Strackee 1983).
+    """
+    inside = np.zeros(len(points), dtype=bool)
+    rows = max(PAIRS // max(len(solid.faces), 1), 1)
+    for start in range(0, len(points), rows):
+        seen = solid.corners[None] - points[start : start + rows, None, None]
+        lengths = np.linalg.norm(seen, axis=-1)
+        a, b, c = np.moveaxis(seen, 2, 0)
+        p, q, r = np.moveaxis(lengths, 2, 0)
+        triple = np.einsum("nfd,nfd->nf", a, np.cross(b, c))
+        ab, bc, ca = (np.einsum("nfd,nfd->nf", *pair) for pair in ((a, b), (b, c), (c, a)))
+        angles = 2.0 * np.arctan2(triple, p * q * r + ab * r + bc * p + ca * q)
+        inside[start : start + rows] = angles.sum(axis=1) > 2.0 * np.pi
+    return inside

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError, NotEnoughMemoryError
-from gsplat_edu.base.headroom import available_memory
-from gsplat_edu.base.text import short_number, spelled_bytes
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.base.text import short_number
 from gsplat_edu.mesh.depths import (
     CONTRADICTIONS,
     LEAST_ALPHA,
@@ -20,10 +19,9 @@ from gsplat_edu.mesh.depths import (
     DepthView,
     Progress,
     checked,
-    focal,
     render_depths,
 )
-from gsplat_edu.mesh.faces import faces_of
+from gsplat_edu.mesh.plan import LONGEST_SIDE, default_voxel, fitting, touched
 from gsplat_edu.mesh.tidy import TidySettings, tidied
 from gsplat_edu.mesh.volume import TRUNCATION, SparseVolume
 from gsplat_edu.render.backend import Backend
@@ -33,11 +31,13 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.rig import through_lenses
 
-VOXEL_PIXELS = 1.5
-"""Edge of a voxel at the median depth, px."""
-
 COARSEST = 4.0
 """Depths are dropped where a pixel covers more voxels than this: the surface there would be stairs."""
+
+ERRORS = 3.0
+"""Least truncation, standard deviations of the depth maps' errors. A view says less and less about voxels that lie more
+than half the truncation behind its surface, so errors that put a surface too near count less than those that put it too
+far. The surface moves inward by 0.19 deviations at 2, by 0.05 at 3 (normal errors)."""
 
 MOST_TRUNCATION = 8.0
 """Largest truncation, voxels: beyond it, corners and thin things fill up."""
@@ -45,24 +45,14 @@ MOST_TRUNCATION = 8.0
 LARGER_VOXEL = 1.25
 """Factor on the voxel if the volume does not fit into the memory."""
 
-BLOCK = 8
-"""Voxels along an edge of a block of the volume."""
-
 MOST_ENLARGEMENTS = 12
 """Largest number of such steps: voxels 15 times as large."""
 
-LONGEST_SIDE = 1_600
-"""Depth maps are rendered with at most so many px on the longer side."""
+BLOCK = 8
+"""Voxels along an edge of a block of the volume."""
 
-
-PROGRAM_BYTES = 450 * 2**20
-"""Memory of the process with a scene before it renders depth maps."""
-
-PIXEL_BYTES = 10
-"""Memory of a pixel of the depth maps."""
-
-AFTERWARDS = 1.6
-"""Memory of mesh, tidying and what is found out about the mesh, as a multiple of the volume's, which is freed first."""
+FEWER = 1.02
+"""Factor on a voxel that would just give the number of triangles: their number is no exact power of it."""
 
 
 @dataclass(frozen=True)
@@ -70,13 +60,17 @@ class MeshSettings:
     """How a mesh is made.
 
     Args:
-        voxel: Edge of a voxel, world units; None for `VOXEL_PIXELS` at the median depth.
+        voxel: Edge of a voxel, world units; None for 1.5 px at the median depth, or more if the limits ask for it.
+        least_voxel: Without `voxel`, the smallest edge, world units, as of `plan_mesh`.
+        most_faces: Most triangles before tidying, as of `plan_mesh`; None for any number.
         bounds: (2, 3) lower and upper corner of the box to mesh, world units; None for everything that is seen.
-        max_bytes: Most memory of the volume, as of `volume_room`; None for what is free.
+        max_bytes: Most memory of the volume, as of `plan_mesh`; None for what is free.
         tidy: How the surface is tidied.
     """
 
     voxel: float | None = None
+    least_voxel: float = 0.0
+    most_faces: int | None = None
     bounds: Float64[np.ndarray, "2 3"] | None = None
     max_bytes: int | None = None
     tidy: TidySettings = field(default_factory=TidySettings)
@@ -121,17 +115,17 @@ def extract_mesh(
         render_settings: How the scene is rendered.
         backend: What renders.
         settings: Voxels, bounds, memory and tidying; None for the defaults.
-        progress: Called after every view of every stage.
+        progress: Called with the stage that runs, after every view or step of it.
 
     Raises:
         ArgumentError: there are no cameras or no Gaussians, or the views show no surface.
-        NotEnoughMemoryError: the volume does not fit, with a given voxel, or at all.
+        NotEnoughMemoryError: the volume or its triangles do not fit, with a given voxel, or at all.
     """
     settings = MeshSettings() if settings is None else settings
     if not cameras or not len(gaussians):
         raise ArgumentError("mesh: needs at least one camera and one splat")
     notes = []
-    shown = [(name, _fitting(camera)) for name, camera in cameras]
+    shown = [(name, fitting(camera)) for name, camera in cameras]
     if any(small is not camera for (_, small), (_, camera) in zip(shown, cameras, strict=True)):
         notes.append(f"depth maps have at most {LONGEST_SIDE} px on their longer side")
     if through_lenses(camera for _, camera in shown):
@@ -139,92 +133,93 @@ def extract_mesh(
             "cameras with a lens of their own are shown by pinholes, of wide lenses by faces of a cube"
         )
     rendered = render_depths(gaussians, shown, render_settings, backend, progress)
-    wanted = settings.voxel or default_voxel(rendered)
-    volume, views, counts = _filled(rendered, wanted, settings, progress)
-    voxel, truncation, memory = volume.voxel, volume.truncation, volume.memory
-    if voxel > wanted:
-        notes.append(
-            f"voxels of {voxel:.4g} instead of {wanted:.4g}, so that the volume fits into the memory"
-        )
-    raw = volume.mesh()
-    del volume  # tidying needs memory too
-    if not len(raw.faces):
+    wanted = settings.voxel or max(default_voxel(rendered), settings.least_voxel)
+    cut = _cut(rendered, wanted, settings, progress)
+    if cut.voxel > wanted:
+        limits = "the volume fits into the memory"
+        if settings.most_faces is not None:
+            limits += f" and has at most {settings.most_faces:,} triangles"
+        notes.append(f"voxels of {cut.voxel:.4g} instead of {wanted:.4g}, so that {limits}")
+    before = len(cut.raw.faces)
+    if not before:
         raise ArgumentError(
             "mesh: the views show no surface; train longer, choose a larger --voxel, or look at the depths with"
             " render --maps"
         )
-    progress("tidying", 0, 1)
-    before = len(raw.faces)
-    mesh = tidied(raw, settings.tidy)
-    progress("tidying", 1, 1)
-    notes += _sentences(counts)
+    mesh = tidied(cut.raw, settings.tidy, progress)
+    notes += _sentences(cut.counts)
     if len(mesh.faces) != before:
         notes.append(f"{before:,} faces before tidying, {len(mesh.faces):,} after it")
-    return MeshResult(mesh, voxel, truncation, memory, counts, views, tuple(notes))
+    return MeshResult(mesh, cut.voxel, cut.truncation, cut.memory, cut.counts, cut.views, tuple(notes))
 
 
-def volume_room(most: int | None, cameras: Sequence[tuple[str, Camera]]) -> int | None:
-    """Return how much memory the volume may take so that all work on a mesh fits.
+class _Cut(NamedTuple):
+    """The surface of a volume, and what is known of the volume, which is freed."""
 
-    Args:
-        most: Most memory of the process, bytes; None for what it has now and what is free.
-        cameras: Names and cameras of the depth maps.
-
-    Returns:
-        Bytes, for `MeshSettings.max_bytes`; None if `most` is None and the system does not say what is free.
-
-    Raises:
-        NotEnoughMemoryError: the depth maps alone do not fit.
-    """
-    faces = [face for _, camera in cameras for face in faces_of(_fitting(camera))]
-    maps = PIXEL_BYTES * sum(face.W * face.H for face in faces)
-    left = available_memory() if most is None else most - PROGRAM_BYTES
-    if left is None:
-        return None
-    if left <= maps:
-        needed = spelled_bytes(maps if most is None else maps + PROGRAM_BYTES)
-        raise NotEnoughMemoryError(f"mesh: {len(faces)} depth maps need {needed}; give more memory")
-    return int((left - maps) / AFTERWARDS)
+    raw: Mesh
+    voxel: float
+    truncation: float
+    memory: int
+    views: list[DepthView]
+    counts: DepthCounts
 
 
-def _fitting(camera: Camera) -> Camera:
-    """Return a camera whose image is at most `LONGEST_SIDE` on its longer side."""
-    return resized(camera, LONGEST_SIDE) if max(camera.W, camera.H) > LONGEST_SIDE else camera
+def _cut(rendered: Sequence[DepthView], wanted: float, settings: MeshSettings, progress: Progress) -> _Cut:
+    """Return the surface of the depth maps.
 
-
-def _filled(
-    rendered: Sequence[DepthView], wanted: float, settings: MeshSettings, progress: Progress
-) -> tuple[SparseVolume, list[DepthView], DepthCounts]:
-    """Return the volume of the depth maps, the maps as they were used, and their counts.
-
-    Voxels are enlarged until the volume fits into the memory, unless the settings give their size.
+    Voxels are enlarged until the volume fits into the memory and its surface has at most `settings.most_faces`
+    triangles, unless the settings give their size.
 
     Raises:
-        NotEnoughMemoryError: the volume does not fit.
+        NotEnoughMemoryError: the volume or its surface does not fit.
     """
     voxel = wanted
     for step in range(MOST_ENLARGEMENTS + 1):
-        views, counts = checked(rendered, COARSEST * voxel, progress)
-        if settings.bounds is not None:
-            views = [_within(view, settings.bounds) for view in views]
-        truncation = max(TRUNCATION * voxel, _twice_the_error(views, counts))
-        volume = SparseVolume(voxel, min(truncation, MOST_TRUNCATION * voxel), settings.max_bytes)
         fixed = settings.voxel is not None or step == MOST_ENLARGEMENTS
-        fitting = _integrate(volume, views, progress, must_fit=fixed)
-        if fitting == len(views):
-            return volume, views, counts
-        del volume
-        voxel = _enlarged(voxel, views, max(fitting, 1))
+        volume, views, counts, added = _filled(rendered, voxel, settings, progress, must_fit=fixed)
+        if added < len(views):
+            del volume
+            voxel = _enlarged(voxel, views, max(added, 1))
+            continue
+        progress("triangles", 0, 1)
+        raw = volume.mesh()
+        progress("triangles", 1, 1)
+        excess = 0.0 if settings.most_faces is None else len(raw.faces) / settings.most_faces
+        if excess <= 1.0:
+            return _Cut(raw, volume.voxel, volume.truncation, volume.memory, views, counts)
+        if fixed:
+            raise NotEnoughMemoryError(
+                f"voxel: {voxel:.3g} makes {len(raw.faces):,} triangles, but the memory has room for"
+                f" {settings.most_faces:,}; take a --voxel of {FEWER * voxel * math.sqrt(excess):.2g} or more"
+            )
+        del volume, raw
+        voxel *= FEWER * math.sqrt(excess)
     raise AssertionError("the last step returns or raises")
+
+
+def _filled(
+    rendered: Sequence[DepthView], voxel: float, settings: MeshSettings, progress: Progress, must_fit: bool
+) -> tuple[SparseVolume, list[DepthView], DepthCounts, int]:
+    """Return the volume of the depth maps, the maps as they were used, their counts, and how many maps fit.
+
+    Raises:
+        NotEnoughMemoryError: they do not all fit, but have to.
+    """
+    views, counts = checked(rendered, COARSEST * voxel, progress)
+    if settings.bounds is not None:
+        views = [_within(view, settings.bounds) for view in views]
+    truncation = max(TRUNCATION * voxel, ERRORS * _error(views, counts))
+    volume = SparseVolume(voxel, min(truncation, MOST_TRUNCATION * voxel), settings.max_bytes)
+    return volume, views, counts, _integrate(volume, views, progress, must_fit)
 
 
 def _enlarged(voxel: float, views: Sequence[DepthView], fitting: int) -> float:
     """Return a larger voxel, with which all views touch about as many blocks as the first `fitting` views do now."""
     points = [_some_points(view) for view in views]
-    most = _touched(points[:fitting], voxel)
+    most = touched(points[:fitting], BLOCK * voxel)
     for _ in range(MOST_ENLARGEMENTS):
         voxel *= LARGER_VOXEL
-        if _touched(points, voxel) <= most:
+        if touched(points, BLOCK * voxel) <= most:
             break
     return voxel
 
@@ -237,32 +232,8 @@ def _some_points(view: DepthView) -> Float64[np.ndarray, "n 3"]:
     return np.asarray(view.camera.eye + depth[rows, columns][:, None] * rays)
 
 
-def _touched(points: Sequence[Float64[np.ndarray, "_ 3"]], voxel: float) -> int:
-    """Return about how many blocks contain a point: those of one hash count once."""
-    x, y, z = np.floor(np.concatenate(points) / (BLOCK * voxel)).astype(np.int64).T
-    return len(np.unique(x * 73_856_093 ^ y * 19_349_663 ^ z * 83_492_791))
-
-
-def default_voxel(views: Sequence[DepthView]) -> float:
-    """Return `VOXEL_PIXELS` times the size of a pixel at the median depth of all views.
-
-    Raises:
-        ArgumentError: no view shows a surface.
-    """
-    sizes = [
-        float(np.median(view.depth[view.depth > 0])) / focal(view.camera)
-        for view in views
-        if view.depth.any()
-    ]
-    if not sizes:
-        raise ArgumentError(
-            f"mesh: no view has a pixel with an alpha of {LEAST_ALPHA:g} or more; train longer, or render other views"
-        )
-    return VOXEL_PIXELS * float(np.median(sizes))
-
-
-def _twice_the_error(views: Sequence[DepthView], counts: DepthCounts) -> float:
-    """Return two standard deviations of the depth maps' disagreement at the median depth, world units.
+def _error(views: Sequence[DepthView], counts: DepthCounts) -> float:
+    """Return the standard deviation of the depth maps' disagreement at the median depth, world units.
 
     The median of |x| of a normal distribution is 0.6745 of its standard deviation; the difference of two maps has the
     root of two times that of one.
@@ -270,7 +241,7 @@ def _twice_the_error(views: Sequence[DepthView], counts: DepthCounts) -> float:
     depths = [float(np.median(view.depth[view.depth > 0])) for view in views if view.depth.any()]
     if not depths:
         return 0.0
-    return 2.0 * counts.error * float(np.median(depths)) / (0.6745 * math.sqrt(2.0))
+    return counts.error * float(np.median(depths)) / (0.6745 * math.sqrt(2.0))
 
 
 def _within(view: DepthView, bounds: Float64[np.ndarray, "2 3"]) -> DepthView:

@@ -14,7 +14,9 @@ faces, nearly all by pairs of faces back to back, and now and then a face that i
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt64
@@ -79,12 +81,17 @@ class TidySettings:
     faces: int | None = None
 
 
-def tidied(mesh: Mesh, settings: TidySettings | None = None) -> Mesh:
+def tidied(
+    mesh: Mesh,
+    settings: TidySettings | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> Mesh:
     """Clean a mesh, drop small components, fill small holes, smooth and decimate it, in this order.
 
     Args:
         mesh: The mesh, without a texture.
         settings: What to do; None for the defaults.
+        progress: Called after each step of "tidying", and before and after "simplifying" if there is something to do.
 
     Returns:
         A manifold mesh. It has no faces if the input has none.
@@ -94,14 +101,22 @@ def tidied(mesh: Mesh, settings: TidySettings | None = None) -> Mesh:
             installed.
     """
     settings = TidySettings() if settings is None else settings
-    mesh = separated(without_spoiled_faces(mesh))
-    mesh = with_large_components(mesh, settings.share, settings.largest)
-    if settings.holes:
-        mesh = with_filled_holes(mesh)
-    mesh = smoothed(mesh, settings.smoothing)
-    if settings.faces is not None:
+    steps: list[Callable[[Mesh], Mesh]] = [
+        without_spoiled_faces,
+        separated,
+        lambda whole: with_large_components(whole, settings.share, settings.largest),
+        lambda whole: with_filled_holes(whole) if settings.holes else whole,
+        lambda whole: smoothed(whole, settings.smoothing),
+    ]
+    for done, step in enumerate(steps):
+        progress("tidying", done, len(steps))
+        mesh = step(mesh)
+    progress("tidying", len(steps), len(steps))
+    if settings.faces is not None and len(mesh.faces) > settings.faces:
+        progress("simplifying", 0, 1)
         # Repairs after decimation cut specks off.
         mesh = with_large_components(decimated(mesh, settings.faces), settings.share, settings.largest)
+        progress("simplifying", 1, 1)
     return mesh
 
 
@@ -370,13 +385,22 @@ def decimated(mesh: Mesh, faces: int) -> Mesh:
     return Mesh(best.vertices, best.faces, colors)
 
 
+def require_simplification() -> None:
+    """Check that meshes can be decimated.
+
+    Raises:
+        ArgumentError: fast-simplification is not installed.
+    """
+    if find_spec("fast_simplification") is None:
+        how = install_command("mesh")
+        raise ArgumentError(f"faces: needs fast-simplification, which is not installed: {how}")
+
+
 def _simplified(mesh: Mesh, faces: int, aggressiveness: float) -> Mesh:
     """Return the result of fast-simplification, without colours."""
-    try:
-        import fast_simplification
-    except ImportError:
-        how = install_command("mesh")
-        raise ArgumentError(f"faces: needs fast-simplification, which is not installed: {how}") from None
+    require_simplification()
+    import fast_simplification
+
     centre = mesh.vertices.mean(axis=0)  # its quadrics lose digits far from the origin
     scale = float(np.abs(mesh.vertices - centre).max()) or 1.0
     with _one_at_a_time:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from gsplat_edu.evaluate.intersections import Intersections, self_intersections
-from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_points
+from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.evaluate.surface import Comparison, Counts, SurfaceScores, score_points, visible_points
 from gsplat_edu.evaluate.topology import Topology, topology
-from gsplat_edu.mesh.depths import DepthView, camera_points
+from gsplat_edu.mesh.depths import DepthView, Progress, camera_points
 from gsplat_edu.mesh.extract import MeshResult
+from gsplat_edu.mesh.raster import rasterized
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.mesh import Mesh
 
 FEW_VIEWS = 3
@@ -22,6 +25,8 @@ FEW_VIEWS = 3
 EVERY = 4
 """Every fourth column and row of a held-out depth map is compared with the mesh."""
 
+TRUTH_SIDE = 640
+"""Longer side, px, of the images in which it is found out what the cameras see of the truth."""
 
 VERTICES = 1 << 13
 """Vertices that are looked up at a time."""
@@ -42,11 +47,11 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class HeldOutDepths:
-    """The depths of views that the mesh was not made from.
+    """The splats' depths from views that the mesh was not made from: how well it follows the splats, not the photos.
 
     Args:
         views: Number of views.
-        within: Fraction of their depths that lie within a voxel of the mesh, 0 to 1.
+        within: Fraction of the splats' depths there that lie within a voxel of the mesh, 0 to 1.
     """
 
     views: int
@@ -77,7 +82,10 @@ class MeshTrust:
 
 
 def trust_of(
-    result: MeshResult, held_out: Sequence[DepthView], scores: SurfaceScores | None = None
+    result: MeshResult,
+    held_out: Sequence[DepthView],
+    scores: SurfaceScores | None = None,
+    progress: Progress = lambda what, done, total: None,
 ) -> MeshTrust:
     """Collect what is known of a mesh's accuracy.
 
@@ -85,34 +93,71 @@ def trust_of(
         result: The mesh and the depth maps that it was made from.
         held_out: Depth maps of other views.
         scores: Comparison with the truth, if there is one.
+        progress: Called after each view, and before and after "intersections".
     """
-    seen = seen_by(result.mesh, result.views, result.truncation)
+    seen = seen_by(result.mesh, result.views, result.truncation, progress)
     areas = _areas_of_vertices(result.mesh)
     known = areas * (seen.views > 0)
     spread = None
     if known.any():
         spread = float((known * np.where(seen.views > 0, seen.error, 0.0)).sum() / known.sum())
-    return MeshTrust(
-        seen,
-        float((areas * (seen.views >= FEW_VIEWS)).sum() / (areas.sum() or 1.0)),
-        spread,
-        _agreement(result, held_out),
-        topology(result.mesh),
-        self_intersections(result.mesh),
-        scores,
-    )
+    agreement, shape = _agreement(result, held_out), topology(result.mesh)
+    progress("intersections", 0, 1)
+    intersections = self_intersections(result.mesh)
+    progress("intersections", 1, 1)
+    certain = float((areas * (seen.views >= FEW_VIEWS)).sum() / (areas.sum() or 1.0))
+    return MeshTrust(seen, certain, spread, agreement, shape, intersections, scores)
 
 
-def seen_by(mesh: Mesh, views: Sequence[DepthView], tolerance: float) -> Seen:
+def seen_truth(
+    truth: Mesh,
+    views: Sequence[DepthView],
+    tolerance: float,
+    origin: tuple[float, float, float] = ORIGIN,
+    progress: Progress = lambda what, done, total: None,
+) -> Counts:
+    """Return what tells which points of the true surface the views see: no method could find the others.
+
+    Args:
+        truth: The true surface.
+        views: The depth maps of the mesh, whose cameras count.
+        tolerance: A point is seen if it lies at most so far behind the true surface in front of it, world units.
+        origin: What was subtracted from the coordinates of the truth for the cameras.
+        progress: Called after each view, "truth".
+    """
+    here = replace(truth, vertices=truth.vertices - np.array(origin))
+
+    def counts(points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        places, seen = points - np.array(origin), np.zeros(len(points), dtype=bool)
+        for done, view in enumerate(views, 1):
+            camera = view.camera
+            if max(camera.W, camera.H) > TRUTH_SIDE:
+                camera = resized(camera, TRUTH_SIDE)
+            left = np.flatnonzero(~seen)
+            depth = rasterized(here, camera).depth
+            seen[left] = visible_points(places[left], [camera], [depth], tolerance)
+            progress("truth", done, len(views))
+        return seen
+
+    return counts
+
+
+def seen_by(
+    mesh: Mesh,
+    views: Sequence[DepthView],
+    tolerance: float,
+    progress: Progress = lambda what, done, total: None,
+) -> Seen:
     """Count the depth maps that show each vertex, and measure how far they are from it.
 
     Args:
         mesh: The mesh.
         views: The depth maps.
         tolerance: A map shows a vertex if its depth there differs by less than this, world units.
+        progress: Called after each view, "trust".
     """
     count, total = np.zeros(len(mesh.vertices), dtype=np.int64), np.zeros(len(mesh.vertices))
-    for view in views:
+    for done, view in enumerate(views, 1):
         camera, depths = view.camera, view.depth
         H, W = depths.shape
         for first in range(0, len(mesh.vertices), VERTICES):  # few enough for the processor's cache
@@ -130,6 +175,7 @@ def seen_by(mesh: Mesh, views: Sequence[DepthView], tolerance: float) -> Seen:
             shown = (depth > 0) & (apart < tolerance)
             count[part][at] += shown
             total[part][at] += np.where(shown, apart, 0.0)
+        progress("trust", done, len(views))
     return Seen(count, np.where(count > 0, total / np.maximum(count, 1), np.inf))
 
 

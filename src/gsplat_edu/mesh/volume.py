@@ -46,8 +46,8 @@ class SparseVolume:
 
     Args:
         voxel: Edge length of a voxel, world units.
-        truncation: t, world units, 1 to 64 voxels; `TRUNCATION` voxels if None. It should be at least twice the
-            standard deviation of the depth maps' errors.
+        truncation: t, world units, 1 to 64 voxels; `TRUNCATION` voxels if None. It should be at least three
+            times the standard deviation of the depth maps' errors, or surfaces shrink.
         max_bytes: Most memory of the blocks; if None, what is free now.
 
     Raises:

@@ -105,7 +105,7 @@ MESH: Mapping[str, Check] = {
     "intersections": _numbers,
     "truth": _numbers,
     "left_out": _numbers,
-    **dict.fromkeys(("area", "voxel", "certain", "spread", "outside"), _number),
+    **dict.fromkeys(("area", "voxel", "certain", "spread", "outside", "filled", "uncovered"), _number),
     **dict.fromkeys(
         ("iterations", "triangles", "vertices", "convex_parts", "volume_bytes", "few_views"), _whole
     ),

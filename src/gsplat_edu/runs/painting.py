@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import decode_mask
-from gsplat_edu.mesh.depths import DepthView
+from gsplat_edu.mesh.depths import DepthView, Progress
 from gsplat_edu.mesh.faces import drawn_in
 from gsplat_edu.mesh.texture import TextureSettings, TextureView, textured
 from gsplat_edu.runs.folder import RunFolder
@@ -30,6 +30,7 @@ def painted(
     views: Sequence[DepthView],
     run: RunFolder | None = None,
     settings: TextureSettings | None = None,
+    progress: Progress = lambda what, done, total: None,
 ) -> Mesh:
     """Give a mesh a texture from the training photos.
 
@@ -42,24 +43,26 @@ def painted(
         views: Depth maps of the scene, by the names of the photos; photos without one are not used.
         run: The scene's run, whose masks of things that move count; None for none.
         settings: Size and blending; None for the defaults.
+        progress: Called before the mesh is laid out, "layout", and after every photo, "painting".
 
     Raises:
         ArgumentError: no photo has a depth map, or as for `textured`.
         DatasetError: a photo or a mask cannot be read.
     """
     photos = {view.name: view for view in dataset.train}
-    if not any(view.name in photos for view in views):
+    used = [view for view in views if view.name in photos]
+    if not used:
         raise ArgumentError("--texture: none of the depth maps is of a photo of the capture; check --dataset")
-    return textured(mesh, _views(views, photos, run), settings)
+    progress("layout", 0, 1)
+    return textured(mesh, _views(used, photos, run, progress), settings)
 
 
 def _views(
-    views: Sequence[DepthView], photos: Mapping[str, View], run: RunFolder | None
+    views: Sequence[DepthView], photos: Mapping[str, View], run: RunFolder | None, progress: Progress
 ) -> Iterator[TextureView]:
     """Yield the photos one by one, at the size of their depth maps, or drawn in the faces of their lens."""
-    for view in views:
-        if view.name not in photos:
-            continue
+    for done, view in enumerate(views):
+        progress("painting", done, len(views))
         photo = photos[view.name].read()
         camera = view.camera if view.lens is None else view.lens
         H, W = camera.H, camera.W
@@ -79,6 +82,7 @@ def _views(
             shown, _ = drawn_in(view.camera, view.depth, camera, counts.astype(np.uint8), cv2.INTER_NEAREST)
             counts = inside & (shown > 0)
         yield TextureView(view.camera, image, np.where(counts, view.depth, np.float32(0)))
+    progress("painting", len(views), len(views))
 
 
 def _bytes(photo: Photo) -> UInt8[np.ndarray, "H W 3"]:

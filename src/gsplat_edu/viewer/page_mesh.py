@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from gsplat_edu.base.constants import PAGE_FACES
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.edit import Similarity
 from gsplat_edu.io.mesh_files import read_mesh
@@ -26,9 +27,6 @@ from gsplat_edu.io.mesh_image import encoded
 from gsplat_edu.io.mesh_parts import split_at_seams
 from gsplat_edu.runs.source import Source
 from gsplat_edu.scene.mesh import Mesh
-
-MOST_FACES = 2_000_000
-"""Faces of all meshes of a page. They take about 60 MB before compression."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +61,7 @@ def open_meshes(surface: Path | None, collider: Path | None, source: Source) -> 
         The meshes in the coordinates of the scene; None without a surface.
 
     Raises:
-        ArgumentError: there is a collider only, a file is of no known format, or they have more than `MOST_FACES`
+        ArgumentError: there is a collider only, a file is of no known format, or they have more than `PAGE_FACES`
             faces.
         SceneFormatError: a file is damaged.
         OSError: a file cannot be read.
@@ -76,9 +74,9 @@ def open_meshes(surface: Path | None, collider: Path | None, source: Source) -> 
     for file in (surface,) if collider is None else (surface, collider):
         mesh = read_mesh(file, source.scene.unit)
         faces += len(mesh.faces)
-        if faces > MOST_FACES:
+        if faces > PAGE_FACES:
             raise ArgumentError(
-                f"{file}: a page holds at most {MOST_FACES:,} triangles, but this makes {faces:,};"
+                f"{file}: a page holds at most {PAGE_FACES:,} triangles, but this makes {faces:,};"
                 " make a smaller one with gsplat-edu mesh --faces"
             )
         found.append(replace(mesh, vertices=mesh.vertices - np.array(source.origin)))

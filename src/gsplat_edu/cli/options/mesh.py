@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsplat_edu.base.constants import PAGE_FACES
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range
 from gsplat_edu.cli.arguments import add_backend, bytes_text, number_text, numbers_text, whole_number_text
@@ -29,6 +30,12 @@ COLLIDERS = ("triangles", "convex")
 COLLIDER_FACES = 5_000
 """Faces of a collider unless --faces gives another number."""
 
+MOST_FACES = PAGE_FACES - COLLIDER_FACES
+"""Most faces of a mesh unless --faces gives another number: a page has room for it and for a collider."""
+
+ALL = "all"
+"""Value of --faces that keeps all triangles."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
@@ -44,13 +51,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number_text,
         metavar="SIZE",
         help="edge of a voxel, world units; details below about two voxels are lost (default: 1.5 px of the photos at"
-        " their median depth)",
+        " their median depth, or more, so that --faces and --max-memory are kept)",
     )
     parser.add_argument(
         "--faces",
-        type=whole_number_text,
-        metavar="N",
-        help="reduce the mesh to about N triangles (extra mesh)",
+        type=_faces_text,
+        metavar="N|all",
+        help=f"reduce the mesh to about N triangles (extra mesh); {ALL}: as many as the memory holds (default: at most"
+        f" {MOST_FACES:,}, by larger voxels, so that a page can show it; with --voxel, by reduction)",
     )
     parser.add_argument(
         "--keep",
@@ -71,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-memory",
         type=bytes_text,
         metavar="SIZE",
-        help="memory of the command, for example 2GiB; without --voxel, larger voxels are chosen until all fits"
+        help="memory of the command, for example 2GiB; without --voxel, voxels are chosen so large that all fits"
         " (default: what is free)",
     )
     _add_truth(parser)
@@ -107,7 +115,8 @@ def _add_truth(parser: argparse.ArgumentParser) -> None:
         "--truth",
         type=Path,
         metavar="FILE",
-        help="true surface in the same coordinates, a mesh file; print distances to it, F1 and the angle of normals",
+        help="true surface in the same coordinates, a mesh file; print distances to it, F1 and the angle of normals;"
+        " only what the cameras see of it, and what --bounds contains, counts",
     )
     parser.add_argument(
         "--tau",
@@ -115,6 +124,11 @@ def _add_truth(parser: argparse.ArgumentParser) -> None:
         metavar="SIZE",
         help="distance below which a point counts as correct for --truth, world units (default: one voxel)",
     )
+
+
+def _faces_text(text: str) -> int | str:
+    """Parse a number of faces, or "all"."""
+    return text if text == ALL else whole_number_text(text)
 
 
 def check(arguments: argparse.Namespace) -> None:
@@ -129,7 +143,7 @@ def check(arguments: argparse.Namespace) -> None:
             in_range(flag, value, 0.0, open_low=True)
     if arguments.out.suffix.lower() not in SUFFIXES:
         raise ArgumentError(f"{arguments.out}: unknown mesh format; known are {', '.join(SUFFIXES)}")
-    if arguments.faces is not None and arguments.faces < 4:
+    if isinstance(arguments.faces, int) and arguments.faces < 4:
         raise ArgumentError(f"--faces: is {arguments.faces}, but has to be at least 4")
     if arguments.dataset is not None and not arguments.texture:
         raise ArgumentError("--dataset: is for --texture; add it, or leave --dataset out")

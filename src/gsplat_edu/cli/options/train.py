@@ -341,7 +341,7 @@ def _add_recipe(group: argparse._ArgumentGroup) -> None:
         "--surface",
         action="store_true",
         help="learn a surface, for meshes: normals and neighbouring photos that agree with the depth, and flat splats."
-        " It costs about 0.2 dB of PSNR and half as much time again",
+        " It takes 2.2 to 2.8 times as long and costs about 0.3 dB of PSNR, 1 dB on the object",
     )
     add_settings(group)
 
