@@ -18,6 +18,7 @@ from gsplat_edu.doctor.cameras import (
     check_parallax,
     check_resolution,
     check_sizes,
+    check_wrong_poses,
 )
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.cut_out import check_masks
@@ -38,6 +39,7 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("parallax", check_parallax),
     ("intrinsics", check_intrinsics),
     ("sizes", check_sizes),
+    ("places", check_wrong_poses),
     ("viewing directions", check_away),
     ("sharpness", check_blur),
     ("exposure", check_exposure),

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 
+from gsplat_edu.base.text import plain_of
 from gsplat_edu.data.notes import Note
+from gsplat_edu.jobs.events import Found
 
 ADVICE = 3
 """Number of pieces of advice at the end of a diagnosis; users do not follow more than three."""
@@ -41,6 +43,9 @@ class Finding:
         values: A measured value for each of these images, as text; empty if there is none.
         options: Options of `train`, by their names in Python, and the values that the advice proposes; empty if it
             proposes none.
+        certain: Whether the capture's lists, poses, headers and points alone prove it
+            (`gsplat_edu.doctor.certain.certain_findings`).
+        leaves_out: Whether a training leaves these images out by itself.
     """
 
     name: str
@@ -50,6 +55,8 @@ class Finding:
     images: tuple[str, ...] = ()
     values: tuple[str, ...] = ()
     options: tuple[tuple[str, str], ...] = ()
+    certain: bool = False
+    leaves_out: bool = False
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -114,6 +121,19 @@ class Diagnosis:
         return list(dict.fromkeys(given))[:ADVICE]
 
 
+def event_of(finding: Finding) -> Found:
+    """Return a finding as the event of a job, in the words of a page."""
+    return Found(
+        finding.name,
+        finding.severity.name.lower(),
+        plain_of(finding.sentence),
+        plain_of(finding.advice),
+        finding.images,
+        finding.values,
+        finding.options,
+    )
+
+
 def command(*words: str | Path) -> str:
     """Return a gsplat-edu command quoted for the shell, safe for any file name."""
     # a file name that begins with a dash would be parsed as an option
@@ -145,10 +165,15 @@ def listed(names: Sequence[str]) -> str:
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     """Return a diagnosis as lines of text, without its advice (see `advice_lines`)."""
     rows = [*diagnosis.facts]
-    rows += [(finding.severity.name.lower(), _described(finding)) for finding in diagnosis.ranked]
+    rows += finding_rows(diagnosis.ranked)
     if diagnosis.fine:
         rows.append(("fine", ", ".join(diagnosis.fine)))
     return table_lines(rows)
+
+
+def finding_rows(findings: Iterable[Finding]) -> list[tuple[str, str]]:
+    """Return a row for each finding: its severity, and its name, sentence and images."""
+    return [(finding.severity.name.lower(), _described(finding)) for finding in findings]
 
 
 def advice_lines(diagnosis: Diagnosis) -> list[str]:

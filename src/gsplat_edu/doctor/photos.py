@@ -65,6 +65,11 @@ class PhotoStats:
         return self.mask is not None
 
 
+def unmeasured() -> PhotoStats:
+    """Return what stands for the measurements of a photo that is not decoded."""
+    return PhotoStats(np.zeros((1, 1, 3), dtype=np.uint8), np.zeros(len(ANGLES)))
+
+
 def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
     """Decode a photo and measure it.
 
