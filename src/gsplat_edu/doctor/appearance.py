@@ -16,7 +16,7 @@ from jaxtyping import Float32, Float64
 
 from gsplat_edu.base.text import Told
 from gsplat_edu.doctor.cameras import facing_away
-from gsplat_edu.doctor.finding import Finding, Severity, counted
+from gsplat_edu.doctor.finding import ALL_PHOTOS, FEWER_PHOTOS, Finding, Severity, counted
 from gsplat_edu.doctor.geometry import inside
 from gsplat_edu.doctor.photos import BRIGHT, COARSE, DARK, GAMMA, WORK_SIDE
 from gsplat_edu.doctor.survey import Shot, Survey
@@ -117,7 +117,7 @@ def check_blur(survey: Survey) -> list[Finding]:
     names = tuple(survey.names[i] for i in worst_first)
     what = f"{len(names)} of {len(losses)} photos show less detail than their neighbours"
     advice = f"remove or retake the blurred photos, first {names[0]}: the scene learns their blur"
-    return [Finding("blurred", Severity.WARNING, what, advice, names)]
+    return [Finding("blurred", Severity.WARNING, what, advice, names, changes=(FEWER_PHOTOS,))]
 
 
 def _chance(shot: Shot) -> float:
@@ -154,14 +154,14 @@ def check_duplicates(survey: Survey) -> list[Finding]:
         named = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
         what = f"{counted(len(moved), 'pair')} of nearly identical photos with different poses"
         advice = "remove one photo of each identical pair with different poses: one of the poses is wrong"
-        found.append(Finding("same photo", Severity.WARNING, what, advice, named))
+        found.append(Finding("same photo", Severity.WARNING, what, advice, named, changes=(FEWER_PHOTOS,)))
     if copies := [pair for pair in duplicates if pair not in moved]:
         named = tuple(f"{names[i]} and {names[j]}" for i, j in copies)
         what = f"{counted(len(copies), 'pair')} of nearly identical photos from one place"
         advice = (
             "remove one photo of each duplicate pair: a test photo with a duplicate in training tests nothing"
         )
-        found.append(Finding("duplicates", Severity.WARNING, what, advice, named))
+        found.append(Finding("duplicates", Severity.WARNING, what, advice, named, changes=(FEWER_PHOTOS,)))
     if apart := sorted(poses - set(duplicates)):
         named = tuple(f"{names[i]} and {names[j]}" for i, j in apart)
         what = f"{counted(len(apart), 'pair')} of different photos with the same pose"
@@ -179,7 +179,7 @@ def _rendered_alike(names: Sequence[str], duplicates: Sequence[tuple[int, int]])
         f"{counted(len(duplicates), 'pair')} of nearly identical photos, which rendered captures often have"
     )
     advice = "keep all photos if you compare with published scores: the split is part of the benchmark"
-    return [Finding("duplicates", Severity.NOTE, what, advice, named)]
+    return [Finding("duplicates", Severity.NOTE, what, advice, named, changes=(ALL_PHOTOS,))]
 
 
 def _duplicates(survey: Survey) -> list[tuple[int, int]]:

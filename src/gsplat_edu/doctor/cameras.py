@@ -13,7 +13,7 @@ from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.dataset import TEST_EVERY
 from gsplat_edu.data.panorama import FaceLens
-from gsplat_edu.doctor.finding import NAMED, Finding, Severity, command
+from gsplat_edu.doctor.finding import FEWER_PHOTOS, MORE_PHOTOS, NAMED, Finding, Severity, command
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
@@ -32,6 +32,9 @@ of phones, in 35 mm equivalent) has 108 degrees and a 200 mm lens has 10."""
 ZOOM = 1.25
 """Warn when a focal length differs from the median of all photos of the same size by more than this factor. Refining it
 per photo changes it by a few per cent only."""
+
+INDIVIDUAL = 0.5
+"""Cameras are calibrated one by one if more than this share of the photos has intrinsics of its own."""
 
 FEW_ZOOMED = 0.2
 """Up to this share of differing photos is a fault; more indicate a second lens or a zoom."""
@@ -96,6 +99,8 @@ def check_intrinsics(survey: Survey) -> list[Finding]:
     """Find implausible intrinsics, and focal lengths that differ from those of the other photos."""
     shots = survey.shots
     zoomed = _zoomed(shots)
+    individual = len({(s.lens.fx, s.lens.fy, s.lens.cx, s.lens.cy) for s in shots}) > INDIVIDUAL * len(shots)
+    camera = "each of these cameras" if individual else "with one camera for all photos of one zoom"
     flagged: dict[str, list[str]] = {}
     first: dict[str, str] = {}
     for shot in shots:
@@ -107,7 +112,7 @@ def check_intrinsics(survey: Survey) -> list[Finding]:
             "intrinsics",
             Severity.WARNING,
             f"{first[kind]} ({len(names)} of {len(shots)} photos)",
-            "calibrate again, with one camera for all photos of one zoom: wrong intrinsics blur everything",
+            f"calibrate again, {camera}: wrong intrinsics blur everything",
             tuple(names) if len(names) < len(shots) else (),
             certain=kind == "field",
         )
@@ -215,13 +220,15 @@ def check_away(survey: Survey) -> list[Finding]:
             f"{len(names)} of {len(survey.shots)} cameras point at something that almost no other camera sees"
         )
         advice = "check the photos of the cameras facing away, and remove those with a wrong pose: they spoil the scene"
-        found.append(Finding("facing away", Severity.WARNING, what, advice, names))
+        found.append(Finding("facing away", Severity.WARNING, what, advice, names, changes=(FEWER_PHOTOS,)))
     if doubtful:
         order = sorted(doubtful)
         names, reasons = tuple(survey.names[i] for i in order), tuple(doubtful[i] for i in order)
         what = f"{len(names)} of {len(survey.shots)} cameras have doubtful poses"
         advice = "remove the cameras with doubtful poses: a wrong pose spoils the scene for all others"
-        found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons))
+        found.append(
+            Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons, changes=(FEWER_PHOTOS,))
+        )
     return found
 
 
@@ -238,7 +245,17 @@ def check_wrong_poses(survey: Survey) -> list[Finding]:
     )
     values = tuple(f"{ratios[i]:.0f} times as far as the others" for i in order)
     return [
-        Finding("wrong poses", Severity.WARNING, what, advice, names, values, certain=True, leaves_out=True)
+        Finding(
+            "wrong poses",
+            Severity.WARNING,
+            what,
+            advice,
+            names,
+            values,
+            changes=(FEWER_PHOTOS,),
+            certain=True,
+            leaves_out=True,
+        )
     ]
 
 
@@ -375,7 +392,7 @@ def check_coverage(survey: Survey) -> list[Finding]:
         advice = (
             f"take photos between the places of {edges[0]} and {edges[1]}: that side of the scene is guessed"
         )
-        found.append(Finding("hole", Severity.WARNING, what, advice))
+        found.append(Finding("hole", Severity.WARNING, what, advice, changes=(MORE_PHOTOS,)))
     low, high = np.quantile(elevations, (0.05, 0.95))
     if high - low < ONE_HEIGHT:
         what = f"all cameras are at about the same height, elevations within {math.degrees(high - low):.0f} degrees"
