@@ -169,8 +169,7 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     shutil.copytree(run.path, place / "run; one")
     config = run.read_config()
     data = config["data"] | {"path": str((place / "capture one").resolve()), "resolution": 40.0}
-    train = {"iterations": 30, "background": [1.0, 1.0, 1.0], "strategy": "fast"}
-    train["alpha_background"] = "fixed"  # as --background sets it
+    train = {"iterations": 30, "background": [1.0, 1.0, 1.0], "strategy": "fast", "alpha_background": "fixed"}
     config |= {"data": data | {"test_every": 0}, "train": train}
     RunFolder(place / "run; one").write_config(config)
     said = [doctor(place / "capture one", "--no-forecast")[1], doctor(place / "run; one")[1]]
@@ -184,7 +183,7 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
         assert "RUN" not in words and "CAPTURE" not in words
     renders = next(words for words in commands if words[0] == "render")
     assert command_line.main([*renders, "--frames", "2"]) == 0 and Path("orbit.mp4").is_file()
-    longer = next(words for words in commands if "10000" in words)
+    longer = next(words for words in commands if "--iterations" in words)
     assert "--strategy" not in longer, "the default is left out"
     assert longer[longer.index("--resolution") + 1] == "40"
     assert longer[longer.index("--test-every") + 1] == "0", "an option of value 0 is kept"

@@ -49,8 +49,8 @@ def test_train_chooses_a_size_and_doctor_advises_the_option(tmp_path, capsys, mo
     survey = prepare(CaptureReader(tmp_path / "capture"))
     (found,) = [one for one in examine(survey).findings if one.name == "resolution"]
     assert "--resolution auto" in found.advice
-    assert "--resolution auto --out" in examine(survey).otherwise[0], "the advised command"
-    given = examine(survey, ("--resolution", "2")).otherwise[0]
+    assert "--resolution auto --out" in examine(survey).otherwise[0].text, "the advised command"
+    given = examine(survey, ("--resolution", "2")).otherwise[0].text
     assert "--resolution 2 --out" in given and "auto" not in given
     assert main([*words, str(tmp_path / "blocks"), "--blocks", "2"]) == 2
     assert "--resolution auto: is for trainings in one piece" in capsys.readouterr().err

@@ -51,6 +51,7 @@ def test_photos_become_a_capture(tmp_path, capsys):
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "my out")]) == 0
     said = capsys.readouterr().out.replace("\n", "")
     assert "6 of 6 photos have a pose" in said and "mean reprojection error 0." in said
+    assert "few photos: 6 photos are few" in said, "what is certain about the capture is said at the end"
     assert f"next: gsplat-edu train '{tmp_path / 'my out'}' --out RUN" in said, "the command can be pasted"
     assert len(load_dataset(tmp_path / "my out").train) == 5
 

@@ -9,14 +9,18 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.blocks.plan import measured_area
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.data.images import ImageStore, PhotoFile
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.points import read_points_ply, write_points_ply
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.visible_cloud import cloud_in_view
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.views import View
+from gsplat_edu.sky.find import scene_size
 
 
 @pytest.mark.parametrize(
@@ -184,6 +188,31 @@ def test_extent():
     assert scene_extent(cameras[:1]) == 1.0 and scene_extent([cameras[2]] * 3) == 1.0
     with pytest.raises(ArgumentError, match="cameras"):
         scene_extent([])
+
+
+@pytest.mark.parametrize(("others", "counts"), [(0, False), (2, False), (3, True)])
+def test_the_extent_ignores_a_camera_far_away_unless_it_has_company(others, counts):
+    """16 cameras on a circle of radius 1, one 100 units away, and some near that: a drone's photos are no mistake."""
+    turns = 2.0 * np.pi * np.arange(16) / 16
+    ring = np.stack([np.cos(turns), np.sin(turns), np.zeros(16)], axis=1)
+    away = np.array([(100.0, i, 0.0) for i in range(1 + others)])
+    eyes = np.concatenate([ring, away])
+    used = eyes if counts else ring
+    expected = 1.1 * max(np.sqrt(((used - used.mean(axis=0)) ** 2).sum(axis=1)))
+    cameras = [Camera(np.eye(3), eye, 4, 4, 1.5, 1.5, 4, 4) for eye in eyes]
+    assert scene_extent(cameras) == pytest.approx(expected, rel=1e-12)
+
+
+def test_sizes_that_follow_the_cameras_ignore_strays():
+    """The radius of a sky and the centre of the ground are those without the camera whose pose is wrong."""
+    views, points, _ = procedural_capture(size=16, count=12)
+    cameras = [view.camera for view in views]
+    one = cameras[5]
+    wrong = Camera(one.R, np.array([4e4, 0.0, 9e3]), one.fx, one.fy, one.cx, one.cy, one.H, one.W)
+    spoiled = [*cameras, wrong]
+    assert scene_size(spoiled, points) == scene_size(cameras, points)
+    assert measured_area(cameras, points).low == measured_area([*cameras, wrong], points).low
+    assert len(cloud_in_view(spoiled).points) and np.abs(cloud_in_view(spoiled).points).max() < 100.0
 
 
 def test_invalid_poses_name_the_frame(tmp_path, small):

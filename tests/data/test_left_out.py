@@ -46,9 +46,7 @@ def test_a_photo_that_is_left_out_is_used_nowhere_and_the_split_stays(capture, c
     dataset = load_dataset(capture)
     gone = next(name for name in train if "0003" in name)
     assert names(dataset) == ([name for name in train if name != gone], test)
-    assert f"1 of 16 photos are left out by the capture's left_out.txt, first {gone}" in map(
-        str, dataset.notes
-    )
+    assert f"1 of 16 photos are left out, first {gone}" in map(str, dataset.notes)
     assert len(dataset.files) == 15
     # a run that was made before keeps its photos
     assert names(load_dataset(capture, DataSettings(left_out=()))) == (train, test)

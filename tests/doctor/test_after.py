@@ -275,7 +275,7 @@ def test_a_short_training_is_reported(scene, reached, gain, severity, says):
     assert ("length" in diagnosis.fine) is (severity is None)
     if found:
         assert found[0].sentence.endswith(says)
-    advice = " ".join([*diagnosis.advice, *diagnosis.otherwise])
+    advice = " ".join([*diagnosis.advice, *(one.text for one in diagnosis.otherwise)])
     longer = "gsplat-edu train 'a b/$c' --iterations 30000 --out out/a_30000"
     assert (longer in advice) is (severity is Severity.WARNING)
     assert ("better photos" in advice) is (severity is not Severity.WARNING)
@@ -302,8 +302,9 @@ def test_a_run_of_the_fast_recipe_is_judged_by_its_lengths(scene, reached, is_sh
     if found:
         assert found[0].severity is Severity.WARNING
         assert found[0].sentence == f"{reached:,} iterations; the recipe has 3,000"
-    said = " ".join([*diagnosis.advice, *diagnosis.otherwise])
-    longer = "train for longer: gsplat-edu train 'a b/$c' --iterations 10000 --out out/a_10000"
+    said = " ".join([*diagnosis.advice, *(one.text for one in diagnosis.otherwise)])
+    length = 3000 if is_short else 10000  # first the length that the finding names, then the longest
+    longer = f"train for longer: gsplat-edu train 'a b/$c' --iterations {length} --out out/a_{length}"
     assert (longer in said) is has_longer and ("better photos" in said) is not has_longer
     assert "rising" not in said and "30000" not in said
 
@@ -313,7 +314,7 @@ def test_the_longer_run_of_the_fast_recipe_keeps_the_mean_pace(scene):
     gaussians, views = scene
     log = [{"iteration": i, "ms": 100.0 if i <= 1_500 else 300.0} for i in range(10, 3_001, 10)]
     run = trained(gaussians, views, reached=3_000, planned=3_000, log=log, capture=Path("a"), strategy="fast")
-    said = " ".join(examine_run(run).otherwise)
+    said = " ".join(one.text for one in examine_run(run).otherwise)
     assert "train for longer (about 33 min 20 s at this run's pace): gsplat-edu train a " in said
 
 

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from doctor.rooms import replaced, room, with_camera, with_photo
+from gsplat_edu.scene.views import View
 
 SPOILED = (4, 13)
 """Views that faults are planted in."""
@@ -140,3 +141,34 @@ def test_two_photos_with_one_pose(named, distance, is_named):
     copy = with_camera(views[9], R=views[8].camera.R, eye=views[8].camera.eye + distance)
     expected = (f"{views[8].name} and {views[9].name}",) if is_named else ()
     assert named(replaced(views, {9: copy}), points).get("same pose", ()) == expected
+
+
+@pytest.mark.parametrize("kind", ["alpha", "mask"])
+@pytest.mark.parametrize("inside", [True, False])
+def test_blur_is_judged_inside_a_cut_out(named, inside, kind):
+    """Inside, blur is found although the edges of the cut-out stay sharp; outside, it does not matter."""
+    views, points = room("forward", 256)
+    H, W = views[0].image.shape[:2]
+    y, x = np.mgrid[:H, :W]
+    disc = np.hypot(x - W / 2, y - H / 2) < 0.42 * H
+    plane = {"alpha": np.where(disc, 255, 0).astype(np.uint8)} if kind == "alpha" else {"mask": disc}
+    photos = []
+    for i, view in enumerate(views):
+        image = view.image.astype(np.uint8)
+        soft = cv2.GaussianBlur(image, (0, 0), 4.0)
+        if i in SPOILED:
+            image = np.where(disc[..., None] == inside, soft, image)
+        photos.append(View(view.camera, image, name=view.name, **plane))
+    found = {name.removeprefix("images/") for name in named(photos, points).get("blurred", ())}
+    assert found == ({views[i].name for i in SPOILED} if inside else set())
+
+
+def test_dark_parts_of_a_scene_are_no_exposure(named):
+    """Photos of which the left 57 % is 1.5 stops darker show another thing there: an exposure changes every pixel."""
+    views, points = room("forward")
+
+    def shaded(image):
+        return np.where(np.arange(image.shape[1])[None, :, None] < 0.57 * image.shape[1], 0.62, 1.0) * image
+
+    spoiled, _ = changed(views, shaded)
+    assert "exposure" not in named(spoiled, points)

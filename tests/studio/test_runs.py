@@ -16,6 +16,8 @@ from gsplat_edu.jobs import events
 from gsplat_edu.jobs.record import Work
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import View
 from gsplat_edu.studio import runs as runs_module
 from gsplat_edu.studio.runs import GAIN
 from processes import Program
@@ -245,6 +247,18 @@ def test_findings_name_photos(page, studio, trained):
     assert finding["photos"] == ["captures/box/images/view_001.png", None]
     assert (answer["fine"], answer["advice"], answer["facts"]) == (["files"], ["train"], [["a", "b"]])
     assert page.get("/api/captures/box/thumbs/images/view_001.png").status_code == 200
+
+
+def test_what_is_certain_about_a_capture_is_there_before_anyone_examines_it(page, studio):
+    views, points, colors = procedural_capture(16, 12)
+    one, eye = views[3].camera, np.array([9000.0, 0.0, -4000.0])
+    far = Camera(one.R, eye, one.fx, one.fy, one.cx, one.cy, one.H, one.W)
+    views[3] = View(far, views[3].read().image, name=views[3].name)
+    write_colmap(studio.library.root / "captures" / "far", views, points, colors)
+    answer = page.get("/api/captures/far/findings").json()
+    (finding,) = (one for one in answer["findings"] if one["name"] == "wrong poses")
+    assert finding["photos"] == [f"captures/far/images/{views[3].name}"]
+    assert answer["job"] is None and "gsplat-edu" not in finding["advice"]
 
 
 def test_exports_are_listed_with_their_figures(page, studio, run):

@@ -24,6 +24,7 @@ from gsplat_edu.blocks.layout import MOST_BLOCKS, PLAN
 from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.runs.folder import write_json
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.rig import settled_eyes
 
 Points = Float64[np.ndarray, "N 3"]
 Pair = tuple[float, float]
@@ -251,12 +252,14 @@ def automatic_count(views: int) -> int:
 def measured_area(cameras: Sequence[Camera], points: Points) -> Area:
     """Find the ground of a capture: up from its cameras, axes along the smallest rectangle that holds them.
 
+    Strays (`gsplat_edu.scene.rig.stray_eyes`) do not count.
+
     Args:
         cameras: At least one.
         points: (N, 3) points of the scene, world units.
     """
     up = common_up(cameras)
-    eyes = np.stack([camera.eye for camera in cameras])
+    eyes = settled_eyes(cameras)
     centre = eyes.mean(axis=0)
     side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     side /= np.linalg.norm(side)

@@ -24,6 +24,7 @@ from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.block_table import BlockTable
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
+from gsplat_edu.cli.findings import with_right_poses
 from gsplat_edu.cli.options.block_parts import parts_of_blocks
 from gsplat_edu.cli.options.blocks import LEAST_VIEWS, SPLIT, block_count
 from gsplat_edu.cli.options.length import quality_of
@@ -110,8 +111,11 @@ def _prepared(
         raise CheckpointError(f"--out: {folder.path} holds a run that is not in blocks; give another folder")
     options = with_poses(options, arguments, console, say)
     reader = CaptureReader(options.data)
+    options = with_right_poses(options, reader, arguments.keep_photos, say)
     if of_coarse is not None:
         coarse = replace(options_from(of_coarse), data=options.data)
+        settings = replace(coarse.data_settings, left_out=options.data_settings.left_out)
+        coarse = replace(coarse, data_settings=settings)
         coarse = with_points(coarse, reader, None, console, say)
         if not coarse.resume:
             names = left_open(of_coarse)

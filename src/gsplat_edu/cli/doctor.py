@@ -25,13 +25,13 @@ from gsplat_edu.doctor.appearance import check_exposure
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.cameras import side_for_training
 from gsplat_edu.doctor.depth import own_depth
-from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, table_lines
+from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, event_of, table_lines
 from gsplat_edu.doctor.moving import moved_parts
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
-from gsplat_edu.jobs.events import Diagnosed, Found
+from gsplat_edu.jobs.events import Diagnosed
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
@@ -58,17 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         diagnosis, lines = _before(arguments, console)
     for finding in diagnosis.ranked:
-        emitter.emit(
-            Found(
-                finding.name,
-                finding.severity.name.lower(),
-                plain_of(finding.sentence),
-                plain_of(finding.advice),
-                finding.images,
-                finding.values,
-                finding.options,
-            )
-        )
+        emitter.emit(event_of(finding))
     advice = tuple(filter(None, map(plain_of, diagnosis.advice)))
     emitter.emit(Diagnosed(diagnosis.facts, diagnosis.fine, advice))
     console.print(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis), sep="\n", soft_wrap=True)

@@ -7,8 +7,10 @@ import shlex
 
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.text import Told
+from gsplat_edu.cli.findings import say_findings
 from gsplat_edu.cli.options.sfm import options_from
 from gsplat_edu.cli.terminal import Terminal, stage_bars
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.jobs import emitter
 from gsplat_edu.sfm.reconstruct import reconstruct
 
@@ -32,4 +34,5 @@ def run(arguments: argparse.Namespace) -> None:
                 )
             ) from None
     emitter.report_output(options.out)
+    say_findings(CaptureReader(options.out), say)
     say(Told(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN", ""))

@@ -25,6 +25,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Plan, plan
 from gsplat_edu.budget.planned import PLANNED
 from gsplat_edu.cli.exporting import export_all
+from gsplat_edu.cli.findings import with_right_poses
 from gsplat_edu.cli.options.length import quality_of
 from gsplat_edu.cli.options.settings import given
 from gsplat_edu.cli.options.train import AUTO, left_open, options_from
@@ -134,6 +135,7 @@ def _run(
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     options = with_poses(options_from(arguments), arguments, console, say)
     reader = CaptureReader(options.data)
+    options = with_right_poses(options, reader, arguments.keep_photos, say)
     if arguments.points is None:
         options = with_points(options, reader, seconds, console, say)
     chosen = _planned(arguments, options, reader, deadline, console, say)
@@ -353,7 +355,9 @@ def with_choices(
 
     if by_photos := [name for name in names if name in CHOICES]:
         with progress_bar(console, "") as bar:
-            remedies = remedies_for(reader, by_photos, photos_read(bar, lambda: False))
+            remedies = remedies_for(
+                reader, by_photos, photos_read(bar, lambda: False), options.data_settings.left_out
+            )
         for name, remedy in remedies.items():
             options = take(options, name, remedy)
     if "transients" in names:

@@ -48,7 +48,7 @@ from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.visible_cloud import cloud_in_cube, cloud_in_view
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.region import Region
-from gsplat_edu.scene.rig import scene_extent as scene_extent
+from gsplat_edu.scene.rig import scene_extent as scene_extent, settled_eyes, stray_eyes
 from gsplat_edu.scene.shutter import AT_ONCE
 from gsplat_edu.scene.views import View
 
@@ -358,7 +358,8 @@ def _places(centres: Sequence[Float64[np.ndarray, "3"]]) -> list[int]:
     Only the centres of a panorama's faces agree so well; poses estimated photo by photo never do.
     """
     eyes = np.stack(centres)
-    near = ONE_PLACE * float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
+    settled = eyes[~stray_eyes(eyes)]
+    near = ONE_PLACE * float(np.linalg.norm(settled - settled.mean(axis=0), axis=1).max())
     tree, number = cKDTree(eyes), list[int]()
     found = dict[int, int]()
     for i, others in enumerate(tree.query_ball_point(eyes, near)):
@@ -376,6 +377,6 @@ def _random_start(
     shared = made is not None
     if made is None:
         half_edge = scene_extent(cameras)
-        made = random_cloud(np.mean([camera.eye for camera in cameras], axis=0), half_edge)
+        made = random_cloud(settled_eyes(cameras).mean(axis=0), half_edge)
     notes.append(RandomStart(capture.no_cloud, len(made.points), half_edge, shared))
     return made

@@ -281,7 +281,7 @@ class Background:
 
 @dataclass(frozen=True)
 class LeftOutPhotos:
-    """Photos that the capture's list of photos to leave out names.
+    """Photos that are left out: by the capture's list, or by a training because their poses are certainly wrong.
 
     Args:
         photos: Number of such photos.
@@ -295,7 +295,7 @@ class LeftOutPhotos:
 
     def __str__(self) -> str:
         """Return the sentence."""
-        return f"{self.photos} of {self.total} photos are left out by the capture's left_out.txt, first {self.first}"
+        return f"{self.photos} of {self.total} photos are left out, first {self.first}"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import RANDOM_POINTS, random_cloud
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.scene.rig import point_nearest_axes, scene_extent
+from gsplat_edu.scene.rig import point_nearest_axes, scene_extent, stray_eyes
 
 LEAST_VIEWS = 2
 """A start point lies in at least this many photos, or in all of them if there are fewer."""
@@ -111,7 +111,11 @@ def cloud_in_view(cameras: Sequence[Camera]) -> Cloud | None:
 
 def _size(cameras: Sequence[Camera]) -> float:
     """Return the distance to what most cameras look at, but at least the extent of the cameras, world units."""
-    extent, focus = scene_extent(cameras), point_nearest_axes(cameras)
+    stray = stray_eyes(np.stack([camera.eye for camera in cameras]))
+    extent = scene_extent(cameras)
+    focus = point_nearest_axes(
+        [camera for camera, is_stray in zip(cameras, stray, strict=True) if not is_stray]
+    )
     if focus is None:
         return extent
     depth = float(np.median([camera.world_to_cam(focus)[2] for camera in cameras]))

@@ -12,7 +12,25 @@ import torch
 
 from gsplat_edu.base.text import Told, spelled_seconds
 from gsplat_edu.doctor.appearance import CORRECTED, EXPOSURE
-from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
+from gsplat_edu.doctor.finding import (
+    AS_LONG,
+    FEWER_PHOTOS,
+    FEWER_SPLATS,
+    LONGER,
+    MORE_PHOTOS,
+    MORE_SPLATS,
+    NAMED,
+    SHORTER,
+    Advice,
+    Change,
+    Diagnosis,
+    Finding,
+    Severity,
+    command,
+    counted,
+    new_run,
+)
+from gsplat_edu.doctor.moving import check_moved
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.scene.gaussians import Gaussians
@@ -115,6 +133,11 @@ class Trained:
         """Iterations of the longest run that is advised."""
         return self._length(max(QUALITIES, key=lambda name: QUALITIES[name]))
 
+    @property
+    def next_length(self) -> int:
+        """Iterations of the longer run that is advised: those of the recipe first, then those of its best quality."""
+        return self.usual if self.reached < self.usual else self.longest
+
     def _length(self, quality: str) -> int:
         if self.strategy != "fast":
             return RECIPE_ITERATIONS
@@ -160,7 +183,7 @@ def examine_run(run: Trained) -> Diagnosis:
         ("length", _length),
         ("training views", _fit),
         ("outliers", _outliers),
-        ("things that moved", _moved),
+        ("things that moved", lambda run: check_moved(run.moved, len(run.train))),
         ("test views", _gap),
         ("exposure", _exposure),
         ("floaters", _floaters),
@@ -176,17 +199,24 @@ def examine_run(run: Trained) -> Diagnosis:
     return Diagnosis(_facts(run), tuple(findings), tuple(fine), _otherwise(run))
 
 
-def _otherwise(run: Trained) -> tuple[str, ...]:
+def _otherwise(run: Trained) -> tuple[Advice, ...]:
     """Return advice for scenes with few problems."""
     longer = run.reached < run.longest and run.rising is not False
     return (
-        Told(f"view it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}", ""),
-        Told(f"a smaller file: {command('convert', run.path, 'scene.spz', '--min-opacity', str(FAINT))}", ""),
-        _train_longer(run)
+        Advice(Told(f"view it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}", "")),
+        Advice(
+            Told(
+                f"a smaller file: {command('convert', run.path, 'scene.spz', '--min-opacity', str(FAINT))}",
+                "",
+            )
+        ),
+        Advice(_train_longer(run), (LONGER,))
         if longer
-        else Told(
-            f"a better scene needs better photos{_what_photos_lack(run)}",
-            "a better scene needs better photos",
+        else Advice(
+            Told(
+                f"a better scene needs better photos{_what_photos_lack(run)}",
+                "a better scene needs better photos",
+            )
         ),
     )
 
@@ -196,18 +226,18 @@ def _what_photos_lack(run: Trained) -> str:
 
 
 def _train_longer(run: Trained) -> str:
-    plain = f"train for {run.longest:,} iterations{_at_its_pace(run)}"
+    plain = f"train for {run.next_length:,} iterations{_at_its_pace(run)}"
     if run.capture is None:
-        return Told(f"train for {run.longest:,} iterations", plain)
-    name = f"{run.path.resolve().name}_{run.longest}"
-    length = ("--iterations", str(run.longest))
+        return Told(f"train for {run.next_length:,} iterations", plain)
+    name = f"{run.path.resolve().name}_{run.next_length}"
+    length = ("--iterations", str(run.next_length))
     words = command("train", run.capture, *length, *run.options, "--out", new_run(name))
     return Told(f"train for longer{_at_its_pace(run)}: {words}", plain)
 
 
 def _longer(run: Trained) -> tuple[tuple[str, str], ...]:
     """Return the options of the advised longer training."""
-    return (("iterations", str(run.longest)),)
+    return (("iterations", str(run.next_length)),)
 
 
 def _at_its_pace(run: Trained) -> str:
@@ -220,7 +250,7 @@ def _at_its_pace(run: Trained) -> str:
     paces = [ms for at, ms in _pairs(run.log, "ms", run.reached) if fast or at > 0.75 * run.reached]
     if not paces:
         return ""
-    takes = spelled_seconds(1e-3 * run.longest * float(np.mean(paces) if fast else np.median(paces)))
+    takes = spelled_seconds(1e-3 * run.next_length * float(np.mean(paces) if fast else np.median(paces)))
     return f" (about {takes} at this run's pace)" if fast else f" ({takes} or more at this run's pace)"
 
 
@@ -258,7 +288,7 @@ def _length(run: Trained) -> list[Finding]:
             "finish the training: repeat its command with --resume",
             "finish the training: Resume continues it",
         )
-        return [Finding("unfinished", Severity.WARNING, what, advice)]
+        return [Finding("unfinished", Severity.WARNING, what, advice, changes=(LONGER,))]
     if run.reached >= run.usual:
         return []
     what = f"{run.reached:,} iterations; the recipe has {run.usual:,}"
@@ -266,12 +296,21 @@ def _length(run: Trained) -> list[Finding]:
         held = "the test views' PSNR no longer rises" if run.test else "the loss no longer falls"
         useless = "more iterations alone will not help much; better photos may"
         advice = Told(f"{useless}{_what_photos_lack(run)}", useless)
-        return [Finding("short training", Severity.NOTE, f"{what}, but {held}", advice)]
+        return [Finding("short training", Severity.NOTE, f"{what}, but {held}", advice, changes=(AS_LONG,))]
     if run.rising:
         what += ", and " + (
             "the test views' PSNR was still rising" if run.test else "the loss was still falling"
         )
-    return [Finding("short training", Severity.WARNING, what, _train_longer(run), options=_longer(run))]
+    return [
+        Finding(
+            "short training",
+            Severity.WARNING,
+            what,
+            _train_longer(run),
+            options=_longer(run),
+            changes=(LONGER,),
+        )
+    ]
 
 
 def _fit(run: Trained) -> list[Finding]:
@@ -282,12 +321,15 @@ def _fit(run: Trained) -> list[Finding]:
     advice = f"check poses and intrinsics{place}; if they are a little off, train with --refine auto"
     plain = "examine the capture's poses; if they are a little off, refine them in the training"
     options: tuple[tuple[str, str], ...] = (("refine", "auto"),)
-    if run.reached < run.usual and run.rising:  # too few iterations may be the only cause
+    early = run.reached < run.usual and bool(run.rising)  # too few iterations may be the only cause
+    if early:
         advice, plain = (
             f"train for longer first; if they do not improve, {words}" for words in (advice, plain)
         )
         options = (*_longer(run), *options)
-    return [Finding("poor fit", Severity.WARNING, what, Told(advice, plain), options=options)]
+    changes = (LONGER,) if early else ()
+    told = Told(advice, plain)
+    return [Finding("poor fit", Severity.WARNING, what, told, options=options, changes=changes)]
 
 
 def _outliers(run: Trained) -> list[Finding]:
@@ -299,10 +341,13 @@ def _outliers(run: Trained) -> list[Finding]:
     scores = tuple(f"{view.psnr:.1f} dB" for view in low)
     what = f"{len(low)} of {len(run.train) + len(run.test)} photos differ strongly from their renders"
     options: tuple[tuple[str, str], ...] = ()
+    changes: tuple[Change, ...] = (FEWER_PHOTOS,)
     if _median_fit(run) < FITTED:
-        longer = _longer(run) if run.reached < run.longest else ()
-        options = (("max_gaussians", str(2 * len(run.gaussians))), *longer)
-    return [Finding("unexplained", Severity.WARNING, what, _about_outliers(run, low), names, scores, options)]
+        longer = run.reached < run.longest
+        options = (("max_gaussians", str(2 * len(run.gaussians))), *(_longer(run) if longer else ()))
+        changes = (MORE_SPLATS, LONGER) if longer else (MORE_SPLATS,)
+    advice = _about_outliers(run, low)
+    return [Finding("unexplained", Severity.WARNING, what, advice, names, scores, options, changes)]
 
 
 def _median_fit(run: Trained) -> float:
@@ -343,21 +388,6 @@ def _far_below(views: Sequence[Residual]) -> list[Residual]:
     return [view for view in views if view.psnr < limit]
 
 
-def _moved(run: Trained) -> list[Finding]:
-    if not run.moved:
-        return []
-    names = tuple(name for name, _ in run.moved)
-    shares = tuple(f"{100 * share:.1f} %" for _, share in run.moved)
-    photos = counted(len(names), "photo")
-    what = f"things or shadows that the other photos do not show in {photos}, in per cent of their pixels"
-    first = f"compare {names[0]} with its render first"
-    advice = Told(
-        f"train with --transients mask, which masks what moved; {first}",
-        f"mask what moved in a training; {first}",
-    )
-    return [Finding("moved", Severity.WARNING, what, advice, names, shares, (("transients", "mask"),))]
-
-
 def _gap(run: Trained) -> list[Finding]:
     if not run.train or not run.test:
         return []
@@ -366,17 +396,12 @@ def _gap(run: Trained) -> list[Finding]:
         return []
     what = f"test views are {gap:.1f} dB below the training views: the scene overfits its {len(run.train)} photos"
     photos = "take more photos between the existing ones"
-    if _improves(run):  # fewer iterations or splats would contradict the advice of the other checks
-        return [Finding("overfitted", Severity.WARNING, what, photos)]
+    if run.rising or _fit(run):  # the test views still gain, or the scene is too small: less would not help
+        return [Finding("overfitted", Severity.WARNING, what, photos, changes=(MORE_PHOTOS,))]
     fewer, rest = max(len(run.gaussians) // 2, 1), "with the present ones, stop earlier or"
     advice = Told(f"{photos}; {rest} lower --max-gaussians", f"{photos}; {rest} train with fewer splats")
-    return [Finding("overfitted", Severity.WARNING, what, advice, options=(("max_gaussians", str(fewer)),))]
-
-
-def _improves(run: Trained) -> bool:
-    """Return whether another check advises more iterations or more splats."""
-    advised = [finding.options for check in (_length, _fit, _outliers) for finding in check(run)]
-    return any(name in ("iterations", "max_gaussians") for options in advised for name, _ in options)
+    options, changes = (("max_gaussians", str(fewer)),), (MORE_PHOTOS, SHORTER, FEWER_SPLATS)
+    return [Finding("overfitted", Severity.WARNING, what, advice, options=options, changes=changes)]
 
 
 def _exposure(run: Trained) -> list[Finding]:

@@ -16,7 +16,7 @@ from jaxtyping import Float32, Float64
 
 from gsplat_edu.base.text import Told
 from gsplat_edu.doctor.cameras import facing_away
-from gsplat_edu.doctor.finding import Finding, Severity, counted
+from gsplat_edu.doctor.finding import ALL_PHOTOS, FEWER_PHOTOS, Finding, Severity, counted
 from gsplat_edu.doctor.geometry import inside
 from gsplat_edu.doctor.photos import BRIGHT, COARSE, DARK, GAMMA, WORK_SIDE
 from gsplat_edu.doctor.survey import Shot, Survey
@@ -70,6 +70,15 @@ ORDINARY = 16.0
 """A jump must exceed this multiple of the pairs' first quartile. That quartile is 0.03 stops in phone captures and 0.07
 if half of the scene is semi-transparent; jumps are much larger."""
 
+THROUGHOUT = 0.75
+"""Two photos differ in exposure only if this share of their points shows at least half of the difference: an exposure
+changes every pixel, other content or a shadow only some. In a rendered capture without any jump, pairs that differ by
+0.4 stops and more have shares of 0.5 to 0.7."""
+
+ROUGHLY_THROUGHOUT = 0.6
+"""The same if the capture has no points, since some of the compared places then do not match; and where many pairs
+have to differ."""
+
 TINT = 0.25
 """White balance jumps if one channel differs from the mean of the three by more than this, stops. The limit is lower
 than `JUMP` because hue differences are more visible; a phone varies by 0.1."""
@@ -97,7 +106,7 @@ SMOOTH_ON_RAYS = 2.5
 
 
 def check_blur(survey: Survey) -> list[Finding]:
-    """Find photos with less fine detail than their neighbours in some direction."""
+    """Find photos with less fine detail than their neighbours in some direction, inside of masks and cut-outs."""
     losses = detail_losses(survey)
     middle = float(np.median(losses))
     sharper = middle - float(np.quantile(losses, 0.16))
@@ -108,14 +117,16 @@ def check_blur(survey: Survey) -> list[Finding]:
     names = tuple(survey.names[i] for i in worst_first)
     what = f"{len(names)} of {len(losses)} photos show less detail than their neighbours"
     advice = f"remove or retake the blurred photos, first {names[0]}: the scene learns their blur"
-    return [Finding("blurred", Severity.WARNING, what, advice, names)]
+    return [Finding("blurred", Severity.WARNING, what, advice, names, changes=(FEWER_PHOTOS,))]
 
 
 def _chance(shot: Shot) -> float:
     """Return the largest loss that chance explains for a photo of this size."""
     W, H = shot.size
     share = min(1.0, WORK_SIDE / max(W, H))
-    return CHANCE * math.sqrt(2.0 * (4.0 * math.pi * COARSE**2) / (W * H * share * share))
+    return CHANCE * math.sqrt(
+        2.0 * (4.0 * math.pi * COARSE**2) / max(W * H * share * share * shot.stats.share, 1.0)
+    )
 
 
 def detail_losses(survey: Survey) -> Float64[np.ndarray, " C"]:
@@ -143,14 +154,14 @@ def check_duplicates(survey: Survey) -> list[Finding]:
         named = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
         what = f"{counted(len(moved), 'pair')} of nearly identical photos with different poses"
         advice = "remove one photo of each identical pair with different poses: one of the poses is wrong"
-        found.append(Finding("same photo", Severity.WARNING, what, advice, named))
+        found.append(Finding("same photo", Severity.WARNING, what, advice, named, changes=(FEWER_PHOTOS,)))
     if copies := [pair for pair in duplicates if pair not in moved]:
         named = tuple(f"{names[i]} and {names[j]}" for i, j in copies)
         what = f"{counted(len(copies), 'pair')} of nearly identical photos from one place"
         advice = (
             "remove one photo of each duplicate pair: a test photo with a duplicate in training tests nothing"
         )
-        found.append(Finding("duplicates", Severity.WARNING, what, advice, named))
+        found.append(Finding("duplicates", Severity.WARNING, what, advice, named, changes=(FEWER_PHOTOS,)))
     if apart := sorted(poses - set(duplicates)):
         named = tuple(f"{names[i]} and {names[j]}" for i, j in apart)
         what = f"{counted(len(apart), 'pair')} of different photos with the same pose"
@@ -168,7 +179,7 @@ def _rendered_alike(names: Sequence[str], duplicates: Sequence[tuple[int, int]])
         f"{counted(len(duplicates), 'pair')} of nearly identical photos, which rendered captures often have"
     )
     advice = "keep all photos if you compare with published scores: the split is part of the benchmark"
-    return [Finding("duplicates", Severity.NOTE, what, advice, named)]
+    return [Finding("duplicates", Severity.NOTE, what, advice, named, changes=(ALL_PHOTOS,))]
 
 
 def _duplicates(survey: Survey) -> list[tuple[int, int]]:
@@ -273,12 +284,15 @@ class Gains:
     @cached_property
     def light(self) -> Float64[np.ndarray, " C"]:
         """(C,) how much brighter each photo is, stops; 0 if it cannot be compared or its neighbours disagree."""
-        return np.array([_agreed(_medians(pairs, MISMATCH)) for pairs in self._light])
+        return np.array([_agreed(_medians(pairs, MISMATCH, self._share)) for pairs in self._light])
 
     @cached_property
     def tint(self) -> Float64[np.ndarray, " C"]:
         """(C,) largest difference of a channel from the mean of the three, stops; 0 as for `light`."""
-        by_channel = [[_agreed(_medians(pairs, TINT_MISMATCH)) for pairs in self._tint(c)] for c in range(3)]
+        by_channel = [
+            [_agreed(_medians(pairs, TINT_MISMATCH, self._share)) for pairs in self._tint(c)]
+            for c in range(3)
+        ]
         return np.asarray(np.abs(by_channel).max(axis=0))
 
     def differing(self, limit: float) -> float:
@@ -286,8 +300,14 @@ class Gains:
 
         The limit is at least `ORDINARY` times the pairs' first quartile.
         """
-        pairs = np.abs(np.concatenate([np.zeros(0), *(_medians(pairs, MISMATCH) for pairs in self._light)]))
+        medians = [_medians(pairs, MISMATCH, ROUGHLY_THROUGHOUT) for pairs in self._light]
+        pairs = np.abs(np.concatenate([np.zeros(0), *medians]))
         return float(np.mean(pairs > max(limit, ORDINARY * np.quantile(pairs, 0.25)))) if len(pairs) else 0.0
+
+    @property
+    def _share(self) -> float:
+        """Least share of the points that show a difference of exposure."""
+        return THROUGHOUT if len(self._survey.points) else ROUGHLY_THROUGHOUT
 
     @property
     def _light(self) -> Iterator[list[Float64[np.ndarray, "..."]]]:
@@ -314,7 +334,7 @@ class Gains:
         return found
 
     def _colors(self, i: int, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Sample a photo at points; NaN if a point is outside the image or its colour is clipped."""
+        """Sample a photo at points; NaN outside the image, its mask or its cut-out, and where the colour is clipped."""
         if not len(points):
             return np.zeros((0, 3))
         image, camera = self._smooth[i], self._survey.geometry.cameras[i]
@@ -326,6 +346,11 @@ class Gains:
         )
         colors = colors.reshape(-1, 3).astype(np.float64)
         good = np.all((colors > DARK) & (colors < BRIGHT), axis=1) & np.isfinite(u)
+        if (counts := self._survey.shots[i].stats.counts) is not None:
+            near = cv2.remap(
+                counts.view(np.uint8), columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+            )
+            good &= near.ravel() > 0
         colors[~good] = np.nan
         return colors
 
@@ -338,9 +363,17 @@ def _agreed(values: Float64[np.ndarray, " n"]) -> float:
     return median if np.mean(values * np.sign(median) > 0.5 * abs(median)) >= AGREEING else 0.0
 
 
-def _medians(pairs: Sequence[Float64[np.ndarray, "..."]], mismatch: float) -> Float64[np.ndarray, " m"]:
-    """Return the median of each pair of photos that show the same thing."""
-    return np.array([np.median(ratios) for ratios in pairs if _deviation(ratios) < mismatch])
+def _medians(
+    pairs: Sequence[Float64[np.ndarray, "..."]], mismatch: float, least: float
+) -> Float64[np.ndarray, " m"]:
+    """Return how each pair of photos that show the same thing differs: the median, or 0 if few points show it."""
+    found = []
+    for ratios in pairs:
+        if _deviation(ratios) < mismatch:
+            median = float(np.median(ratios))
+            shown = np.mean(ratios * np.sign(median) > 0.5 * abs(median))
+            found.append(median if shown >= least else 0.0)
+    return np.array(found)
 
 
 def _deviation(values: Float64[np.ndarray, " n"]) -> float:

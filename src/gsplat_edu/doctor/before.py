@@ -18,11 +18,12 @@ from gsplat_edu.doctor.cameras import (
     check_parallax,
     check_resolution,
     check_sizes,
+    check_wrong_poses,
 )
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.cut_out import check_masks
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
-from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
+from gsplat_edu.doctor.finding import Advice, Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.remedies import check_sky
 from gsplat_edu.doctor.survey import Survey
 
@@ -38,6 +39,7 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("parallax", check_parallax),
     ("intrinsics", check_intrinsics),
     ("sizes", check_sizes),
+    ("places", check_wrong_poses),
     ("viewing directions", check_away),
     ("sharpness", check_blur),
     ("exposure", check_exposure),
@@ -117,7 +119,7 @@ def _arrangement(survey: Survey) -> str:
     return f"{arrangement}; {short_number(geometry.depth, 3)} world units from their subject"
 
 
-def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
+def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[Advice, ...]:
     """Return advice for captures with few problems."""
     place = survey.path.resolve()
     name = place.name if place.is_dir() else place.parent.name  # transforms.json is in its capture's folder
@@ -135,9 +137,10 @@ def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
     draft = command("train", survey.path, "--quality", "draft", "--out", short)
     why = "a short run shows in minutes whether the poses are right"
     trial = (Told(f"{why}: {draft}", f"{why}: train with the quality Draft"),)
-    return (
+    given = (
         Told(f"train: {command('train', survey.path, *options, '--out', out)}", ""),
         *cloud,
         *(() if options else trial),
         Told(f"check the run afterwards: {command('doctor', out)}", ""),
     )
+    return tuple(map(Advice, given))

@@ -13,10 +13,12 @@ from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.dataset import TEST_EVERY
 from gsplat_edu.data.panorama import FaceLens
-from gsplat_edu.doctor.finding import Finding, Severity
+from gsplat_edu.doctor.finding import FEWER_PHOTOS, MORE_PHOTOS, NAMED, Finding, Severity, command
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.rig import FAR_AWAY, SAME_PLACE, far_ratios, settled_eyes, stray_eyes
 from gsplat_edu.train.capacity import advised_side
 
 OFF_CENTRE = 0.1
@@ -31,15 +33,15 @@ ZOOM = 1.25
 """Warn when a focal length differs from the median of all photos of the same size by more than this factor. Refining it
 per photo changes it by a few per cent only."""
 
+INDIVIDUAL = 0.5
+"""Cameras are calibrated one by one if more than this share of the photos has intrinsics of its own."""
+
 FEW_ZOOMED = 0.2
 """Up to this share of differing photos is a fault; more indicate a second lens or a zoom."""
 
 NO_PARALLAX = 5e-3
 """Depth cannot be estimated if the cameras' spread is below this multiple of the subject's depth: a point then moves by
 at most one degree across all photos, less than 10 px of 1000."""
-
-SAME_PLACE = 1e-9
-"""The same limit relative to the largest coordinate, if the subject's depth is unknown: rounding error."""
 
 AWAY = math.radians(45.0)
 """A camera faces away if its axis points at least this far from the point or direction that the others look at: more
@@ -65,9 +67,10 @@ captures with little texture every photo has few points."""
 HALF_SUPPORT = 0.5
 """A camera with an odd position or direction is reported below this share of the median camera's points."""
 
-FAR_AWAY = 8.0
-"""A camera is far away if its distance from the median position exceeds this multiple of the 75th percentile of all.
-The ratio is 1.4 at the ends of a straight path and 1 on an orbit."""
+SPECK = 0.04
+"""A stray camera's pose is certainly wrong if all that the others see would be smaller in its photo than this fraction
+of the longer side. A photo of 60 degrees shows it so from 43 times the distance of the others; a telephoto lens, or a
+drone's photo with points of its own, shows more."""
 
 APART = 2.0
 """A camera is also far away if its nearest neighbour is farther than this, in units of that 75th percentile. The
@@ -96,6 +99,8 @@ def check_intrinsics(survey: Survey) -> list[Finding]:
     """Find implausible intrinsics, and focal lengths that differ from those of the other photos."""
     shots = survey.shots
     zoomed = _zoomed(shots)
+    individual = len({(s.lens.fx, s.lens.fy, s.lens.cx, s.lens.cy) for s in shots}) > INDIVIDUAL * len(shots)
+    camera = "each of these cameras" if individual else "with one camera for all photos of one zoom"
     flagged: dict[str, list[str]] = {}
     first: dict[str, str] = {}
     for shot in shots:
@@ -107,8 +112,9 @@ def check_intrinsics(survey: Survey) -> list[Finding]:
             "intrinsics",
             Severity.WARNING,
             f"{first[kind]} ({len(names)} of {len(shots)} photos)",
-            "calibrate again, with one camera for all photos of one zoom: wrong intrinsics blur everything",
+            f"calibrate again, {camera}: wrong intrinsics blur everything",
             tuple(names) if len(names) < len(shots) else (),
+            certain=kind == "field",
         )
         for kind, names in flagged.items()
     ]
@@ -186,7 +192,7 @@ def check_resolution(survey: Survey) -> list[Finding]:
 def check_parallax(survey: Survey) -> list[Finding]:
     """Find captures taken from one place, which contain no depth information."""
     geometry = survey.geometry
-    eyes = geometry.eyes
+    eyes = settled_eyes(geometry.cameras)
     spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
     same = spread <= SAME_PLACE * max(1.0, float(np.abs(eyes).max()))
     if not same and (not len(survey.points) or geometry.spread >= NO_PARALLAX):
@@ -199,27 +205,82 @@ def check_parallax(survey: Survey) -> list[Finding]:
         )
     )
     advice = "walk while you take the photos: photos from one spot contain no depth, so no scene can be reconstructed"
-    return [Finding("no parallax", Severity.FATAL, what, advice)]
+    return [Finding("no parallax", Severity.FATAL, what, advice, certain=True)]
 
 
 def check_away(survey: Survey) -> list[Finding]:
     """Find cameras whose pose is probably wrong, from their direction, position and observed points."""
-    away = facing_away(survey.geometry)
+    wrong = wrong_poses(survey.geometry)
+    away = facing_away(survey.geometry) - wrong
     doubtful, found = _doubtful(survey, away), list[Finding]()
+    doubtful = {i: reason for i, reason in doubtful.items() if i not in wrong}
     if named := away - doubtful.keys():
         names = tuple(survey.names[i] for i in sorted(named))
         what = (
             f"{len(names)} of {len(survey.shots)} cameras point at something that almost no other camera sees"
         )
         advice = "check the photos of the cameras facing away, and remove those with a wrong pose: they spoil the scene"
-        found.append(Finding("facing away", Severity.WARNING, what, advice, names))
+        found.append(Finding("facing away", Severity.WARNING, what, advice, names, changes=(FEWER_PHOTOS,)))
     if doubtful:
         order = sorted(doubtful)
         names, reasons = tuple(survey.names[i] for i in order), tuple(doubtful[i] for i in order)
         what = f"{len(names)} of {len(survey.shots)} cameras have doubtful poses"
         advice = "remove the cameras with doubtful poses: a wrong pose spoils the scene for all others"
-        found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons))
+        found.append(
+            Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons, changes=(FEWER_PHOTOS,))
+        )
     return found
+
+
+def check_wrong_poses(survey: Survey) -> list[Finding]:
+    """Find cameras whose pose is certainly wrong: alone, far away, and seeing of the scene no more than a speck."""
+    order = sorted(wrong_poses(survey.geometry))
+    if not order:
+        return []
+    names, ratios = tuple(survey.names[i] for i in order), far_ratios(survey.geometry.eyes)
+    what = f"{len(names)} of {len(survey.shots)} cameras are so far away that the scene is a speck in their photos"
+    advice = Told(
+        f"leave them out, as a training does by itself: {command('leave-out', survey.path, *names[:NAMED])}",
+        "leave out the photos with wrong poses, as a training does by itself",
+    )
+    values = tuple(f"{ratios[i]:.0f} times as far as the others" for i in order)
+    return [
+        Finding(
+            "wrong poses",
+            Severity.WARNING,
+            what,
+            advice,
+            names,
+            values,
+            changes=(FEWER_PHOTOS,),
+            certain=True,
+            leaves_out=True,
+        )
+    ]
+
+
+def wrong_poses(geometry: Geometry) -> set[int]:
+    """Return the cameras whose pose is certainly wrong.
+
+    Each is a stray (`gsplat_edu.scene.rig.stray_eyes`), and both what the other cameras stand around and the points in
+    its view are, if they are in its photo at all, smaller than `SPECK`.
+    """
+    stray = stray_eyes(geometry.eyes)
+    settled = geometry.eyes[~stray]
+    return {
+        i
+        for i in np.flatnonzero(stray).tolist()
+        if max(_seen_size(geometry.cameras[i], part) for part in (settled, geometry.some_points)) < SPECK
+    }
+
+
+def _seen_size(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> float:
+    """Return the size of the points inside a photo, 10th to 90th percentile, as a fraction of its longer side."""
+    u, v, _ = camera.project(camera.world_to_cam(points[inside(camera, points)]))
+    if len(u) < 2:
+        return 0.0
+    low, high = np.quantile(np.stack([u, v]), (0.1, 0.9), axis=1)
+    return float((high - low).max()) / max(camera.W, camera.H)
 
 
 def _doubtful(survey: Survey, away: set[int]) -> dict[int, str]:
@@ -229,10 +290,10 @@ def _doubtful(survey: Survey, away: set[int]) -> dict[int, str]:
     count is below average and its position or direction is odd. Otherwise a camera is doubtful if it is far from all
     others, or if its image misses their common centre; cameras in `away` are reported separately.
     """
-    (distances, nearest), angles = _stands(survey.geometry), _past(survey.geometry)
+    distances, angles = far_ratios(survey.geometry.eyes), _past(survey.geometry)
     far = distances > FAR_AWAY
     if not any(survey.observed.values()):
-        far |= nearest > APART
+        far |= _nearest(survey.geometry) > APART
         return {
             int(i): f"{distances[i]:.0f} times as far as the others"
             if far[i]
@@ -253,15 +314,11 @@ def _doubtful(survey: Survey, away: set[int]) -> dict[int, str]:
     return found
 
 
-def _stands(geometry: Geometry) -> tuple[Float64[np.ndarray, " C"], Float64[np.ndarray, " C"]]:
-    """Return each camera's distance from the median position and from its nearest neighbour.
-
-    The unit is the 75th percentile of the distances from the median position.
-    """
+def _nearest(geometry: Geometry) -> Float64[np.ndarray, " C"]:
+    """Return each camera's distance from its nearest neighbour, in the unit of `far_ratios`."""
     distances = np.linalg.norm(geometry.eyes - np.median(geometry.eyes, axis=0), axis=1)
-    kept = max(float(np.quantile(distances, 0.75)), 1e-300)
-    nearest = cKDTree(geometry.eyes).query(geometry.eyes, k=[2])[0][:, 0]
-    return np.asarray(distances / kept), np.asarray(nearest / kept)
+    usual = max(float(np.quantile(distances, 0.75)), 1e-300)
+    return np.asarray(cKDTree(geometry.eyes).query(geometry.eyes, k=[2])[0][:, 0] / usual)
 
 
 def _missing(geometry: Geometry) -> Bool[np.ndarray, " C"]:
@@ -335,7 +392,7 @@ def check_coverage(survey: Survey) -> list[Finding]:
         advice = (
             f"take photos between the places of {edges[0]} and {edges[1]}: that side of the scene is guessed"
         )
-        found.append(Finding("hole", Severity.WARNING, what, advice))
+        found.append(Finding("hole", Severity.WARNING, what, advice, changes=(MORE_PHOTOS,)))
     low, high = np.quantile(elevations, (0.05, 0.95))
     if high - low < ONE_HEIGHT:
         what = f"all cameras are at about the same height, elevations within {math.degrees(high - low):.0f} degrees"

@@ -33,12 +33,12 @@ def check_cloud(survey: Survey) -> list[Finding]:
     if far > FAR_SHARE:
         what = f"{short_number(100 * far, 2)} % of the points lie far outside the scene"
         advice = "remove the points far outside: they become splats that no photo constrains"
-        found.append(Finding("far points", Severity.WARNING, what, advice))
+        found.append(Finding("far points", Severity.WARNING, what, advice, certain=True))
     unseen = float(np.mean(~survey.geometry.in_sight.any(axis=0)))
     if unseen > UNSEEN_SHARE:
         what = f"{short_number(100 * unseen, 2)} % of the points lie outside every camera's view"
         advice = "check that the points belong to these poses: a triangulated point is visible in some photos"
-        found.append(Finding("unseen points", Severity.WARNING, what, advice))
+        found.append(Finding("unseen points", Severity.WARNING, what, advice, certain=True))
     if len(points) < FEW_POINTS:
         what = f"{len(points)} points are few to start from"
         advice = (

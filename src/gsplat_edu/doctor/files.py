@@ -21,7 +21,11 @@ def check_usable(survey: Survey) -> list[Finding]:
         what = f"{count} of {total} photos can be used, but a scene needs several views"
         return [
             Finding(
-                "usable", Severity.FATAL, what, "take or copy the photos again: training needs at least two"
+                "usable",
+                Severity.FATAL,
+                what,
+                "take or copy the photos again: training needs at least two",
+                certain=True,
             )
         ]
     if count < FEW:
@@ -31,6 +35,7 @@ def check_usable(survey: Survey) -> list[Finding]:
                 Severity.WARNING,
                 f"{count} photos are few: the scene between them is guessed",
                 f"take more photos: at least {FEW}, better 30 or more, each sharing most of its view with the next",
+                certain=True,
             )
         ]
     return []
@@ -80,5 +85,6 @@ def check_poses(survey: Survey) -> list[Finding]:
             f"{len(survey.unposed)} of {total} photos in the folder, not used",
             "find poses for the photos that have none: more overlap with their neighbours, or another matching",
             survey.unposed,
+            certain=True,
         )
     ]

@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsplat_edu.data.dataset import scene_extent
 from gsplat_edu.evaluate.following import point_nearest_most_axes
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.rig import scene_extent, settled_eyes
 
 SAMPLES = 300
 """Sample points per camera: enough to know a median of ratios to a tenth of their spread."""
@@ -127,8 +127,9 @@ class Geometry:
 
     @cached_property
     def spread(self) -> float:
-        """Largest distance of a camera from the mean position, divided by the subject's depth."""
-        return float(np.linalg.norm(self.eyes - self.eyes.mean(axis=0), axis=1).max()) / self.depth
+        """Largest distance of a camera from the mean position, divided by the subject's depth; without strays."""
+        settled = settled_eyes(self.cameras)
+        return float(np.linalg.norm(settled - settled.mean(axis=0), axis=1).max()) / self.depth
 
     @cached_property
     def arrangement(self) -> str:
@@ -137,7 +138,7 @@ class Geometry:
             return FORWARD
         if self.centre is not None and np.mean([_holds(c, self.centre) for c in self.cameras]) >= MOST:
             return INWARD
-        outwards = np.sum((self.eyes - self.eyes.mean(axis=0)) * self.axes, axis=1) > 0
+        outwards = np.sum((self.eyes - settled_eyes(self.cameras).mean(axis=0)) * self.axes, axis=1) > 0
         return OUTWARD if np.mean(outwards) >= MOST else FREE
 
     @cached_property

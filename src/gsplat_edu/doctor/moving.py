@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.text import Told
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.doctor.finding import command, counted
+from gsplat_edu.doctor.finding import Finding, Severity, command, counted
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
@@ -16,6 +16,10 @@ from gsplat_edu.train.transients import FEWEST, reduced
 
 NOTABLE = 0.01
 """Report a photo only if at least this fraction of it differs."""
+
+
+SUBJECT_SHARE = 0.3
+"""If at least this share of the training photos shows things that moved, a subject moves through the scene."""
 
 
 def moved_parts(
@@ -45,6 +49,39 @@ def moved_parts(
         if one.mask.mean() >= NOTABLE
     ]
     return sorted(shares, key=lambda entry: (-entry[1], entry[0]))
+
+
+def check_moved(moved: Sequence[tuple[str, float]], photos: int) -> list[Finding]:
+    """Report objects that moved, and whether they are the subject of the photos.
+
+    Args:
+        moved: The training photos that show them, as `moved_parts` returns them.
+        photos: Number of training photos.
+    """
+    if not moved:
+        return []
+    names = tuple(name for name, _ in moved)
+    shares = tuple(f"{100 * share:.1f} %" for _, share in moved)
+    if len(names) >= max(SUBJECT_SHARE * photos, 2):
+        what = (
+            f"a subject moves through the scene: {len(names)} of {photos} training photos show it where others"
+            " do not, in per cent of their pixels"
+        )
+        still = "to have it in the scene, photograph it while it stands still"
+        advice = Told(
+            f"train with --transients mask, which leaves the moving subject out; {still}",
+            f"mask the moving subject in a training; {still}",
+        )
+        options = (("transients", "mask"),)
+        return [Finding("moving subject", Severity.WARNING, what, advice, names, shares, options)]
+    shown = counted(len(names), "photo")
+    what = f"things or shadows that the other photos do not show in {shown}, in per cent of their pixels"
+    first = f"compare {names[0]} with its render first"
+    advice = Told(
+        f"train with --transients mask, which masks what moved; {first}",
+        f"mask what moved in a training; {first}",
+    )
+    return [Finding("moved", Severity.WARNING, what, advice, names, shares, (("transients", "mask"),))]
 
 
 def moved_line(

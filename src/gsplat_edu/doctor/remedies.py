@@ -31,7 +31,10 @@ four photos show most places, which are too few to compare."""
 
 
 def remedies_for(
-    reader: CaptureReader, names: Sequence[str], progress: Progress | None = None
+    reader: CaptureReader,
+    names: Sequence[str],
+    progress: Progress | None = None,
+    left_out: Sequence[str] | None = None,
 ) -> dict[str, Remedy]:
     """Choose settings for a capture from its photos, which are read once.
 
@@ -39,11 +42,12 @@ def remedies_for(
         reader: The capture.
         names: Of `CHOICES`.
         progress: Called with (photos done, total) in the calling thread.
+        left_out: Photos that are not used; None uses the capture's own list.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
-    survey = prepare(reader, progress, sharpness=False)
+    survey = prepare(reader, progress, sharpness=False, left_out=left_out)
     return {name: CHOICES[name](survey) for name in names}
 
 

@@ -26,7 +26,7 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.depth import judge_depth
 from gsplat_edu.doctor.finding import Finding
 from gsplat_edu.doctor.geometry import Geometry
-from gsplat_edu.doctor.photos import PhotoStats, measure_photo
+from gsplat_edu.doctor.photos import PhotoStats, measure_photo, unmeasured
 from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.scene.camera import Camera
 
@@ -118,6 +118,7 @@ def prepare(
     progress: Progress | None = None,
     sharpness: bool = True,
     depth: Path | None = None,
+    left_out: Sequence[str] | None = None,
 ) -> Survey:
     """Read a capture and measure its photos, a few at a time.
 
@@ -126,18 +127,13 @@ def prepare(
         progress: Called with (photos done, total) in the calling thread.
         sharpness: Measure the photos' sharpness too, which takes most of the time.
         depth: Where depth comes from that is judged too; see `gsplat_edu.data.depths.DepthSource`.
+        left_out: Photos that are not used; None uses the capture's own list.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
-    capture, headers = reader.capture, reader.headers
-    listed = read_left_out(reader.path)
-    used = [frame for frame in capture.frames if not is_left_out(frame, reader.path, listed)]
-    if not used:
-        raise DatasetError(f"{reader.path}: {LEFT_OUT} leaves out every photo; take some off it")
-    gone = sorted({frame.name for frame in capture.frames} - {frame.name for frame in used})
-    left = [LeftOutPhotos(len(gone), len(capture.frames), gone[0])] if gone else []
-    frames = oriented(sorted(used, key=lambda frame: frame.name), headers)
+    frames, left = _used(reader, left_out)
+    headers = reader.headers
     shots, refused = list[Shot](), list[Refused]()
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
@@ -151,8 +147,57 @@ def prepare(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    cameras = [(shot.name, shot.camera) for shot in shots]
-    judged = None if depth is None or not shots else JudgedDepth(*judge_depth(reader, cameras, depth))
+    judged = None
+    if depth is not None and shots:
+        judged = JudgedDepth(*judge_depth(reader, [(shot.name, shot.camera) for shot in shots], depth))
+    return _survey(reader, shots, refused, left, judged)
+
+
+def survey_of_poses(reader: CaptureReader, left_out: Sequence[str] | None = None) -> Survey:
+    """Read a capture for the checks that need no pixels: only the photos' headers are read.
+
+    Args:
+        reader: The capture.
+        left_out: Photos that are not used; None uses the capture's own list.
+
+    Raises:
+        DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
+    """
+    frames, left = _used(reader, left_out)
+    shots, refused = list[Shot](), list[Refused]()
+    for frame in frames:
+        try:
+            _, camera, _ = photo_file(frame, DataSettings(), reader.headers)
+        except DatasetError as error:
+            refused.append(Refused(frame.name, error.reason))
+        else:
+            shots.append(Shot(frame.name, frame.lens, (camera.W, camera.H), camera, unmeasured()))
+    return _survey(reader, shots, refused, left)
+
+
+def _used(
+    reader: CaptureReader, left_out: Sequence[str] | None
+) -> tuple[Sequence[Frame], Sequence[LeftOutPhotos]]:
+    """Return the frames that are used, sorted by name and turned upright, and a note about the others."""
+    capture = reader.capture
+    listed = read_left_out(reader.path) if left_out is None else left_out
+    used = [frame for frame in capture.frames if not is_left_out(frame, reader.path, listed)]
+    if not used:
+        raise DatasetError(f"{reader.path}: {LEFT_OUT} leaves out every photo; take some off it")
+    gone = sorted({frame.name for frame in capture.frames} - {frame.name for frame in used})
+    left = [LeftOutPhotos(len(gone), len(capture.frames), gone[0])] if gone else []
+    return oriented(sorted(used, key=lambda frame: frame.name), reader.headers), left
+
+
+def _survey(
+    reader: CaptureReader,
+    shots: Sequence[Shot],
+    refused: Sequence[Refused],
+    left: Sequence[LeftOutPhotos],
+    judged: JudgedDepth | None = None,
+) -> Survey:
+    """Add to the photos of a survey what the capture has besides."""
+    capture = reader.capture
     return Survey(
         reader.path,
         capture.layout,

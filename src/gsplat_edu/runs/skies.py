@@ -9,6 +9,7 @@ import numpy as np
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.rig import settled_eyes
 from gsplat_edu.sky.find import SIDE, find_sky, scene_size
 from gsplat_edu.sky.shell import MOST, sky_splats
 from gsplat_edu.train.config import TrainConfig
@@ -32,7 +33,7 @@ def shell_around(dataset: Dataset) -> Shell:
         dataset: The capture.
     """
     cameras = [view.camera for view in dataset.train]
-    centre = np.mean([camera.eye for camera in cameras], axis=0)
+    centre = settled_eyes(cameras).mean(axis=0)
     return Shell(centre, RADIUS * scene_size(cameras, dataset.points))
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
+from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import float64_array, in_range
@@ -17,6 +18,17 @@ PARALLEL = 1e-3
 
 EXTENT_MARGIN = 1.1
 """Factor between the cameras' spread and the extent (the code of Kerbl et al. 2023)."""
+
+SAME_PLACE = 1e-9
+"""Cameras within this fraction of their largest coordinate, or of 1, are at the same place: rounding error."""
+
+FAR_AWAY = 8.0
+"""A camera is far away if its distance from the median position exceeds this multiple of the 75th percentile of all.
+The ratio is 1.4 at the ends of a straight path and 1 on an orbit."""
+
+COMPANY = 3
+"""Far cameras with at least this many others within half of that distance are no strays, but part of the capture, such
+as the photos of a drone."""
 
 
 def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius: float = 3.0) -> Camera:
@@ -91,8 +103,58 @@ def through_lenses(cameras: Iterable[Camera]) -> bool:
     return not all(camera.pinhole for camera in cameras)
 
 
+def far_ratios(eyes: Float64[np.ndarray, "C 3"]) -> Float64[np.ndarray, " C"]:
+    """Return the cameras' distances from their median position, in units of the 75th percentile of these distances.
+
+    Args:
+        eyes: (C, 3) centres of the cameras, world units; at least one.
+
+    Returns:
+        (C,) ratios; 0 if three quarters of the cameras are at one place.
+    """
+    distances = np.linalg.norm(eyes - np.median(eyes, axis=0), axis=1)
+    usual = float(np.quantile(distances, 0.75))
+    if usual <= SAME_PLACE * max(1.0, float(np.quantile(np.abs(eyes), 0.75))):
+        return np.zeros(len(eyes))
+    return np.asarray(distances / usual)
+
+
+def stray_eyes(eyes: Float64[np.ndarray, "C 3"]) -> Bool[np.ndarray, " C"]:
+    """Return which cameras stand alone and far from all others, as those whose pose is wrong do.
+
+    A camera is a stray if its distance from the median position exceeds `FAR_AWAY` times the 75th percentile of all
+    distances, and fewer than `COMPANY` other cameras are within half of its distance.
+
+    Args:
+        eyes: (C, 3) centres of the cameras, world units; at least one.
+
+    Returns:
+        (C,) true for strays; at most a quarter of the cameras are.
+    """
+    stray = far_ratios(eyes) > FAR_AWAY
+    if stray.any():
+        offsets = eyes - np.median(eyes, axis=0)
+        near = 0.5 * np.linalg.norm(offsets[stray], axis=1)
+        counts = cKDTree(offsets).query_ball_point(offsets[stray], near, return_length=True)
+        stray[stray] = counts - 1 < COMPANY  # each camera is within its own radius
+    return stray
+
+
+def settled_eyes(cameras: Sequence[Camera]) -> Float64[np.ndarray, "n 3"]:
+    """Return the centres of the cameras that are no strays (`stray_eyes`): those that measure a scene.
+
+    Args:
+        cameras: At least one.
+
+    Returns:
+        (n, 3) world units, in the order of the cameras.
+    """
+    eyes = np.stack([camera.eye for camera in cameras])
+    return np.asarray(eyes[~stray_eyes(eyes)])
+
+
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """Measure the scale of a scene by the spread of its cameras.
+    """Measure the scale of a scene by the spread of its cameras. Strays (`stray_eyes`) do not count.
 
     1.1 max_i |e_i - mean e|,  e_i: centre of camera i
 
@@ -109,7 +171,7 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     """
     if not cameras:
         raise ArgumentError("cameras: is empty; the extent of a scene needs at least one camera")
-    eyes = np.stack([camera.eye for camera in cameras])
+    eyes = settled_eyes(cameras)
     spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
     # Differences within rounding count as the same place.
-    return EXTENT_MARGIN * spread if spread > 1e-9 * max(1.0, float(np.abs(eyes).max())) else 1.0
+    return EXTENT_MARGIN * spread if spread > SAME_PLACE * max(1.0, float(np.abs(eyes).max())) else 1.0

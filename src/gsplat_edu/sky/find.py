@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.rig import settled_eyes
 
 Vector = Float64[np.ndarray, "3"]
 Pixels = UInt8[np.ndarray, "_ _ 3"]
@@ -160,6 +161,8 @@ def find_sky(
 def scene_size(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> float:
     """Return the distance from the cameras' centre to the farthest camera or to most points, whichever is larger.
 
+    Strays (`gsplat_edu.scene.rig.stray_eyes`) do not count.
+
     Args:
         cameras: At least one.
         points: (N, 3) points of the capture; N may be 0.
@@ -167,7 +170,7 @@ def scene_size(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) ->
     Returns:
         World units; 1 if that is 0.
     """
-    eyes = np.stack([camera.eye for camera in cameras])
+    eyes = settled_eyes(cameras)
     centre = eyes.mean(axis=0)
     size = float(np.linalg.norm(eyes - centre, axis=1).max())
     if len(points):
@@ -267,7 +270,7 @@ def _spreads(
     if not len(rows):
         return math.inf, math.inf
     eyes = np.stack([camera.eye for camera in cameras])
-    centre = eyes.mean(axis=0)
+    centre = settled_eyes(cameras).mean(axis=0)
     cells = cKDTree(fibonacci(CELLS))
     rays, paint, of = directions[rows], 100 * np.log(colors[rows] + DARK), photo[rows]
     at_infinity = _spread(cells.query(rays)[1], paint, of)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -110,10 +111,12 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
         job for job in studio.queue.jobs() if job.work.command == "doctor" and job.work.inputs == (subject,)
     ]
     if not jobs:
+        certain = studio.prober.ask("certain", capture=str(entry))["findings"] if kind == "captures" else []
+        events = [Found(**{key: _frozen(value) for key, value in one.items()}) for one in certain]
         return {
             "job": None,
             "state": None,
-            "findings": [],
+            "findings": _with_photos(studio, kind, entry, entry if kind == "captures" else None, events),
             "facts": [],
             "fine": [],
             "advice": [],
@@ -123,6 +126,33 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     return _diagnosis(studio, jobs[-1], kind, entry)
 
 
+def _frozen(value: Any) -> Any:  # noqa: ANN401
+    """Return the value of an event's field that JSON has turned into lists."""
+    return tuple(_frozen(one) for one in value) if isinstance(value, list) else value
+
+
+def _with_photos(
+    studio: Studio, kind: str, entry: Path, capture: Path | None, findings: Sequence[Found]
+) -> list[dict[str, Any]]:
+    """Return findings with the affected photos, and with what the page offers to do."""
+    places = {} if capture is None else _photo_places(capture)
+    out, drawn = set[str](), set[str]()
+    if capture is not None:
+        prefix = f"captures/{legible(capture.name)}/"
+        out, drawn = ({f"{prefix}{name}" for name in those(capture)} for those in (left_out, masked))
+    shown = []
+    for finding in findings:
+        photos = [places.get(name) for name in finding.images]
+        facts = {
+            "photos": photos,
+            "left_out": [photo in out for photo in photos],
+            "masked": [photo in drawn for photo in photos],
+            "proposals": proposals(studio, kind, entry, finding),
+        }
+        shown.append({**dataclasses.asdict(finding), **facts})
+    return shown
+
+
 def _diagnosis(studio: Studio, job: Job, kind: str, entry: Path) -> dict[str, Any]:
     """Return the findings of a doctor job, with the affected photos."""
     path = studio.queue.files(job.id).events
@@ -130,23 +160,8 @@ def _diagnosis(studio: Studio, job: Job, kind: str, entry: Path) -> dict[str, An
     starts = [index for index, event in enumerate(events) if isinstance(event, Started)]
     events = events[starts[-1] :] if starts else events
     capture = entry if kind == "captures" else _capture_of(studio, entry)
-    places = {} if capture is None else _photo_places(capture)
-    out, drawn = set[str](), set[str]()
-    if capture is not None:
-        prefix = f"captures/{legible(capture.name)}/"
-        out, drawn = ({f"{prefix}{name}" for name in those(capture)} for those in (left_out, masked))
-    findings = []
-    for event in events:
-        if isinstance(event, Found):
-            photos = [places.get(name) for name in event.images]
-            offered = proposals(studio, kind, entry, event)
-            facts = {
-                "photos": photos,
-                "left_out": [photo in out for photo in photos],
-                "masked": [photo in drawn for photo in photos],
-                "proposals": offered,
-            }
-            findings.append({**dataclasses.asdict(event), **facts})
+    found = [event for event in events if isinstance(event, Found)]
+    findings = _with_photos(studio, kind, entry, capture, found)
     rest = next((event for event in events if isinstance(event, Diagnosed)), Diagnosed((), (), ()))
     changing = entry / "metrics.json" if kind == "runs" else entry
     # a change while the doctor looked may have come after what it read

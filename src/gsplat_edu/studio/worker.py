@@ -299,6 +299,25 @@ def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     return {name: found[name] for name in QUALITIES}
 
 
+def certain(capture: str) -> dict[str, Any]:
+    """Return what is certain about a capture that nobody has examined, as the fields of events.
+
+    Args:
+        capture: Folder of the capture; one whose poses are missing or damaged has no findings yet.
+    """
+    from dataclasses import asdict
+
+    from gsplat_edu.base.errors import DatasetError
+    from gsplat_edu.data.reader import CaptureReader
+    from gsplat_edu.doctor.certain import certain_findings
+    from gsplat_edu.doctor.finding import event_of
+
+    try:
+        return {"findings": [asdict(event_of(one)) for one in certain_findings(CaptureReader(capture))]}
+    except DatasetError:
+        return {"findings": []}
+
+
 def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
     """Write a photo's thumbnail; see `gsplat_edu.studio.pictures.make_thumbnail`."""
     from gsplat_edu.studio.pictures import make_thumbnail
@@ -332,6 +351,7 @@ TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "mask": draw_mask,
     "view_pictures": make_view_pictures,
     "forecast": forecast,
+    "certain": certain,
 }
 
 

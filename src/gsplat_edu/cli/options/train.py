@@ -127,6 +127,11 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     _add_length(parser.add_argument_group("length and limits"))
     photos = parser.add_argument_group("photos")
     _add_photos(photos)
+    photos.add_argument(
+        "--keep-photos",
+        action="store_true",
+        help="also train on photos whose poses are certainly wrong (default: leave them out and say so)",
+    )
     add_panorama(photos)
     add_scale(photos)
     _add_results(parser.add_argument_group("results"))

@@ -64,7 +64,7 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
       ask.textContent = view ? "Examine again" : "Examine";
       ask.hidden = Boolean(view?.active);
       const version = `${view?.job.id} ${view?.job.state} ${now.modified}`;
-      if (view) findings.read(version);
+      findings.read(version); // before anyone examines a capture, what is certain about it
     },
   };
 }
