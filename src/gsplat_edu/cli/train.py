@@ -165,7 +165,8 @@ def _run(
         if pace is not None and pace.outcome is not None:
             say(pace.outcome)
         with progress_bar(console, "") as bar:
-            task = bar.add_task("evaluating", total=len(capture.dataset.test) + len(capture.dataset.train))
+            scored_views = len(capture.dataset.test) + len(capture.dataset.train)
+            task = bar.add_task("evaluating", total=scored_views, visible=capture.options.scores_at_end)
 
             def scored(split: str, score: ImageScore) -> None:
                 if interrupted():

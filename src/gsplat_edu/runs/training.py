@@ -418,6 +418,8 @@ class CaptureRun:
     ) -> Evaluation:
         """Write the scene, in other formats too if `export` is given, and score it on the test and training views.
 
+        With `RunOptions.eval_every` 0, no view is scored; metrics.json and the report say so.
+
         Args:
             progress: Called for every scored view.
             export: Called with the written scene; metrics.json and the report get its result as "exports".
@@ -442,11 +444,16 @@ class CaptureRun:
         if refined is not None:
             write_refined(self.folder, refined)
             self._say(f"wrote {self.folder.refined}: the capture with its refined cameras")
-            facts |= aligned_score(refined.test, gaussians, self.options, trainer.extent, self._say)
+            if self.options.scores_at_end:
+                facts |= aligned_score(refined.test, gaussians, self.options, trainer.extent, self._say)
         return evaluate_run(
             self.folder,
             ScoredViews(
-                dataset.test, (refined or dataset).train, self.options.config.background, dataset.notes
+                dataset.test,
+                (refined or dataset).train,
+                self.options.config.background,
+                dataset.notes,
+                skipped=not self.options.scores_at_end,
             ),
             gaussians,
             self.options.renderer,
