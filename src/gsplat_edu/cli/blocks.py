@@ -28,9 +28,9 @@ from gsplat_edu.cli.options.block_parts import parts_of_blocks
 from gsplat_edu.cli.options.blocks import LEAST_VIEWS, SPLIT, block_count
 from gsplat_edu.cli.options.length import quality_of
 from gsplat_edu.cli.options.train import OPEN, left_open, options_from
+from gsplat_edu.cli.process import interruptible
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train import (
-    interruptible,
     photos_read,
     progress_bar,
     train_with_bar,

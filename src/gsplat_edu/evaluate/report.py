@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from gsplat_edu.base.constants import FAR_BELOW
 from gsplat_edu.base.content_policy import content_policy, policy_element
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import stored_path
@@ -44,6 +45,9 @@ PICTURES = 8
 SKIPPED = "not_scored"
 """Key of metrics.json: by "test" and "train", the number of views that an evaluation left out."""
 
+FULL_LENGTH = "full_length"
+"""Key of metrics.json: the iterations that the training would have without a time limit."""
+
 SCORES = (
     ("psnr", "PSNR (dB)"),
     ("psnr_8bit", "PSNR, 8-bit (dB)"),
@@ -65,6 +69,7 @@ SHOWN = 0.95
 NAMES = {
     "num_gaussians": "Gaussians",
     "seconds": "training time",
+    FULL_LENGTH: "iterations without a time limit",
     "psnr_aligned": "test PSNR on half of each photo, pose (and colours, with appearance) fitted on the other (dB)",
 }
 """Labels for the keys of metrics.json that are not plain English."""
@@ -269,6 +274,8 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
     test, train = (_mean(metrics, split, key) for split in ("test", "train"))
     steps = metrics.get("iterations")
     after = f"After {steps:,} iterations, " if isinstance(steps, int) else ""
+    if short := too_short(metrics):
+        after = f"{short} {after}"
     if test is None:
         if skipped := skipped_views(metrics):
             return (
@@ -291,6 +298,18 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
         parts.append(f"the worst view is {low.name} at {low.psnr:.1f} dB")
     sentence = "; ".join(parts) + "."
     return sentence[0].upper() + sentence[1:]
+
+
+def too_short(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence if a time limit ended the training long before the scene is usable; empty otherwise.
+
+    Args:
+        metrics: As in `Report`.
+    """
+    steps, full = metrics.get("iterations"), metrics.get(FULL_LENGTH)
+    if not isinstance(steps, int) or not isinstance(full, int) or steps >= FAR_BELOW * full:
+        return ""
+    return f"The scene is not usable: it was trained for {steps:,} of {full:,} iterations; give it more time."
 
 
 def skipped_views(metrics: Mapping[str, Any]) -> str:
