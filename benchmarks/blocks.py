@@ -123,7 +123,7 @@ def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: AN
         "--sky",
         "none",
     ]
-    recipe += ["--eval-every", "0", "--save-every", "0", *given.words]
+    recipe += ["--eval-every", given.iterations, "--save-every", "0", *given.words]
     whole, parts = folder / "whole", BlocksFolder(folder / "blocks")
     costs = {}
     if not (whole / "report.html").is_file():

@@ -286,7 +286,9 @@ def trained(folder: Path, backend: str, iterations: int) -> dict[str, float]:
         words = ["train", str(folder), "--out", str(out), "--strategy", "adc", "--backend", backend]
         start = time.perf_counter()
         with contextlib.redirect_stdout(io.StringIO()):
-            code = command_line.main([*words, "--iterations", str(iterations), "--eval-every", "0"])
+            code = command_line.main(
+                [*words, "--iterations", str(iterations), "--eval-every", str(iterations)]
+            )
         if code != 0:
             raise SystemExit(f"gpu.py: the training on {backend} failed")
         seconds = time.perf_counter() - start

@@ -229,6 +229,8 @@ def test_the_time_of_a_run_is_the_sum_of_its_parts():
     assert found.total == pytest.approx(sum(found.seconds.values()))
     silent = predict(FACTS, MEASURED, PLAIN, eval_every=0, save_every=0)
     assert silent.seconds["judging"] == silent.seconds["saving"] == 0.0
+    scoring = (100 * 2e-6 + 20 * 3e-6) * 1e4
+    assert found.seconds["ending"] - silent.seconds["ending"] == pytest.approx(scoring), "0 scores nothing"
 
 
 def test_the_training_time_is_the_sum_over_growing_counts():

@@ -4,6 +4,7 @@ The clock is simulated: a step takes the modelled seconds times a factor that ch
 
 import dataclasses
 import math
+import shutil
 
 import pytest
 
@@ -97,6 +98,30 @@ def test_between_92_and_100_percent_of_the_limit_are_used(capture, tmp_path, spe
     assert run.folder.read_metrics()["iterations"] == run.folder.read_config()["train"]["iterations"] == done
     assert run.trainer.position >= 0.9 * 200, "the schedule is completed in fewer or more iterations"
     assert is_finished(dataclasses.replace(run.options, resume=True))
+
+
+def test_a_run_that_scores_nothing_reads_no_held_out_photo(capture, tmp_path):
+    """The held-out photos are gone before training begins, and all photos before it ends."""
+    shutil.copytree(capture, tmp_path / "capture")
+    chosen = options(tmp_path / "capture", tmp_path / "run", 30, refine="poses", appearance="exposure")
+    chosen = dataclasses.replace(chosen, data_settings=DataSettings(image_memory=0))
+    run = CaptureRun(chosen)
+    held_out = {view.name for view in run.dataset.test}
+    photos = {path.name: path for path in (tmp_path / "capture" / "images").iterdir()}
+    assert len(held_out) == 2
+    for name in held_out:
+        photos.pop(name).unlink()
+    profile = step_profile(chosen.config, Facts.of(run.dataset), SPEED)
+    clock = SimulatedClock(profile)
+    pace = Pace(run, Deadline(100.0, clock), profile=profile)
+    run.train(pace.over, [clock, pace])
+    for path in photos.values():
+        path.unlink()
+    run.finish()
+    metrics = run.folder.read_metrics()
+    assert metrics["not_scored"] == {"test": 2, "train": 14}
+    assert not {"test", "train", "test_views", "psnr_aligned"} & metrics.keys()
+    assert not run.folder.renders.exists()
 
 
 def test_the_printed_options_repeat_the_run_exactly(capture, tmp_path):

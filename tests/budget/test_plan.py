@@ -21,14 +21,16 @@ from gsplat_edu.budget.costs import (
     wanted_gaussians,
 )
 from gsplat_edu.budget.deadline import Deadline
-from gsplat_edu.budget.plan import Limits, Request, choose, plan
+from gsplat_edu.budget.plan import Limits, Request, choose, look_ahead, plan
 from gsplat_edu.budget.planned import flags, taken_up
 from gsplat_edu.budget.probe import resident_bytes
+from gsplat_edu.cli import train
 from gsplat_edu.cli.arguments import bytes_text, seconds_text
-from gsplat_edu.cli.main import build_parser
+from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.runs.folder import RunFolder
@@ -175,6 +177,20 @@ def test_too_little_time_is_one_line_and_the_time_it_names_is_enough():
     assert chosen(None, enough).iterations >= 50
 
 
+def test_a_limit_that_leaves_no_usable_scene_is_called_so_with_the_time_that_would_do():
+    """84 photos are a standard training of 3,000 iterations, whatever the strategy; a tenth is the least."""
+    one_size = {"factors": (1.0,), "strategy": "fast"}
+    enough, short = chosen(None, 600.0, **one_size), chosen(None, 33.0, **one_size)
+    assert enough.full_length == short.full_length == 3_000
+    assert enough.iterations > 300 and not any("usable" in line for line in enough.sentences)
+    assert short.iterations < 300
+    said = short.sentences[-1]
+    assert f"it leaves {short.iterations} iterations of 3,000" in said and "far too short" in said
+    named = seconds_text(said.rsplit("about ", 1)[1].replace(" ", "").replace("min", "m"))
+    assert 2_900 <= chosen(None, named, **one_size).iterations <= 3_500
+    assert chosen(None, 33.0, given=["iterations"], iterations=40, **one_size).full_length == 40
+
+
 def test_the_sentences_name_what_was_chosen():
     found = chosen(1_024, 240.0)
     first, *forecast = found.sentences
@@ -310,6 +326,28 @@ def test_the_time_before_the_plan_counts(capture, tmp_path):
     late = Limits(time=Deadline(3_600.0, lambda: 3_599.0))
     with pytest.raises(ArgumentError, match="--time-limit 1 h 0 min: is too short"):
         plan(dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), late)
+
+
+def test_a_limit_that_cannot_be_kept_is_refused_before_any_trial(capture, tmp_path, monkeypatch, capsys):
+    """Nothing can be done in a millisecond, which has passed before the command reads its options."""
+    monkeypatch.setattr(train, "refinement_for", lambda *words: pytest.fail("trials were made"))
+    monkeypatch.setattr(train, "remedies_for", lambda *words: pytest.fail("all photos were read"))
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--refine", "auto", "--time-limit"]
+    assert main([*words, "0.001s"]) == 2
+    said = capsys.readouterr().err
+    assert "--time-limit" in said and "give at least" in said and said.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_one_measurement_serves_the_outlook_and_the_plan(capture, tmp_path):
+    run = dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run")
+    limits, reader = Limits(time=Deadline(3_600.0, lambda: 0.0)), CaptureReader(capture)
+    ahead = look_ahead(run, limits, (), rescale=True, reader=reader)
+    assert ahead.warning == "" and 0.0 < ahead.shortest < 3_600.0
+    first, second = (plan(run, limits, reader=reader, outlook=ahead) for _ in range(2))
+    assert first == second, "measured anew, the forecasts would differ"
+    assert look_ahead(run, limits, ["iterations"], rescale=True, reader=reader) is None
+    assert look_ahead(run, Limits(2**32), (), rescale=True, reader=reader) is None
 
 
 def test_a_resumed_run_keeps_the_numbers_of_its_config(capture, tmp_path):

@@ -209,3 +209,22 @@ def test_help_shows_an_example(cli, capsys):
     with pytest.raises(SystemExit):
         cli(["eval", "--help"])
     assert "example: gsplat-edu eval " in capsys.readouterr().out
+
+
+def test_a_training_without_scores_names_the_command_that_scores_it(made, cli, tmp_path, capsys):
+    _, capture = made
+    words = ["train", str(capture), "--iterations", "8", "--test-every", "3", "--eval-every"]
+    unscored, scored = (RunFolder(tmp_path / name) for name in ("unscored", "scored"))
+    assert cli([*words, "0", "--out", str(unscored.path)]) == 0
+    said = capsys.readouterr().out.replace("\n", " ")
+    assert "--eval-every 0 skipped the scores of 2 held-out and 4 training photos" in said
+    assert f"gsplat-edu eval {unscored.path}" in said and "worst view" not in said
+    assert not unscored.renders.exists()
+    assert cli(["info", str(unscored.path)]) == 0
+    assert "--eval-every 0 skipped the scores" in capsys.readouterr().out.replace("\n", " ")
+    assert cli([*words, "0", "--out", str(unscored.path), "--resume"]) == 0
+    assert "nothing to do" in capsys.readouterr().out
+    assert cli(["eval", str(unscored.path)]) == 0
+    assert cli([*words, "1000", "--out", str(scored.path)]) == 0
+    assert unscored.scene(8).read_bytes() == scored.scene(8).read_bytes()
+    assert unscored.read_metrics()["test"] == scored.read_metrics()["test"]

@@ -5,7 +5,7 @@ from importlib.metadata import version
 import pytest
 
 from gsplat_edu.cli.main import COMMANDS, main
-from gsplat_edu.cli.train import interruptible
+from gsplat_edu.cli.process import interruptible
 
 TINY = ["demo", "--iters", "2", "--k0", "5", "--cap", "8", "--size", "16"]
 

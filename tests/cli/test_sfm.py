@@ -98,8 +98,8 @@ def _unreadable(folder):
             _unreadable,
             "holds no photo that can be decoded: 0.jpg (not a JPEG, PNG, WebP, TIFF, BMP, PPM or HEIC image), 1.jpg",
         ),
-        (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
-        (_blank, "the photos show too little in common"),
+        (_noise, "no two photos match; 59 features a photo, 0 of 6 pairs match (medians): "),
+        (_blank, "0 features a photo, 0 of 3 pairs match (medians): 100 % of a photo is blank; show more"),
         (lambda folder: folder.write_text("hello"), "photos: is neither a photo nor a video"),
         (
             lambda file: Image.fromarray(photograph_box(box_camera(0.0))).save(file, format="PNG"),

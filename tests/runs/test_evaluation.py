@@ -88,3 +88,26 @@ def test_metrics_json_is_checked_for_every_score():
     from gsplat_edu.runs import fields
 
     assert fields.MEASURES == metrics.MEASURES
+
+
+def test_an_evaluation_that_skips_its_views_says_so_and_removes_earlier_scores(capture, folder):
+    views, points, colors = capture
+    gaussians = splats_on(points, colors)
+    evaluate_run(folder, ScoredViews(views[:2], views[2:]), gaussians, RENDER, {"psnr_aligned": 20.0})
+    assert len(list((folder.renders / "test").iterdir())) == 2
+    judged = ScoredViews(views[:2], views[2:], skipped=True)
+    result = evaluate_run(folder, judged, gaussians, RENDER, {"iterations": 70})
+    assert (result.test, result.train) == ([], [])
+    assert folder.read_metrics() == {
+        "num_gaussians": len(points),
+        "iterations": 70,
+        "not_scored": {"test": 2, "train": 3},
+    }
+    assert not list((folder.renders / "test").iterdir())
+    page = folder.report.read_text()
+    assert "nothing was scored: --eval-every 0 skipped 2 held-out and 3 training photos" in page
+    assert f"gsplat-edu eval {folder.path}" in page and "held out for testing" not in page
+    evaluate_run(folder, ScoredViews(views[:2], views[2:]), gaussians, RENDER)
+    metrics = folder.read_metrics()
+    assert "not_scored" not in metrics and metrics["test"]["num_images"] == 2
+    assert "--eval-every" not in folder.report.read_text()

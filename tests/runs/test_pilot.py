@@ -8,6 +8,7 @@ import torch
 
 import panorama_room
 from gsplat_edu import Camera
+from gsplat_edu.budget.deadline import Deadline, TrialTime
 from gsplat_edu.data.lens_captures import LENS_SCENES, lens_photos, nearer
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
@@ -121,6 +122,22 @@ def test_the_smallest_refinement_without_a_clearly_better_one_is_chosen():
     assert chosen(20.0, 20.0 + 1.1 * LEAST_GAIN, 20.0 + 1.9 * LEAST_GAIN) == "poses"
     assert chosen(20.0, 20.0, 20.0 + 1.1 * LEAST_GAIN) == "both"
     assert chosen(20.0, 19.0, 19.0) == "none"
+
+
+@pytest.mark.parametrize("asked", ["", "poses"])
+def test_pilots_end_early_if_they_would_take_too_much_of_a_time_limit(tmp_path, asked):
+    """Each of 1,800 steps takes a second by the clock, of a limit of 1,000 s."""
+    write_colmap(tmp_path / "capture", *procedural_capture(32, 8, splats=60))
+    reader, steps = CaptureReader(tmp_path / "capture"), []
+    time = TrialTime(Deadline(1_000.0, lambda: float(len(steps))))
+    found = refinement_for(options(reader.path, tmp_path), reader, steps.append, asked, time.is_over)
+    assert (found.refine, found.trials) == (asked or "none", None)
+    assert "more than a quarter of the time that is left" in found.reason
+    assert 0 < len(steps) < 50, "the pace tells long before 250 s"
+    late = TrialTime(Deadline(1_000.0, lambda: 1_001.0))
+    steps.clear()
+    assert refinement_for(options(reader.path, tmp_path), reader, steps.append, asked, late.is_over) == found
+    assert not steps
 
 
 def test_without_held_out_photos_nothing_is_refined(tmp_path):

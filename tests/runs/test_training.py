@@ -410,8 +410,12 @@ def test_a_time_limit_leaves_a_scene_and_metrics_and_can_be_lifted(capture, fini
     assert train(capture, out, *SHORT, "--time-limit", "0.001s") == 0
     metrics = RunFolder(out).read_metrics()
     assert metrics["iterations"] == 1 and metrics["test"]["num_images"] == 2
-    assert "time limit" in capsys.readouterr().out
+    said = capsys.readouterr().out.replace("\n", " ")
+    unusable = "The scene is not usable: it was trained for 1 of 40 iterations"
+    assert "time limit" in said and unusable in said.rsplit("wrote ", 1)[1]
+    assert unusable in RunFolder(out).report.read_text() and metrics["full_length"] == 40
     assert train(capture, out, *SHORT, "--resume") == 0
+    assert "not usable" not in capsys.readouterr().out + RunFolder(out).report.read_text()
     assert ply(out, 40) == ply(finished, 40)
 
 

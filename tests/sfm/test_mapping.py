@@ -8,6 +8,7 @@ from gsplat_edu.sfm import mapping
 from gsplat_edu.sfm.mapping import MANY_PHOTOS, Attempt, attempts, best_model, shared_cameras
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.result import QUARTER, output_names
+from sfm.databases import write_database, write_photos
 
 
 def test_attempts_vary_mapper_lens_thresholds_and_cameras_in_turn():
@@ -220,7 +221,13 @@ def test_attempts_stop_once_two_models_agree(mapped):
     assert tried == 2 and len(best["names"]) == 6, "two attempts register the same six photos"
 
 
-def test_the_error_gives_the_reason_why_there_are_no_poses(mapped):
+def test_the_error_gives_the_reason_why_there_are_no_poses(mapped, tmp_path):
+    """Ten photos with 500 features each, whose 45 pairs match, most of them without parallax."""
+    write_database(tmp_path / "database.db", [500] * 10, [(40, 6)] * 30 + [(40, 3)] * 15)
+    write_photos(tmp_path / "photos", 10)
     best, _, _ = mapped(0, 0, 0)
-    assert "10 of 10 photos match one another, but their matches yield no poses" in str(best)
-    assert "too little in common" not in str(best)
+    assert str(best).startswith(
+        "none of 10 photos has a pose that counts; 10 of them are connected by matches; "
+    )
+    assert "500 features a photo, 45 of 45 pairs match with 40 inliers" in str(best)
+    assert "67 % of them without parallax: photos from one spot" in str(best) and "\n" not in str(best)

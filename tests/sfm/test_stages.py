@@ -13,6 +13,8 @@ GOOD = {
         "panoramas": [{"name": "a.jpg", "faces": ["a_0.jpg", "a_1.jpg"], "place": None}],
     },
     "photos": {"summary": "", "names": ["a.jpg", "b/c.jpg"]},
+    "features": {"summary": "", "few": ["a.jpg"]},
+    "more features": {"summary": ""},
     "matches": {"summary": "", "connected": 3},
     "mapping": {"summary": "", "folder": "models/1/0", "names": ["a"], "doubtful": [], "unclear": []},
 }
@@ -44,6 +46,7 @@ def test_facts_of_a_completed_stage_are_read(tmp_path, name):
         ("faces", {"panoramas": [{"name": "a", "faces": [], "place": None}]}),
         ("faces", {"panoramas": [{"name": "a", "faces": ["a.jpg"], "place": [1.0, 2.0]}]}),
         ("photos", {"names": {"a": 1}}),
+        ("features", {"few": 3}),
         ("matches", {"connected": "3"}),
         ("matches", {"connected": True}),
     ],

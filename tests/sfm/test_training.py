@@ -15,7 +15,7 @@ from gsplat_edu.scene.views import View
 from sfm.test_video import write_video
 from sfm.textured_box import cameras_of, check
 
-TRAINING = ["--no-rescale", "--strategy", "none", "--eval-every", "0", "--save-every", "0"]
+TRAINING = ["--no-rescale", "--strategy", "none", "--eval-every", "1000", "--save-every", "0"]
 
 
 def trained(source, run, iterations=200):

@@ -126,7 +126,7 @@ def test_a_job_whose_parent_was_killed_while_it_started_ends(views, tmp_path):
         "focal": camera.fx,
     }
     order = {"job": "features", "database": str(tmp_path / "db"), "photos": str(tmp_path), "masks": ""}
-    order |= {"groups": [group], "max_features": 500, "threads": 1, "seed": 0}
+    order |= {"groups": [group], "sift": {"max_num_features": 500}, "threads": 1, "seed": 0}
     with subprocess.Popen(
         [sys.executable, "-P", engine], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:

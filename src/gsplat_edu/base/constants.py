@@ -127,3 +127,6 @@ SRGB_OFFSET: Final = 0.055
 PAGE_FACES: Final = 2_000_000
 """Most triangles of all meshes of a page. They take about 60 MB before compression. `gsplat-edu mesh` keeps to it
 unless told otherwise. Source: ours."""
+
+FAR_BELOW: Final = 0.1
+"""A scene that was trained for less than this fraction of its length is not usable: splats have hardly moved."""

@@ -109,7 +109,7 @@ def merge_blocks(
     progress: Progress | None = None,
     export: Export | None = None,
 ) -> Evaluation:
-    """Merge the blocks of a run, write the scene into its folder, and score it on the held-out views.
+    """Merge the blocks of a run, write the scene into its folder, and score it on the held-out views if its plan does.
 
     Args:
         path: Folder of the run in blocks.
@@ -148,14 +148,16 @@ def merge_blocks(
         "blocks": _facts(plan, records, counts, dataset),
         "seams": None,
     }
-    if len(records) > 1 and dataset.test:
+    if len(records) > 1 and dataset.test and options.scores_at_end:
         masks = masks_of(plan.area, plan.cores, gaussians, [view.camera for view in dataset.test], renderer)
         strips, rest = pooled_psnr(gaussians, dataset.test, masks, renderer, options.config.background)
         width = 2 * strip_width(plan.area, plan.cores)
         facts["seams"] = {"width": width, "psnr": strips, "psnr_elsewhere": rest}
     if export is not None:
         facts["exports"] = export(open_source(scene))
-    judged = ScoredViews(dataset.test, (), options.config.background, dataset.notes)
+    judged = ScoredViews(
+        dataset.test, (), options.config.background, dataset.notes, skipped=not options.scores_at_end
+    )
     return evaluate_run(run, judged, gaussians, options.renderer, facts, progress)
 
 

@@ -114,7 +114,7 @@ class Prospect:
         config: The run, with the cap that it plans.
         scene: Gaussians that it starts from; None for the capture's points.
         image_memory: Bytes of photos kept in memory.
-        eval_every: Iterations between evaluations; 0 for none.
+        eval_every: Iterations between evaluations; 0 for none, not even at the end.
         save_every: Iterations between checkpoints; 0 for none.
         depth: As for `RunOptions`: where depth comes from that it learns from; None for none.
     """

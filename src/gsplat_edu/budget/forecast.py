@@ -106,7 +106,7 @@ def predict(
         measured: Measurements of this machine.
         config: The run.
         image_memory: Bytes of photos kept in memory; the others are read again, on one of the rendering cores.
-        eval_every: Iterations between evaluations; 0 for none.
+        eval_every: Iterations between evaluations; 0 for none, not even at the end.
         save_every: Iterations between checkpoints; 0 for none.
     """
     counts = expected_counts(config, facts.points, facts.pixels)
@@ -126,7 +126,7 @@ def predict(
     footprint = Footprint(facts, process, measured.pairs, config.sh_degree, config.batch, room)
     evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))
     saving = saving_seconds(float(counts.mean()), config.sh_degree)
-    views = facts.train + facts.test
+    views, at_end = facts.train + facts.test, (measured.score, measured.picture)
     return Forecast(
         iterations=config.iterations,
         backend=measured.backend,
@@ -137,7 +137,7 @@ def predict(
             "training": each * config.iterations,
             "judging": evaluations * facts.test * measured.score * facts.pixels,
             "saving": saved * saving,
-            "ending": ending_seconds(facts, measured.score, measured.picture) + 2 * saving,
+            "ending": ending_seconds(facts, *(at_end if eval_every else (0.0, 0.0))) + 2 * saving,
             **({} if room is None else {"density": measured.exchange * exchanged_gaussians(config, counts)}),
         },
         memory=footprint.parts(most, image_memory),
@@ -185,7 +185,7 @@ def forecast(
         config: The run.
         measured: Measurements of `probe`; None to measure now.
         backend: The rendering backend, by its own name.
-        eval_every: Iterations between evaluations; 0 for none.
+        eval_every: Iterations between evaluations; 0 for none, not even at the end.
         save_every: Iterations between checkpoints; 0 for none.
 
     Raises:

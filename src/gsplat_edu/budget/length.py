@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from gsplat_edu.budget.deadline import Deadline
+from gsplat_edu.budget.deadline import TrialTime
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.thin import ThinTrial, needs_trial, try_lengths
 from gsplat_edu.train.config import MILESTONES, TrainConfig, recipe
 from gsplat_edu.train.length import planned_iterations, reasons
-
-TRIAL_SHARE = 0.25
-"""Share of the time left until a limit that trials of lengths may take."""
 
 
 def with_iterations(
@@ -39,7 +36,7 @@ def tried(
     reader: CaptureReader,
     views: int,
     progress: Callable[[], None] = lambda: None,
-    deadline: Deadline | None = None,
+    time: TrialTime | None = None,
 ) -> ThinTrial | None:
     """Try how long a training by the recipe fast may be; None if there are enough photos, or too few to try.
 
@@ -48,7 +45,7 @@ def tried(
         reader: The run's capture.
         views: Number of training views.
         progress: Called after every iteration of a trial.
-        deadline: Trials end after `TRIAL_SHARE` of the time that is left until then; None for no limit.
+        time: Trials end when it is over; None for no limit.
 
     Raises:
         DatasetError: one of the photos cannot be read.
@@ -56,10 +53,9 @@ def tried(
     fresh = options.scene is None and not options.resume
     if options.config.strategy != "fast" or not fresh or not needs_trial(views):
         return None
-    if deadline is None:
+    if time is None:
         return try_lengths(options, reader, progress)
-    latest = deadline.spent + TRIAL_SHARE * deadline.left
-    return try_lengths(options, reader, progress, lambda: deadline.spent > latest)
+    return try_lengths(options, reader, progress, time.is_over)
 
 
 def with_planned_length(

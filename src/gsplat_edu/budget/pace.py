@@ -150,8 +150,11 @@ class Pace:
         return RESERVE_FACTOR * ending * max(slower, 1.0)
 
     def _measure(self, trainer: Trainer) -> None:
-        """Score a view to estimate the time that the end of the run takes."""
+        """Score a view to estimate the time that the end of the run takes; none if the end scores none."""
         dataset, options = self._run.dataset, self._run.options
+        if not options.scores_at_end:
+            self._costs.append((0.0, 0.0, self._slowness))
+            return
         view = (dataset.test or dataset.train)[0]
         clock = self._deadline.clock
         found = scoring_seconds(trainer.gaussians, [view], options.config, options.backend, clock)

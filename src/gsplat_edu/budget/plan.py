@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from gsplat_edu.base.constants import FAR_BELOW
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import Told, easily_read, spelled_seconds
 from gsplat_edu.budget.costs import (
@@ -26,22 +27,21 @@ from gsplat_edu.budget.costs import (
     photo_copies,
     step_profile,
 )
-from gsplat_edu.budget.deadline import Deadline
+from gsplat_edu.budget.deadline import TrialTime
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
-from gsplat_edu.budget.length import tried, with_iterations, with_planned_length
-from gsplat_edu.budget.on_device import cap_sentence, check_device, most_gaussians, room_of
+from gsplat_edu.budget.length import tried, with_planned_length
+from gsplat_edu.budget.on_device import cap_sentence, check_device, room_of
 from gsplat_edu.budget.planned import flags, taken_up
 from gsplat_edu.budget.probe import probe, resident_bytes
+from gsplat_edu.budget.request import Limits as Limits, Request as Request
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.engine.room import Room
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.start import scene_start
-from gsplat_edu.runs.thin import ThinTrial
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.capacity import SEPARATE
-from gsplat_edu.train.config import RECIPE_ITERATIONS, TrainConfig
+from gsplat_edu.train.config import TrainConfig
 
 FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
 """Factors by which photos may be downscaled."""
@@ -70,32 +70,8 @@ WORTHWHILE_PIXELS = 100_000
 TIME_SHARE = 0.95
 """Fraction of the time limit for which the schedule is planned; `gsplat_edu.budget.pace` fits it to the time later."""
 
-GUARD = 1.5
-"""adc: the cap as a multiple of the expected number of Gaussians, so that a scene that grows more keeps the time."""
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of a run.
-
-    Args:
-        memory: Peak resident memory of the process, bytes; None for no limit.
-        time: Time from the start of the command to its end; None for no limit.
-    """
-
-    memory: int | None = None
-    time: Deadline | None = None
-
-    @property
-    def seconds(self) -> float | None:
-        """The time limit in seconds, from the start of the command to its end; None for no limit."""
-        return None if self.time is None else self.time.seconds
-
-    def __str__(self) -> str:
-        """Return the limits as command-line options."""
-        memory = [] if self.memory is None else [f"--max-memory {spelled_bytes(self.memory)}"]
-        seconds = [] if self.seconds is None else [f"--time-limit {spelled_seconds(self.seconds)}"]
-        return " and ".join(memory + seconds)
+TOO_SHORT = "the time limit is far too short"
+"""Beginning of the sentence about a limit that allows no usable scene."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +83,7 @@ class Plan:
         by_time: Whether the time limit chose the iterations; `gsplat_edu.budget.pace` then fits them to the machine.
         forecast: Expected time and memory; None if nothing had to be chosen.
         sentences: Explanation for the user.
+        full_length: Iterations that the run would have without a time limit.
         profile: Expected seconds of every iteration if `by_time`.
     """
 
@@ -114,6 +91,7 @@ class Plan:
     by_time: bool = False
     forecast: Forecast | None = None
     sentences: tuple[str, ...] = ()
+    full_length: int | None = None
     profile: Float64[np.ndarray, " iterations"] | None = dataclasses.field(default=None, compare=False)
 
     @property
@@ -138,85 +116,47 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Request:
-    """Input of a plan.
+class Outlook:
+    """What a forecast says of a time limit before any trial.
 
     Args:
-        options: The run as it would be without limits.
+        request: Input of the plan.
+        measured: Measurements of this machine.
+        shortest: Seconds that the shortest training takes, its evaluation included.
+        warning: A sentence if the limit allows no usable scene; empty otherwise.
+    """
+
+    request: Request
+    measured: Measurements
+    shortest: float
+    warning: str = ""
+
+
+def look_ahead(
+    options: RunOptions, limits: Limits, given: Collection[str], *, rescale: bool, reader: CaptureReader
+) -> Outlook | None:
+    """Check by a forecast that a time limit can be kept, before trials use a part of it.
+
+    Args:
+        options: The run as it would be without limits; settings may still be open.
         limits: The limits.
         given: Names of `PLANNED` that the user gave.
         rescale: Whether milestones that are not given stretch with the iterations.
-        facts: The capture at the size given by the user, or at the size of its files.
-        factors: Allowed downscaling factors, ascending.
-        trial: Of a capture with few photos; its longest training bounds the iterations.
-        room: The device on which the training stays; None for the processor and CUDA.
+        reader: Has read the capture.
+
+    Returns:
+        The outlook; None if no time limit chooses the iterations, or the run is resumed.
+
+    Raises:
+        ArgumentError: the limit is too short; the message names a sufficient one.
+        DatasetError: the capture cannot be read.
     """
-
-    options: RunOptions
-    limits: Limits
-    given: frozenset[str]
-    rescale: bool
-    facts: Facts
-    factors: tuple[float, ...] = (1.0,)
-    trial: ThinTrial | None = None
-    room: Room | None = None
-
-    @property
-    def most_on_device(self) -> int | None:
-        """How many Gaussians the device has room for, with the pairs of a trained scene; None without one."""
-        return None if self.room is None else most_gaussians(self.room, self.options.config)
-
-    @property
-    def most_iterations(self) -> int:
-        """Bound of the iterations that a time limit chooses."""
-        longest = None if self.trial is None else self.trial.longest
-        return RECIPE_ITERATIONS if longest is None else longest
-
-    @property
-    def least(self) -> int:
-        """Smallest cap: a start scene is used whole, whereas of points a cap selects some."""
-        return 0 if self.options.scene is None else self.facts.points
-
-    @property
-    def by_time(self) -> bool:
-        """Whether the plan chooses the iterations."""
-        return self.limits.seconds is not None and "iterations" not in self.given
-
-    def config(self, iterations: int, factor: float, cap: int | None) -> TrainConfig:
-        """Return the recipe for a number of iterations, with a cap that fits the memory and the planned time.
-
-        Args:
-            iterations: Number of iterations, of which whole batches count.
-            factor: Downscaling factor of the photos.
-            cap: Number of Gaussians that fit into memory; None for no limit.
-        """
-        config = self.options.config
-        if "iterations" not in self.given:
-            config = with_iterations(config, iterations, self.given, rescale=self.rescale)
-        if "max_gaussians" in self.given:
-            return config
-        caps = [] if cap is None else [max(easily_read(cap), self.least)]
-        caps += self.device_caps(config, factor)
-        if config.strategy in ("mcmc", "fast") or (self.by_time and config.strategy == "adc"):
-            facts = self.facts.smaller(factor)
-            wanted = facts.wanted(config)
-            guarded = config.strategy == "adc"
-            caps.append(easily_read(math.ceil(GUARD * wanted)) if guarded else max(wanted, self.least))
-        return dataclasses.replace(config, max_gaussians=min(caps) if caps else None)
-
-    def wanted(self, config: TrainConfig, factor: float) -> int:
-        """Return the Gaussians that a run plans, or for adc may be expected to reach, without regard to memory."""
-        facts = self.facts.smaller(factor)
-        wanted = facts.wanted(config)
-        return math.ceil(GUARD * wanted) if config.strategy == "adc" else wanted
-
-    def device_caps(self, config: TrainConfig, factor: float) -> list[int]:
-        """Return the cap that the device's buffers need, if the run would grow beyond it."""
-        most = self.most_on_device
-        grows = config.strategy != "none" and most is not None
-        return (
-            [easily_read(most)] if grows and most is not None and most < self.wanted(config, factor) else []
-        )
+    if limits.time is None or "iterations" in given or (options.resume and options.folder.exists()):
+        return None
+    request, measured = _measured(options, limits, given, rescale, reader)
+    found = choose(request, measured, limits.time.spent)
+    warning = next((line for line in found.sentences if line.startswith(TOO_SHORT)), "")
+    return Outlook(request, measured, _shortest(request, measured), warning)
 
 
 @dataclass(frozen=True)
@@ -237,6 +177,7 @@ def plan(
     reader: CaptureReader | None = None,
     quality: str | None = None,
     progress: Callable[[], None] = lambda: None,
+    outlook: Outlook | None = None,
 ) -> Plan:
     """Choose the settings that the user did not give so that the limits hold. The probe takes a few seconds.
 
@@ -252,6 +193,7 @@ def plan(
         reader: Has read the capture already; None to read it.
         quality: Of `gsplat_edu.train.length.QUALITIES`, to choose the iterations; None to keep them.
         progress: Called after every iteration of a trial of lengths.
+        outlook: Of the same run, to measure only once.
 
     Raises:
         ArgumentError: even the smallest settings exceed a limit (the message names a sufficient one), or the backend is
@@ -275,9 +217,13 @@ def plan(
         found = _with_planned_count(options, given, reader)
         check_device(found.options, reader)
         return dataclasses.replace(found, sentences=(*first_sentences, *found.sentences))
-    request, measured = _measured(options, limits, given, rescale, reader)
+    if outlook is not None and outlook.measured.backend == options.backend:
+        request, measured = dataclasses.replace(outlook.request, options=options), outlook.measured
+    else:
+        request, measured = _measured(options, limits, given, rescale, reader)
     if request.by_time:
-        trial = tried(options, reader, request.facts.train, progress, limits.time)
+        time = None if limits.time is None else TrialTime(limits.time, _shortest(request, measured))
+        trial = tried(options, reader, request.facts.train, progress, time)
         request = dataclasses.replace(request, trial=trial)
     found = choose(request, measured, 0.0 if limits.time is None else limits.time.spent)
     check_device(found.options, reader)
@@ -379,12 +325,19 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     if by_time:
         profile = step_profile(config, request.facts.smaller(choice.factor), measured.speed)
     forecast = _predicted(request, measured, choice, config)
-    found = Plan(options, by_time, forecast, profile=profile)
+    found = Plan(options, by_time, forecast, full_length=request.full_length, profile=profile)
     at_cap = Footprint(
         facts, process + photo_copies(config, facts), pairs, config.sh_degree, config.batch, request.room
     ).peak(found.max_gaussians or 0, found.image_memory)
     needed = _device_sentences(request, config, choice.factor)
-    return dataclasses.replace(found, sentences=(*needed, *_sentences(request, found, at_cap)))
+    full, warning = request.full_length, tuple[str, ...]()
+    if by_time and full is not None and length < FAR_BELOW * full:
+        seconds = spent + _seconds(request, measured, choice, full)
+        warning = (
+            f"{TOO_SHORT} for a usable scene: it leaves {length:,} iterations of {full:,}; all of them need about"
+            f" {spelled_seconds(5 * math.ceil(seconds / 5))}",
+        )
+    return dataclasses.replace(found, sentences=(*needed, *_sentences(request, found, at_cap), *warning))
 
 
 def _within_memory(
@@ -444,8 +397,7 @@ def _within_time(
     found, least = 0, math.inf
 
     def takes(iterations: int, choice: _Choice) -> float:
-        config = request.config(iterations, choice.factor, choice.cap)
-        return spent + _predicted(request, measured, choice, config).total / TIME_SHARE
+        return spent + _seconds(request, measured, choice, iterations)
 
     for factor in (f for f in request.factors if f >= choice.factor):
         smaller = dataclasses.replace(choice, factor=factor)
@@ -464,6 +416,19 @@ def _within_time(
             f"train; give at least {spelled_seconds(5 * math.ceil(least / 5))}"
         )
     return easily_read(found), choice.factor
+
+
+def _seconds(request: Request, measured: Measurements, choice: _Choice, iterations: int) -> float:
+    """Return the seconds of a training, with the margin of a plan."""
+    config = request.config(iterations, choice.factor, choice.cap)
+    return _predicted(request, measured, choice, config).total / TIME_SHARE
+
+
+def _shortest(request: Request, measured: Measurements) -> float:
+    """Return the seconds of the shortest training that a plan may choose, with the smallest photos."""
+    length, last = request.options.config.iterations, request.factors[-1:]
+    choice = _within_memory(request, measured.process, measured.pairs, length, last)
+    return _seconds(request, measured, choice, LEAST_ITERATIONS)
 
 
 def _predicted(request: Request, measured: Measurements, choice: _Choice, config: TrainConfig) -> Forecast:

@@ -8,8 +8,8 @@ from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.task import train_block
 from gsplat_edu.cli.block_table import BlockTable
+from gsplat_edu.cli.process import interruptible
 from gsplat_edu.cli.terminal import Terminal
-from gsplat_edu.cli.train import interruptible
 from gsplat_edu.data.reader import CaptureReader
 
 

@@ -22,16 +22,16 @@ from gsplat_edu.blocks.split import SplitOptions, check_recipe, coarse_scene, sp
 from gsplat_edu.blocks.task import train_block
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.block_table import BlockTable
-from gsplat_edu.cli.eval import score_lines
+from gsplat_edu.cli.eval import result_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.findings import with_right_poses
 from gsplat_edu.cli.options.block_parts import parts_of_blocks
 from gsplat_edu.cli.options.blocks import LEAST_VIEWS, SPLIT, block_count
 from gsplat_edu.cli.options.length import quality_of
 from gsplat_edu.cli.options.train import OPEN, left_open, options_from
+from gsplat_edu.cli.process import interruptible
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train import (
-    interruptible,
     photos_read,
     progress_bar,
     train_with_bar,
@@ -208,7 +208,7 @@ def merge_and_report(
             functools.partial(export_all, exports, bar, str(recipe.get("backend")), say) if exports else None
         )
         result = merge_blocks(path, say, reader, scored, export)
-    for line in score_lines(result.test, result.train):
+    for line in result_lines(result, BlocksFolder(path).merged):
         say(line)
     seams = result.metrics["seams"]
     if seams is not None and seams["psnr"] is not None:

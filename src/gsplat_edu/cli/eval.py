@@ -13,12 +13,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.locks import LOCK, locked
 from gsplat_edu.cli.terminal import Bar, Terminal
+from gsplat_edu.doctor.finding import command
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
+from gsplat_edu.evaluate.report import skipped_views
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
-from gsplat_edu.runs.evaluation import EVALUATED, ScoredViews, evaluate_run
+from gsplat_edu.runs.evaluation import EVALUATED, Evaluation, ScoredViews, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.identity import capture_difference
 
@@ -91,12 +93,20 @@ def _evaluate(
             lambda split, score: bar.advance(task),
             into,
         )
-    console.print(*score_lines(result.test, result.train), sep="\n", soft_wrap=True)
+    console.print(*result_lines(result, folder), sep="\n", soft_wrap=True)
     written = into or folder
     wrote = [str(written.metrics)]
     if result.test:
         wrote.append(f"{written.renders / 'test'}/")
     say(f"wrote {', '.join([*wrote, str(written.report)])}")
+
+
+def result_lines(result: Evaluation, folder: RunFolder) -> list[str]:
+    """Return the table of scores, or a line that says how many views were not scored and how to score them."""
+    if skipped := skipped_views(result.metrics):
+        how = command("eval", folder.path)
+        return [f"--eval-every 0 skipped the scores of {skipped}; to score them: {how}"]
+    return score_lines(result.test, result.train)
 
 
 def score_lines(test: Sequence[ImageScore], train: Sequence[ImageScore]) -> list[str]:

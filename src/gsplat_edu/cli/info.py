@@ -22,6 +22,7 @@ from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.engine import adapters
+from gsplat_edu.evaluate.report import skipped_views
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_scene, stored_bytes
 from gsplat_edu.io.lod.codec import read_index
@@ -188,6 +189,9 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
                     ", ".join(_scores(scores)),
                 )
             )
+    if skipped := skipped_views(metrics):
+        unscored = f"--eval-every 0 skipped the scores of {skipped}; run: gsplat-edu eval {folder.path}"
+        facts.append(("test", unscored))
     if not metrics:
         facts.append(("test", f"not evaluated yet; run: gsplat-edu eval {folder.path}"))
     if isinstance(seconds := metrics.get("seconds"), int | float):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-from gsplat_edu.cli.eval import score_lines
+from gsplat_edu.cli.eval import result_lines
 from gsplat_edu.doctor.moving import moved_line
 from gsplat_edu.doctor.remedies import ENOUGH
+from gsplat_edu.evaluate.report import too_short
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Metric
 from gsplat_edu.render.api import render
@@ -31,20 +32,22 @@ def tell_result(
     say(
         f"{trainer.iteration} iterations in {capture.seconds:.1f} s -> {rate}, {len(trainer.gaussians)} Gaussians"
     )
-    for line in score_lines(result.test, result.train):
+    folder = capture.folder.path
+    for line in result_lines(result, capture.folder):
         say(line)
     for name, unit in (("psnr", "dB"), ("ssim", "")) if result.test else ():
         emitter.emit(Metric(name, result.metrics["test"][name], unit, "test"))
-    emitter.report_output(capture.folder.path)
+    emitter.report_output(folder)
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
-    _tell_odd_photos(capture, say, limited=limited)
+    _tell_odd_photos(capture, say, limited=limited or not capture.options.scores_at_end)
     if (planned := trainer.config.iterations) > trainer.iteration:
-        folder = capture.folder.path
         say(f"the time limit ended training before iteration {planned}; --resume continues it: {folder}")
+    if short := too_short(result.metrics):
+        say(short)
 
 
 def _tell_odd_photos(capture: CaptureRun, say: Callable[[str], None], *, limited: bool) -> None:
-    """Name the photos that show what others do not, or the command that finds them if a time limit is running."""
+    """Name the photos that show what others do not; with a time limit or without scores, the command that does."""
     trainer, options = capture.trainer, capture.options
     if trainer.transients is not None or len(capture.dataset.train) < ENOUGH:
         return

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 import functools
 import math
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -20,16 +19,16 @@ from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.text import Told, option_flag
 from gsplat_edu.budget.choice import Prospect, choose_backend, resumed_backend
-from gsplat_edu.budget.deadline import Deadline, stopwatch
+from gsplat_edu.budget.deadline import Deadline, TrialTime, stopwatch
 from gsplat_edu.budget.pace import Pace
-from gsplat_edu.budget.plan import Limits, Plan, plan
+from gsplat_edu.budget.plan import Limits, Plan, look_ahead, plan
 from gsplat_edu.budget.planned import PLANNED
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.findings import with_right_poses
 from gsplat_edu.cli.options.length import quality_of
 from gsplat_edu.cli.options.settings import given
 from gsplat_edu.cli.options.train import AUTO, left_open, options_from
-from gsplat_edu.cli.process import process_age
+from gsplat_edu.cli.process import interruptible, process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.result import tell_result
 from gsplat_edu.cli.terminal import Bar, Field, Terminal, stage_bars
@@ -166,7 +165,8 @@ def _run(
         if pace is not None and pace.outcome is not None:
             say(pace.outcome)
         with progress_bar(console, "") as bar:
-            task = bar.add_task("evaluating", total=len(capture.dataset.test) + len(capture.dataset.train))
+            scored_views = len(capture.dataset.test) + len(capture.dataset.train)
+            task = bar.add_task("evaluating", total=scored_views, visible=capture.options.scores_at_end)
 
             def scored(split: str, score: ImageScore) -> None:
                 if interrupted():
@@ -176,7 +176,8 @@ def _run(
 
             export = functools.partial(export_all, arguments.export, bar, options.backend, say)
             clean = _cleaner(capture, say) if arguments.clean else None
-            result = capture.finish(scored, export if arguments.export else None, clean)
+            exporting = export if arguments.export else None
+            result = capture.finish(scored, exporting, clean, chosen.full_length)
         tell_result(capture, result, say, limited=deadline is not None)
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
@@ -286,20 +287,29 @@ def _planned(
     """Choose the options that are auto, and those that the limits leave open."""
     if arguments.resolution == AUTO and not (arguments.resume and options.folder.exists()):
         options = _with_resolution(options, reader, say)
-    options = with_choices(options, reader, left_open(arguments), console, say)
+    limits, fixed = Limits(arguments.max_memory, deadline), given(arguments, PLANNED)
+    outlook = look_ahead(options, limits, fixed, rescale=not arguments.no_rescale, reader=reader)
+    if outlook is not None and outlook.warning:
+        say(outlook.warning)
+    time = None if deadline is None else TrialTime(deadline, 0.0 if outlook is None else outlook.shortest)
+    options = with_choices(options, reader, left_open(arguments), console, say, time)
     if arguments.backend == AUTO and num_processes() == 1:
         options = _with_backend(options, reader, say)
-    limits = Limits(arguments.max_memory, deadline)
-    fixed = given(arguments, PLANNED)
     with progress_bar(console, "") as bar:
         task = bar.add_task("trials of lengths", total=sum(LENGTHS), visible=False)
 
         def progress() -> None:
             bar.update(task, advance=1, visible=True)
 
-        quality, rescale = quality_of(arguments), not arguments.no_rescale
         chosen = plan(
-            options, limits, fixed, rescale=rescale, reader=reader, quality=quality, progress=progress
+            options,
+            limits,
+            fixed,
+            rescale=not arguments.no_rescale,
+            reader=reader,
+            quality=quality_of(arguments),
+            progress=progress,
+            outlook=outlook,
         )
     for sentence in chosen.sentences:
         say(sentence)
@@ -345,8 +355,12 @@ def with_choices(
     names: tuple[str, ...],
     console: Console,
     say: Callable[[str], None],
+    time: TrialTime | None = None,
 ) -> RunOptions:
-    """Choose the settings whose option is auto, judge a lens or shutter to learn, and say what was found."""
+    """Choose the settings whose option is auto, judge a lens or shutter to learn, and say what was found.
+
+    Short trainings end when `time` is over.
+    """
 
     def take(options: RunOptions, name: str, remedy: Remedy) -> RunOptions:
         if remedy.reason:
@@ -368,7 +382,11 @@ def with_choices(
         with progress_bar(console, "") as bar:
             task = bar.add_task("short trainings", total=None)
             chosen = refinement_for(
-                options, reader, lambda total: bar.update(task, advance=1, total=total), asked
+                options,
+                reader,
+                lambda total: bar.update(task, advance=1, total=total),
+                asked,
+                *(() if time is None else (time.is_over,)),
             )
         options = replace(options, trials=chosen.trials)
         options = take(options, "refine", Remedy(chosen.refine, chosen.reason))
@@ -465,35 +483,3 @@ def progress_bar(console: Console, state: str) -> Bar:
         Field(state),
     )
     return Bar(*columns, console=console, transient=not state, disable=not console.is_terminal)
-
-
-@contextmanager
-def interruptible(patient: bool = False) -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C and SIGTERM end a training between two iterations; a second signal ends it at once.
-
-    Args:
-        patient: Ignore a second signal: torchrun sends one after that of the terminal.
-
-    Yields:
-        A function that returns whether a signal arrived. A loop that polls it should end soon after.
-    """
-    came = False
-
-    def note(number: int, frame: object) -> None:
-        nonlocal came
-        if came and not patient:
-            raise KeyboardInterrupt(
-                Told(
-                    "interrupted; saved checkpoints are intact, --resume continues from the last one",
-                    "stopped at once; it can be continued from its last saved state",
-                )
-            )
-        came = True
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: came
-    finally:
-        for number, handler in before.items():
-            # None stands for a handler that Python did not install and cannot put back
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)

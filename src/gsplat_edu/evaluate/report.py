@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from gsplat_edu.base.constants import FAR_BELOW
 from gsplat_edu.base.content_policy import content_policy, policy_element
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import stored_path
@@ -41,6 +42,12 @@ from gsplat_edu.evaluate.report_parts import (
 PICTURES = 8
 """Most test views shown in a report."""
 
+SKIPPED = "not_scored"
+"""Key of metrics.json: by "test" and "train", the number of views that an evaluation left out."""
+
+FULL_LENGTH = "full_length"
+"""Key of metrics.json: the iterations that the training would have without a time limit."""
+
 SCORES = (
     ("psnr", "PSNR (dB)"),
     ("psnr_8bit", "PSNR, 8-bit (dB)"),
@@ -62,6 +69,7 @@ SHOWN = 0.95
 NAMES = {
     "num_gaussians": "Gaussians",
     "seconds": "training time",
+    FULL_LENGTH: "iterations without a time limit",
     "psnr_aligned": "test PSNR on half of each photo, pose (and colours, with appearance) fitted on the other (dB)",
 }
 """Labels for the keys of metrics.json that are not plain English."""
@@ -221,11 +229,12 @@ def write_report(path: Path, report: Report) -> None:
     config = {key: value for key, value in report.config.items() if key != "machine"}
     sections = [
         f'<p class="verdict">{html.escape(verdict(report.metrics, report.scores))}</p>\n',
+        _how_to_score(path, report.metrics),
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
         section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
         section("Blocks", cells),
-        _views(report.scores, report.pictures),
+        _views(report.scores, report.pictures, skipped_views(report.metrics)),
         section("Masked things that moved", masked_figures(report.masked)),
         mesh_section(report.meshes),
         _exports(report.metrics.get("exports")),
@@ -265,7 +274,13 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
     test, train = (_mean(metrics, split, key) for split in ("test", "train"))
     steps = metrics.get("iterations")
     after = f"After {steps:,} iterations, " if isinstance(steps, int) else ""
+    if short := too_short(metrics):
+        after = f"{short} {after}"
     if test is None:
+        if skipped := skipped_views(metrics):
+            return (
+                f"{after or 'The scene was trained; '}nothing was scored: --eval-every 0 skipped {skipped}."
+            )
         if train is None:
             return "The scene was not evaluated: no photo was compared with a render."
         known = f"renders of the training photos reach {train:.1f} dB PSNR"
@@ -283,6 +298,39 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
         parts.append(f"the worst view is {low.name} at {low.psnr:.1f} dB")
     sentence = "; ".join(parts) + "."
     return sentence[0].upper() + sentence[1:]
+
+
+def too_short(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence if a time limit ended the training long before the scene is usable; empty otherwise.
+
+    Args:
+        metrics: As in `Report`.
+    """
+    steps, full = metrics.get("iterations"), metrics.get(FULL_LENGTH)
+    if not isinstance(steps, int) or not isinstance(full, int) or steps >= FAR_BELOW * full:
+        return ""
+    return f"The scene is not usable: it was trained for {steps:,} of {full:,} iterations; give it more time."
+
+
+def skipped_views(metrics: Mapping[str, Any]) -> str:
+    """Return how many views of a run were not scored because `--eval-every` was 0; empty if they were scored.
+
+    Args:
+        metrics: As in `Report`.
+    """
+    counts = metrics.get(SKIPPED)
+    if not isinstance(counts, Mapping):
+        return ""
+    test, train = (counts.get(split, 0) for split in ("test", "train"))
+    return f"{test} held-out and {train} training photos"
+
+
+def _how_to_score(report: Path, metrics: Mapping[str, Any]) -> str:
+    """Show the command that scores a run which was not scored."""
+    if not skipped_views(metrics):
+        return ""
+    command = shlex.join(["gsplat-edu", "eval", str(report.parent.absolute())])
+    return f"<p>To score the photos: <code>{html.escape(command)}</code></p>\n"
 
 
 def _mean(metrics: Mapping[str, Any], split: str, key: str) -> float | None:
@@ -370,9 +418,10 @@ def _numbers(cells: Sequence[str]) -> str:
     return "".join(f'<td class="n">{cell}</td>' for cell in cells)
 
 
-def _views(scores: Sequence[ImageScore], pictures: Sequence[Picture]) -> str:
+def _views(scores: Sequence[ImageScore], pictures: Sequence[Picture], skipped: str) -> str:
     if not scores:
-        return section("Test views", '<p class="quiet">No view was held out for testing.</p>\n')
+        why = f"Not scored: {skipped}." if skipped else "No view was held out for testing."
+        return section("Test views", f'<p class="quiet">{why}</p>\n')
     high, low = best(scores), worst(scores)
     said = (
         f"<p>Best: {html.escape(high.name)} ({_score('psnr', high.psnr)} dB). "

@@ -15,7 +15,7 @@ from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.loading_notes import LoadingNote
 from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
-from gsplat_edu.evaluate.report import Picture, Report, write_report
+from gsplat_edu.evaluate.report import SKIPPED, Picture, Report, write_report
 from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.runs.meshes import mesh_entries
@@ -28,6 +28,9 @@ Image = UInt8[np.ndarray, "H W 3"]
 
 EVALUATED = "evaluated"
 """Key of a metrics.json written outside the run's folder: which run was scored, and on which dataset."""
+
+SCORES = ("test", "train", "test_views", "psnr_aligned")
+"""Keys of metrics.json that hold scores."""
 
 Progress = Callable[[str, ImageScore], None]
 """Called with the split and the score of every scored view."""
@@ -42,12 +45,14 @@ class ScoredViews:
         train: Training views; empty to skip them.
         background: (3,) colour behind the renders and behind photos that are not opaque.
         notes: Notes of the capture, for the report.
+        skipped: Score none of the views; metrics.json and the report say how many were left out.
     """
 
     test: Sequence[View]
     train: Sequence[View] = ()
     background: ArrayLike = (0.0, 0.0, 0.0)
     notes: Sequence[LoadingNote] = ()
+    skipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ def evaluate_run(
 ) -> Evaluation:
     """Score a scene and write metrics.json, renders/test/NAME.png (photo | render) and report.html.
 
-    Other keys of an existing metrics.json are kept, and the report shows what is known of the run's meshes.
+    Other keys of an existing metrics.json are kept; old scores and renders never are. The report lists known meshes.
 
     Args:
         folder: The run's folder; its config and log go into the report.
@@ -97,34 +102,42 @@ def evaluate_run(
         OSError: a file cannot be written.
     """
     into = into or folder
-    check_links("RUN" if into.path == folder.path else "--out", into.path)
-    config, log = folder.read_config(), folder.log()
-    before = into.read_metrics()
-    earlier = before if into.path == folder.path else {}
-    gallery = _Gallery(into, judged.test, progress)
+    own = into.path == folder.path
+    check_links("RUN" if own else "--out", into.path)
+    config, log, before = folder.read_config(), folder.log(), into.read_metrics()
+    stale = SCORES if judged.skipped else (SKIPPED,)
+    earlier = {key: value for key, value in before.items() if own and key not in stale}
+    test_views, train_views = ((), ()) if judged.skipped else (judged.test, judged.train)
+    gallery = _Gallery(into, test_views, progress)
 
     def tell(view: View, score: ImageScore, image: Image, truth: Image) -> None:
         if progress is not None:
             progress("train", score)
 
-    test = score_views(gaussians, judged.test, render, judged.background, gallery.add)
-    train = score_views(gaussians, judged.train, render, judged.background, tell)
+    test = score_views(gaussians, test_views, render, judged.background, gallery.add)
+    train = score_views(gaussians, train_views, render, judged.background, tell)
     metrics = {
         **earlier,
-        "test": summarize(test),
-        "train": summarize(train),
+        **_scores(judged, test, train),
         "num_gaussians": len(gaussians),
         **_appearance(config),
         **(facts or {}),
-        "test_views": [dataclasses.asdict(score) for score in test],
     }
-    masked = masked_pictures(folder, metrics, judged.train, gaussians, render, judged.background)
+    masked = masked_pictures(folder, metrics, train_views, gaussians, render, judged.background)
     title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", _notes(judged, config)
     report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, mesh_entries(folder))
     write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated
     return Evaluation(test, train, metrics)
+
+
+def _scores(judged: ScoredViews, test: list[ImageScore], train: list[ImageScore]) -> dict[str, Any]:
+    """Return the scores for metrics.json, or how many views were skipped."""
+    if judged.skipped:
+        return {SKIPPED: {"test": len(judged.test), "train": len(judged.train)}}
+    views = [dataclasses.asdict(score) for score in test]
+    return {"test": summarize(test), "train": summarize(train), "test_views": views}
 
 
 def _notes(judged: ScoredViews, config: Mapping[str, Any]) -> list[str]:

@@ -29,7 +29,8 @@ class RunOptions:
         scene: A trained scene to start from instead of points: a scene file or the folder of a run.
         depth: Depth to learn from: a folder of maps, or a word of `gsplat_edu.data.depths`; None for none.
         backend: Name of the rendering backend.
-        eval_every: Iterations between evaluations on the test views; 0 evaluates only at the end.
+        eval_every: Iterations between evaluations on the test views; the end of the run scores all views. 0 scores none
+            at any time.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
         resume: Continue from the last checkpoint of the folder.
         trials: Scores by which `config.refine` was chosen, for config.json; None if no short trainings were judged.
@@ -74,6 +75,11 @@ class RunOptions:
             jacobian_limit=config.jacobian_limit,
             depth=False,
         )
+
+    @property
+    def scores_at_end(self) -> bool:
+        """Whether the end of the run scores the views."""
+        return self.eval_every > 0
 
     @property
     def renderer(self) -> Callable[..., Any]:

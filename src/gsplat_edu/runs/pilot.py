@@ -84,6 +84,14 @@ WITH_SHUTTER = {
 """What is tried with the shutter, by the best without it."""
 
 
+OUT_OF_TIME = "short trainings would take more than a quarter of the time that is left, so none is judged"
+"""Why a time limit left no choice."""
+
+
+class OutOfTimeError(Exception):
+    """The time for pilots is over."""
+
+
 class Chosen(NamedTuple):
     """What a run refines, why, and the scores that say so."""
 
@@ -97,6 +105,7 @@ def refinement_for(
     reader: CaptureReader,
     progress: Callable[[int], None] = lambda total: None,
     asked: str = "",
+    is_over: Callable[[int, int], bool] = lambda done, planned: False,
 ) -> Chosen:
     """Choose `--refine` for a run by pilots, or judge the value that the user gave.
 
@@ -105,6 +114,8 @@ def refinement_for(
         reader: The run's capture.
         progress: Called after every iteration with the number of iterations of all pilots, as far as it is known.
         asked: The value that the user gave, which is chosen and compared with "none"; "" chooses.
+        is_over: Called with the iterations done and those of all pilots, as far as they are known; if it returns true,
+            no pilot is judged, and nothing that the user did not ask for is refined.
 
     Returns:
         What to refine, and why.
@@ -113,10 +124,15 @@ def refinement_for(
         ArgumentError: the capture has no training photos, or the backend cannot learn what was asked for.
         DatasetError: the capture or one of its photos cannot be read.
     """
-    pilots = _Pilots(options, reader, progress)
+    if is_over(0, 0):
+        return Chosen(asked or "none", OUT_OF_TIME, None)
+    pilots = _Pilots(options, reader, progress, is_over)
     if why := pilots.cannot_judge():
         return Chosen(asked or "none", why, None)
-    chosen = _judged(pilots, asked) if asked else _chosen(pilots)
+    try:
+        chosen = _judged(pilots, asked) if asked else _chosen(pilots)
+    except OutOfTimeError:
+        return Chosen(asked or "none", OUT_OF_TIME, None)
     trials = RefineTrials(pilots.posed, pilots.moving, asked)
     again = f", a lens trained on from what it found less than {REPEATED_GAIN} dB" if pilots.repeated else ""
     rule = "" if asked else f"; what adds less than {LEAST_GAIN} dB is left out{again}"
@@ -185,16 +201,22 @@ class _Pilot(NamedTuple):
 class _Pilots:
     """Trains pilots on one small dataset and keeps their scenes and scores."""
 
-    def __init__(self, options: RunOptions, reader: CaptureReader, progress: Callable[[int], None]) -> None:
+    def __init__(
+        self,
+        options: RunOptions,
+        reader: CaptureReader,
+        progress: Callable[[int], None],
+        is_over: Callable[[int, int], bool],
+    ) -> None:
         size = options.data_settings.resolution
         small = SIDE if size is None or not 32 <= size <= SIDE else size
         settings = as_trained(replace(options.data_settings, resolution=small), options.config.appearance)
-        self._options, self._progress = options, progress
+        self._options, self._progress, self._is_over = options, progress, is_over
         self._dataset = Dataset.of(reader, settings, points=options.points)
         self._backend = load_backend(options.backend)
         self._names_readout = any(frame.shutter is not None for frame in reader.capture.frames)
         self._pilots: dict[str, _Pilot] = {}
-        self._trainings = 0
+        self._trainings = self._steps = 0
         self.repeated = False
         self.posed: dict[str, float] = {}
         self.moving: dict[str, float] = {}
@@ -261,13 +283,19 @@ class _Pilots:
 
         def step(trainer: Trainer, event: Event) -> None:
             if isinstance(event, StepEvent):
+                self._steps += 1
                 self._progress(total)
+                self._check_time(total)
 
         trainer.run(callbacks=[step])
         shown = dataset if refinement is None else with_refined_cameras(refinement, dataset)
         self._pilots[name] = _Pilot(trainer.gaussians, dataset, shown, trainer.extent)
         self.posed[name] = self._score(name)
         return name
+
+    def _check_time(self, total: int) -> None:
+        if self._is_over(self._steps, total):
+            raise OutOfTimeError
 
     def score_moving(self, name: str) -> float:
         """Return the score of a trained pilot at aligned poses and motions."""
@@ -279,10 +307,13 @@ class _Pilots:
         gaussians, _, shown, extent = self._pilots[name]
         config = _config(self._options.config, "none")  # renders are alike for all
         renderer, colors = replace(self._options, config=config).renderer, config.appearance != "none"
-        scores = [
-            aligned_psnr(gaussians, view, renderer, config.background, extent, colors=colors, moving=moving)
-            for view in shown.test
-        ]
+        scores = []
+        for view in shown.test:
+            self._check_time(self._steps)
+            psnr = aligned_psnr(
+                gaussians, view, renderer, config.background, extent, colors=colors, moving=moving
+            )
+            scores.append(psnr)
         return float(np.mean([score for score in scores if score is not None]))
 
 

@@ -24,7 +24,7 @@ from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.region import read_region
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.evaluate.report import machine_facts
+from gsplat_edu.evaluate.report import FULL_LENGTH, machine_facts
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for
@@ -414,14 +414,21 @@ class CaptureRun:
         return None
 
     def finish(
-        self, progress: Progress | None = None, export: Export | None = None, clean: Clean | None = None
+        self,
+        progress: Progress | None = None,
+        export: Export | None = None,
+        clean: Clean | None = None,
+        full_length: int | None = None,
     ) -> Evaluation:
         """Write the scene, in other formats too if `export` is given, and score it on the test and training views.
+
+        With `RunOptions.eval_every` 0, no view is scored; metrics.json and the report say so.
 
         Args:
             progress: Called for every scored view.
             export: Called with the written scene; metrics.json and the report get its result as "exports".
             clean: Called with the scene and the capture first; metrics.json gets its record as "cleaning".
+            full_length: Iterations that the run would have without a time limit; None for those of its configuration.
         """
         trainer, dataset = self.trainer, self.dataset
         refinement = refinement_of(trainer.view_model)
@@ -430,6 +437,7 @@ class CaptureRun:
         if lost := len(trainer.gaussians) - len(gaussians):
             self._say(f"{lost} Gaussians are NaN or infinite and are left out of the scene")
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
+        facts[FULL_LENGTH] = full_length or self.options.config.iterations
         if clean is not None:
             gaussians, facts["cleaning"] = clean(gaussians, refined or dataset)
         if trainer.transients is not None:
@@ -442,11 +450,16 @@ class CaptureRun:
         if refined is not None:
             write_refined(self.folder, refined)
             self._say(f"wrote {self.folder.refined}: the capture with its refined cameras")
-            facts |= aligned_score(refined.test, gaussians, self.options, trainer.extent, self._say)
+            if self.options.scores_at_end:
+                facts |= aligned_score(refined.test, gaussians, self.options, trainer.extent, self._say)
         return evaluate_run(
             self.folder,
             ScoredViews(
-                dataset.test, (refined or dataset).train, self.options.config.background, dataset.notes
+                dataset.test,
+                (refined or dataset).train,
+                self.options.config.background,
+                dataset.notes,
+                skipped=not self.options.scores_at_end,
             ),
             gaussians,
             self.options.renderer,

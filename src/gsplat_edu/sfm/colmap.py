@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -117,12 +117,31 @@ def forget_matches(database: Path) -> None:
     Raises:
         DatasetError: the database cannot be modified.
     """
+    _change(database, [("DELETE FROM matches", ()), ("DELETE FROM two_view_geometries", ())])
+
+
+def forget_features(database: Path, names: Sequence[str]) -> None:
+    """Remove the features of some photos from the database; photos and cameras stay.
+
+    Args:
+        database: As for `forget_matches`.
+        names: The photos.
+
+    Raises:
+        DatasetError: the database cannot be modified.
+    """
+    which = "image_id IN (SELECT image_id FROM images WHERE name = ?)"
+    tables = ("keypoints", "descriptors")
+    _change(database, [(f"DELETE FROM {table} WHERE {which}", (name,)) for table in tables for name in names])
+
+
+def _change(database: Path, statements: Sequence[tuple[str, tuple[str, ...]]]) -> None:
     if not database.is_file():
         return
     try:
         with closing(sqlite3.connect(database)) as writer, writer:
-            for table in ("matches", "two_view_geometries"):
-                writer.execute(f"DELETE FROM {table}")
+            for statement, values in statements:
+                writer.execute(statement, values)
     except sqlite3.Error as error:
         raise _unchangeable(database, error) from None
 

@@ -12,6 +12,7 @@ from typing import Any
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.colmap import read_cameras, read_images
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call
+from gsplat_edu.sfm.diagnosis import diagnosis, evidence
 from gsplat_edu.sfm.source import FEWEST
 
 ENOUGH = 0.8
@@ -218,7 +219,7 @@ def map_photos(
         say(f"{way}: {counting} of {total} photos have a pose that counts")
     best = best_model(found) if found else {"names": []}
     if len(best["names"]) < min(FEWEST, total):
-        raise DatasetError(_without_poses(total, connected))
+        raise DatasetError(_without_poses(folder, total, connected))
     return best
 
 
@@ -254,14 +255,11 @@ def best_model(models: Sequence[dict[str, Any]]) -> dict[str, Any]:
     )
 
 
-def _without_poses(total: int, connected: int) -> str:
+def _without_poses(folder: Path, total: int, connected: int) -> str:
     """Return a message that explains why there is no model."""
-    if connected < FEWEST:
-        return no_overlap(f"of {total} photos, no {FEWEST} match one another")
-    return (
-        f"{connected} of {total} photos match one another, but their matches yield no poses; photos from one "
-        "spot show no depth: walk around the subject in small steps, and photograph something that is not flat"
-    )
+    copies = [path for path in sorted((folder / "photos").rglob("*")) if path.is_file()]
+    what = f"none of {total} photos has a pose that counts; {connected} of them are connected by matches"
+    return f"{what}; {diagnosis(evidence(folder, copies, connected))}"
 
 
 def _mapped(
@@ -286,14 +284,6 @@ def _mapped(
         seed=COLMAP_SEED,
     )["models"]
     return [_usable(out, model) for model in found]
-
-
-def no_overlap(what: str) -> str:
-    """Return a message about the missing overlap, with advice on how to photograph."""
-    return (
-        f"{what}: the photos show too little in common; walk around the subject in small steps, each photo showing two "
-        "thirds of the previous one, sharp and in even light (plain walls, glass and mirrors have no features to match)"
-    )
 
 
 def _usable(out: Path, model: dict[str, Any]) -> dict[str, Any]:

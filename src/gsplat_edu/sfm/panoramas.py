@@ -28,6 +28,7 @@ from gsplat_edu.data.images import (
     turned,
     upright_size,
 )
+from gsplat_edu.data.masks import MASKS
 from gsplat_edu.data.panorama import FACES, cut_face, face_rotations, face_side, is_panorama_size
 from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
 from gsplat_edu.sfm.masks import find_masks
@@ -53,6 +54,10 @@ CONTRAST = 6.0
 
 POLE = 0.5
 """Largest standard deviation of the first and last row, in that of the rows between them."""
+
+LEAST_MOVING = 0.2
+"""Panoramas are warned of if a smaller fraction of their matches moves by more than a turn. Of a garden under a sky,
+whose positions came out wrong, 0.1 does, of a room 0.85."""
 
 FACE_QUALITY = 95
 """JPEG quality of the faces of lossy panoramas; faces of other panoramas are PNG."""
@@ -286,3 +291,18 @@ def _write(image: Image.Image, target: Path, ending: str) -> None:
     options: dict[str, Any] = {"quality": FACE_QUALITY, "subsampling": 0} if ending == ".jpg" else {}
     with written_aside(target) as aside:
         image.save(aside, format="JPEG" if ending == ".jpg" else "PNG", **options)
+
+
+def moving_line(share: float) -> str:
+    """Return a warning if too few matches tell where panoramas stood; empty otherwise.
+
+    Args:
+        share: Fraction of the matches that move by more than a turn.
+    """
+    if share >= LEAST_MOVING:
+        return ""
+    return (
+        f"only {100 * share:.0f} % of the matches move between the panoramas by more than a turn; the rest is far away,"
+        f" as sky is, and says little of where they stood: check the poses, mask the sky ({MASKS}/), or take more"
+        " panoramas near things"
+    )

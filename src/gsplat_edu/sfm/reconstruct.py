@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,28 @@ from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import remove_leftovers
 from gsplat_edu.data.images import UPRIGHT
-from gsplat_edu.data.masks import MASKS
 from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.candidates import Candidates
-from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
-from gsplat_edu.sfm.mapping import Cameras, attempts, map_photos, no_overlap, rig_attempts, shared_cameras
+from gsplat_edu.sfm.colmap import (
+    COLMAP_SEED,
+    call,
+    forget_features,
+    forget_matches,
+    limit_features,
+    require_colmap,
+)
+from gsplat_edu.sfm.diagnosis import (
+    COMPLETE,
+    FEW_FEATURES,
+    INLIERS,
+    WEAK_SHARE,
+    WEAK_THRESHOLD,
+    diagnosis,
+    evidence,
+)
+from gsplat_edu.sfm.mapping import Cameras, attempts, map_photos, rig_attempts, shared_cameras
 from gsplat_edu.sfm.masks import check_some_used, find_masks, unused_folders
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions, lens_choice
 from gsplat_edu.sfm.panoramas import (
@@ -35,6 +51,7 @@ from gsplat_edu.sfm.panoramas import (
     cut_panoramas,
     face_facts,
     face_groups,
+    moving_line,
     rig_of,
 )
 from gsplat_edu.sfm.photos import (
@@ -54,21 +71,13 @@ from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
 from gsplat_edu.sfm.whole_photos import WholePhotos
 from gsplat_edu.sfm.wide_lenses import CameraGroup, camera_groups, circles_of, lens_lines, write_lens_masks
 
-INLIERS = 15
-"""Smallest number of matches with one geometry that connects two photos: COLMAP's own bound."""
-
-
-FEATURES, MAPPING = 2, 4
+FEATURES, MAPPING = 3, 4
 """Versions of the methods. They are part of the stages' options, so results of an earlier version in a work folder are
 recomputed. Version 2 limits features to `max_features` and judges poses. Version 3 shares focal lengths between sizes;
 version 4 also if every photo has its own size."""
 
 FACES = 1
 """Version of the method that cuts panoramas."""
-
-LEAST_MOVING = 0.2
-"""Panoramas are warned of if a smaller fraction of their matches moves by more than a turn. Of a garden under a sky,
-whose positions came out wrong, 0.1 does, of a room 0.85."""
 
 PHOTOS = 2
 """Version of the method that copies photos. Version 2 reads the facts of the photos from their headers."""
@@ -99,8 +108,9 @@ def reconstruct(
 
     Raises:
         ArgumentError: pycolmap is not installed, or the output folder cannot be used.
-        DatasetError: there are no photos, or they overlap too little. If no stage was completed, the folders created
-            for the run are removed.
+        DatasetError: there are no photos, or too few of them get a pose: the message names the cause. Fewer than
+            `COMPLETE` of them still make a capture, which is written first. If no stage was completed, the folders
+            created for the run are removed.
         OSError: a file cannot be written.
     """
     require_colmap()
@@ -170,29 +180,27 @@ class _Run:
             self.photos = face_facts(self.photos, self.panoramas)
             self.groups = face_groups(self.photos, options.max_image_size)
         database = [self.folder / f"database.db{ending}" for ending in ("", "-wal", "-shm")]
-        wanted = {
-            "max_features": options.max_features,
-            "pycolmap": version("pycolmap"),
-            "method": FEATURES,
-        }
-        if lenses := [group["lens"] for group in self.groups if group.get("lens")]:
-            wanted |= {"fisheyes": lenses}
-        self._stage("features", wanted, self._features, database)
-        facts = self._stage("matches", {"matcher": options.matcher}, self._match, [], self._forget_matches)
+        self._find_features(database)
+        forget = partial(forget_matches, database[0])
+        facts = self._stage("matches", {"matcher": options.matcher}, self._match, [], forget)
         wanted = {"mapper": options.mapper, "camera_model": options.camera_model, "method": MAPPING}
         connected = facts["connected"]
         self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
-        if self.model.get("moving", 1.0) < LEAST_MOVING:
-            self._say(
-                f"only {100 * self.model['moving']:.0f} % of the matches move between the panoramas by more than a"
-                " turn; the rest is far away, as sky is, and says little of where they stood: check the poses, mask"
-                f" the sky ({MASKS}/), or take more panoramas near things"
-            )
+        if line := moving_line(self.model.get("moving", 1.0)):
+            self._say(line)
         if not all((options.out / part).is_dir() for part in ("images", "sparse/0")):
             self.stages.forget("capture")
         wanted = {} if options.scale == AUTO else {"scale": options.scale}
         self._stage("capture", wanted, self._finish, [])
+        count, total = len(self.model["names"]) // self.unit, len(self.photos) // self.unit
+        if count < COMPLETE * total:
+            said = f"only {count} of {total} {self._kind} have a pose; {self._diagnosis(connected)}"
+            raise DatasetError(f"{options.out}: {said}; the incomplete capture is kept")
         return options.out
+
+    def _diagnosis(self, connected: int) -> str:
+        copies = [self.folder / "photos" / photo.copy for photo in self.photos]
+        return diagnosis(evidence(self.folder, copies, connected))
 
     def _group(self, copies: Path) -> None:
         """Group the photos by camera, and say which are fisheyes."""
@@ -321,7 +329,29 @@ class _Run:
                 f"masks assumed to be stored like their photos, not upright (their sizes fit both): {listed(unknown)}"
             )
 
-    def _features(self) -> dict[str, Any]:
+    def _find_features(self, database: list[Path]) -> None:
+        """Find features; where photos have few, again with a lower threshold."""
+        wanted = {
+            "max_features": self.options.max_features,
+            "pycolmap": version("pycolmap"),
+            "method": FEATURES,
+        }
+        if lenses := [group["lens"] for group in self.groups if group.get("lens")]:
+            wanted |= {"fisheyes": lenses}
+        facts = self._stage("features", wanted, self._features, database)
+        few, sift = facts["few"], {"peak_threshold": WEAK_THRESHOLD}
+        if len(few) >= WEAK_SHARE * len(self.photos) and self.panoramas is None:
+            counted = f"{len(few)} of {len(self.photos)} photos have fewer than {self._least} features"
+            self._say(f"{counted}; searching them again with a threshold of {WEAK_THRESHOLD}")
+            forget = partial(forget_features, database[0], few)
+            self._stage("more features", sift, lambda: self._features(sift), [], forget)
+
+    @property
+    def _least(self) -> int:
+        """A photo with fewer features has too few."""
+        return min(FEW_FEATURES, self.options.max_features // 2)
+
+    def _features(self, sift: Mapping[str, float] | None = None) -> dict[str, Any]:
         total, most = len(self.photos), self.options.max_features
         masks = write_lens_masks(
             self.cameras, mask_folder(self.folder / "photos"), self.folder / "lens_masks"
@@ -332,14 +362,15 @@ class _Run:
             photos=str(self.folder / "photos"),
             masks=str(masks) if masks.is_dir() else "",
             groups=self.groups,
-            max_features=most,
+            sift={"max_num_features": most, **(sift or {})},
         )["features"]
         limit_features(self.folder / "database.db", most)
         found = {name: min(count, most) for name, count in found.items()}
         names = [photo.name for photo in self.photos if not found.get(photo.copy)]
         if names:
             self._say(f"no features found, because blank or out of focus: {listed(names)}")
-        return {"summary": f"{sum(found.values()):,} in {total - len(names)} photos"}
+        few = [photo.copy for photo in self.photos if found.get(photo.copy, 0) < self._least]
+        return {"summary": f"{sum(found.values()):,} in {total - len(names)} photos", "few": few}
 
     def _match(self) -> dict[str, Any]:
         count, kind = len(self.photos), self.options.matcher
@@ -360,15 +391,11 @@ class _Run:
             verified = self._match_pairs(chosen)
             part = self._connected(verified)
         if not verified:
-            raise DatasetError(no_overlap(f"{self.options.source}: of {len(chosen):,} pairs, none match"))
+            raise DatasetError(f"{self.options.source}: no two photos match; {self._diagnosis(0)}")
         summary = f"{len(verified):,} of {len(chosen):,} pairs match"
         if len(part) < count:
             summary += f"; {len(part) // self.unit} of {count // self.unit} {self._kind} are connected"
         return {"summary": summary, "connected": len(part)}
-
-    def _forget_matches(self) -> None:
-        """Delete all matches, because the mapper would also use the pairs of another matcher."""
-        forget_matches(self.folder / "database.db")
 
     @property
     def _kind(self) -> str:
@@ -462,16 +489,8 @@ class _Run:
         return ", ".join(f"{count} photos {how}" for count, how in counts if count)
 
     def _call(self, job: str, progress: Callable[[int], None], **arguments: object) -> dict[str, Any]:
-        database = str(self.folder / "database.db")
-        return call(
-            job,
-            self.folder / "log.txt",
-            progress,
-            database=database,
-            threads=self.threads,
-            seed=COLMAP_SEED,
-            **arguments,
-        )
+        common = {"database": str(self.folder / "database.db"), "threads": self.threads, "seed": COLMAP_SEED}
+        return call(job, self.folder / "log.txt", progress, **common, **arguments)
 
 
 def _place(value: Sequence[float] | None) -> tuple[float, float, float] | None:

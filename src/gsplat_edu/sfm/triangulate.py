@@ -94,7 +94,7 @@ def _triangulated(views: Sequence[View], folder: Path, progress: Progress, threa
         "photos": photos,
         "masks": str(folder / "masks"),
         "groups": groups,
-        "max_features": MAX_FEATURES,
+        "sift": {"max_num_features": MAX_FEATURES},
     }
     run("features", STAGES[0], len(views), **features, **common)
     run("matches", STAGES[1], len(chosen), pairs=str(listed), **common)

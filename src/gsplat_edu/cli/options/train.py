@@ -209,11 +209,16 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_results(group: argparse._ArgumentGroup) -> None:
-    for flag, what, every in (
-        ("--eval-every", "evaluations on the test views", RunOptions.eval_every),
-        ("--save-every", "checkpoints", RunOptions.save_every),
+    for flag, what, zero, every in (
+        (
+            "--eval-every",
+            "evaluations on the test views",
+            "0 scores nothing, not even at the end",
+            RunOptions.eval_every,
+        ),
+        ("--save-every", "checkpoints", "0 for the end only", RunOptions.save_every),
     ):
-        _add_number(group, flag, f"iterations between {what}; 0 for the end only (default: {every})", every)
+        _add_number(group, flag, f"iterations between {what}; {zero} (default: {every})", every)
     group.add_argument(
         "--clean",
         action="store_true",

@@ -44,7 +44,7 @@ def features(
     photos: str,
     masks: str,
     groups: list[dict[str, Any]],
-    max_features: int,
+    sift: dict[str, float],
     threads: int,
     seed: int,
 ) -> dict[str, Any]:
@@ -57,7 +57,7 @@ def features(
         masks: Folder of their masks, NAME.png; features are found where a mask is not zero. Empty for none.
         groups: Photos that share a camera: "names", "width" and "height", and the "focal" length if known, px. "lens"
             is None, or a fisheye: "model", and "focal", "cx" and "cy" with the first pixel's centre at (0.5, 0.5), px.
-        max_features: Largest number of features per photo.
+        sift: Options of COLMAP's detector: "max_num_features" per photo, and "peak_threshold" for another than its own.
         threads: Number of threads, -1 for all.
         seed: Seed of COLMAP's generator.
 
@@ -67,7 +67,8 @@ def features(
     pycolmap.set_random_seed(seed)
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu = threads, False
-    options.sift.max_num_features = max_features
+    for name, value in sift.items():
+        setattr(options.sift, name, value)
     names = sorted(name for group in groups for name in group["names"])
     # Otherwise COLMAP numbers photos in the order in which its threads finish them.
     with opened(database) as db, pycolmap.DatabaseTransaction(db):
