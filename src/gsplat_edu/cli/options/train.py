@@ -321,8 +321,7 @@ def _add_background(group: argparse._ArgumentGroup) -> None:
     behind.add_argument(
         "--white-background",
         action="store_true",
-        help="white background (default: black), behind photos with alpha too, which are opaque then: the scene learns"
-        " the white",
+        help="white background (default: black); photos with alpha are laid on it, and the scene learns the white",
     )
     behind.add_argument(
         "--background",
@@ -457,9 +456,8 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         arguments.time_limit is not None and arguments.iterations is None
     )
     if _starts_from_scene(arguments):
-        if idle := [name for name in FOR_POINTS if changes.get(name, "none") != "none"]:
-            flag = option_of(idle[0])
-            raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
+        if idle := [option_of(name) for name in FOR_POINTS if changes.get(name, "none") != "none"]:
+            raise ArgumentError(f"{idle[0]}: only a start from points uses it, not --from; leave it out")
         changes = FROM_SCENE | (FAST_FROM_SCENE if strategy == "fast" else {}) | changes
     iterations = length_of(arguments, strategy)
     config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
@@ -488,10 +486,8 @@ def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:
     if arguments.resume and RunFolder(arguments.out).exists():
         return ()
     default = OPEN_FOR_FAST if strategy_of(arguments) == "fast" else ()
-    names = [
-        name for name in OPEN if (getattr(arguments, name) or (AUTO if name in default else None)) == AUTO
-    ]
-    return tuple(name for name in names if name != "sky" or arguments.scene is None)
+    given = {name: getattr(arguments, name) or (AUTO if name in default else None) for name in OPEN}
+    return tuple(n for n in OPEN if given[n] == AUTO and (n != "sky" or arguments.scene is None))
 
 
 def _starts_from_scene(arguments: argparse.Namespace) -> bool:
