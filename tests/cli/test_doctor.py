@@ -188,7 +188,7 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     assert longer[longer.index("--resolution") + 1] == "40"
     assert longer[longer.index("--test-every") + 1] == "0", "an option of value 0 is kept"
     assert longer[longer.index("--background") + 1 :][:3] == ["1", "1", "1"]
-    assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_10000").is_dir()
+    assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_3000").is_dir()
     # The advice repeats the recipe of the run. A run without a stored recipe was trained by adc.
     for changes, strategy in (
         ({"strategy": "mcmc", "max_gaussians": 300}, "mcmc"),

@@ -161,14 +161,3 @@ def test_blur_is_judged_inside_a_cut_out(named, inside, kind):
         photos.append(View(view.camera, image, name=view.name, **plane))
     found = {name.removeprefix("images/") for name in named(photos, points).get("blurred", ())}
     assert found == ({views[i].name for i in SPOILED} if inside else set())
-
-
-def test_dark_parts_of_a_scene_are_no_exposure(named):
-    """Photos of which the left 57 % is 1.5 stops darker show another thing there: an exposure changes every pixel."""
-    views, points = room("forward")
-
-    def shaded(image):
-        return np.where(np.arange(image.shape[1])[None, :, None] < 0.57 * image.shape[1], 0.62, 1.0) * image
-
-    spoiled, _ = changed(views, shaded)
-    assert "exposure" not in named(spoiled, points)

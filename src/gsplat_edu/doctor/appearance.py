@@ -70,15 +70,6 @@ ORDINARY = 16.0
 """A jump must exceed this multiple of the pairs' first quartile. That quartile is 0.03 stops in phone captures and 0.07
 if half of the scene is semi-transparent; jumps are much larger."""
 
-THROUGHOUT = 0.75
-"""Two photos differ in exposure only if this share of their points shows at least half of the difference: an exposure
-changes every pixel, other content or a shadow only some. In a rendered capture without any jump, pairs that differ by
-0.4 stops and more have shares of 0.5 to 0.7."""
-
-ROUGHLY_THROUGHOUT = 0.6
-"""The same if the capture has no points, since some of the compared places then do not match; and where many pairs
-have to differ."""
-
 TINT = 0.25
 """White balance jumps if one channel differs from the mean of the three by more than this, stops. The limit is lower
 than `JUMP` because hue differences are more visible; a phone varies by 0.1."""
@@ -284,15 +275,12 @@ class Gains:
     @cached_property
     def light(self) -> Float64[np.ndarray, " C"]:
         """(C,) how much brighter each photo is, stops; 0 if it cannot be compared or its neighbours disagree."""
-        return np.array([_agreed(_medians(pairs, MISMATCH, self._share)) for pairs in self._light])
+        return np.array([_agreed(_medians(pairs, MISMATCH)) for pairs in self._light])
 
     @cached_property
     def tint(self) -> Float64[np.ndarray, " C"]:
         """(C,) largest difference of a channel from the mean of the three, stops; 0 as for `light`."""
-        by_channel = [
-            [_agreed(_medians(pairs, TINT_MISMATCH, self._share)) for pairs in self._tint(c)]
-            for c in range(3)
-        ]
+        by_channel = [[_agreed(_medians(pairs, TINT_MISMATCH)) for pairs in self._tint(c)] for c in range(3)]
         return np.asarray(np.abs(by_channel).max(axis=0))
 
     def differing(self, limit: float) -> float:
@@ -300,14 +288,9 @@ class Gains:
 
         The limit is at least `ORDINARY` times the pairs' first quartile.
         """
-        medians = [_medians(pairs, MISMATCH, ROUGHLY_THROUGHOUT) for pairs in self._light]
+        medians = [_medians(pairs, MISMATCH) for pairs in self._light]
         pairs = np.abs(np.concatenate([np.zeros(0), *medians]))
         return float(np.mean(pairs > max(limit, ORDINARY * np.quantile(pairs, 0.25)))) if len(pairs) else 0.0
-
-    @property
-    def _share(self) -> float:
-        """Least share of the points that show a difference of exposure."""
-        return THROUGHOUT if len(self._survey.points) else ROUGHLY_THROUGHOUT
 
     @property
     def _light(self) -> Iterator[list[Float64[np.ndarray, "..."]]]:
@@ -363,17 +346,9 @@ def _agreed(values: Float64[np.ndarray, " n"]) -> float:
     return median if np.mean(values * np.sign(median) > 0.5 * abs(median)) >= AGREEING else 0.0
 
 
-def _medians(
-    pairs: Sequence[Float64[np.ndarray, "..."]], mismatch: float, least: float
-) -> Float64[np.ndarray, " m"]:
-    """Return how each pair of photos that show the same thing differs: the median, or 0 if few points show it."""
-    found = []
-    for ratios in pairs:
-        if _deviation(ratios) < mismatch:
-            median = float(np.median(ratios))
-            shown = np.mean(ratios * np.sign(median) > 0.5 * abs(median))
-            found.append(median if shown >= least else 0.0)
-    return np.array(found)
+def _medians(pairs: Sequence[Float64[np.ndarray, "..."]], mismatch: float) -> Float64[np.ndarray, " m"]:
+    """Return the median of each pair of photos that show the same thing."""
+    return np.array([np.median(ratios) for ratios in pairs if _deviation(ratios) < mismatch])
 
 
 def _deviation(values: Float64[np.ndarray, " n"]) -> float:
