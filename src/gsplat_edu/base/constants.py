@@ -124,5 +124,5 @@ LOOPBACK: Final = "127.0.0.1"
 SRGB_OFFSET: Final = 0.055
 """Offset of the sRGB curve, of encoded colours: 1.055 l^(1/2.4) - 0.055. Source: IEC 61966-2-1."""
 
-FAR_BELOW = 0.1
+FAR_BELOW: Final = 0.1
 """A scene that was trained for less than this fraction of its length is not usable: splats have hardly moved."""
