@@ -103,7 +103,7 @@ def test_between_92_and_100_percent_of_the_limit_are_used(capture, tmp_path, spe
 def test_a_run_that_scores_nothing_reads_no_held_out_photo(capture, tmp_path):
     """The held-out photos are gone before training begins, and all photos before it ends."""
     shutil.copytree(capture, tmp_path / "capture")
-    chosen = options(tmp_path / "capture", tmp_path / "run", 30, refine="poses", appearance="exposure")
+    chosen = options(tmp_path / "capture", tmp_path / "run", 30, appearance="exposure")
     chosen = dataclasses.replace(chosen, data_settings=DataSettings(image_memory=0))
     run = CaptureRun(chosen)
     held_out = {view.name for view in run.dataset.test}

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import float64_array, in_range
@@ -134,9 +133,10 @@ def stray_eyes(eyes: Float64[np.ndarray, "C 3"]) -> Bool[np.ndarray, " C"]:
     stray = far_ratios(eyes) > FAR_AWAY
     if stray.any():
         offsets = eyes - np.median(eyes, axis=0)
-        near = 0.5 * np.linalg.norm(offsets[stray], axis=1)
-        counts = cKDTree(offsets).query_ball_point(offsets[stray], near, return_length=True)
-        stray[stray] = counts - 1 < COMPANY  # each camera is within its own radius
+        for index in np.flatnonzero(stray):
+            near = 0.5 * np.linalg.norm(offsets[index])
+            within = np.linalg.norm(offsets - offsets[index], axis=1) <= near
+            stray[index] = int(within.sum()) - 1 < COMPANY  # each camera is within its own radius
     return stray
 
 
