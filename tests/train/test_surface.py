@@ -184,7 +184,9 @@ def test_flatness_has_its_gradient_and_leaves_the_sky_alone(capture):
 def test_a_step_without_normals_is_refused(capture):
     term = NormalTerm(1.0, Turns(0))
 
-    given = rendered(output=SimpleNamespace(features=None, depth=None), iteration=0)
+    given = rendered(
+        output=SimpleNamespace(features=None, depth=torch.ones(2, 2), alpha=torch.ones(2, 2)), iteration=0
+    )
     with pytest.raises(ArgumentError, match="facing_normals"):
         term(given)
 

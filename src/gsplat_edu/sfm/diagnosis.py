@@ -8,9 +8,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float32
+
+from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
 
 INLIERS = 15
 """Smallest number of matches with one geometry that connects two photos: COLMAP's own bound."""
@@ -144,8 +145,8 @@ def evidence(folder: Path, photos: Sequence[Path], connected: int) -> Evidence:
         query = "SELECT rows, config FROM two_view_geometries WHERE rows >= ?"
         verified = np.array(reader.execute(query, (INLIERS,)).fetchall(), dtype=np.int64).reshape(-1, 2)
     looked_at = [photos[i * len(photos) // LOOKED_AT] for i in range(LOOKED_AT)] if photos else []
-    greys = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in dict.fromkeys(looked_at)]
-    measured = [texture(grey.astype(np.float32)) for grey in greys if grey is not None]
+    greys = map(_grey, dict.fromkeys(looked_at))
+    measured = [texture(grey) for grey in greys if grey is not None]
     blank, edge = np.median(measured, axis=0).tolist() if measured else (0.0, 0.0)
     return Evidence(
         photos=len(photos),
@@ -158,6 +159,15 @@ def evidence(folder: Path, photos: Sequence[Path], connected: int) -> Evidence:
         blank=blank,
         edge=edge,
     )
+
+
+def _grey(path: Path) -> Float32[np.ndarray, "H W"] | None:
+    """Return the grey values of a photo, 0 to 255; None if it cannot be decoded."""
+    try:
+        with opened_image(path) as image:
+            return np.asarray(image.convert("L"), dtype=np.float32)
+    except UNDECODABLE:
+        return None
 
 
 def texture(grey: Float32[np.ndarray, "H W"]) -> tuple[float, float]:
