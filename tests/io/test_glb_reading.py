@@ -38,6 +38,22 @@ def values(count=4, seed=0, degree=1):
     return found
 
 
+@pytest.mark.parametrize(
+    ("nodes", "roots", "named"),
+    [
+        (b"{}" + b",{}" * (1 << 18), b"0", "262,145 nodes, and at most"),
+        (b"{}", b"0" + b",0" * 999, "two parents"),
+    ],
+)
+def test_more_nodes_than_a_file_may_have_are_refused_before_their_transforms(tmp_path, nodes, roots, named):
+    text = b'{"asset":{"version":"2.0"},"nodes":[%b],"scenes":[{"nodes":[%b]}]}' % (nodes, roots)
+    text += b" " * (-len(text) % 4)
+    header = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
+    (tmp_path / "a.glb").write_bytes(header + text)
+    with pytest.raises(SceneFormatError, match=named):
+        read_scene(tmp_path / "a.glb")
+
+
 class Builder:
     """A glTF that is put together piece by piece."""
 

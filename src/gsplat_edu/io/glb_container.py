@@ -40,8 +40,17 @@ GENERATOR = "gsplat-edu"
 LARGEST_FILE = (1 << 32) - 1
 """Largest file in bytes: its length is stored in 32 bits."""
 
-MOST_JSON = 1 << 20
-"""Most bytes of JSON to parse; a description of splats needs a few thousand."""
+MOST_JSON = 1 << 24
+"""Most bytes of JSON to parse; files of other programs may describe thousands of meshes."""
+
+MOST_NODES = 1 << 18
+"""Most nodes of a file."""
+
+REPEATS = 64
+"""A file may show its own size at most so many times, by nodes that share a mesh."""
+
+MISREAD = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
+"""What it raises to follow JSON that does not describe a file as glTF does."""
 
 
 def write_container(
@@ -94,13 +103,12 @@ def refuse(path: Path, fault: str) -> NoReturn:
     raise SceneFormatError(f"{path}: {fault}; export it again")
 
 
-def container(path: Path, data: bytes, most_json: int = MOST_JSON) -> tuple[dict[str, Any], memoryview]:
+def container(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview]:
     """Return the JSON and the buffer of a binary glTF.
 
     Args:
         path: The file, for messages.
         data: Its bytes.
-        most_json: Most bytes of JSON to parse.
 
     Raises:
         SceneFormatError: the file is not a binary glTF of version 2, or is damaged.
@@ -116,7 +124,7 @@ def container(path: Path, data: bytes, most_json: int = MOST_JSON) -> tuple[dict
         refuse(path, f"is version {version} of {length:,} bytes, where {len(data):,} of version 2 should be")
     size, kind = CHUNK_HEADER.unpack_from(data, FILE_HEADER.size)
     start = FILE_HEADER.size + CHUNK_HEADER.size
-    if kind != b"JSON" or size > min(len(data) - start, most_json):
+    if kind != b"JSON" or size > min(len(data) - start, MOST_JSON):
         refuse(path, "does not begin with its JSON")
     try:
         document = parse_json(data[start : start + size])
@@ -168,21 +176,31 @@ def node_matrices(path: Path, document: Mapping[str, Any]) -> dict[int, Float64[
         document: Its JSON.
 
     Raises:
-        SceneFormatError: a node does not exist, or has two parents.
+        SceneFormatError: a node does not exist, or has two parents, or there are more than `MOST_NODES`.
     """
     nodes, scenes = document.get("nodes", []), document.get("scenes", [])
+    if len(nodes) > MOST_NODES:
+        refuse(path, f"has {len(nodes):,} nodes, and at most {MOST_NODES:,} are read")
     if scenes:
         roots = scenes[document.get("scene", 0)].get("nodes", [])
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in children]
     matrices: dict[int, Float64[np.ndarray, "4 4"]] = {}
-    waiting = [(root, np.eye(4)) for root in reversed(roots)]
+    waiting: list[tuple[Any, Float64[np.ndarray, "4 4"]]] = []
+
+    def add(children: list[Any], outer: Float64[np.ndarray, "4 4"]) -> None:
+        """Add nodes to those that wait, at most as many as there are; more would have two parents."""
+        if len(waiting) + len(children) > len(nodes) - len(matrices):
+            refuse(path, "has a node that does not exist, or has two parents")
+        waiting.extend((child, outer) for child in reversed(children))
+
+    add(roots, np.eye(4))
     while waiting:
         index, outer = waiting.pop()
         if type(index) is not int or not 0 <= index < len(nodes) or index in matrices:
             refuse(path, f"has a node {str(index)[:20]} that does not exist, or has two parents")
         with np.errstate(all="ignore"):  # the caller looks for NaN and infinity
             matrices[index] = outer @ node_matrix(nodes[index])
-        waiting += [(child, matrices[index]) for child in reversed(nodes[index].get("children", []))]
+        add(nodes[index].get("children", []), matrices[index])
     return matrices

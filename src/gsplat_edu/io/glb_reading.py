@@ -19,6 +19,8 @@ from gsplat_edu.io.edit import Similarity, joined
 from gsplat_edu.io.glb_container import (
     EXTENSION,
     GENERATOR,
+    MISREAD,
+    REPEATS,
     SPZ_EXTENSION,
     container,
     node_matrices,
@@ -27,12 +29,6 @@ from gsplat_edu.io.glb_container import (
 from gsplat_edu.io.scene import Scene, read_extras
 from gsplat_edu.scene.frame import ORIGIN, Vector, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
-
-MOST_JSON = 1 << 24
-"""Most bytes of JSON to parse; files of other programs may describe thousands of meshes."""
-
-REPEATS = 64
-"""A file may show its own size at most so many times, by nodes that share a mesh."""
 
 MOST_ENTRY = 1e30
 """Largest entry of a transform: the cube of a larger scale would overflow."""
@@ -76,9 +72,6 @@ SceneFrame = tuple[Vector | None, str | None, Vector]
 HALF_TURN_ABOUT_Y = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3))
 """A half turn about x, then this one, is a half turn about z."""
 
-MISREAD = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
-"""What it raises to follow JSON that does not describe splats as glTF does."""
-
 
 class Placed(NamedTuple):
     """A primitive of splats at a node."""
@@ -90,7 +83,7 @@ class Placed(NamedTuple):
 def read(path: Path) -> Scene:
     """Read a binary glTF; see `gsplat_edu.io.formats.read_scene`."""
     data = read_bytes(path)
-    document, body = container(path, data, MOST_JSON)
+    document, body = container(path, data)
     try:
         return _File(path, document, body).scene()
     except MISREAD:

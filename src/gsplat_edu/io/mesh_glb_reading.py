@@ -12,22 +12,13 @@ from jaxtyping import Float, Float32, Float64, Int64
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE, read_bytes
 from gsplat_edu.io.axes import POSITION_SIGNS, root_transform
-from gsplat_edu.io.glb_container import GENERATOR, container, node_matrix, refuse
+from gsplat_edu.io.glb_container import GENERATOR, MISREAD, REPEATS, container, node_matrices, refuse
 from gsplat_edu.io.mesh_glb import TRIANGLES, UNLIT
 from gsplat_edu.io.mesh_image import decoded
 from gsplat_edu.io.mesh_parts import Polygons, StoredMesh, check_vertices, distinct_rows, triangles_in
 from gsplat_edu.io.scene import read_extras
 from gsplat_edu.scene.frame import ORIGIN, Vector
 from gsplat_edu.scene.mesh import Mesh, Texture
-
-MOST_JSON = 1 << 24
-"""Most bytes of JSON to parse; files of other programs may describe thousands of meshes."""
-
-REPEATS = 64
-"""A file may show its own size at most so many times, by nodes that share a mesh."""
-
-MOST_NODES = 1 << 18
-"""Most nodes of a file."""
 
 MOST_PARTS = 100_000
 """Most primitives at nodes. Each takes time and memory, even one without triangles; nodes may share them."""
@@ -47,9 +38,6 @@ ATTRIBUTE_BYTES = 36
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 """Numbers of each accessor type that meshes need."""
 
-MISREAD = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
-"""What it raises to follow JSON that does not describe a mesh as glTF does."""
-
 
 def srgb(linear: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
     """Return sRGB values of linear values, both 0 to 1 (IEC 61966-2-1)."""
@@ -60,7 +48,7 @@ def srgb(linear: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
 def read(path: Path) -> StoredMesh:
     """Read a mesh; see `gsplat_edu.io.mesh_files.read_mesh`."""
     data = read_bytes(path)
-    document, body = container(path, data, MOST_JSON)
+    document, body = container(path, data)
     needed = document.get("extensionsRequired", [])
     if not isinstance(needed, list) or set(map(str, needed)) - {UNLIT}:
         names = ", ".join(sorted(map(str, needed))) if isinstance(needed, list) else "?"
@@ -174,40 +162,11 @@ class _File:
 
     def parts(self) -> Iterator[_Part]:
         """Yield the primitives of the scene's nodes; of all nodes if there is no scene."""
-        nodes = self._document.get("nodes", [])
-        if len(nodes) > MOST_NODES:
-            refuse(self._path, f"has {len(nodes):,} nodes, and at most {MOST_NODES:,} are read")
-        scenes = self._document.get("scenes", [])
-        if scenes:
-            roots = scenes[self._document.get("scene", 0)].get("nodes", [])
-        else:
-            children = {child for node in nodes for child in node.get("children", [])}
-            roots = [index for index in range(len(nodes)) if index not in children]
-        seen: set[int] = set()
-        waiting: list[tuple[Any, Float64[np.ndarray, "4 4"]]] = []
-        self._add(waiting, roots, np.eye(4), len(nodes))
-        while waiting:
-            index, outer = waiting.pop()
-            if type(index) is not int or not 0 <= index < len(nodes) or index in seen:
-                refuse(self._path, f"has a node {str(index)[:20]} that does not exist, or has two parents")
-            seen.add(index)
-            matrix = outer @ node_matrix(nodes[index])
-            if "mesh" in nodes[index]:
-                for primitive in self._item("meshes", nodes[index]["mesh"])["primitives"]:
+        for index, matrix in node_matrices(self._path, self._document).items():
+            node = self._document["nodes"][index]
+            if "mesh" in node:
+                for primitive in self._item("meshes", node["mesh"])["primitives"]:
                     yield self._part(primitive, matrix)
-            self._add(waiting, nodes[index].get("children", []), matrix, len(nodes) - len(seen))
-
-    def _add(
-        self,
-        waiting: list[tuple[Any, Float64[np.ndarray, "4 4"]]],
-        children: list[Any],
-        matrix: Float64[np.ndarray, "4 4"],
-        most: int,
-    ) -> None:
-        """Add nodes to those that wait, at most as many as there are; more would have two parents."""
-        if len(waiting) + len(children) > most:
-            refuse(self._path, "has a node that does not exist, or has two parents")
-        waiting += [(child, matrix) for child in reversed(children)]
 
     def _item(self, kind: str, index: Any) -> dict[str, Any]:  # noqa: ANN401 - of a stranger's JSON
         """Return an entry of one of the document's lists."""
