@@ -202,9 +202,7 @@ def edit_page(visit, tmp_path):
     """Return a function that opens a scene's page with the editor."""
 
     def make(gaussians, cameras=(), width=900, height=700, **options):
-        source = Source(
-            tmp_path / "s.ply", Scene(gaussians), cameras, RenderSettings(jacobian_limit=1.3), (0.0,) * 3
-        )
+        source = Source(tmp_path / "s.ply", Scene(gaussians), cameras, RenderSettings(jacobian_limit=1.3))
         editing = editing_of(source, tmp_path / "s.ply", tmp_path / "edits.json")
         html = page.html(source.scene, cameras, source.settings, "scene", (), editing=editing)
         (tmp_path / "edit.html").write_bytes(html)

@@ -321,8 +321,8 @@ def test_measuring_snaps_to_the_mesh(visit, tmp_path, random_gaussians):
 def test_meshes_follow_the_origin_the_unit_and_moves_of_the_scene(tmp_path, random_gaussians):
     mesh = ball()
     write_mesh(tmp_path / "a.glb", mesh, "cm")
-    scene = Scene(random_gaussians(3), unit="cm")
-    source = Source(tmp_path / "a.ply", scene, (), file_settings(scene), (100.0, 0.0, -5.0))
+    scene = Scene(random_gaussians(3), unit="cm", origin=(100.0, 0.0, -5.0))
+    source = Source(tmp_path / "a.ply", scene, (), file_settings(scene))
     found = open_meshes(tmp_path / "a.glb", tmp_path / "a.glb", source)
     np.testing.assert_allclose(found.surface.vertices, mesh.vertices - [100.0, 0.0, -5.0], atol=1e-6)
     assert found.collider is not None
