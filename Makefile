@@ -3,28 +3,28 @@
 BIN := .venv/bin
 OUT ?= out/sphere.png
 # Processes that run the tests: one more than there are cores, because some tests wait for a browser, and at most 4, which
-# take up to 1 GiB each. Each test file stays in one process, so that its fixtures are made once; the longest files start
-# first (tests/slices.py), so that no process is left with a long one at the end.
+# take up to 1 GiB each. Each test file stays in one process, so that its fixtures are made once.
 WORKERS ?= $(shell n=$$(nproc 2> /dev/null || echo 1); [ $$n -lt 3 ] && echo $$((n + 1)) || echo 4)
 # Bytecode is written even where the environment forbids it: the tests start Python a hundred times.
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 BENCH := $(if $(SMOKE),--smoke)
 export PYTHON
 
-# The eighth of the long tests that runs: 0 to 7 (tests/slices.py). Without it, `make test` takes that of the commit count
-# and `make soak` all. SHARD=none: `make test` runs only those that the change touches. BASE: what the change is compared with.
-SHARD ?= $(GSPLAT_EDU_SHARD)
-BASE ?= $(GSPLAT_EDU_BASE)
-PART ?= cases sanitize neon chapters
-export GSPLAT_EDU_SHARD := $(SHARD)
-export GSPLAT_EDU_BASE := $(BASE)
+# The parts of `make soak`, and the seed of its fuzzers.
+PART ?= cases sanitize neon chapters wheels
+SEED ?= $(shell date +%s)
+# The tests that `make stress` repeats, and how often.
+FILES ?= tests
+ROUNDS ?= 10
 
-.PHONY: help demo test soak check sanitize bench notebooks site wheels clean
+.PHONY: help demo test test-slow stress soak check sanitize bench notebooks site wheels clean
 
 help:
 	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
-	@echo "make test        run all tests; of the sliced ones, the cases that the change touches and an eighth of the others"
-	@echo "make soak        every case of the sliced tests, large fuzzing runs, the native tests under sanitizers and on ARM, the full chapters: hours (SHARD=0 to 7: an eighth)"
+	@echo "make test        every test without a browser and without a whole training: the first tier"
+	@echo "make test-slow   the second tier: browser journeys, whole trainings, poses of photos, kills, the site, chapters, sanitizers"
+	@echo "make stress      repeat the tests of the second tier (FILES=...) ten times (ROUNDS=...) with slow tabs beside eight busy processes"
+	@echo "make soak        large fuzzing runs, sanitizers and ARM, the full chapters, wheels: hours; before a release (PART=...: one of them)"
 	@echo "make check       lint, format, types, import layers and size limits"
 	@echo "make sanitize    run the native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
 	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
@@ -40,26 +40,38 @@ demo:
 
 test:
 	@tools/set_up.sh dev
-	@echo "== test: running the suite"
-	@$(PYTEST)
+	@echo "== test: the first tier"
+	@$(PYTEST) -m "not slow"
+
+test-slow: sanitize
+	@echo "== test-slow: the second tier"
+	@$(PYTEST) -m slow
+
+stress:
+	@tools/set_up.sh dev
+	@echo "== stress: $(ROUNDS) rounds of $(FILES)"
+	@tools/stress.sh $(ROUNDS) $(PYTEST) -m slow $(FILES)
 
 soak:
 	@tools/set_up.sh dev
 ifneq ($(filter cases,$(PART)),)
-	@echo "== soak: the cases of the sliced tests, $(if $(SHARD),shard $(SHARD),all)"
-	@GSPLAT_EDU_SOAK=1 $(PYTEST) -m sliced
+	@echo "== soak: fuzzers and the tests of soaks, seed $(SEED)"
+	@GSPLAT_EDU_SOAK=1 GSPLAT_EDU_SEED=$(SEED) $(PYTEST) -m "soak or fuzz"
 endif
 ifneq ($(filter sanitize,$(PART)),)
-	@echo "== soak: the native tests, damaged checkpoints and configurations under sanitizers"
-	@GSPLAT_EDU_SOAK=1 GSPLAT_EDU_SPLIT=all tools/sanitize.sh
+	@echo "== soak: the native tests, damaged checkpoints and configurations under sanitizers, seed $(SEED)"
+	@GSPLAT_EDU_SOAK=1 GSPLAT_EDU_SEED=$(SEED) tools/sanitize.sh
 endif
 ifneq ($(filter neon,$(PART)),)
 	@echo "== soak: the native tests on 64-bit ARM, emulated"
-	@GSPLAT_EDU_SPLIT=all tools/neon.sh
+	@tools/neon.sh
 endif
 ifneq ($(filter chapters,$(PART)),)
 	@echo "== soak: chapters on the full budget"
-	@$(BIN)/python tools/build_notebooks.py --out out/soak/notebooks $(if $(SHARD),--shard $(SHARD))
+	@$(BIN)/python tools/build_notebooks.py --out out/soak/notebooks
+endif
+ifneq ($(filter wheels,$(PART)),)
+	@$(MAKE) wheels REPEAT=1
 endif
 
 check:

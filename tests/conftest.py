@@ -22,12 +22,13 @@ if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: to
     sys.modules["gsplat_edu._native"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sys.modules["gsplat_edu._native"])
 
+import browsers
 import outside
 import photos
-import slices
+import tiers
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
 from shape_checker import pytest_runtest_setup  # noqa: F401
-from slices import pytest_collection_modifyitems, pytest_report_header, pytest_runtest_makereport  # noqa: F401
+from tiers import pytest_itemcollected, pytest_report_header  # noqa: F401
 
 outside.forbid()
 
@@ -36,9 +37,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Each run has the same examples, so failures are reproducible. `make soak` tries more, and random ones.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=100)
-EXAMPLES = slices.count("GSPLAT_EDU_EXAMPLES", 100, 5_000)
+EXAMPLES = tiers.count("GSPLAT_EDU_EXAMPLES", 100, 5_000)
 settings.register_profile("soak", deadline=None, max_examples=EXAMPLES, print_blob=True)
-settings.load_profile("soak" if slices.SOAK else "repeatable")
+settings.load_profile("soak" if tiers.SOAK else "repeatable")
 
 
 @pytest.fixture
@@ -57,6 +58,18 @@ def photographed_once(tmp_path_factory: pytest.TempPathFactory) -> None:
         folder = folder.parent
     os.environ[photos.VARIABLE] = str(folder / "photos")
     photos.keep()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[browsers.Tabs]:
+    """Open tabs in the Chromium of this process; they are closed after the module's tests."""
+    with browsers.chromium() as tabs:
+        yield tabs
+
+
+def pytest_sessionfinish() -> None:
+    """End this process's Chromium."""
+    browsers.stop()
 
 
 @pytest.fixture

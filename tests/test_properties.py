@@ -7,7 +7,7 @@ from hypothesis.extra.numpy import arrays
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R, quat_to_R_batch, render_gaussians
 
-pytestmark = pytest.mark.sliced  # a soak tries more examples
+pytestmark = pytest.mark.fuzz
 
 CAM = Camera(np.eye(3), (0, 0, 0), fx=20, fy=22, cx=9.3, cy=6.8, H=14, W=19)
 

@@ -130,7 +130,7 @@ def _train_3d() -> str:
 
 def _make() -> str:
     """List the targets of the Makefile with the texts of `make help`."""
-    texts = re.findall(r'@echo "make ([a-z]+) +(.*)"', (ROOT / "Makefile").read_text(encoding="utf-8"))
+    texts = re.findall(r'@echo "make ([a-z-]+) +(.*)"', (ROOT / "Makefile").read_text(encoding="utf-8"))
     rows = [f"| `make {name}` | {_cell(text.replace('$(OUT)', 'out/sphere.png'))} |" for name, text in texts]
     head = "## make\n\nEvery target sets up `.venv` first and skips that if it is up to date.\n\n"
     return head + "\n".join(["| target | what it does |", "|---|---|", *rows]) + "\n"

@@ -2,7 +2,6 @@
 
     python tools/build_notebooks.py                      every chapter, with the full budget
     python tools/build_notebooks.py 09 --out DIR         chapters whose names start with 09, into another folder
-    python tools/build_notebooks.py --shard 3            an eighth of the chapters
     python tools/build_notebooks.py --prose 02           only the text: outputs stay, because no code has changed
 
 A chapter's exercises are in notebooks/exercises/NN_name.py: a markdown cell for each question, behind it a code cell
@@ -144,7 +143,6 @@ def main() -> int:
     """Build the requested chapters."""
     parser = argparse.ArgumentParser(description="Execute the chapters into notebooks.")
     parser.add_argument("names", nargs="*", help="beginnings of chapter names, for example 09 (default: all)")
-    parser.add_argument("--shard", type=int, choices=range(8), help="every eighth chapter, from this one on")
     parser.add_argument("--prose", action="store_true", help="replace the text only; refused if code changed")
     parser.add_argument("--out", type=Path, default=ROOT / "notebooks", help="folder (default: notebooks)")
     arguments = parser.parse_args()
@@ -155,8 +153,6 @@ def main() -> int:
             f"build_notebooks.py: no chapter of {SOURCES} starts with {' or '.join(chosen)}", file=sys.stderr
         )
         return 2
-    if arguments.shard is not None:
-        sources = sources[arguments.shard :: 8]
     for source in sources:
         start = time.perf_counter()
         print(f"{source.stem}: {'replacing the text' if arguments.prose else 'executing'}", flush=True)

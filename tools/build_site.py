@@ -1,6 +1,6 @@
 """Build the site: chapters, documents and the reference of every module, as pages that open from disk.
 
-    python tools/build_site.py [--out out/site] [--members gsplat_edu.scene.camera ...]
+    python tools/build_site.py [--out out/site]
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
@@ -21,7 +21,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -159,13 +159,8 @@ def relinked(text: str, page: Path, stage: Path) -> str:
     return LINK.sub(replaced, text)
 
 
-def gather(stage: Path, members: Collection[str]) -> None:
-    """Write all pages to a folder.
-
-    Args:
-        stage: An empty folder.
-        members: Modules whose pages show their documentation; those of the others have only a title and links.
-    """
+def gather(stage: Path) -> None:
+    """Write all pages to an empty folder."""
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
     documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if not name.endswith("/index.md")]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
@@ -181,7 +176,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
         notebook["cells"].append(_origin(page, len(notebook["cells"])))
         _write(stage / page, json.dumps(notebook))
     for name in modules():
-        _write(stage / "reference" / f"{name}.md", _reference(name, documented=name in members))
+        _write(stage / "reference" / f"{name}.md", _reference(name))
     _write(stage / "reference" / "index.md", _public_api())
     _write(stage / "docs" / "decisions" / "index.md", _records(records))
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
@@ -240,7 +235,7 @@ def _figure(page: str, number: int) -> bytes:
     return base64.b64decode("".join(figures[number]))
 
 
-def _reference(name: str, *, documented: bool) -> str:
+def _reference(name: str) -> str:
     """Return the page of a module; the page of a package also lists its modules.
 
     These pages are not part of the sidebar: two hundred entries on every page would hide the others.
@@ -251,8 +246,7 @@ def _reference(name: str, *, documented: bool) -> str:
     path = [f"[{'.'.join(above[: i + 1])}]({'.'.join(above[: i + 1])}.md)" for i in range(len(above))]
     head = " / ".join(["[Reference](index.md)", *path])
     page = f"---\norphan: true\n---\n\n{head}\n\n# {name}\n\n"
-    automodule = f".. automodule:: {name}\n   :members:\n{again}"
-    page += f"```{{eval-rst}}\n{automodule if documented else f'.. py:module:: {name}'}\n```\n"
+    page += f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}\n```\n"
     inside = [other for other in modules() if other.rpartition(".")[0] == name and name != "gsplat_edu"]
     return page + ("\n## Modules\n\n" + _listed(inside) if inside else "")
 
@@ -281,14 +275,6 @@ def _public_api() -> str:
     parts += ["## Packages\n", _listed(packages)]
     parts += ["## Modules\n", _listed(["gsplat_edu", *(n for n in top if n not in packages)])]
     return "\n".join(parts)
-
-
-def _public_modules() -> set[str]:
-    """Return the modules that define the public API."""
-    listed = [_names(names) if isinstance(names, str) else names for names in PUBLIC.values()]
-    return {
-        getattr(_found(name), "__module__", name.rpartition(".")[0]) for names in listed for name in names
-    }
 
 
 def _names(module: str) -> list[str]:
@@ -347,21 +333,14 @@ def main() -> int:
     """Build the site; return 1 if the generator warned."""
     parser = argparse.ArgumentParser(description="Build the site of chapters, documents and reference.")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="folder (default: out/site)")
-    parser.add_argument(
-        "--members",
-        nargs="*",
-        metavar="MODULE",
-        help="document only these modules and the public API",
-    )
     given = parser.parse_args()
-    members = modules() if given.members is None else {*given.members, *_public_modules()}
     out = given.out.resolve()
     if out.exists() and not (out / "objects.inv").is_file() and not (out.is_dir() and not any(out.iterdir())):
         print(f"build_site.py: --out: {out} exists and is not a site; choose another folder", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory() as scratch:
         stage, made = Path(scratch) / "source", Path(scratch) / "site"
-        gather(stage, members)
+        gather(stage)
         # Python's collector would look through all pages again and again.
         program = (
             "import gc, sys; gc.set_threshold(200_000); from sphinx.cmd.build import main; sys.exit(main())"

@@ -18,7 +18,7 @@ from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.status import statuses
 from gsplat_edu.cli.main import main
 from processes import Program
-from slices import SEED
+from tiers import SEED
 
 SCHEDULER = "from distributed.cli.dask_scheduler import main; main()"
 WORKER = "from distributed.cli.dask_worker import main; main()"
@@ -134,7 +134,6 @@ def wait_for(condition):
         time.sleep(0.02)
 
 
-@pytest.mark.sliced(1, group="several processes")
 def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, serial, tmp_path):
     draw = random.Random(SEED)
     moments = sorted(draw.sample(range(5, 120), 2))  # a whole block is left
@@ -177,7 +176,6 @@ def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, s
     assert {n: folder.record(n).stat().st_mtime_ns for n in finished} == finished, "trained once"
 
 
-@pytest.mark.sliced(1, group="several processes")
 def test_a_local_cluster_gives_the_same_bytes_and_names_the_missing_photo(city, split, serial, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(split, run)
@@ -209,7 +207,6 @@ def names_of(plan):
     return sorted({name for block in plan.blocks for name in block.train})
 
 
-@pytest.mark.sliced(1, group="several processes")
 def test_no_scheduler_no_workers_and_lost_workers_are_one_line(split, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(split, run)

@@ -45,7 +45,6 @@ def split(request, tmp_path_factory):
     return request.param, data, folder / "run"
 
 
-@pytest.mark.sliced(1)
 def test_blocks_have_the_same_bytes_for_any_threads_and_caps_hold(split, tmp_path):
     """Each block has its cap, the merged scene that of the whole, and held-out views are scored through the lens."""
     kind, _, run = split
@@ -72,7 +71,6 @@ def test_blocks_have_the_same_bytes_for_any_threads_and_caps_hold(split, tmp_pat
     assert (views[0].camera.shutter is not None) == (kind == "shutter")
 
 
-@pytest.mark.sliced(1)
 def test_a_block_starts_from_what_its_lenses_show(split):
     """Each Gaussian of the coarse model is in a start, and those are left out that no pixel of the cell shows."""
     _, _, run = split

@@ -84,7 +84,6 @@ SPEEDS = {
 }
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     ("speed", "strategy"), [*((speed, "fast") for speed in SPEEDS), ("slower by 3 in mid-run", "adc")]
 )

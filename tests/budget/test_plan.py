@@ -421,7 +421,6 @@ sys.exit(os.waitstatus_to_exitcode(status))
 
 @pytest.mark.own_process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss is in KiB on Linux")
-@pytest.mark.sliced(1, group="memory of a long run")
 def test_a_training_stays_below_its_memory_limit_as_the_system_counts_it(capture, tmp_path):
     """Every Gaussian is cloned or split, so the run reaches the chosen cap and uses the memory that was planned."""
     limit = 560 * MIB

@@ -77,7 +77,6 @@ def replace_eye(camera, eye):
     return type(camera)(camera.R, eye, camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W)
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("threads", [2, 5])
 def test_the_same_bits_on_any_number_of_threads(planted, room, rings, set_threads, threads):
     views = photographed(room, rings[0])

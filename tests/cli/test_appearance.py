@@ -84,7 +84,6 @@ def test_transparent_photos_are_corrected_and_unknown_names_are_refused(tmp_path
 
 
 @pytest.mark.parametrize("appearance", ["auto", "vignetting"])
-@pytest.mark.sliced(1, group="reports on photos that differ")
 def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, tmp_path, capsys, appearance):
     run = tmp_path / "run"
     words = ["train", str(uneven), "--out", str(run), "--iterations", "40", "--resolution", "2"]

@@ -258,7 +258,6 @@ def real(name):
     return folder
 
 
-@pytest.mark.sliced(1, group="captures that the doctor reads")
 def test_snowmiku97(doctor):
     """Checked by eye: two photos have motion blur, and in two the photographer's shadow falls on the toy."""
     code, said = doctor(real("snowmiku97"), "--no-forecast")
@@ -271,7 +270,6 @@ def test_snowmiku97(doctor):
     assert said.count("warning") == 2
 
 
-@pytest.mark.sliced(1, group="captures that the doctor reads")
 def test_fox(doctor):
     code, said = doctor(real("fox"), "--no-forecast")
     assert code == 0 and "17 missing images of 67 listed" in said and said.count("warning") == 1

@@ -36,7 +36,6 @@ def tree(folder):
     return {path.relative_to(folder): path.is_file() and path.read_bytes() for path in folder.rglob("*")}
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.own_process
 @pytest.mark.parametrize("name", ["web/meta.json", "web/lod-meta.json", "web/tileset.json", "out.ply"])
 def test_of_two_conversions_to_one_output_the_second_is_refused(tmp_path, capsys, name):

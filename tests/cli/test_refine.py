@@ -24,7 +24,6 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.mark.sliced(1, group="reports on photos that differ")
 def test_a_run_writes_the_refined_capture_and_an_aligned_score(capture, tmp_path, capsys):
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--iterations", "12", "--refine", "both"]
@@ -61,7 +60,6 @@ def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
     assert judged and all(abs(view.camera.eye - refined[view.name].eye).max() < 1e-9 for view in judged)
 
 
-@pytest.mark.sliced(2, group="resumed with more to learn")
 def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
     run = tmp_path / "run"

@@ -27,7 +27,6 @@ def run(*arguments, **options):
     return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 
-@pytest.mark.sliced(0)
 @pytest.mark.slow
 def test_the_default_budget_trains_end_to_end(tmp_path):
     """The dense backend's reduced budget cuts the held-out error at least threefold.

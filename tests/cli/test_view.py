@@ -123,7 +123,6 @@ def test_a_run_is_shown_with_its_cameras_path_and_settings_until_ctrl_c(made, tm
 
 
 @own_process
-@pytest.mark.sliced(1, group="scenes served by a process")
 def test_a_scene_of_another_format_has_no_cameras(made):
     _, bare = made
     with viewing(bare, "--port", "0", "--host", "0.0.0.0", "--no-open") as (printed, url):
@@ -137,7 +136,6 @@ def test_a_scene_of_another_format_has_no_cameras(made):
 
 
 @own_process
-@pytest.mark.sliced(1, group="scenes served by a process")
 def test_levels_of_detail_are_served_with_their_files(tmp_path):
     path = small_levels(tmp_path)
     with viewing(path.parent, "--port", "0", "--no-open", "--budget", "30") as (printed, url):
@@ -162,7 +160,6 @@ def test_ctrl_c_right_after_the_address_was_printed_ends_the_command_cleanly(mad
 
 @pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")
 @own_process
-@pytest.mark.sliced(1, group="scenes served by a process")
 def test_the_browser_opens_only_on_a_terminal_with_a_screen(made, tmp_path):
     import pty
 

@@ -275,7 +275,6 @@ def test_between_the_ends_the_pose_is_gsplats_up_to_third_order(angle):
         assert np.linalg.norm(Rotation.from_matrix(own @ other.T).as_rotvec()) > 0.0035 * angle**3
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
 def test_gradients_agree_with_finite_differences(model):
     scene = gsplat_witness.smooth()

@@ -287,7 +287,6 @@ def test_an_empty_view_is_background(count):
     assert torch.equal(tensors["means"].grad, torch.zeros(count, 3, dtype=torch.float64))
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 def test_finite_differences(rasterize_mode):
     tensors = gsplat_witness.smooth()

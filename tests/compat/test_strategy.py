@@ -53,7 +53,6 @@ def psnr(image, photo):
     return -10.0 * torch.log10(((image - photo) ** 2).mean(dim=(-3, -2, -1)))
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize(("packed", "absgrad", "cameras_at_once"), [(False, False, 1), (True, True, 2)])
 def test_the_default_strategy_trains_through_our_rasterization(packed, absgrad, cameras_at_once):
     """The start points are off by 0.03 world units, 0.26 px at the cameras' distance. An image that is off by that much

@@ -37,7 +37,6 @@ def changed(views, change):
     return replaced(views, spoiled), {views[i].name for i in SPOILED}
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize("degrees", [0, 90, 35])
 @pytest.mark.parametrize(("length", "is_named"), [(2, False), (10, True), (20, True)])
 def test_motion_blur(named, length, degrees, is_named):
@@ -48,7 +47,6 @@ def test_motion_blur(named, length, degrees, is_named):
     assert set(found) <= {"blurred"}
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize(("sigma", "is_named"), [(0.4, False), (2.0, True), (4.0, True)])
 def test_a_photo_out_of_focus(named, sigma, is_named):
     views, points = room("orbit", 256)
@@ -56,7 +54,6 @@ def test_a_photo_out_of_focus(named, sigma, is_named):
     assert set(named(spoiled, points).get("blurred", ())) == (names if is_named else set())
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("contrast", [0.5, 0.2])
 def test_a_dull_photo_is_not_blurred(named, contrast):
     """The measure of detail falls with the square of the contrast, but low contrast is not blur."""
@@ -65,7 +62,6 @@ def test_a_dull_photo_is_not_blurred(named, contrast):
     assert "blurred" not in named(spoiled, points)
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize("with_points", [True, False])
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("stops", "is_named"), [(0.15, False), (0.9, True), (1.8, True)])
@@ -83,7 +79,6 @@ def test_exposure(named, stops, sign, is_named, with_points):
         assert measured == pytest.approx(sign * stops, rel=0.2 if stops < 1 else 0.4)
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize(
     "which", [range(3, 7), range(12), range(0, 24, 2)], ids=["four", "half", "every second"]
 )
@@ -95,7 +90,6 @@ def test_photos_that_are_dark_in_a_row(named, which, stops, is_named):
     assert ("exposure" in named(replaced(views, dark), points)) == is_named
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize(("stops", "is_named"), [(0.1, False), (0.7, True), (1.4, True)])
 @pytest.mark.parametrize("channel", [0, 2])
 def test_white_balance(named, channel, stops, is_named):
@@ -120,7 +114,6 @@ DUPLICATES = {
 }
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("how", DUPLICATES)
 def test_duplicated_photos(named, how):
     """Photo 9 is replaced by photo 8, once with photo 9's pose and once with photo 8's."""
@@ -134,7 +127,6 @@ def test_duplicated_photos(named, how):
     assert found.get("duplicates", ()) == expected and "same photo" not in found
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize(("distance", "is_named"), [(0.05, False), (1e-5, True), (0.0, True)])
 def test_two_photos_with_one_pose(named, distance, is_named):
     views, points = room("orbit", 160)

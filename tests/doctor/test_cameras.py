@@ -48,7 +48,6 @@ INTRINSICS = {
 }
 
 
-@pytest.mark.sliced(1, by="how")
 @pytest.mark.parametrize(
     ("how", "amount", "is_named"), [(how, *case) for how, (_, cases) in INTRINSICS.items() for case in cases]
 )
@@ -86,7 +85,6 @@ def test_without_points_only_cameras_with_one_centre_are_hopeless(diagnosed):
     assert diagnosed([with_camera(view, eye=(7.0, 8.0, 9.0)) for view in views]).hopeless
 
 
-@pytest.mark.sliced(2, by="is_named")
 @pytest.mark.parametrize("with_points", [True, False])
 @pytest.mark.parametrize("layout", ["orbit", "forward"])
 @pytest.mark.parametrize(("degrees", "is_named"), [(8, False), (95, True), (175, True)])
@@ -100,7 +98,6 @@ def test_cameras_that_look_away(named, layout, degrees, is_named, with_points):
     assert ends == ((views[5].name, views[16].name) if is_named else ())
 
 
-@pytest.mark.sliced(1, by="name")
 @pytest.mark.parametrize(("missing", "name"), [(2, None), (4, "hole"), (6, "hole"), (14, "one side")])
 def test_a_hole_in_an_orbit(diagnosed, orbit, missing, name):
     views, points = orbit
@@ -124,7 +121,6 @@ def test_one_height_is_a_note(diagnosed, orbit):
     assert "one height" not in [f.name for f in diagnosed(views, points).findings]
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize(("share", "is_named"), [(0.005, False), (0.06, True), (0.15, True)])
 def test_points_far_outside(named, orbit, share, is_named):
     views, points = orbit
@@ -133,7 +129,6 @@ def test_points_far_outside(named, orbit, share, is_named):
     assert ("far points" in named(views, np.concatenate([points, far]))) == is_named
 
 
-@pytest.mark.sliced(1, by="is_named")
 @pytest.mark.parametrize(("share", "is_named"), [(0.02, False), (0.12, True), (0.6, True)])
 def test_points_that_no_camera_sees(named, share, is_named):
     views, points = room("forward", 96)

@@ -17,7 +17,6 @@ LAYOUTS = ("orbit", "forward", "outward", "walk")
 procedural_capture = functools.cache(procedural.procedural_capture)
 
 
-@pytest.mark.sliced(1, by="layout")
 @pytest.mark.parametrize("with_points", [True, False])
 @pytest.mark.parametrize(
     ("layout", "size", "count", "height"),
@@ -29,7 +28,6 @@ def test_a_clean_room_gets_no_warning(named, layout, size, count, height, with_p
     assert named(views, points if with_points else None) == {}
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("with_points", [True, False])
 @pytest.mark.parametrize(
     ("size", "count", "height"), [(48, 12, None), (64, 24, None), (80, 36, None), (72, 18, 128)]
@@ -47,7 +45,6 @@ def test_blenders_layout_gets_no_warning(tmp_path):
     assert [f for f in diagnosis.findings if f.severity > Severity.NOTE] == []
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_camera_layout_is_recognised(diagnosed, layout):
     views, points = room(layout, 128)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from browsers import chromium
 from engine.frames import packed, view_of
 from float32_backends import SMALLER
 from gsplat_edu.engine import frame
@@ -23,7 +22,6 @@ from gsplat_edu.render.output import STATISTICS
 from lens_scenes import around, lens_camera
 
 SCRIPT = (Path(__file__).parent / "host.js").read_text()
-FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
 THROUGH_LENSES = {
     name: dataclasses.replace(around(60), camera=lens_camera(name))
     for name in ("radial first", "opencv, moving up", "panorama, moving", "orthographic, moving")
@@ -33,16 +31,15 @@ READS = ("live", "image", "core_grads", "rest_grads", "camera_sums")
 
 
 @pytest.fixture(scope="module")
-def page():
-    with chromium(FLAGS) as browser:
-        one = browser.new_page()
-        one.route(
-            "http://localhost/**",
-            lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"),
-        )
-        one.goto("http://localhost/")  # WebGPU needs a secure context
-        one.add_script_tag(content=SCRIPT)
-        yield one
+def page(browser):
+    one = browser.new_page()
+    one.route(
+        "http://localhost/**",
+        lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"),
+    )
+    one.goto("http://localhost/")  # WebGPU needs a secure context
+    one.add_script_tag(content=SCRIPT)
+    return one
 
 
 def text_of(array):
@@ -94,7 +91,6 @@ def test_a_browser_splits_passes_with_the_same_bits(page, pool):
         np.testing.assert_array_equal(whole[name], split[name])
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("name", ["random", "opaque, tiles stop", "needles 100:1", *THROUGH_LENSES])
 def test_image_and_gradients_in_a_browser(page, pool, name):
     scene, view = (make((SMALLER | THROUGH_LENSES)[name]) for make in (packed, view_of))

@@ -48,7 +48,6 @@ def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkey
     assert not empty_cache.exists()
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     ("file", "right", "wrong", "message"),
     [

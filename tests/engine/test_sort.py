@@ -58,7 +58,6 @@ def test_sort_is_numpy_s_stable_one(device, count, kind):
     np.testing.assert_array_equal(values, order)
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("kind", ["random", "equal", "sorted", "reversed"])
 def test_a_million(device, kind):
     keys = keys_of(kind, 10**6)

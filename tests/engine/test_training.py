@@ -99,7 +99,6 @@ def test_the_same_bits_again_and_after_a_resume(views, tmp_path, strategy):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(0)
 def test_the_sphere_reaches_the_course_s_quality(tmp_path, capsys):
     """The demo's 800 iterations at half its size, which is a minute in software; 0.0088 was measured."""
     assert main(["demo", "--backend", "webgpu", "--size", "64", "--out", str(tmp_path / "sphere.png")]) == 0

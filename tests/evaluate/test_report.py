@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 import gsplat_edu.evaluate.report as report_module
-from browsers import chromium
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, summarize
 from gsplat_edu.evaluate.report import SCRIPT, Picture, Report, machine_facts, verdict, write_report
@@ -207,9 +206,8 @@ def test_the_machine_is_stated_once_and_the_configuration_is_folded(tmp_path):
     assert "Training machine processor <another>" in text and "Evaluation machine" in text
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("width", [1440, 390])
-def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_path, width):
+def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(browser, tmp_path, width):
     scores = [
         score("a_rather_long_folder_name/with_a_photo_0001.jpg", 20.0),
         score('" onload="alert(1)', 30.0),
@@ -218,50 +216,45 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
     config = {"data": {"path": "/a/very/long/path" * 9}}
     metrics = {"test": summarize(scores), "train": summarize(scores), "num_gaussians": 1234567}
     write_report(tmp_path / "r.html", Report("t", metrics, config=config, scores=scores, pictures=pictures))
-    with chromium() as browser:
-        context = browser.new_context(viewport={"width": width, "height": 800}, has_touch=True)
-        tab, complaints = context.new_page(), []
-        tab.on("console", lambda message: complaints.append(message.text))
-        tab.on("dialog", lambda dialog: complaints.append(dialog.message))
-        tab.goto((tmp_path / "r.html").as_uri())
-        assert tab.evaluate("document.documentElement.scrollWidth") <= width
-        tab.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-        assert tab.evaluate("document.documentElement.scrollWidth") <= width
-        # A cell with a number has the height of one line.
-        heights = tab.evaluate(
-            "[...document.querySelectorAll('td.n')].map((e) => e.getClientRects()[0].height)"
-        )
-        lines = tab.evaluate(
-            "[...document.querySelectorAll('td.n')].map((e) => {const r = document.createRange();"
-            " r.selectNodeContents(e); return r.getClientRects().length; })"
-        )
-        assert len(heights) == 22 and set(lines) == {1}
-        at = "getComputedStyle(document.querySelector('.pair')).getPropertyValue('--at')"
-        slider = tab.locator(".pair input").first
-        slider.focus()
-        assert tab.evaluate(at) == "50%"
-        tab.keyboard.press("ArrowRight")
-        assert tab.evaluate(at) == "51%"
-        box = slider.bounding_box()
-        tab.touchscreen.tap(box["x"] + 0.2 * box["width"], box["y"] + 0.5 * box["height"])
-        until(tab, f"Math.abs(parseFloat({at}) - 20) < 4")
-        # The photo (200) is left of the line, the render (150) right of it.
-        shot = np.array(Image.open(io.BytesIO(tab.locator(".pair").first.screenshot())))
-        row = shot[shot.shape[0] // 2, :, 0].astype(int)
-        assert abs(row[int(0.1 * len(row))] - 200) < 4 and abs(row[int(0.6 * len(row))] - 150) < 4
-        assert complaints == []
+    context = browser.new_context(viewport={"width": width, "height": 800}, has_touch=True)
+    tab, complaints = context.new_page(), []
+    tab.on("console", lambda message: complaints.append(message.text))
+    tab.on("dialog", lambda dialog: complaints.append(dialog.message))
+    tab.goto((tmp_path / "r.html").as_uri())
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    tab.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    # A cell with a number has the height of one line.
+    heights = tab.evaluate("[...document.querySelectorAll('td.n')].map((e) => e.getClientRects()[0].height)")
+    lines = tab.evaluate(
+        "[...document.querySelectorAll('td.n')].map((e) => {const r = document.createRange();"
+        " r.selectNodeContents(e); return r.getClientRects().length; })"
+    )
+    assert len(heights) == 22 and set(lines) == {1}
+    at = "getComputedStyle(document.querySelector('.pair')).getPropertyValue('--at')"
+    slider = tab.locator(".pair input").first
+    slider.focus()
+    assert tab.evaluate(at) == "50%"
+    tab.keyboard.press("ArrowRight")
+    assert tab.evaluate(at) == "51%"
+    box = slider.bounding_box()
+    tab.touchscreen.tap(box["x"] + 0.2 * box["width"], box["y"] + 0.5 * box["height"])
+    until(tab, f"Math.abs(parseFloat({at}) - 20) < 4")
+    # The photo (200) is left of the line, the render (150) right of it.
+    shot = np.array(Image.open(io.BytesIO(tab.locator(".pair").first.screenshot())))
+    row = shot[shot.shape[0] // 2, :, 0].astype(int)
+    assert abs(row[int(0.1 * len(row))] - 200) < 4 and abs(row[int(0.6 * len(row))] - 150) < 4
+    assert complaints == []
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_a_report_has_the_colours_of_its_reader(tmp_path, scheme):
+def test_a_report_has_the_colours_of_its_reader(browser, tmp_path, scheme):
     log = [{"iteration": i, "loss": 1 / i, "num_gaussians": i} for i in range(1, 20)]
     write_report(tmp_path / "r.html", Report("t", {}, config={"a": 1}, log=log))
-    with chromium() as browser:
-        tab = browser.new_context(color_scheme=scheme, viewport={"width": 800, "height": 900}).new_page()
-        tab.goto((tmp_path / "r.html").as_uri())
-        curve = np.array(Image.open(io.BytesIO(tab.locator(".curves svg").first.screenshot())).convert("L"))
-        whole = np.array(Image.open(io.BytesIO(tab.screenshot())).convert("L"))
+    tab = browser.new_context(color_scheme=scheme, viewport={"width": 800, "height": 900}).new_page()
+    tab.goto((tmp_path / "r.html").as_uri())
+    curve = np.array(Image.open(io.BytesIO(tab.locator(".curves svg").first.screenshot())).convert("L"))
+    whole = np.array(Image.open(io.BytesIO(tab.screenshot())).convert("L"))
     for shot in (curve, whole):  # most of it is ground, and something is written on it
         assert (np.median(shot) < 60) == (scheme == "dark"), np.median(shot)
         assert (shot > 150).any() and (shot < 100).any()

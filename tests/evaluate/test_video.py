@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from browsers import chromium
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.evaluate.images import write_frames
 from gsplat_edu.evaluate.video import streamable
@@ -127,20 +126,18 @@ def test_data_that_is_not_a_video_is_refused():
             streamable(data)
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize(
     ("height", "width", "sphere"), [(63, 95, False), (720, 1280, False), (64, 128, True)]
 )
-def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width, sphere):
+def test_a_browser_plays_it_in_the_right_colours(browser, tmp_path, height, width, sphere):
     """Chromium does not play MPEG-4 Part 2, and assumes BT.709 for untagged videos of any size."""
     frames = [quarters(height, width, i) for i in range(4)]
     (path,) = write_frames(tmp_path / "v.mp4", frames, fps=10, sphere=sphere)
-    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as browser:
-        tab = browser.new_page()
-        tab.set_content("<video muted playsinline></video>")
-        data = base64.b64encode(path.read_bytes()).decode()
-        expected = [np.roll(COLOURS, i, axis=0).tolist() for i in range(len(frames))]
-        played = tab.evaluate(PLAY, ["video/mp4", data, expected])
+    tab = browser.new_page()
+    tab.set_content("<video muted playsinline></video>")
+    data = base64.b64encode(path.read_bytes()).decode()
+    expected = [np.roll(COLOURS, i, axis=0).tolist() for i in range(len(frames))]
+    played = tab.evaluate(PLAY, ["video/mp4", data, expected])
     assert played["size"] == [width + width % 2, height + height % 2]
     assert played["duration"] == pytest.approx(0.4, abs=0.01) and played["time"] == pytest.approx(
         0.4, abs=0.01

@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-import slices
+import tiers
 from damage import damaged_bytes, damaged_json, damaged_text
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
@@ -14,10 +14,12 @@ from gsplat_edu.data.scale import Scale, write_scale
 from gsplat_edu.data.writers import write_blender, write_colmap, write_transforms
 from gsplat_edu.scene.views import View
 
-CAPTURES = slices.count("GSPLAT_EDU_FUZZ_CAPTURES", 40, 3_000)
+pytestmark = pytest.mark.fuzz
+
+CAPTURES = tiers.count("GSPLAT_EDU_FUZZ_CAPTURES", 40, 3_000)
 """Damaged captures per file."""
 
-SEEDS = range(slices.SEED, slices.SEED + CAPTURES)
+SEEDS = range(tiers.SEED, tiers.SEED + CAPTURES)
 
 MOST_MEMORY = 32 << 20
 """Largest memory that reading may take, bytes; the captures have less than 20 KiB. Photos are excluded, because

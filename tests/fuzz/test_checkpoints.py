@@ -7,15 +7,17 @@ import json
 import numpy as np
 import pytest
 
-import slices
+import tiers
 from checkpoints import Maker, mutate, step
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.train.checkpoint import load_checkpoint, read_seconds, save_checkpoint
 
-MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CHECKPOINTS", 50, 2_000)
+pytestmark = pytest.mark.fuzz
+
+MUTATIONS = tiers.count("GSPLAT_EDU_FUZZ_CHECKPOINTS", 50, 2_000)
 """Damaged checkpoints per strategy."""
 
-SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
+SEEDS = range(tiers.SEED, tiers.SEED + MUTATIONS)
 
 
 def snapshot(trainer):
@@ -27,7 +29,6 @@ def snapshot(trainer):
     return kept, state, json.dumps(numbers), id(trainer.gaussians)
 
 
-@pytest.mark.sliced
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("strategy", ["adc", "mcmc", "fast"])
 def test_damaged_checkpoints(tmp_path, strategy):

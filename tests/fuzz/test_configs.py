@@ -6,7 +6,7 @@ import io
 import numpy as np
 import pytest
 
-import slices
+import tiers
 from damage import damaged_json
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.cli.main import main
@@ -15,10 +15,12 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.source import open_source
 
-MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CONFIGS", 25, 1_000)
+pytestmark = pytest.mark.fuzz
+
+MUTATIONS = tiers.count("GSPLAT_EDU_FUZZ_CONFIGS", 25, 1_000)
 """Number of damaged files."""
 
-SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
+SEEDS = range(tiers.SEED, tiers.SEED + MUTATIONS)
 
 
 def resumed(words):
@@ -29,7 +31,6 @@ def resumed(words):
     return code, stream.buffer.getvalue().decode()
 
 
-@pytest.mark.sliced
 @pytest.mark.usefixtures("as_shipped")
 def test_damaged_configs(tmp_path):
     write_colmap(tmp_path / "egg", *procedural_capture(12, 4, splats=30))

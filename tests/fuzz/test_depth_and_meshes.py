@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import slices
+import tiers
 from damage import damaged_bytes, damaged_json, damaged_text
 from gsplat_edu.base.errors import DatasetError, NotEnoughMemoryError, SceneFormatError
 from gsplat_edu.data.depth_files import read_depth
@@ -21,10 +21,10 @@ from gsplat_edu.scene.mesh import Mesh, Texture
 from processes import Program
 from systems import needs_posix
 
-FILES = slices.count("GSPLAT_EDU_FUZZ", 200, 20_000)
+FILES = tiers.count("GSPLAT_EDU_FUZZ", 200, 20_000)
 """Damaged files per reader."""
 
-SEEDS = range(slices.SEED, slices.SEED + FILES)
+SEEDS = range(tiers.SEED, tiers.SEED + FILES)
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
@@ -41,6 +41,8 @@ from gsplat_edu.base.errors import DatasetError, NotEnoughMemoryError, SceneForm
 from gsplat_edu.data.depth_files import read_depth
 from gsplat_edu.io.mesh_files import read_mesh
 import numpy as np
+
+pytestmark = pytest.mark.fuzz
 
 folder, first, count, whole, *names = sys.argv[1:]
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -66,7 +68,7 @@ print(1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before))
 
 def measured(folder, names=(), whole="", count=0):
     """Read files in a process of their own; return what is said of each, and the bytes of memory."""
-    ended = Program(MEASURED, [folder, slices.SEED, count, whole, *names], folder).ended()
+    ended = Program(MEASURED, [folder, tiers.SEED, count, whole, *names], folder).ended()
     assert ended[0] == 0, ended[2]
     *said, size = ended[1].splitlines()
     return said, int(size)
@@ -136,7 +138,6 @@ def check(read, path, seed):
     assert peak < MOST_MEMORY, f"seed {seed}: {peak:,} bytes"
 
 
-@pytest.mark.sliced
 @pytest.mark.parametrize("name", ["a.npy", "a.npz", "deflated.npz", "a.png", "a.tif", "a.geometric.bin"])
 def test_damaged_depth_maps(tmp_path, name):
     data, path = depth_file(tmp_path, name).read_bytes(), tmp_path / f"damaged{name}"
@@ -145,7 +146,6 @@ def test_damaged_depth_maps(tmp_path, name):
         check(read_depth, path, seed)
 
 
-@pytest.mark.sliced
 def test_damage_inside_an_npz(tmp_path):
     """A zip has checksums, so the damage is done before zipping."""
     data, path = depth_file(tmp_path, "a.npy").read_bytes(), tmp_path / "damaged.npz"
@@ -157,7 +157,6 @@ def test_damage_inside_an_npz(tmp_path):
         check(read_depth, path, seed)
 
 
-@pytest.mark.sliced
 @pytest.mark.parametrize(
     "name", ["a.ply", "various.ply", "text.ply", "a.obj", "textured.obj", "a.glb", "textured.glb"]
 )
@@ -178,7 +177,6 @@ def glb(document, body=b""):
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-@pytest.mark.sliced
 @pytest.mark.parametrize("name", ["a.glb", "textured.glb"])
 def test_damage_inside_the_json_of_a_glb(tmp_path, name):
     data, path = mesh_file(tmp_path, name).read_bytes(), tmp_path / "damaged.glb"
@@ -190,7 +188,6 @@ def test_damage_inside_the_json_of_a_glb(tmp_path, name):
 
 
 @needs_posix
-@pytest.mark.sliced
 def test_damaged_exr(tmp_path):
     exr = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed (extra depth)")
     parts = [

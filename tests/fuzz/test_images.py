@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageCms, TiffImagePlugin
 
-import slices
+import tiers
 from damage import damaged_bytes
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.data.images import decode, decode_mask, image_header, image_orientation, image_size
 from gsplat_edu.sfm.photos import copy_photos, taken_at
 
-IMAGES = slices.count("GSPLAT_EDU_FUZZ_IMAGES", 60, 4_000)
+pytestmark = pytest.mark.fuzz
+
+IMAGES = tiers.count("GSPLAT_EDU_FUZZ_IMAGES", 60, 4_000)
 """Damaged photos per format."""
 
-SEEDS = range(slices.SEED, slices.SEED + IMAGES)
+SEEDS = range(tiers.SEED, tiers.SEED + IMAGES)
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import slices
+import tiers
 from blocks.test_plan import flight, under
 from damage import damaged_json
 from gsplat_edu.base.errors import SplatError
@@ -31,12 +31,12 @@ from gsplat_edu.studio.unpack import ZipLimits, unpack
 from gsplat_edu.train.config import recipe
 from studio.test_uploads import zipped
 
-pytestmark = pytest.mark.sliced  # a soak reads many more records
+pytestmark = pytest.mark.fuzz
 
-RECORDS = slices.count("GSPLAT_EDU_FUZZ_RECORDS", 60, 20_000)
+RECORDS = tiers.count("GSPLAT_EDU_FUZZ_RECORDS", 60, 20_000)
 """Damaged records per reader."""
 
-SEEDS = range(slices.SEED, slices.SEED + RECORDS)
+SEEDS = range(tiers.SEED, tiers.SEED + RECORDS)
 
 
 def each_damage(data):

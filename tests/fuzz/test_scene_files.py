@@ -6,16 +6,18 @@ import zipfile
 import numpy as np
 import pytest
 
-import slices
+import tiers
 from damage import damaged_bytes
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.formats import FORMATS, read_scene
 from scene_files import small_file, small_levels
 
-FILES = slices.count("GSPLAT_EDU_FUZZ", 100, 20_000)
+pytestmark = pytest.mark.fuzz
+
+FILES = tiers.count("GSPLAT_EDU_FUZZ", 100, 20_000)
 """Mutated files per reader."""
 
-SEEDS = range(slices.SEED, slices.SEED + FILES)
+SEEDS = range(tiers.SEED, tiers.SEED + FILES)
 
 MOST_MEMORY = 24 << 20
 """Largest memory that reading may take, bytes. The files have at most 32 KiB; 1 MiB of contents and float32 copies of
@@ -37,7 +39,6 @@ def check(path, seed):
     assert peak < MOST_MEMORY, f"seed {seed}: {peak:,} bytes"
 
 
-@pytest.mark.sliced
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 def test_damaged_files(tmp_path, suffix):
     data = small_file(tmp_path, suffix).read_bytes()
@@ -47,7 +48,6 @@ def test_damaged_files(tmp_path, suffix):
         check(path, seed)
 
 
-@pytest.mark.sliced
 def test_damage_inside_a_sog(tmp_path):
     """A zip has checksums, so the damage is done before zipping."""
     parts = {}
@@ -65,7 +65,6 @@ def test_damage_inside_a_sog(tmp_path):
         check(path, seed)
 
 
-@pytest.mark.sliced
 def test_damage_inside_levels_of_detail(tmp_path):
     """Half of the damage is in the index, the rest in one of the files that it names."""
     whole = small_levels(tmp_path)

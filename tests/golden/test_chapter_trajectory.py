@@ -31,7 +31,7 @@ TOLERANCE = {"torch": 2e-4, "cpu": 1e-3}
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("backend", "iterations"),
-    [("torch", 1), ("cpu", 101), pytest.param("torch", 101, marks=pytest.mark.sliced(0))],
+    [("torch", 1), ("cpu", 101), pytest.param("torch", 101, marks=pytest.mark.soak)],
     ids=["torch", "cpu", "torch, whole"],
 )
 def test_the_first_iterations_give_the_numbers_of_the_chapter(backend, iterations):

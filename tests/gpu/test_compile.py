@@ -14,7 +14,6 @@ SPILLED = 64
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize(("kernels", "count"), [("gaussians", 9), ("lenses", 8), ("pixels", 4), ("loss", 6)])
 @pytest.mark.parametrize("variant", ["least", "most"])
 @pytest.mark.parametrize("capability", [80, 90])

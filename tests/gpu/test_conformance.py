@@ -11,7 +11,6 @@ CASES = {case.name: case for case in run.load_cases()}
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter computes with NumPy, which warns
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.sliced(6)
 def test_the_kernels_pass(device, name):
     renderer = Renderer("cuda", torch.float32)
     report = run.check(renderer.render, renderer.gradients, precision="float32", cases=[CASES[name]])

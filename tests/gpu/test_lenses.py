@@ -45,7 +45,6 @@ def rendered(scene, camera, device):
     )
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", LENSES)
 def test_images_agree_with_the_reference(device, name):
     """Bounds are those of tests/parity/test_lenses.py."""
@@ -63,14 +62,12 @@ def test_images_agree_with_the_reference(device, name):
     assert np.median(np.abs(out.depth.cpu().numpy() - depth)) <= 122 * EPS * max(1.0, depth.max())
 
 
-@pytest.mark.sliced(3)
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", LENSES)
 def test_gradients_match_the_native_kernels_in_float64(check, name, antialiased):
     check(around(60, seed=3), lens_camera(name), dataclasses.replace(SETTINGS, antialiased=antialiased))
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", CLAMPED)
 def test_clamped_gradients_match_the_native_kernels(check, name, monkeypatch):
     scene, camera = around(60, seed=3), lens_camera(name)
@@ -94,7 +91,6 @@ def test_two_runs_give_the_same_bits(device):
         assert all(torch.equal(tensor, other[key]) for key, tensor in ours.items())
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-4, 1e-2, 0.29, 0.31, 0.33, 1.5707, 1.6, 2.5])
 def test_a_fisheye_near_its_axis_and_past_90_degrees(check, angle):
     """Also on both sides of the switch from the series to the closed form, at tan² = 0.1.
@@ -111,7 +107,6 @@ def test_a_fisheye_near_its_axis_and_past_90_degrees(check, angle):
     check(dataclasses.replace(scene, means=rounded), camera, bound=1e-4, but=but)
 
 
-@pytest.mark.sliced(1, by="name")
 @pytest.mark.parametrize("latitude", [70.0, 79.9, 80.1, 88.9, 89.1, 89.9])
 @pytest.mark.parametrize("name", PANORAMAS)
 def test_a_panorama_near_its_poles(check, name, latitude):
@@ -124,7 +119,6 @@ def test_a_panorama_near_its_poles(check, name, latitude):
     check(dataclasses.replace(scene, means=CENTRE + apart * direction @ camera.R), camera)
 
 
-@pytest.mark.sliced(1, by="name")
 @pytest.mark.parametrize("W", [45, 64])
 @pytest.mark.parametrize("name", PANORAMAS)
 def test_the_seam(check, device, name, W):
@@ -169,7 +163,6 @@ def test_coefficients_of_zero_have_a_gradient(device, kind):
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=BOUND * float(found[1].abs().max()))
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("readout", ["down", "up", "left", "right"])
 def test_every_readout(check, readout):
     projection = LENSES["opencv"][0]
@@ -204,7 +197,6 @@ def test_what_moves_too_fast_for_the_shutter_is_not_drawn(device):
     assert len(ours.visible) < len(slow.visible)
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize(("name", "value"), [("means", np.nan), ("means", 1e30), ("log_scales", 60.0)])
 @pytest.mark.parametrize("lens", ["fisheye, moving", "panorama", "orthographic", "opencv"])
 def test_one_bad_gaussian_does_not_affect_others(device, lens, name, value):
@@ -222,7 +214,6 @@ def test_one_bad_gaussian_does_not_affect_others(device, lens, name, value):
         assert torch.equal(torch.cat([tensor.grad[:7], tensor.grad[8:]]), without.tensors()[key].grad), key
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("place", ["at the centre", "at the pole"])
 @pytest.mark.parametrize("lens", ["fisheye", "equidistant", "panorama", "panorama, moving"])
 def test_where_a_lens_has_no_direction(device, lens, place):

@@ -114,7 +114,6 @@ def value_and_gradient(loss, image, target, weight):
     return value.detach().cpu().double(), image.grad.cpu().double()
 
 
-@pytest.mark.sliced(4)
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (19, 23), (33, 48)])
 @pytest.mark.parametrize("kind", ["floats", "bytes", "flat"])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
@@ -143,7 +142,6 @@ def test_a_slightly_wrong_window_exceeds_the_bound(monkeypatch):
     assert ((truth[1] - other[1]).abs() > e_gradient).double().mean() > 0.9
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("weight", [0.0, 0.2])
 def test_results_are_reproducible_and_independent_of_memory_contents(device, weight):
     image, target = (t.to(device) for t in images((19, 23), "bytes"))

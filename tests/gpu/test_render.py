@@ -28,7 +28,6 @@ from gsplat_edu.render.settings import RenderSettings
 from native_scenes import BACKGROUND, random
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", [name for name in SMALLER if name != "ties in depth"])
 def test_images_match_the_reference(device, name):
     scene = SMALLER[name]
@@ -41,7 +40,6 @@ def test_images_match_the_reference(device, name):
     assert np.abs(values["depth"] - truth_depth).max() < 1.1 * max(1.0, truth_depth.max()) / 255
 
 
-@pytest.mark.sliced(3)
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", SMALLER)
 def test_gradients_match_the_native_kernels_in_float64(device, name, antialiased):
@@ -59,7 +57,6 @@ def test_gradients_match_the_native_kernels_in_float64(device, name, antialiased
         assert np.abs(gradients[key] - truth).max() <= parts * bound * np.abs(truth).max(), key
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_lower_sh_degrees(device, degree):
     settings = dataclasses.replace(SETTINGS, sh_degree=degree)
@@ -107,7 +104,6 @@ def test_several_cameras_and_no_depth(device):
     assert torch.equal(stack.image[0], stack.image[1])
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("kind", ["empty", "behind", "faint", "one"])
 def test_almost_empty_scenes(device, kind):
     scene = random(0 if kind == "empty" else 1 if kind == "one" else 9, (17, 33), seed=2)
@@ -126,7 +122,6 @@ def test_almost_empty_scenes(device, kind):
         assert all((t.grad == 0).all() for t in gaussians.tensors().values())
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter computes with NumPy, which warns
 @pytest.mark.parametrize(("name", "value"), POISON)
 def test_one_bad_gaussian_does_not_affect_others(device, name, value):
@@ -192,7 +187,6 @@ def test_a_camera_is_uploaded_once(device):
     assert len(_camera_rows) == before + 1 and rows[0] is rows[1]
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("channels", [1, 3, 7, 32])
 def test_features_and_median_depth_match_the_native_kernels(device, channels):
     """As for colours, the bound is 3e-4 of the largest gradient.

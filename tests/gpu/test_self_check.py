@@ -51,7 +51,6 @@ def test_a_shifted_image_fails(device, empty_cache, monkeypatch):
     assert not empty_cache.exists()
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", rasterize.RAW)
 def test_a_gradient_that_is_one_percent_too_large_fails(device, monkeypatch, name):
     right = rasterize.render_triton

@@ -37,7 +37,6 @@ def with_gradients(camera, means, see):
     return numbers.detach().cpu(), found | {"means": means.grad.cpu().double()}
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     ("name", "limit"), [*((name, None) for name in LENSES), *((name, LIMIT) for name in CLAMPED)]
 )

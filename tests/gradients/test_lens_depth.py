@@ -42,7 +42,6 @@ def samples(camera, gaussians, backend, dtype=torch.float64):
     return places, middle.to(dtype).cpu() * (1 + off), weights
 
 
-@pytest.mark.sliced(1, by="name")
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize(("name", "away"), CASES)

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import slices
+import tiers
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.mesh_files import MESH_FORMATS, mesh_format_of, mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.mesh_glb import linear
 from gsplat_edu.scene.mesh import Mesh, Texture
 
+pytestmark = pytest.mark.fuzz
+
 SUFFIXES = [found.suffix for found in MESH_FORMATS if found.reader]
-SEEDS = range(slices.SEED, slices.SEED + slices.count("GSPLAT_EDU_FUZZ", 150, 20_000))
+SEEDS = range(tiers.SEED, tiers.SEED + tiers.count("GSPLAT_EDU_FUZZ", 150, 20_000))
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 KINDS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 

@@ -42,7 +42,6 @@ def test_every_rung_has_an_oracle():
     assert set(ORACLES) == set(forward.RUNGS)
 
 
-@pytest.mark.sliced(5)
 @pytest.mark.parametrize("rung", ORACLES)
 @pytest.mark.parametrize(("count", "stretch"), [(1, 1.0), (150, 1.0), (150, 8.0), (900, 3.0)])
 def test_a_rung_matches_the_oracle(rung, count, stretch):

@@ -53,7 +53,6 @@ def test_every_instruction_set_takes_the_dilation(isa):
         np.testing.assert_allclose(ours, truth, rtol=0, atol=1e-12)
 
 
-@pytest.mark.sliced(1, by="backend")
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("dilation", [0.0, 0.1, 1.0])
 @pytest.mark.parametrize("backend", ["cpu", "torch"])

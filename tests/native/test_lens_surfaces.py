@@ -155,7 +155,6 @@ def test_the_native_loss_on_patches_is_its_definition(name):
         assert other_one.abs().max() > 1e-4
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", LENSES)
 def test_gradients_of_the_loss_on_patches(name):
     """The loss is smooth where no sample crosses a pixel's border and no patch reaches a bound.

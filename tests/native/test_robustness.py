@@ -231,7 +231,6 @@ def test_several_cameras_give_stacked_views():
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(1, group="memory of a long run")
 def test_memory_does_not_grow():
     """Render scenes of changing size in a new process: after 100 warm-up renders, 300 more may not add 16 MiB.
 

@@ -45,7 +45,6 @@ def tile_lists(dtype, columns, shape):
     return [part.numpy() for part in torch.tensor_split(ids, begin[1:-1])]
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_large_gaussian_is_written_to_the_tiles_that_it_was_counted_in(isa, dtype):
     """Means lie ever closer to columns at which a Gaussian enters or leaves a tile, down to neighbouring numbers.

@@ -2,7 +2,6 @@
 
 import pytest
 
-from browsers import chromium
 from figure_pages import CHAPTERS, NO_ADAPTER, write_pages
 
 
@@ -10,12 +9,6 @@ from figure_pages import CHAPTERS, NO_ADAPTER, write_pages
 def pages(tmp_path_factory):
     """Pages with nothing but the cells that `with_figures` adds, one for each chapter."""
     return write_pages(tmp_path_factory.mktemp("figures"), CHAPTERS)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as launched:
-        yield launched
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from browsers import chromium
+from browsers import GRAPHICS, chromium
 from chapters import ROOT, tool
 from figure_pages import NO_ADAPTER, canvas_box, drag, read_data, state, swipe, tap, told, write_pages
 
@@ -19,8 +19,7 @@ from ladder.tape import autograd_gradients
 from ladder import gpu
 
 CHAPTERS = {"naive": "10_the_naive_kernel", "tiles": "11_tiles", "slots": "12_the_backward_pass"}
-FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
-WAYS = {"webgpu": FLAGS, "javascript": ("--disable-features=WebGPU",)}
+WAYS = {"webgpu": GRAPHICS, "javascript": ("--disable-features=WebGPU",)}
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,6 @@ def test_the_contracts_hold(copy):
     assert "0 broken" in done.stdout
 
 
-@pytest.mark.sliced(4)
 @pytest.mark.parametrize(
     ("file", "line"),
     [

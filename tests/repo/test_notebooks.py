@@ -260,7 +260,6 @@ def test_shipped_notebooks_match_their_source_and_were_executed(source):
     assert not any("(reduced)" in output.get("text", "") for output in outputs), "it has the full budget"
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.slow
 @CHAPTERS
 def test_chapters_execute_on_a_reduced_budget(source, tmp_path):

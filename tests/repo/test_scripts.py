@@ -47,6 +47,7 @@ ELSEWHERE = {
     "module_map.py": "tests/repo/test_docs.py",
     "neon.sh": "Makefile",
     "sanitize.sh": "Makefile",
+    "stress.sh": "Makefile",
     "set_up.sh": "Makefile",
     "site_figures.py": "tests/repo/test_figures.py",
 }
@@ -65,7 +66,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 def run(*words, cwd=ROOT):
     """Run a command without the environment of a make that runs these tests."""
-    own = ("SHARD", "PART", "SMOKE", "BASE", "MAKEFLAGS", "MFLAGS", "GSPLAT_EDU_SHARD", "GSPLAT_EDU_BASE")
+    own = ("PART", "SEED", "SMOKE", "FILES", "ROUNDS", "MAKEFLAGS", "MFLAGS")
     env = {name: value for name, value in os.environ.items() if name not in own}
     return subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, check=False)
 
@@ -76,7 +77,6 @@ def script(path, *words, folder):
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     "path",
     [p.parent if p.name == "__main__.py" else p for p in BENCHMARKS if p.name not in SHARED],
@@ -131,7 +131,7 @@ def test_every_make_target_is_explained_and_run():
     """.ci/run, this file or a test of the same tool runs each target. Targets that take hours are run by hand."""
     explained = run("make", "help").stdout
     ci = (ROOT / ".ci" / "run").read_text()
-    elsewhere = {"help", "clean", "notebooks", "site", "bench", "soak", "wheels"}
+    elsewhere = {"help", "clean", "notebooks", "site", "bench", "soak", "stress", "wheels", "sanitize"}
     for name in targets():
         assert name == "help" or re.search(rf"^make {name} ", explained, re.M), name
         assert name in elsewhere or re.search(rf"^make .*\b{name}\b", ci, re.M), name
@@ -154,32 +154,33 @@ def soak(*settings):
     """Return the commands of `make soak` by its parts."""
     done = run("make", "-n", "soak", *settings)
     assert done.returncode == 0, done.stderr
-    lines = [line for line in done.stdout.splitlines() if "GSPLAT_EDU" in line or "build_notebooks" in line]
+    lines = [line for line in done.stdout.splitlines() if not line.lstrip().startswith("echo")]
     parts = {
-        "cases": "-m sliced",
+        "cases": '-m "soak or fuzz"',
         "sanitize": "sanitize.sh",
         "neon": "neon.sh",
         "chapters": "build_notebooks.py",
+        "wheels": "build_wheels.py",
     }
     return {part: line for part, sign in parts.items() for line in lines if sign in line}
 
 
 def test_make_soak_runs_every_case_and_the_whole_budget():
     commands = soak()
-    assert set(commands) == {"cases", "sanitize", "neon", "chapters"}
+    assert set(commands) == {"cases", "sanitize", "neon", "chapters", "wheels"}
     assert "GSPLAT_EDU_SOAK=1" in commands["cases"] and "GSPLAT_EDU_SOAK=1" in commands["sanitize"]
-    assert "reduced" not in commands["chapters"] and "--shard" not in commands["chapters"]
+    assert "reduced" not in commands["chapters"]
 
 
-def test_make_soak_runs_one_shard_and_the_parts_that_are_named():
-    assert "--shard 3" in soak("SHARD=3")["chapters"]
-    assert set(soak("SHARD=3", "PART=cases sanitize")) == {"cases", "sanitize"}
+def test_make_soak_runs_the_parts_that_are_named():
+    assert set(soak("PART=cases sanitize")) == {"cases", "sanitize"}
 
 
-def test_ci_runs_the_soak_shard_of_the_commit_count_and_leaves_its_cases_out_of_make_test():
-    ci = (ROOT / ".ci" / "run").read_text()
-    assert "\nmake test SHARD=none\n" in ci
-    assert '\nshard=$(.venv/bin/python tests/slices.py)\nmake soak SHARD="$shard" ' in ci
+def test_ci_runs_both_tiers_whole():
+    """Every test belongs to one tier: `make test` deselects what `make test-slow` selects."""
+    tiers = [run("make", "-n", name).stdout for name in ("test", "test-slow")]
+    assert '-m "not slow"' in tiers[0] and "-m slow" in tiers[1] and "sanitize.sh" in tiers[1]
+    assert {"make test", "make test-slow"} <= set((ROOT / ".ci" / "run").read_text().splitlines())
 
 
 def test_make_clean_keeps_the_source(tmp_path):

@@ -15,9 +15,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from browsers import chromium
 from chapters import SOURCES, tool
-from slices import SHARD, SHARDS, SOAK
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "tools"))  # where build_site.py finds its parts
@@ -57,19 +55,10 @@ class Page(HTMLParser):
 def site(tmp_path_factory):
     out = tmp_path_factory.mktemp("built") / "site"
     command = [sys.executable, str(ROOT / "tools" / "build_site.py"), "--out", str(out)]
-    if not SOAK:
-        parts = [path.relative_to(ROOT / "src").with_suffix("").parts for path in MODULES[SHARD::SHARDS]]
-        command += ["--members", *(".".join(words).removesuffix(".__init__") for words in parts)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stdout + done.stderr
     return {path: Page(path.read_text()) for path in sorted(out.rglob("*.html"))}, out
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as launched:
-        yield launched
 
 
 def broken(pages, out):
@@ -88,7 +77,6 @@ def broken(pages, out):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_no_link_is_broken_and_nothing_is_loaded_from_elsewhere(site):
     pages, out = site
     assert broken(pages, out) == []
@@ -98,7 +86,6 @@ def test_no_link_is_broken_and_nothing_is_loaded_from_elsewhere(site):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_every_chapter_document_and_module_has_a_page(site):
     pages, out = site
     names = {str(path.relative_to(out).with_suffix("")) for path in pages}
@@ -111,7 +98,6 @@ def test_every_chapter_document_and_module_has_a_page(site):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_landing_page_shows_pictures_and_three_ways_in(site):
     pages, out = site
     text = (out / "index.html").read_text()
@@ -160,7 +146,6 @@ def overflowing(tab):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_landing_page_shows_a_live_scene_that_keys_turn(site, browser, width, height):
     _, out = site
     assert (out / "_static" / "scene.html").stat().st_size < 700_000
@@ -194,7 +179,6 @@ def test_the_landing_page_shows_a_live_scene_that_keys_turn(site, browser, width
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_wheel_scrolls_the_landing_page_until_the_scene_is_clicked(site, browser):
     _, out = site
     tab = browser.new_page(viewport={"width": 1200, "height": 600})
@@ -212,7 +196,6 @@ def test_the_wheel_scrolls_the_landing_page_until_the_scene_is_clicked(site, bro
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_landing_page_without_scripts_shows_the_still_picture(site, browser):
     _, out = site
     context = browser.new_context(java_script_enabled=False)
@@ -224,7 +207,6 @@ def test_the_landing_page_without_scripts_shows_the_still_picture(site, browser)
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_reference_begins_with_the_public_api_and_links_every_name(site):
     _, out = site
     text = (out / "reference" / "index.html").read_text()
@@ -238,7 +220,6 @@ def test_the_reference_begins_with_the_public_api_and_links_every_name(site):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_set_up_cells_are_folded_and_others_are_not(site):
     _, out = site
     for path in (out / "notebooks").glob("*.html"):
@@ -249,7 +230,6 @@ def test_set_up_cells_are_folded_and_others_are_not(site):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1440, 390])
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_no_line_of_code_is_cut_off(site, width, browser):
     """Code and printed output fit into their box or wrap."""
     _, out = site
@@ -268,7 +248,6 @@ def test_no_line_of_code_is_cut_off(site, width, browser):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1440, 390])
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_pictures_of_chapters_are_whole_and_large_enough_to_read(site, width, browser):
     """A picture that is wider than a phone keeps up to 640 px of its width, and its cell scrolls."""
     _, out = site
@@ -292,7 +271,6 @@ def test_pictures_of_chapters_are_whole_and_large_enough_to_read(site, width, br
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_broken_links_are_found(site, tmp_path):
     texts = {"a": '<a href="b.html#here"><a href="gone.html#x">', "b": '<p id="there"><img src="c.png">'}
     for name, text in texts.items():
@@ -302,7 +280,6 @@ def test_broken_links_are_found(site, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_no_equation_and_no_docstring_is_garbled(site):
     pages, _ = site
     for path, page in pages.items():
@@ -312,7 +289,6 @@ def test_no_equation_and_no_docstring_is_garbled(site):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_every_chapter_says_which_commit_it_was_built_from(site):
     _, out = site
     commit = tool("build_site").built_from()

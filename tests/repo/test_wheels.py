@@ -23,7 +23,6 @@ import nanobind
 import pytest
 
 import gsplat_edu._native
-import touched
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -99,7 +98,6 @@ def run_installed(installed, *words, cwd):
     )
 
 
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
     done = run_installed(installed, "python", "-c", ONLY_INSTALLED, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -112,7 +110,6 @@ def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
     }
 
 
-@pytest.mark.sliced(1, group="built whole", together=True)
 def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
     # this plugin fails the run if it tested another gsplat_edu
     lines = "".join(f"    {line}\n" for line in ONLY_INSTALLED.splitlines())
@@ -134,7 +131,6 @@ def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
 NEWER = {version: path for version, path in build_wheels.pythons().items() if version != "3.11"}
 
 
-@pytest.mark.sliced(1, group="built whole", together=True)
 @pytest.mark.skipif(not NEWER, reason="no Python 3.12 or newer is here, whose headers the stable ABI needs")
 def test_one_abi3_wheel_is_imported_by_every_newer_python(pure, tmp_path):
     """Only nanobind and the bindings depend on Python and are compiled again; other object files are the set-up's."""
@@ -187,6 +183,13 @@ def test_wheels_have_no_modules_that_only_tests_and_benchmarks_use(wheel):
     assert not [name for name, data in fixtures.items() if data in packed]
 
 
+def imports(source, module):
+    """Return whether a Python file imports a module or names of it."""
+    package, _, name = module.rpartition(".")
+    found = rf"(from|import) {re.escape(module)}\b|from {re.escape(package)} import [^\n]*\b{name}\b"
+    return re.search(found, source.read_text()) is not None
+
+
 @pytest.mark.parametrize("room", ["data", "clean"])
 def test_packages_that_had_fixtures_have_only_modules_for_users(room):
     """Each module of these packages is imported by the package, or used in the course or the documents."""
@@ -198,7 +201,7 @@ def test_packages_that_had_fixtures_have_only_modules_for_users(room):
     del modules[package / room / "__init__.py"]
     assert len(modules) > 3
     for path, module in modules.items():
-        users = [source for source in sources if source != path and touched.imports(source, module)]
+        users = [source for source in sources if source != path and imports(source, module)]
         assert users or module in text, f"{module}: only tests use it; move it to tests/fixtures"
 
 

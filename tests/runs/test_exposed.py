@@ -68,7 +68,6 @@ def test_the_vignetting_of_a_photo_is_removed(tmp_path):
 
 
 @pytest.mark.parametrize("appearance", ["none", "exposure", "vignetting"])
-@pytest.mark.sliced(1)
 def test_clean_judges_a_corrected_run_at_its_exposure(tmp_path, appearance, capsys):
     """The photos that judge a run are converted if its training corrected exposures, and only then."""
     views, points, colors = procedural_capture(32, 8, splats=120)

@@ -128,7 +128,6 @@ def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, t
     assert set(RunFolder(tmp_path / "extended").log()[-1]["terms"]) == {"photo", "opacity", "scale"}
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_a_run_is_resumed_with_its_own_strategy_unless_another_is_named(capture, tmp_path, capsys, strategy):
     words, (whole, out) = STRATEGIES[strategy], (tmp_path / "whole", tmp_path / "cut")

@@ -66,7 +66,6 @@ def changed(text: str, name: str, field: str, value: object) -> str:
     return json.dumps(contents) + "\n"
 
 
-@pytest.mark.sliced(8)
 @pytest.mark.parametrize("field", FIELDS)
 def test_a_field_of_the_wrong_type_prints_at_most_one_line(run, capsys, field):
     """Commands either succeed or print one line, and never send an escape code."""

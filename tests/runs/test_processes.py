@@ -124,7 +124,6 @@ def test_processes_with_different_arithmetic_are_refused(name):
 
 
 @pytest.mark.parametrize("size", [2, 4])
-@pytest.mark.sliced(1)
 def test_a_run_of_several_processes_has_the_bytes_of_one(capture, alone, tmp_path, size):
     together(size, lambda team: train(options(capture, tmp_path / "run"), team))
     assert scene(tmp_path / "run") == scene(alone)
@@ -214,7 +213,6 @@ of the next step, so the run cannot end before.
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(1, group="several processes")
 @pytest.mark.parametrize(("size", "victim"), [(2, 0), (2, 1), (4, None), (4, 3)])
 def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
     assert main(["train", str(capture), "--out", str(tmp_path / "alone"), *WORDS]) == 0
@@ -240,7 +238,6 @@ def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tm
     assert ("resuming after" in done.stdout) == (victim is not None), done.stdout
 
 
-@pytest.mark.sliced(1, group="several processes")
 @pytest.mark.own_process
 def test_points_that_one_process_triangulates_start_all(tmp_path):
     pytest.importorskip("pycolmap")
@@ -281,7 +278,6 @@ def test_the_first_process_gives_the_start_points(capture, tmp_path):
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize(
     ("words", "line"),
     [

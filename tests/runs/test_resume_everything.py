@@ -82,7 +82,6 @@ def interrupt(capture, folder, at):
     assert run.trainer.state()[0]["transients.masks"].any(), "the checkpoint has masks"
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("at", [12, 13], ids=["before masks are found anew", "after"])
 def test_the_bits_are_those_of_a_run_without_interruption(capture, whole, tmp_path, at):
     before = torch.get_num_threads()

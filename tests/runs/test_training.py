@@ -177,7 +177,6 @@ def newest(out):
 
 @pytest.mark.slow
 @pytest.mark.own_process
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_killed_at_any_moment_and_resumed_gives_the_same_bytes(capture, whole, tmp_path, strategy):
     """kill -9 before the first checkpoint and at two later moments, alternating between one and two threads."""
@@ -243,7 +242,6 @@ DEATHS = (
 )
 
 
-@pytest.mark.sliced(1, group="runs that are disturbed")
 @pytest.mark.slow
 @pytest.mark.own_process
 def test_a_run_killed_around_the_renaming_of_any_file_resumes(capture, finished, tmp_path):
@@ -453,12 +451,10 @@ def test_a_file_in_place_of_the_run_folder_is_a_one_line_error(capture, tmp_path
     assert capsys.readouterr().err.count("\n") == 2
 
 
-@pytest.mark.sliced(1, by="strategy")
 @pytest.mark.parametrize(
     ("strategy", "cap"),
     [("fast", 200), ("fast", 500), ("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 240)],
 )
-@pytest.mark.sliced(2)
 def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, strategy, cap):
     """The start has more points than the lower cap."""
     options = [*LONG[2:], "--iterations", "150", "--strategy", strategy, "--max-gaussians", str(cap)]

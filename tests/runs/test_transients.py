@@ -44,7 +44,6 @@ class KilledError(Exception):
     pass
 
 
-@pytest.mark.sliced(2, group="resumed with more to learn")
 def test_a_killed_and_resumed_run_writes_the_same_bytes(capture, tmp_path):
     whole = run_of(capture, tmp_path / "whole")
     whole.train()

@@ -8,7 +8,6 @@ from sfm.engine_check import printed
 
 pytestmark = [
     pytest.mark.usefixtures("colmap"),
-    pytest.mark.sliced(1, group="captures from photos", together=True),
 ]
 
 

@@ -132,7 +132,6 @@ def test_a_mask_that_cannot_be_decoded_is_named(tmp_path):
 
 
 @pytest.mark.usefixtures("colmap")
-@pytest.mark.sliced(1, group="captures from photos")
 def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
     """Some photos have a mask, some are transparent at the same place, and one has neither."""
     source, out = tmp_path / "photos", tmp_path / "capture"

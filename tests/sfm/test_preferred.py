@@ -20,7 +20,6 @@ from sfm.engine_check import printed
 
 pytestmark = [
     pytest.mark.usefixtures("colmap"),
-    pytest.mark.sliced(1, group="captures from photos", together=True),
 ]
 
 SOUND, ALL = 26, 40

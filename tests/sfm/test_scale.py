@@ -94,7 +94,6 @@ def at_scale(camera):
 
 
 @pytest.mark.usefixtures("colmap")
-@pytest.mark.sliced(1, group="captures from photos")
 def test_gps_gives_scale_and_up_end_to_end(tmp_path):
     """Photos with GPS, in a world that is tilted relative to the cameras' mean up, give scale to 0.5 % and up to a
     degree. EXIF has hundredths of arc seconds, 0.3 m. The box has 20 m per unit, so the positions spread over 80 m.

@@ -64,7 +64,6 @@ def a_video_becomes_a_scene(tmp_path, _):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(1)
 @pytest.mark.usefixtures("colmap")
 @pytest.mark.parametrize(
     "claim", [a_dozen_photos_train_as_well_as_with_their_true_poses, a_video_becomes_a_scene]

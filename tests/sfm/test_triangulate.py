@@ -28,8 +28,6 @@ from gsplat_edu.sfm.colmap import _listen
 from gsplat_edu.sfm.triangulate import LEAST_POINTS, STAGES, triangulate
 from gsplat_edu.train.config import recipe
 
-pytestmark = pytest.mark.sliced(1, group="reconstructions")
-
 pytest.importorskip("pycolmap")
 
 PATIENCE = 180.0

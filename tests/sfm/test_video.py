@@ -74,7 +74,6 @@ def test_sharp_frames_are_chosen_at_equal_steps_of_motion(walk):
     assert steps.max() < 2 * 1.5 * walk.angles[-1] / 24
 
 
-@pytest.mark.sliced(1, group="captures from photos")
 def test_frames_become_a_capture(walk, colmap, tmp_path):
     said = []
     out = reconstruct(SfmOptions(walk.path, tmp_path / "capture", frames=24), said.append)

@@ -15,7 +15,6 @@ from sfm.textured_box import cameras_of
 
 pytestmark = [
     pytest.mark.usefixtures("colmap"),
-    pytest.mark.sliced(1, group="captures from photos", together=True),
 ]
 
 

@@ -8,7 +8,6 @@ import torch
 from PIL import Image
 from starlette.testclient import TestClient
 
-from browsers import chromium
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
@@ -77,12 +76,6 @@ def picture(form, size=(24, 18), **options):
     pixels = np.random.default_rng(5).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
     Image.fromarray(pixels).save(data, format=form, **options)
     return data.getvalue()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as launched:
-        yield launched
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,6 @@ def check_that_run_and_capture_lead_to_each_other(person):
     person.reach("#/runs/box")
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path):
     """A reload and a second tab show the same screen, and the printed commands give the same bytes."""
     write_colmap(tmp_path / "box", *procedural_capture(24, 14))
@@ -155,7 +154,6 @@ def test_hostile_names_are_text_and_refused_files_say_why(visitor):
     assert tab.locator("img[src=x]").count() == 0
 
 
-@pytest.mark.sliced(0)
 def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
     pytest.importorskip("pycolmap")
     files = []

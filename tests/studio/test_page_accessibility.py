@@ -11,8 +11,6 @@ from studio.pages import until
 from studio.test_page_doctor import examined
 from studio.test_page_watch import at, frame_of, runs
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 __all__ = ["runs"]
 
 SCREENS = {

@@ -2,14 +2,10 @@
 
 import re
 
-import pytest
-
 from accessibility import grave_faults_in_all_styles
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from studio.pages import waiting
-
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
 
 SHOWN = """async (events) => {
   const { Store } = await import("/web/store.js");

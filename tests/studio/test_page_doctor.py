@@ -18,8 +18,6 @@ from processes import Program
 from studio.pages import COMMAND, awaited, until, waiting
 from studio.test_page_watch import at, runs
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 __all__ = ["runs"]
 
 COMMANDS = re.compile(r"gsplat-edu|--[a-z]|/live/|\.json")

@@ -4,8 +4,6 @@ import json
 import re
 import struct
 
-import pytest
-
 from accessibility import grave_faults_in_all_styles
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.formats import read_scene
@@ -57,7 +55,6 @@ def select_and_delete(tab, frame, corners):
     frame.get_by_role("button", name="delete", exact=True).click()
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path):
     person, scene = visitor(), wall_entry
     tab = person.tab
@@ -104,7 +101,6 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     assert f"{len(read_scene(out).gaussians)} of 176 left" in left
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     """Although the page has not yet heard from the library that there are any."""
     person, stored = visitor(), wall_entry / "edits.json"
@@ -131,7 +127,6 @@ def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     stored.unlink()
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_two_saves_at_once_are_no_conflict(visitor, wall_entry):
     """Ctrl S twice, and an edit in between: the second one waits for the first one, and both are stored."""
     person, stored = visitor(), wall_entry / "edits.json"
@@ -167,7 +162,6 @@ def focused(frame):
     return frame.evaluate("document.activeElement.textContent.trim() || document.activeElement.tagName")
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
     person = visitor()
     tab = person.tab
@@ -210,7 +204,6 @@ def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
     until(tab, tab, "document.activeElement.textContent === 'Restore'")
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     """They come back unsaved; if others were saved meanwhile, the person chooses."""
     person, stored = visitor(), wall_entry / "edits.json"
@@ -253,7 +246,6 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     tabs.get_by_role("link", name="Edit", exact=True).wait_for()
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_entry):
     """Like exports; a box switches to the scene as it was, and edits of another scene are named and left out."""
     person, stored = visitor(), wall_entry / "edits.json"
@@ -304,7 +296,6 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     stored.unlink()
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wall_entry):
     """The browser's storage has them; the editor of this scene offers them, that of another does not."""
     person, stored = visitor(), wall_entry / "edits.json"

@@ -83,7 +83,6 @@ def without_search(route):
     route.fulfill(response=answer, json=known)
 
 
-@pytest.mark.sliced(0)
 def test_a_dropped_video_becomes_a_capture(visitor, library, tmp_path):
     pytest.importorskip("pycolmap")
     frames = [photograph_box(camera) for camera in box_orbit(90, 4.5)]

@@ -22,8 +22,6 @@ from studio.pages import COMMAND, until, waiting
 from studio.test_page_doctor import examined
 from studio.test_page_watch import at
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 W, H = 96, 72
 
 

@@ -10,8 +10,6 @@ from gsplat_edu.io.mesh_files import read_mesh, write_mesh
 from gsplat_edu.scene.mesh import Mesh
 from studio.pages import until
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 
 def viewer_frame(tab):
     """Return the frame with the page that shows the mesh, once its address has arrived."""

@@ -2,13 +2,9 @@
 
 import json
 
-import pytest
-
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from studio.pages import DROP, encoded, png, until, visitor_of
-
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
 
 
 def drop(tab, count, seed=0):

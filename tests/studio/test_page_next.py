@@ -12,8 +12,6 @@ from PIL import Image
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from studio.pages import DROP, encoded, until
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 NEXT = re.compile("^Next: ")
 
 SIZES = ((390, 844), (1440, 900))
@@ -82,7 +80,6 @@ def check_access(tab, label):
     assert present.count() == 1
 
 
-@pytest.mark.sliced(0)
 def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tmp_path):
     pytest.importorskip("pycolmap")
     files = []

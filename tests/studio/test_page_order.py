@@ -17,8 +17,6 @@ from gsplat_edu.studio.commands import title_of
 from studio.pages import awaited, held_back, until, visitor_of, waiting
 from studio.test_page_watch import at
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 REVERSED = """async ([first, second]) => {
   const { Store } = await import("/web/store.js");
   const { gallery } = await import("/web/gallery.js");

@@ -96,7 +96,6 @@ def test_the_editor_reports_missing_webgl_in_one_line(visitor, wall_entry):
     assert "\n" not in frame.inner_text("#message")
 
 
-@pytest.mark.sliced(1, group="the studio in a browser")
 def test_a_training_is_drawn_while_it_runs(visitor, library, tmp_path):
     write_colmap(library[0].library.root / "captures" / "egg", *procedural_capture(24, 6, splats=60))
     person = visitor()

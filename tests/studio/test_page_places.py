@@ -12,8 +12,6 @@ from gsplat_edu.scene.views import View
 from studio.pages import until
 from studio.test_page_watch import at
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 STYLES = "viewer.cameras.list.map((_, i) => [...viewer.cameras.styles.slice(8 * viewer.cameras.firsts[i]).slice(0, 3)])"
 """Colour of each camera's lines."""
 

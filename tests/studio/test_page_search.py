@@ -6,8 +6,6 @@ import pytest
 
 from studio.pages import DROP, encoded, png, until
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 PRIMARY = "[...document.querySelectorAll('main .primary')].filter((one) => one.checkVisibility())"
 
 

@@ -13,8 +13,6 @@ from gsplat_edu.runs.source import open_source
 from processes import Program
 from studio.pages import COMMAND, DROP, encoded, png, until
 
-pytestmark = pytest.mark.sliced(1, group="the studio in a browser")
-
 
 @pytest.fixture(scope="module")
 def runs(library, tmp_path_factory):

@@ -369,7 +369,6 @@ def test_zipfile_reads_as_many_entries_as_were_counted(tmp_path, seed):
     assert passed
 
 
-@pytest.mark.sliced(40)
 @pytest.mark.parametrize("seed", range(400))
 def test_damaged_zip_files_end_in_one_line(tmp_path, seed):
     draw = random.Random(seed)

@@ -208,7 +208,6 @@ def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_imag
 
 @pytest.mark.parametrize("name", [*CONFIGS])
 @pytest.mark.parametrize("extra", [{}, {"appearance": "exposure", "refine": "both"}], ids=["plain", "models"])
-@pytest.mark.sliced(2)
 def test_ranks_train_to_the_same_bits(name, extra):
     """The number of Gaussians changes, and with it the range of each rank."""
     settings = config(name, **extra) if not extra else config(name, **extra, random_background=False)
@@ -323,7 +322,6 @@ def test_options_that_contradict_a_batch_are_refused():
         together(3, lambda team: trainer(config(), team))
 
 
-@pytest.mark.sliced(1, group="quality that comes back")
 def test_batches_learn_as_well_from_as_many_images():
     """Batches of 1, 2 and 4 gave 29.5, 29.3 and 29.3 dB; with unscaled rates 29.5, 28.5 and 27.3 dB."""
     views, points, colors = procedural_capture(24, 9, splats=300)

@@ -40,7 +40,6 @@ def steps(run: Trainer, count: int) -> None:
     run.run(lambda: run.iteration >= end)
 
 
-@pytest.mark.sliced(1, by="name")
 @pytest.mark.parametrize("name", CONFIGS)
 @pytest.mark.parametrize("at", [1, 20, 33])
 def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, name, at):

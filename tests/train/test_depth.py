@@ -156,7 +156,6 @@ def error_of(trainer, capture):
     return np.median(np.concatenate(errors))
 
 
-@pytest.mark.sliced(1, group="quality that comes back")
 @pytest.mark.parametrize("sparse", [False, True])
 def test_depth_makes_the_rendered_depth_better(bare, sparse):
     """From points 5 cm off the surface, exact depth lowers the median error by a fifth at least."""

@@ -46,7 +46,6 @@ def fitted(run, views):
     return summarize(scores)["psnr_fitted"]
 
 
-@pytest.mark.sliced(1, group="quality that comes back")
 def test_exposures_are_recovered_and_held_out_quality_with_them(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]
@@ -78,7 +77,6 @@ def test_the_mean_correction_is_the_identity(capture):
 
 
 @pytest.mark.parametrize(("at", "appearance"), [(1, "exposure"), (17, "exposure"), (17, "vignetting")])
-@pytest.mark.sliced(2, group="resumed with more to learn")
 def test_a_resumed_run_has_the_same_bits_for_any_number_of_threads(capture, tmp_path, at, appearance):
     before = torch.get_num_threads()
     try:

@@ -57,7 +57,6 @@ def trained(capture, views, appearance):
     return run
 
 
-@pytest.mark.sliced(1, group="quality that comes back")
 def test_exposures_of_transparent_photos_are_recovered(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]

@@ -338,7 +338,6 @@ def test_any_number_of_threads_gives_the_same_bits(set_threads):
     assert len(run.gaussians) > 120
 
 
-@pytest.mark.sliced(3)
 @pytest.mark.parametrize("stop", [1, 17, 18, 27, 36, 37, 50])
 def test_a_resumed_training_has_the_same_bits(tmp_path, stop):
     """Runs are interrupted in every phase: at each change of the photo size, while growing, and while rates fall."""

@@ -57,7 +57,6 @@ def depth_error_of(gaussians, views):
     return float(np.median(np.concatenate(errors)))
 
 
-@pytest.mark.sliced(1, group="quality that comes back")
 def test_depth_of_held_out_views_becomes_better(room):
     """With maps, the median error of held-out depth is a sixth smaller at least, and photos are hardly worse."""
     plain, guided = run(without_depth(room)), run(room)

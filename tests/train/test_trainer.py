@@ -47,7 +47,6 @@ def set_threads():
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.sliced(1)
 def test_two_runs_give_the_same_bits(set_threads, threads):
     """64 px and chunks of 16 splats are 65,536 numbers per operation, twice as many as torch needs to use threads."""
     set_threads(threads)

@@ -50,7 +50,6 @@ def quality(run, capture):
     return summarize(score_views(run.gaussians, capture[1], render, (0.0, 0.0, 0.0)))["psnr"]
 
 
-@pytest.mark.sliced(1, group="quality that comes back")
 def test_found_masks_recover_most_of_the_quality_of_true_masks(capture):
     lost, ours, best = [], [], []
     for seed in SEEDS:
@@ -87,7 +86,6 @@ def test_a_clean_capture_keeps_every_pixel_and_its_bits(capture):
     ],
     ids=["adc", "mcmc", "exposure", "poses", "backgrounds"],
 )
-@pytest.mark.sliced(1)
 def test_masks_are_found_in_every_recipe(capture, changes):
     struck, truth = pasted(capture[0])
     run = trained(capture, struck, "mask", **{"iterations": 200, **changes})
@@ -97,7 +95,6 @@ def test_masks_are_found_in_every_recipe(capture, changes):
 
 
 @pytest.mark.parametrize("stop", [30, 60, 61, 105])
-@pytest.mark.sliced(1)
 def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, stop):
     """Masks are found before the 31st, 61st, 106th and 151st of 300 steps."""
     struck, _ = pasted(capture[0])
@@ -116,7 +113,6 @@ def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, stop):
 
 
 @pytest.mark.parametrize("threads", [2, 5])
-@pytest.mark.sliced(1)
 def test_the_bits_do_not_depend_on_the_threads(capture, threads):
     struck, _ = pasted(capture[0])
     before, found = torch.get_num_threads(), []

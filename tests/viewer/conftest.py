@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from browsers import chromium
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.source import Source
@@ -16,8 +15,6 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.edit_page import editing_of
 from viewer.handles import until
-
-FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 PIXELS = """async (camera) => {
   const { pixels } = await viewer.setCamera(camera);
@@ -100,12 +97,6 @@ class Visit:
 def picture():
     """Return a function that draws a camera's picture in a tab of any page."""
     return picture_of
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium(FLAGS) as launched:
-        yield launched
 
 
 @pytest.fixture(scope="module")

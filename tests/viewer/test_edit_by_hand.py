@@ -20,8 +20,6 @@ from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 from viewer.handles import touch, until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 
 def wall():
     """A wall of splats at z = 0, so that every click near its middle hits a surface."""

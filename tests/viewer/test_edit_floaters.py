@@ -22,8 +22,6 @@ from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, FLOATERS, EditServer
 from viewer.handles import until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 N = 400
 
 

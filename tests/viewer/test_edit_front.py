@@ -18,8 +18,6 @@ from gsplat_edu.viewer import page
 from gsplat_edu.viewer.edit_page import editing_of
 from viewer.handles import until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 NEAR_WALL, FAR_WALL = 0.0, 0.8
 """z of two walls that face the camera; the far one is larger."""
 

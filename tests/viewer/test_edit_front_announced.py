@@ -1,11 +1,7 @@
 """The editor says that it measures the visible surface of a large scene before it does."""
 
-import pytest
-
 from gsplat_edu.edits.document import parse_edits
 from viewer.handles import until
-
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
 
 WATCH = """() => {
   window.painted = [];

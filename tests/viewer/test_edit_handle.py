@@ -9,8 +9,6 @@ from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.io.scene import Scene
 from viewer.handles import ARROW, RING, Scale, about, drag, shape, touch
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 KEY = 8
 """CSS pixels that an arrow key moves; 1 with Shift."""
 

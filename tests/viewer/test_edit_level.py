@@ -11,8 +11,6 @@ from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.scene.camera import Camera, look_at
 from viewer.handles import until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 TILT = Rotation.from_rotvec((0.2, 0.1, -0.35)).as_matrix()
 """From the level world to the scene's."""
 

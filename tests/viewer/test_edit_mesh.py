@@ -3,13 +3,10 @@
 import json
 
 import numpy as np
-import pytest
 
 from gsplat_edu.scene.mesh import Mesh
 from viewer.handles import Scale, shape, until
 from viewer.test_page_mesh import PART, TURN, ball, drawn, editor_of
-
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
 
 PLACED = "JSON.stringify(viewer.meshes.placed)"
 

@@ -10,8 +10,6 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, look_at
 from viewer.handles import ARROW, RING, Scale, about, drag, shape, touch
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 CHOOSE = """([center, radius]) => {
   editor.perform({ op: "select", how: "replace", by: "sphere", center, radius });
   editor.tools.choose("move");

@@ -22,8 +22,6 @@ from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.edit_page import editing_of
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 SEEDS, SIZE = 20, (360, 240)
 """Number of sequences. Size of the picture, px: small, to take little time; the panel covers the lower part."""
 

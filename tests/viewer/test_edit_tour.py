@@ -8,8 +8,6 @@ from gsplat_edu.edits.apply import views_after
 from gsplat_edu.edits.document import parse_edits
 from viewer.handles import touch, until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 STEPS = [("Door", "Enter <b>here</b>."), ("Bookmark", ""), ("Window", "Second.\nLine."), ("Roof", "The end.")]
 
 

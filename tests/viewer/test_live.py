@@ -149,7 +149,6 @@ def bits(run):
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, repr(numbers)
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_watching_does_not_change_the_bits_of_a_training(capture, tmp_path, strategy, monkeypatch):
     """One training runs without a page, the other with two pages, pictures, pauses and steps."""

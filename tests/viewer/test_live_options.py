@@ -16,7 +16,6 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize(
     ("words", "says"),

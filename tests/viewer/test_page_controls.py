@@ -12,8 +12,6 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from viewer.handles import touch as put_fingers, until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 SIZE = (640, 400)
 MIDDLE = (400, 250)  # right of the panel
 

@@ -43,7 +43,6 @@ def likeness(seen, visit, gaussians, camera, settings):
     return psnr(visit.picture(camera), seen(gaussians, camera, settings).clip(0, 1))
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     "settings",
     [
@@ -148,7 +147,6 @@ def test_no_splat_or_one_splat(show, random_gaussians, camera, count):
         assert likeness(drawn, visit, random_gaussians(count), one, settings) >= ALIKE
 
 
-@pytest.mark.sliced(1, by="antialiased")
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("size", [(0.0, 0.0, 0.0), (-12.0, -12.0, -12.0), (-5.0, -30.0, -30.0)])
 def test_one_black_splat_on_white(show, random_gaussians, camera, size, antialiased):
@@ -188,7 +186,6 @@ def test_a_trained_scene(show):
         assert likeness(drawn, visit, gaussians, one, settings) >= ALIKE
 
 
-@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     ("width", "height", "scale"),
     [

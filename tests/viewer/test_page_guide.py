@@ -15,8 +15,6 @@ from gsplat_edu.viewer import page
 from gsplat_edu.viewer.page_proof import Proof, ShownPhoto
 from viewer.handles import touch, until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 SIZE = (640, 480)
 
 RED = (200, 30, 40)

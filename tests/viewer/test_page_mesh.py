@@ -26,8 +26,6 @@ from gsplat_edu.viewer.edited import edited_meshes
 from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
 from viewer.conftest import described
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 BACKGROUND = (0.2, 0.5, 0.8)
 
 VIEW = Camera(

@@ -5,8 +5,6 @@ import pytest
 
 from gsplat_edu.render.settings import RenderSettings
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 PARTS = """async () => {
   const { renderer } = viewer;
   const sizes = [];

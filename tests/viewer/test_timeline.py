@@ -15,8 +15,6 @@ from gsplat_edu.scene.camera import look_at
 from gsplat_edu.viewer import page
 from viewer.handles import touch, until
 
-pytestmark = pytest.mark.sliced(1, group="the viewer in a browser")
-
 EYES = [(0, 0, -4), (0.5, -0.2, -3.6), (2.5, -0.5, -2), (3, 0, 1)]
 TIMES = (0.0, 1.0, 3.0, 6.0)
 
