@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-PATIENCE = 180_000
-"""Milliseconds that a tab waits by default, long enough for a computer that runs other tests as well."""
+from waiting import PATIENCE
 
 SLOWDOWN = float(os.environ.get("GSPLAT_EDU_SLOW_TABS", "1"))
 """How many times slower the scripts of each new tab run (`make stress`): it finds tests that do not wait for what they
@@ -40,7 +39,7 @@ class Tabs:
     def new_context(self, **options: Any) -> Any:
         """Open a window without cookies or storage; the options are Playwright's."""
         context = self._browser.new_context(**options)
-        context.set_default_timeout(PATIENCE)
+        context.set_default_timeout(1000 * PATIENCE)
         self._contexts.append(context)
         if SLOWDOWN > 1:
             context.on("page", _slow_down)

@@ -3,7 +3,6 @@
 import http.client
 import json
 import threading
-import time
 import urllib.parse
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,9 +16,7 @@ from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import LiveView
 from gsplat_edu.viewer.snapshots import Broadcast
-
-PATIENCE = 180.0
-"""Longest time that a test waits, seconds."""
+from waiting import PATIENCE, until
 
 GROWING = ["--max-gaussians", "600", "--set", "densify_start=5", "densify_every=10"]
 STRATEGIES = {
@@ -36,15 +33,6 @@ STRATEGIES = {
     "mcmc": ["--strategy", "mcmc", "--set", "mcmc_stop=150"],
     "fast": ["--set", "fast_full_size=150", "fast_start_factor=1.5"],
 }
-
-
-def until(true, what):
-    """Wait until a function returns a true value, and return it."""
-    deadline = time.monotonic() + PATIENCE
-    while not (found := true()):
-        assert time.monotonic() < deadline, f"timed out waiting for: {what}"
-        time.sleep(0.01)
-    return found
 
 
 def made_run(capture, out, *words):

@@ -5,7 +5,6 @@ import random
 import shutil
 import signal
 import socket
-import time
 
 import pytest
 
@@ -19,6 +18,7 @@ from gsplat_edu.blocks.status import statuses
 from gsplat_edu.cli.main import main
 from processes import Program
 from tiers import SEED
+from waiting import PATIENCE, until
 
 SCHEDULER = "from distributed.cli.dask_scheduler import main; main()"
 WORKER = "from distributed.cli.dask_worker import main; main()"
@@ -53,9 +53,6 @@ main()
 It waits long enough for a test to kill the scheduler. It does not wait forever: the block of another worker that was
 killed may be waiting for this one.
 """
-
-PATIENCE = 180.0
-"""Longest time that a test waits for an event, seconds."""
 
 
 def scene(folder):
@@ -105,7 +102,7 @@ class Cluster:
             "--dashboard-address",
             "127.0.0.1:0",
         )
-        wait_for(lambda: answers(self.port))
+        until(lambda: answers(self.port))
         return program
 
     def worker(self, passed=None):
@@ -127,13 +124,6 @@ def answers(port):
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def wait_for(condition):
-    until = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < until, "the awaited event did not occur"
-        time.sleep(0.02)
-
-
 def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, serial, tmp_path):
     draw = random.Random(SEED)
     moments = sorted(draw.sample(range(5, 120), 2))  # a whole block is left
@@ -151,10 +141,10 @@ def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, s
         scheduler = cluster.scheduler()
         workers = [cluster.worker(passed), cluster.worker(passed)]
         command = cluster.start(COMMAND, *words, cluster.address)
-        wait_for(lambda: steps() >= moments[0] or not command.runs)
+        until(lambda: steps() >= moments[0] or not command.runs)
         kill(draw.choice(workers))
         cluster.worker(passed)
-        wait_for(lambda: steps() >= moments[1] or not command.runs)
+        until(lambda: steps() >= moments[1] or not command.runs)
         kill(scheduler)
         code, _, err = command.ended()
         assert code == 2, f"moments {moments}: {err}"

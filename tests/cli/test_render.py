@@ -1,6 +1,5 @@
 import json
 import signal
-import time
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from processes import Program
+from waiting import until
 
 
 @pytest.fixture
@@ -142,8 +142,7 @@ def test_an_interrupted_render_leaves_no_temporary_file(made, cli, tmp_path, num
     (folder / ".mine.original.mp4").write_text("a user's own hidden file")
     words = ["render", str(made[2]), "--size", "64", "--out", str(folder / "x.mp4")]
     rendering = Program(program, [*words, "--frames", "3000"], tmp_path)
-    while rendering.runs and not list(folder.glob(".x.*.mp4")):
-        time.sleep(0.05)
+    until(lambda: not rendering.runs or list(folder.glob(".x.*.mp4")))
     rendering.send(number)
     code, _, said = rendering.ended()
     left = {path.name for path in folder.iterdir()} - {".mine.original.mp4"}

@@ -7,13 +7,10 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import gsplat_edu
-
-PATIENCE = 180.0
-"""Longest time that a test waits, seconds."""
+from waiting import PATIENCE, until
 
 BROWSER = """#!{python}
 import html, json, os, re, sys, urllib.request
@@ -45,10 +42,7 @@ def test_the_browser_of_a_studio_gets_a_private_file_that_leads_to_the_page(tmp_
         while b"token=" not in printed or b"\n" not in printed.partition(b"token=")[2]:
             printed += os.read(near, 65536)
         (token,) = re.findall(r"token=(\S+)", printed.decode())
-        end = time.monotonic() + PATIENCE
-        while not out.is_file():
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        until(out.is_file)
         found = json.loads(out.read_text())
         assert found["argv"][1:] == [str(next(private.rglob("*.html")).as_uri())]
         assert not any(token in word for word in found["argv"])

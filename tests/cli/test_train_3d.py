@@ -5,13 +5,13 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
 
 from processes import Program
+from waiting import until
 
 SCRIPT = Path(__file__).parents[2] / "train" / "train_3d.py"
 RUN = """
@@ -74,9 +74,8 @@ def test_an_interrupt_is_one_line_and_exit_code_130(tmp_path):
     out.mkdir()
     words = [SCRIPT, "--iters", 100_000, "--size", 16, "--out", out / "x.png"]
     program, said = Program(RUN, words, tmp_path), tmp_path / "stdout.txt"
-    while not (said.exists() and "\niter " in "\n" + said.read_text()):
-        assert program.runs, program.ended()
-        time.sleep(0.01)
+    until(lambda: not program.runs or (said.exists() and "\niter " in "\n" + said.read_text()))
+    assert program.runs, program.ended()
     program.send(signal.SIGINT)
     code, _, complained = program.ended()
     assert (code, complained) == (130, "train_3d.py: interrupted\n")

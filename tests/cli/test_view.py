@@ -1,5 +1,6 @@
 """`gsplat-edu view`: a real server in its own process, and real requests."""
 
+import contextlib
 import dataclasses
 import os
 import re
@@ -34,9 +35,9 @@ from gsplat_edu.viewer.page_mesh import open_meshes
 from gsplat_edu.viewer.stream import folder_page
 from scene_files import small_levels
 from splats import splats_on
+from waiting import PATIENCE
 
 COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
-PATIENCE = 180.0
 ORIGIN = (512.0, -64.0, 8.0)
 ORANGE = (1.0, 0.5, 0.0)
 
@@ -178,22 +179,24 @@ def test_the_browser_opens_only_on_a_terminal_with_a_screen(made, tmp_path):
         process = subprocess.Popen(
             command, stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, **quiet, **environment}
         )
-        os.close(theirs)
         try:
             printed, deadline = b"", time.monotonic() + PATIENCE
             while b"press Ctrl-C to stop" not in printed:
                 assert select.select([ours], [], [], deadline - time.monotonic())[0], printed
                 printed += os.read(ours, 1 << 16)
-            until = time.monotonic() + (PATIENCE if not words and not environment else 1.0)
-            while not noted.exists() and time.monotonic() < until:
-                time.sleep(0.02)
+            url = re.search(rb"http://\S+", printed)[0].decode()
+            with urllib.request.urlopen(url, timeout=PATIENCE):
+                pass  # whatever is opened has been opened
             process.send_signal(signal.SIGINT)
             assert process.wait(PATIENCE) == 0
+            os.close(theirs)
+            with contextlib.suppress(OSError):  # once the command and the browser have closed the terminal
+                while os.read(ours, 1 << 16):
+                    pass
         finally:
             process.kill()
             process.wait()
             os.close(ours)
-        url = re.search(rb"http://\S+", printed)[0].decode()
         return noted.exists() and noted.read_text().strip() == url
 
     assert opened()

@@ -5,16 +5,15 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import urllib.request
 
 import pytest
 
 import gsplat_edu.cli.main as command_line
 from viewer.captures import ring
+from waiting import PATIENCE, until
 
 COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
-PATIENCE = 180.0
 
 
 @pytest.mark.own_process
@@ -36,10 +35,7 @@ def test_a_capture_is_served_with_its_photos_and_findings(tmp_path):
             f"{url}thumbs/images/view_003.png{token}&side=128", timeout=PATIENCE
         ).read()
         assert photo[:2] == b"\xff\xd8"
-        end = time.monotonic() + PATIENCE
-        while not json.load(urllib.request.urlopen(f"{url}findings{token}", timeout=PATIENCE))["done"]:
-            assert time.monotonic() < end
-            time.sleep(0.1)
+        until(lambda: json.load(urllib.request.urlopen(f"{url}findings{token}", timeout=PATIENCE))["done"])
         process.send_signal(signal.SIGINT)
         rest, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, rest, complaints) == (0, "ended\n", "")

@@ -2,7 +2,6 @@
 
 import signal
 import sys
-import time
 
 import pytest
 
@@ -11,6 +10,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import Rendered, State, Work
+from waiting import until
 
 pytestmark = [
     pytest.mark.own_process,
@@ -40,13 +40,6 @@ sys.meta_path.insert(0, Waits())
 runpy.run_module("gsplat_edu", run_name="__main__", alter_sys=True)
 """
 """The command line, which waits for a signal in the import of one of its modules."""
-
-
-def until(condition, patience=180.0):
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end, "the awaited state did not occur"
-        time.sleep(0.02)
 
 
 @pytest.fixture(params=[signal.default_int_handler, signal.SIG_IGN], ids=["terminal", "background"])

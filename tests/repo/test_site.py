@@ -8,7 +8,6 @@ import math
 import re
 import subprocess
 import sys
-import time
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -16,6 +15,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from chapters import SOURCES, tool
+from waiting import until, until_in
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "tools"))  # where build_site.py finds its parts
@@ -111,23 +111,11 @@ def test_the_landing_page_shows_pictures_and_three_ways_in(site):
     assert "docs/decisions/index.html" in shown and "reference/index.html" in shown
 
 
-PATIENCE = 180_000
-"""Milliseconds that a test waits for the scene: a processor that other work keeps busy draws in place of a GPU."""
-
-
-def until(condition):
-    """Wait for a condition. The page's policy forbids the `eval` that the browser's own waiting needs."""
-    ends = time.monotonic() + PATIENCE / 1000
-    while not condition():
-        assert time.monotonic() < ends
-        time.sleep(0.05)
-
-
 def live_scene(tab):
     """Return the frame of the scene in an open landing page, once it has drawn all splats."""
-    tab.wait_for_selector(".live #scene iframe", timeout=PATIENCE)
+    tab.wait_for_selector(".live #scene iframe")
     scene = tab.locator("#scene iframe").element_handle().content_frame()
-    until(lambda: scene.evaluate("Boolean(window.viewer?.isWhole)"))
+    until_in(tab, scene, "Boolean(window.viewer?.isWhole)")
     return scene
 
 

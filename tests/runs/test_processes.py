@@ -26,6 +26,7 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.team import ALONE
 from ranks import together
+from waiting import PATIENCE
 
 
 @pytest.fixture(scope="module")
@@ -169,9 +170,6 @@ def test_processes_with_different_captures_are_refused(capture, tmp_path):
     with pytest.raises(SplatError, match="the processes have to start alike: "):
         together(2, work)
 
-
-PATIENCE = 600.0
-"""Longest time that a test waits for processes which each import torch, seconds."""
 
 WORDS = (
     "--batch",

@@ -6,7 +6,6 @@ import json
 import math
 import signal
 import tempfile
-import time
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.training import CaptureRun
 from processes import Program
+from waiting import until
 
 SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--set", "densify_start=5"]
 SHORT += ["--set", "densify_every=10"]
@@ -156,12 +156,9 @@ def whole(capture, tmp_path_factory):
     return run
 
 
-def wait_for(condition, program, patience=300.0):
-    end = time.monotonic() + patience
-    while not condition():
-        assert program.runs, "the run ended before it could be killed"
-        assert time.monotonic() < end
-        time.sleep(0.001)
+def wait_for(condition, program):
+    until(lambda: not program.runs or condition())
+    assert condition(), "the run ended before it could be killed"
 
 
 def checkpoints(out):

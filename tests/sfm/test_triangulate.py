@@ -27,11 +27,10 @@ from gsplat_edu.sfm import colmap
 from gsplat_edu.sfm.colmap import _listen
 from gsplat_edu.sfm.triangulate import LEAST_POINTS, STAGES, triangulate
 from gsplat_edu.train.config import recipe
+from waiting import PATIENCE
 
 pytest.importorskip("pycolmap")
 
-PATIENCE = 180.0
-"""Longest time that a test waits, seconds."""
 
 GIVEN = [
     "--strategy",

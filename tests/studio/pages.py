@@ -7,18 +7,16 @@ import re
 import shlex
 import socket
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Error
 
-from browsers import PATIENCE
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.server import _config, _Server
 from gsplat_edu.studio.state import Studio
 from processes import Program
+from waiting import PATIENCE, awaited
 
 TOKEN = "a-token"
 
@@ -69,12 +67,12 @@ def served(folder, worker, limits=None):
         server = _Server(_config(app), ready.set, studio.stream.close)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]})
         thread.start()
-        assert ready.wait(PATIENCE / 1000)
+        assert ready.wait(PATIENCE)
         try:
             yield studio, f"http://127.0.0.1:{port}/?token={TOKEN}"
         finally:
             server.should_exit = True
-            thread.join(PATIENCE / 1000)
+            thread.join(PATIENCE)
             studio.close()
 
 
@@ -99,12 +97,9 @@ class Visitor:
         """The part of the address that names the screen."""
         return self.tab.evaluate("location.hash")
 
-    def reach(self, place, patience=PATIENCE / 1000):
+    def reach(self, place):
         """Wait until the page shows a screen."""
-        end = time.monotonic() + patience
-        while self.place() != place:
-            assert time.monotonic() < end, (self.place(), self.tab.inner_text("main"))
-            self.tab.wait_for_timeout(30)
+        awaited(self.tab, lambda: self.place() == place, place)
 
     def shift(self):
         """Cumulative layout shift since the page was loaded."""
@@ -113,33 +108,6 @@ class Visitor:
     def command(self, job):
         """Return the printed command of a job's card, by the job's title."""
         return self.tab.get_by_role("article", name=job).get_by_role("textbox", name="command").inner_text()
-
-
-def until(tab, frame, condition, patience=PATIENCE / 1000):
-    """Wait until an expression is true in a frame. Playwright's function needs eval, which our policies forbid."""
-    end = time.monotonic() + patience
-    while not _holds(frame, condition):
-        assert time.monotonic() < end, condition
-        tab.wait_for_timeout(50)
-
-
-def _holds(frame, condition):
-    """Evaluate the expression; false in a frame that is navigating."""
-    try:
-        return frame.evaluate(condition)
-    except Error as error:
-        if "navigation" not in str(error):
-            raise
-        return False
-
-
-def awaited(tab, condition, patience=PATIENCE / 1000):
-    """Let a tab and its routes go on until a condition of the test's process holds; return its value."""
-    end = time.monotonic() + patience
-    while not (found := condition()):
-        assert time.monotonic() < end, "the awaited state did not occur"
-        tab.wait_for_timeout(20)
-    return found
 
 
 def held_back(tab, address, of=lambda request: True):

@@ -1,7 +1,6 @@
 """Requests become command lines that the command line accepts; other requests are refused."""
 
 import argparse
-import time
 
 import pytest
 
@@ -19,6 +18,7 @@ from gsplat_edu.studio.command_options import (
 from gsplat_edu.studio.commands import command_line, subject_of, title_of, work_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.refusal import RefusedError
+from waiting import until
 
 
 @pytest.fixture
@@ -393,10 +393,7 @@ def test_a_training_and_jobs_that_read_its_run_wait_for_each_other(page, studio)
         return [[(other["job"], other["place"]) for other in job["waits_for"]] for job in found]
 
     expected = [[], [("000001", "runs/r")], [("000002", "runs/r")], [("000002", "runs/r")], []]
-    end = time.monotonic() + 120
-    while waits() != expected:
-        assert time.monotonic() < end, waits()
-        time.sleep(0.02)
+    until(lambda: waits() == expected)
 
 
 def test_two_jobs_do_not_write_to_one_place(page, studio):

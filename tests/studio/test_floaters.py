@@ -1,15 +1,12 @@
 """The studio proposes splats to delete for its editor: one scene at a time, and only to its own page."""
 
-import time
-
 import pytest
 import torch
 
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
-
-PATIENCE = 120.0
+from waiting import PATIENCE, until
 
 
 @pytest.fixture
@@ -32,10 +29,8 @@ def scenes(studio):
 
 def ended(page, address):
     """Wait until a judgement has ended, and return its state."""
-    until = time.monotonic() + PATIENCE
-    while (state := page.get(address).json())["state"] == "running" and time.monotonic() < until:
-        time.sleep(0.05)
-    return state
+    until(lambda: page.get(address).json()["state"] != "running")
+    return page.get(address).json()
 
 
 def test_a_scene_is_judged_on_request_one_at_a_time_until_it_changes(page, studio, scenes):

@@ -9,7 +9,6 @@ import re
 import signal
 import socket
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -21,11 +20,9 @@ from gsplat_edu.studio.adopted import note_adopted
 from studio.conftest import Inline
 from studio.pages import Visitor, served
 from studio.test_server import Server
+from waiting import PATIENCE, until
 
 LONG = "x" * 5_000
-
-PATIENCE = 120.0
-"""Longest time that a test waits, seconds."""
 
 
 def work(command, inputs, outputs=(), **options):
@@ -223,12 +220,9 @@ def test_a_strangers_library_runs_nothing_until_a_click_that_shows_what(tmp_path
             assert state == "S"  # the process was not stopped either
             # a click runs exactly the command that was shown
             assert server.client.post("/api/jobs/000031/resume").json()["state"] == "queued"
-            end = time.monotonic() + PATIENCE
             # until it executes its program, a forked child has the server's command line
-            while not (found := children(server.process.pid)) or " studio " in found[0]:
-                assert time.monotonic() < end
-                time.sleep(0.01)
-            (child,) = found
+            until(lambda: (found := children(server.process.pid)) and " studio " not in found[0])
+            (child,) = children(server.process.pid)
             assert child.split(" ", 3)[3] == f"doctor {library}/captures/box --no-forecast "
             server.client.post("/api/jobs/000031/cancel")
         finally:

@@ -2,8 +2,6 @@
 
 import json
 import os
-import threading
-import time
 
 import pytest
 
@@ -12,6 +10,7 @@ from gsplat_edu.jobs.process import identity
 from gsplat_edu.jobs.record import Job, State
 from gsplat_edu.studio import live_routes
 from gsplat_edu.viewer.live_folder import LiveFolder, framed
+from waiting import PATIENCE
 
 STATE = {"state": "training", "iteration": 30, "scene": 30}
 
@@ -54,16 +53,19 @@ def test_requests_wait_for_a_new_state(page, training, monkeypatch):
     training.write(training.state, STATE)
     version = page.get("/api/runs/r/live/state").json()["version"]
     assert page.get(f"/api/runs/r/live/state?after={version}").status_code == 204
-    monkeypatch.setattr(live_routes, "WAIT", 20.0)
+    monkeypatch.setattr(live_routes, "WAIT", PATIENCE)
+    look, looks = live_routes._new_state, []
 
-    def later():
-        time.sleep(0.2)
-        training.write(training.state, {**STATE, "iteration": 31})
+    def later(*found):
+        """Write the next state once the first look has found none."""
+        looks.append(look(*found))
+        if len(looks) == 1:
+            training.write(training.state, {**STATE, "iteration": 31})
+        return looks[-1]
 
-    thread = threading.Thread(target=later)
-    thread.start()
+    monkeypatch.setattr(live_routes, "_new_state", later)
     assert page.get(f"/api/runs/r/live/state?after={version}").json()["iteration"] == 31
-    thread.join()
+    assert looks[0] is None and len(looks) == 2
 
 
 def test_pausing_the_view_pauses_the_job(page, studio, training):

@@ -10,7 +10,8 @@ from PIL import Image
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap
-from studio.pages import DROP, encoded, png, repeated, train_and_download, until, visitor_of
+from studio.pages import DROP, encoded, png, repeated, train_and_download, visitor_of
+from waiting import until_in
 
 HOSTILE = "<img src=x onerror=hacked=1>"
 
@@ -175,7 +176,7 @@ def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
     found = re.compile(r"14 of 14 photos have a pose, mean error \d\.\d\d px")
     tab.locator(".next", has_text=found).wait_for()
     onward.click()
-    until(tab, tab, "location.hash.startsWith('#/captures/')")
+    until_in(tab, tab, "location.hash.startsWith('#/captures/')")
     name = re.fullmatch("#/captures/(.+)", person.place())[1]
     tab.locator("main h1", has_text=name).wait_for()
     tab.locator(".head .facts", has_text=found).wait_for()

@@ -7,9 +7,9 @@ import pytest
 from accessibility import grave_faults, grave_faults_in_all_styles
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from studio.pages import until
 from studio.test_page_doctor import examined
 from studio.test_page_watch import at, frame_of, runs
+from waiting import until_in
 
 __all__ = ["runs"]
 
@@ -58,7 +58,7 @@ def test_the_dialog_that_draws_a_mask(visitor, library):
     tab.get_by_role("button", name="Mask this: images/view_001.png").click()
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
-    until(tab, tab, "document.activeElement === document.querySelector('dialog.mask svg')")
+    until_in(tab, tab, "document.activeElement === document.querySelector('dialog.mask svg')")
     for key in ("Enter", "ArrowRight", "ArrowDown", "Enter"):
         tab.keyboard.press(key)
     assert grave_faults_in_all_styles(tab) == []

@@ -15,8 +15,9 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import ACTIVE, JobFolder
 from gsplat_edu.scene.views import View
 from processes import Program
-from studio.pages import COMMAND, awaited, until, waiting
+from studio.pages import COMMAND, waiting
 from studio.test_page_watch import at, runs
+from waiting import awaited, settle, until_in
 
 __all__ = ["runs"]
 
@@ -92,13 +93,14 @@ def test_a_press_counts_although_the_page_changes_meanwhile(visitor, library, ju
     begin = examined(tab).get_by_role("button", name="Train with exposure correction").first
     begin.hover()
     begin.focus()
-    held, heard = begin.element_handle(), []
+    held, heard, asked = begin.element_handle(), [], []
     tab.on("response", lambda answer: heard.append(answer.url.rpartition("/")[2]))
+    tab.on("request", lambda request: asked.append(request.url.rpartition("/")[2]))
     tab.mouse.down() if by == "mouse" else tab.keyboard.down(" ")
     other.get_by_role("button", name="Leave out").first.click()
     awaited(tab, lambda: "library" in heard)
-    tab.wait_for_timeout(1000)  # in which the page would ask for the findings, and show them
-    assert "findings" not in heard and held.evaluate("(button) => button.isConnected")
+    settle(tab)  # the page would ask for the findings at once
+    assert "findings" not in asked and held.evaluate("(button) => button.isConnected")
     with waiting(library[0]):
         tab.mouse.up() if by == "mouse" else tab.keyboard.up(" ")
         tab.wait_for_url(re.compile(f"#/runs/{jumping}"))
@@ -244,7 +246,7 @@ def test_findings_that_are_shown_anew_keep_the_focus_and_what_was_unfolded(visit
     leave.focus()
     tab.keyboard.press("Enter")
     part.get_by_text("This has changed since the doctor looked").wait_for()
-    until(tab, tab, f"document.activeElement.getAttribute('aria-label') === 'Use again {photo}'")
+    until_in(tab, tab, f"document.activeElement.getAttribute('aria-label') === 'Use again {photo}'")
     assert part.locator("details table").is_visible()
 
 

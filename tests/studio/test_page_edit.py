@@ -7,7 +7,8 @@ import struct
 from accessibility import grave_faults_in_all_styles
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.formats import read_scene
-from studio.pages import until, visitor_of
+from studio.pages import visitor_of
+from waiting import awaited, pass_time, until_in
 
 
 def opened(tab, address):
@@ -16,7 +17,7 @@ def opened(tab, address):
     # by its title, because the screen before this one may have had a scene as well
     frame = tab.wait_for_selector("iframe[title='editor of wall']:not([hidden])").content_frame()
     frame.wait_for_selector("#edit")
-    until(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
+    until_in(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
     return frame
 
 
@@ -113,7 +114,7 @@ def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     frame = opened(tab, address)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
     tab.evaluate("hold()")
-    until(tab, tab, "unanswered === 0")  # an answer on its way would tell of the edits
+    until_in(tab, tab, "unanswered === 0")  # an answer on its way would tell of the edits
     frame.get_by_role("button", name="save", exact=True).click()
     frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
     shares(tab)
@@ -144,11 +145,7 @@ def test_two_saves_at_once_are_no_conflict(visitor, wall_entry):
     frame.get_by_role("button", name="invert", exact=True).click()
     save.click()
     for count in (1, 2):
-        for _ in range(9000):
-            if len(held) >= count:
-                break
-            tab.wait_for_timeout(20)
-        assert len(held) == count
+        awaited(tab, lambda count=count: len(held) == count)
         held[-1].continue_()
     frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
     assert frame.inner_text("#edit-message") == ""
@@ -195,13 +192,13 @@ def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
     tab.get_by_role("button", name="Restore").nth(1).wait_for()
     tab.get_by_role("button", name="Restore").first.focus()
     tab.keyboard.press("Enter")
-    until(tab, tab, "document.querySelectorAll('main li').length === 1")
-    until(tab, tab, "document.activeElement.textContent === 'Restore'")
+    until_in(tab, tab, "document.querySelectorAll('main li').length === 1")
+    until_in(tab, tab, "document.activeElement.textContent === 'Restore'")
     tab.keyboard.press("?")
-    until(tab, tab, "document.getElementById('keys').open")
+    until_in(tab, tab, "document.getElementById('keys').open")
     tab.keyboard.press("Escape")
     # the element that had the focus before the list of keys
-    until(tab, tab, "document.activeElement.textContent === 'Restore'")
+    until_in(tab, tab, "document.activeElement.textContent === 'Restore'")
 
 
 def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
@@ -256,7 +253,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     tab.goto(f"{address}#/")
     card = tab.locator("a.card", has_text="wall").locator("img")
     tab.locator("a.card", has_text="wall").scroll_into_view_if_needed()
-    until(tab, tab, "document.querySelector('a.card[href*=wall] img').naturalWidth > 0")
+    until_in(tab, tab, "document.querySelector('a.card[href*=wall] img').naturalWidth > 0")
     before = card.get_attribute("src")
     frame = opened(tab, address)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
@@ -265,7 +262,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
 
     def shows(count):
-        until(
+        until_in(
             tab,
             tab,
             f"document.querySelector('.scene iframe')?.contentWindow?.viewer?.facts.count === {count}",
@@ -280,7 +277,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     shows(left)
     tab.get_by_role("link", name="Library", exact=True).click()
     tab.locator("a.card", has_text="wall").scroll_into_view_if_needed()
-    until(
+    until_in(
         tab,
         tab,
         f"document.querySelector('a.card[href*=wall] img').naturalWidth > 0 && {before!r} !== "
@@ -308,29 +305,33 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
         tab.set_viewport_size({"width": 1000, "height": 620})
         frame = opened(tab, address)
         select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
-        until(tab, tab, "localStorage.length === 1")
+        until_in(tab, tab, "localStorage.length === 1")
         tab.evaluate("for (let i = 0; i < 10000; ++i) clearInterval(i)")
         frame.get_by_role("button", name="invert", exact=True).click()
         left = frame.inner_text("#edit-count")
         tab.goto("about:blank")  # a page that goes writes down what has changed since the last look
-        until(person.tab, person.tab, "Object.values(localStorage).some((text) => text.includes('invert'))")
+        until_in(
+            person.tab, person.tab, "Object.values(localStorage).some((text) => text.includes('invert'))"
+        )
         tab.close()
         return left
 
     left = closed_with_edits()
     tab = person.tab
+    tab.clock.install()
+    tab.reload()
     frame = opened(tab, address)
     notice = tab.get_by_text(re.compile(r"There are unsaved changes from .*\d:\d\d"))
     notice.wait_for()
     assert "176 of 176 left" in frame.inner_text("#edit-count")
     assert grave_faults_in_all_styles(tab) == []
-    tab.wait_for_timeout(1500)  # the offer outlasts the looks at what is not saved
+    pass_time(tab, 1500)  # the offer outlasts the looks at what is not saved
     tab.get_by_role("button", name="Restore").click()
     assert frame.inner_text("#edit-count") == left and frame.inner_text("#edit-saved") == "not saved"
-    until(tab, tab, "localStorage.length === 1")
+    until_in(tab, tab, "localStorage.length === 1")
     frame.get_by_role("button", name="save", exact=True).click()
     frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
-    until(tab, tab, "localStorage.length === 0")
+    until_in(tab, tab, "localStorage.length === 0")
 
     stored.unlink()
     tab.goto(f"{address}#/")
@@ -343,13 +344,13 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
     (other / "other.ply").write_bytes(scene[:-32] + opacity + scene[-28:])
     tab.goto(f"{address}#/scenes/other/edit")
     frame = tab.wait_for_selector("iframe[title='editor of other']:not([hidden])").content_frame()
-    until(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
-    tab.wait_for_timeout(1500)
+    until_in(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
+    pass_time(tab, 1500)
     assert not notice.is_visible()
     opened(tab, address)
     tab.get_by_role("button", name="Forget").click()
-    until(tab, tab, "localStorage.length === 0")
+    until_in(tab, tab, "localStorage.length === 0")
     tab.reload()
     opened(tab, address)
-    tab.wait_for_timeout(1000)
+    pass_time(tab, 1500)
     assert not notice.is_visible()

@@ -18,9 +18,10 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import Work
 from gsplat_edu.scene.views import View
 from processes import Program
-from studio.pages import COMMAND, until, waiting
+from studio.pages import COMMAND, waiting
 from studio.test_page_doctor import examined
 from studio.test_page_watch import at
+from waiting import until_in
 
 W, H = 96, 72
 
@@ -53,8 +54,8 @@ def opened(tab, photo):
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
     sheet = dialog.locator("svg")
-    until(tab, tab, "document.activeElement === document.querySelector('dialog.mask svg')")
-    until(tab, tab, "document.querySelector('.sheet img').complete")
+    until_in(tab, tab, "document.activeElement === document.querySelector('dialog.mask svg')")
+    until_in(tab, tab, "document.querySelector('.sheet img').complete")
     return dialog, sheet.bounding_box()
 
 
@@ -164,7 +165,7 @@ def test_a_brush_paints_beside_the_photo_too_and_a_command_repeats_it(visitor, c
     dialog.get_by_text("2 shapes, not saved").wait_for()
     assert dialog.locator(".strokes:not(.trace) path").count() == 2
     tab.mouse.move(1, 1)
-    until(tab, tab, "document.querySelector('.tip').style.display === 'none'")
+    until_in(tab, tab, "document.querySelector('.tip').style.display === 'none'")
     command = saved(dialog)
     tap, stroke = read_drawings(capture)["images/view_002.png"].shapes
     assert tap == BrushStroke(2, (20, 30)) and stroke.radius == 4 and max(stroke.points[::2]) > W
@@ -251,7 +252,7 @@ def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swa
     part.get_by_role("button", name="Mask this: view_005.png").first.click()
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
-    until(tab, tab, "document.querySelector('.sheet img').complete")
+    until_in(tab, tab, "document.querySelector('.sheet img').complete")
     drag(tab, dialog.locator("svg").bounding_box(), (10, 10), (80, 60))
     saved(dialog)
     dialog.get_by_role("button", name="Close").click()

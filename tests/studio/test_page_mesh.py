@@ -8,7 +8,7 @@ import pytest
 
 from gsplat_edu.io.mesh_files import read_mesh, write_mesh
 from gsplat_edu.scene.mesh import Mesh
-from studio.pages import until
+from waiting import until_in
 
 
 def viewer_frame(tab):
@@ -43,12 +43,12 @@ def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library,
     section.get_by_role("article", name="mesh of wall").wait_for()
     show.click()
     frame = viewer_frame(tab)
-    until(tab, frame, "window.viewer?.meshes && document.getElementById('message').hidden")
+    until_in(tab, frame, "window.viewer?.meshes && document.getElementById('message').hidden")
     mesh = read_mesh(wall_entry / "exports" / "wall.mesh.glb")
     assert 50 < len(mesh.faces) < 50_000
     assert frame.evaluate("viewer.meshes.surface.faces.length") == mesh.faces.size
     assert frame.evaluate("viewer.meshes.collider.faces.length") == 3
-    until(tab, frame, "document.getElementById('mesh-line').checkVisibility()")
+    until_in(tab, frame, "document.getElementById('mesh-line').checkVisibility()")
 
     item = tab.locator(".exports li", has_text="wall.mesh.glb")
     with tab.expect_download() as download:

@@ -4,7 +4,8 @@ import json
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from studio.pages import DROP, encoded, png, until, visitor_of
+from studio.pages import DROP, encoded, png, visitor_of
+from waiting import until_in
 
 
 def drop(tab, count, seed=0):
@@ -26,7 +27,7 @@ def test_a_stale_tab_makes_a_set_of_its_own(visitor, library):
     drop(first.tab, 2, seed=1)
     first.reach("#/photos/photos")
     drop(stale, 3, seed=2)
-    until(stale, stale, "location.hash.startsWith('#/photos/')")
+    until_in(stale, stale, "location.hash.startsWith('#/photos/')")
     stale.locator(".thumbs img").nth(2).wait_for()
     name = stale.evaluate("decodeURIComponent(location.hash.slice(9))")
     assert name != "photos" and "is not in this library" not in stale.inner_text("main")
@@ -42,7 +43,7 @@ def test_a_tab_learns_of_the_library_by_the_stream(visitor):
     other.wait_for_selector("footer p:not(:empty)")
     other.evaluate("addEventListener('focus', (event) => event.stopImmediatePropagation(), true)")
     drop(person.tab, 1, seed=3)
-    until(person.tab, person.tab, "location.hash.startsWith('#/photos/')")
+    until_in(person.tab, person.tab, "location.hash.startsWith('#/photos/')")
     name = person.tab.evaluate("decodeURIComponent(location.hash.slice(9))")
     other.locator("a.card", has_text=name).wait_for()
     person.tab.locator("summary", has_text="Rename or remove").click()

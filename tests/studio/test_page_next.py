@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
-from studio.pages import DROP, encoded, until
+from studio.pages import DROP, encoded
+from waiting import until_in
 
 NEXT = re.compile("^Next: ")
 
@@ -117,5 +118,5 @@ def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tm
     page = tab.context.new_page()
     download.value.save_as(tmp_path / "photos.html")  # the browser's own copy has no ending
     page.goto((tmp_path / "photos.html").as_uri())
-    until(page, page, "Boolean(window.viewer?.isWhole)")
+    until_in(page, page, "Boolean(window.viewer?.isWhole)")
     assert said == []

@@ -14,8 +14,9 @@ from gsplat_edu.data.region import read_region, write_region
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.region import Region
 from gsplat_edu.studio.commands import title_of
-from studio.pages import awaited, held_back, until, visitor_of, waiting
+from studio.pages import held_back, visitor_of, waiting
 from studio.test_page_watch import at
+from waiting import awaited, settle, until_in
 
 REVERSED = """async ([first, second]) => {
   const { Store } = await import("/web/store.js");
@@ -58,7 +59,7 @@ def framed(tab, folder):
     section.scroll_into_view_if_needed()
     frame = section.locator("iframe:not([hidden])").element_handle().content_frame()
     frame.wait_for_url(re.compile(f"/captures/{folder.name}/page"), wait_until="commit")
-    until(tab, frame, "Boolean(window.viewer?.isWhole)")
+    until_in(tab, frame, "Boolean(window.viewer?.isWhole)")
     return frame
 
 
@@ -90,7 +91,7 @@ def test_the_saved_box_is_changed_although_its_page_was_not_there(visitor, captu
     tab.locator("summary", has_text="More").click()
     tab.get_by_role("button", name="Change the box").click()
     frame = framed(tab, capture)
-    until(tab, frame, "viewer.region.drawing")
+    until_in(tab, frame, "viewer.region.drawing")
     assert frame.evaluate("viewer.region.shape.half") == pytest.approx([0.3, 0.2, 0.1])
 
 
@@ -136,10 +137,10 @@ def test_another_tab_shows_what_is_left_out(visitor, library, capture):
     (here, _), (there, frame) = beside(visitor, library, capture)
     here.get_by_role("button", name="Leave out images/view_003.png").click()
     there.locator(".thumbs li.left-out", has_text="view_003.png").wait_for()
-    until(there, frame, "viewer.cameras.list.map(({ left_out }) => left_out).indexOf(true) === 3")
+    until_in(there, frame, "viewer.cameras.list.map(({ left_out }) => left_out).indexOf(true) === 3")
     here.get_by_role("button", name="Use again images/view_003.png").click()
     there.locator(".thumbs li.left-out").wait_for(state="detached")
-    until(there, frame, "!viewer.cameras.list.some(({ left_out }) => left_out)")
+    until_in(there, frame, "!viewer.cameras.list.some(({ left_out }) => left_out)")
 
 
 def test_another_tab_shows_the_box_and_keeps_what_is_drawn_there(visitor, library, capture):
@@ -153,7 +154,7 @@ def test_another_tab_shows_the_box_and_keeps_what_is_drawn_there(visitor, librar
     first.get_by_role("button", name="draw a box").click()
     first.get_by_role("button", name="save the box").click()
     there.get_by_role("button", name="Change the box").wait_for()
-    until(there, second, "Boolean(viewer.region.saved)")
+    until_in(there, second, "Boolean(viewer.region.saved)")
     box.uncheck()  # what the user has chosen stays while other boxes are saved
     there.get_by_role("region", name="cameras").scroll_into_view_if_needed()
     second.get_by_role("button", name="change the box").click()
@@ -171,7 +172,7 @@ def test_another_tab_shows_the_box_and_keeps_what_is_drawn_there(visitor, librar
     there.get_by_role("button", name="Draw the box").wait_for()
     assert second.evaluate(DRAWN) == drawn and box.is_disabled()
     second.get_by_role("button", name="save the box").click()
-    until(here, first, "viewer.region.saved?.half[0] === 0.125")
+    until_in(here, first, "viewer.region.saved?.half[0] === 0.125")
     assert read_region(capture).half[0] == 0.125
 
 
@@ -192,7 +193,7 @@ def masking(tab):
     ).click()
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
-    until(tab, tab, "document.querySelector('.sheet img').complete")
+    until_in(tab, tab, "document.querySelector('.sheet img').complete")
     box = dialog.locator("svg").bounding_box()  # what the dialog says later does not move it
 
     def draw(x0, y0, x1, y1):
@@ -312,8 +313,7 @@ def test_a_job_that_was_removed_does_not_come_back_with_an_older_list(visitor, l
             assert first.id in answer.text()
             route.fulfill(response=answer)
         tab.get_by_role("article", name=title_of(second.work)).wait_for()
-        tab.evaluate("fetch('/api/library').then((answer) => answer.text())")  # both answers have been read
-        tab.wait_for_timeout(500)  # in which the page would show them
+        settle(tab)
         assert tab.get_by_role("article", name=title_of(first.work)).count() == 0 and card.is_visible()
         tab.unroute("**/api/jobs")
 

@@ -4,13 +4,12 @@ import base64
 import io
 import json
 import re
-import time
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from browsers import PATIENCE, chromium
+from browsers import chromium
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
@@ -21,7 +20,7 @@ from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import picture_camera
 from gsplat_edu.viewer.live_folder import LiveFolder, framed
 from studio.conftest import Inline
-from studio.pages import until
+from waiting import awaited, until_in
 
 CAMERA = """() => {
   const { R, eye, fx, fy, cx, cy, W, H } = viewer.camera();
@@ -38,7 +37,7 @@ def browser():
 def framed_viewer(tab):
     """Wait for a picture in the screen's frame; return the frame."""
     frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
-    until(tab, frame, "Boolean(window.viewer) && !viewer.renderer.asking && !viewer.frameAsked")
+    until_in(tab, frame, "Boolean(window.viewer) && !viewer.renderer.asking && !viewer.frameAsked")
     return frame
 
 
@@ -48,13 +47,10 @@ def shown(frame):
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), dtype=float)
 
 
-def drawn(tab, frame, as_wanted, patience=PATIENCE / 1000):
+def drawn(tab, frame, as_wanted):
     """Wait for a picture and return it."""
-    end = time.monotonic() + patience
-    while not as_wanted(pixels := shown(frame)):
-        assert time.monotonic() < end, frame.evaluate("viewer.renderer.failure")
-        tab.wait_for_timeout(100)
-    return pixels
+    awaited(tab, lambda: as_wanted(shown(frame)), "the picture")
+    return shown(frame)
 
 
 def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):

@@ -9,8 +9,8 @@ from gsplat_edu.data.left_out import LEFT_OUT, read_left_out, write_left_out
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.views import View
-from studio.pages import until
 from studio.test_page_watch import at
+from waiting import until_in
 
 STYLES = "viewer.cameras.list.map((_, i) => [...viewer.cameras.styles.slice(8 * viewer.cameras.firsts[i]).slice(0, 3)])"
 """Colour of each camera's lines."""
@@ -35,7 +35,7 @@ def cameras(tab):
     section.scroll_into_view_if_needed()
     frame = section.locator("iframe:not([hidden])").element_handle().content_frame()
     frame.wait_for_url(re.compile("/captures/dimmed/page"), wait_until="commit")
-    until(tab, frame, "Boolean(window.viewer?.isWhole) && document.getElementById('message').hidden")
+    until_in(tab, frame, "Boolean(window.viewer?.isWhole) && document.getElementById('message').hidden")
     return section, frame
 
 
@@ -45,7 +45,7 @@ def test_cameras_are_shown_with_their_photos(visitor, dimmed):
     assert section.get_by_role("heading", name="Where the photos were taken").is_visible()
     assert frame.evaluate("viewer.cameras.list.length") == 16
     frame.evaluate("viewer.choose(4)")
-    until(tab, frame, "document.getElementById('photo').naturalWidth === 96")
+    until_in(tab, frame, "document.getElementById('photo').naturalWidth === 96")
     assert frame.evaluate("viewer.renderer.gl.getError()") == 0
     assert frame.locator("#doctor").is_hidden()  # the studio's own part of the screen asks the doctor
 
@@ -58,7 +58,7 @@ def test_findings_color_the_cameras(visitor, library, dimmed):
     assert len({tuple(color) for color in before}) == 1
     part.get_by_role("button", name=re.compile("^Examine")).click()
     part.locator(".findings li").first.wait_for()
-    until(tab, frame, "viewer.cameras.list.some(({ marks }) => marks.includes('exposure'))")
+    until_in(tab, frame, "viewer.cameras.list.some(({ marks }) => marks.includes('exposure'))")
     marked = frame.evaluate("viewer.cameras.list.map(({ marks }) => marks.length > 0)")
     found = json.loads(tab.evaluate("fetch('/api/captures/dimmed/findings').then((answer) => answer.text())"))
     named = {name for finding in found["findings"] for name in finding["images"]}
@@ -70,7 +70,7 @@ def test_findings_color_the_cameras(visitor, library, dimmed):
     # a page that opens later has the colours as well
     tab.reload()
     _, frame = cameras(tab)
-    until(tab, frame, "viewer.cameras.list.some(({ marks }) => marks.includes('exposure'))")
+    until_in(tab, frame, "viewer.cameras.list.some(({ marks }) => marks.includes('exposure'))")
     assert frame.evaluate(STYLES) == after
 
 
@@ -88,7 +88,7 @@ def test_a_photo_is_left_out_in_the_frame_and_taken_back_in_the_gallery(visitor,
     assert frame.evaluate(STYLES)[2] != frame.evaluate(STYLES)[1]
     item.get_by_role("button", name=re.compile("^Use again")).click()
     item.wait_for(state="detached")
-    until(tab, frame, "!viewer.cameras.list[2].left_out")
+    until_in(tab, frame, "!viewer.cameras.list[2].left_out")
     assert not (dimmed / LEFT_OUT).exists()
     assert frame.locator("#leave").inner_text() == "leave out"
 

@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from studio.pages import DROP, encoded, png, until
+from studio.pages import DROP, encoded, png
+from waiting import until_in
 
 PRIMARY = "[...document.querySelectorAll('main .primary')].filter((one) => one.checkVisibility())"
 
@@ -27,7 +28,7 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     assert tab.evaluate(f"{PRIMARY}.map((one) => one.textContent)") == ["Try again"]
 
     tab.goto(f"{tab.url.split('#')[0]}#/")
-    until(tab, tab, "document.querySelectorAll('.project li .badge').length === 2")
+    until_in(tab, tab, "document.querySelectorAll('.project li .badge').length === 2")
     assert tab.locator("a.card").count() == 1, "photos and what was made from them are one project"
     inside = tab.get_by_role("article", name="photos")
     inside.locator("summary", has_text="Everything in it (2)").click()
@@ -38,7 +39,7 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     assert not tab.get_by_role("button", name="Start training").is_visible()
     assert not tab.get_by_role("button", name="Examine").is_visible()
     back = tab.get_by_role("link", name="Go to the photos")
-    until(tab, tab, f"{PRIMARY}.length > 0")  # the next step comes with the library's list
+    until_in(tab, tab, f"{PRIMARY}.length > 0")  # the next step comes with the library's list
     assert tab.evaluate(f"{PRIMARY}.length") == 1
     back.click()
     person.reach("#/photos/photos")

@@ -11,7 +11,8 @@ from gsplat_edu.edits.document import empty_document
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.runs.source import open_source
 from processes import Program
-from studio.pages import COMMAND, DROP, encoded, png, until
+from studio.pages import COMMAND, DROP, encoded, png
+from waiting import awaited, until_in
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def at(person, place):
 
 def frame_of(tab):
     frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
-    until(tab, frame, "Boolean(window.viewer) && document.getElementById('message').hidden")
+    until_in(tab, frame, "Boolean(window.viewer) && document.getElementById('message').hidden")
     return frame
 
 
@@ -78,7 +79,7 @@ def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     tab = at(person, "runs/egg")
     tab.set_viewport_size({"width": size[0], "height": size[1]})
     frame = frame_of(tab)
-    until(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
+    until_in(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
     tab.get_by_label("View", exact=True).select_option(index=2)
     tab.locator(".over-photo:not([hidden])").wait_for()
     assert not frame.locator("#panel").is_visible(), "the panel lies on the photo"
@@ -97,16 +98,13 @@ def test_a_photo_that_comes_late_is_not_laid_over_another_view(visitor, runs):
     """The list of photos is on its way when the free view is chosen again."""
     tab, held = at(visitor(), "runs/egg"), []
     frame_of(tab)
-    until(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
+    until_in(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
     tab.evaluate(PHOTOS_SHOWN)
     tab.route("**/captures/egg/photos", lambda route: route.continue_() if held else held.append(route))
     view = tab.get_by_label("View", exact=True)
     names = view.locator("option").all_inner_texts()
     view.select_option(index=2)
-    for _ in range(9000):
-        if held:
-            break
-        tab.wait_for_timeout(20)
+    awaited(tab, lambda: held)
     view.select_option(index=0)
     held[0].continue_()
     view.select_option(index=1)
@@ -193,7 +191,9 @@ def test_a_training_has_one_counter_and_one_clock(visitor, runs):
     person.reach("#/runs/egg-run-2")
     # by its title, because the screen before this one has a scene as well
     frame = tab.wait_for_selector("iframe[title='scene of egg-run-2']:not([hidden])").content_frame()
-    until(tab, frame, "Boolean(window.live?.state?.iteration) && document.getElementById('message').hidden")
+    until_in(
+        tab, frame, "Boolean(window.live?.state?.iteration) && document.getElementById('message').hidden"
+    )
     tab.locator(".left", has_text=CLOCKS).wait_for()
     tab.locator(".curve .axis .last:not(:empty)").first.wait_for()
     for unfold in (False, True):

@@ -5,12 +5,12 @@ import io
 import json
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
 import zipfile
 from pathlib import Path
 
@@ -22,8 +22,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.viewer.serve import REQUEST_SECONDS
 from processes import Program
-
-PATIENCE = 120.0
+from waiting import PATIENCE, until
 
 HELD = """
 import sys, time
@@ -84,11 +83,12 @@ class Server:
         return answer.json()["id"]
 
     def reached(self, job, *states):
-        end = time.monotonic() + PATIENCE
-        while (found := self.get(f"jobs/{job}"))["state"] not in states:
-            assert time.monotonic() < end and found["state"] not in ("failed", "interrupted"), found
-            time.sleep(0.05)
-        return found
+        def found():
+            one = self.get(f"jobs/{job}")
+            assert one["state"] in states or one["state"] not in ("failed", "interrupted"), one
+            return one["state"] in states and one
+
+        return until(found)
 
     def kill(self):
         self.process.kill()
@@ -140,11 +140,9 @@ def logged(folder):
 
 def check_that_an_export_waits(server, training):
     """Check that an export of a run in training waits, although another job could run; then cancel it."""
-    end = time.monotonic() + PATIENCE
     late = server.start(command="convert", subject="runs/box", format="ply")
-    while not (found := server.get(f"jobs/{late}"))["waits_for"]:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    until(lambda: server.get(f"jobs/{late}")["waits_for"])
+    found = server.get(f"jobs/{late}")
     assert (found["state"], found["waits_for"]) == ("queued", [{"job": training, "place": "runs/box"}])
     assert server.client.post(f"/api/jobs/{late}/cancel").json()["attempts"] == 0
 
@@ -161,10 +159,7 @@ def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, captu
     assert server.client.put("/api/captures/box/zip", content=zipped).json()["files"] > 14
     options = {"iterations": 400, "save_every": 50, "seed": 3}
     job = server.start(command="train", subject="captures/box", to="box", options=options)
-    end = time.monotonic() + PATIENCE
-    while logged(run) < 80:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    until(lambda: logged(run) >= 80)
     assert server.client.post(f"/api/jobs/{job}/pause").json()["state"] == "paused"
     check_that_an_export_waits(server, job)
     pid = _pid(library, job)
@@ -252,9 +247,8 @@ def check_refusals(server):
     text = f"PUT /api/photos/a/files/a.txt HTTP/1.1\r\n{head}Content-Length: 300000\r\n\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE) as connection:
         connection.sendall(text.encode())
-        for _ in range(3):
-            time.sleep(0.1)
-            connection.sendall(bytes(100_000))
+        assert select.select([connection], [], [], PATIENCE)[0], "the refusal"
+        connection.sendall(bytes(300_000))
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
         assert b"neither a photo nor a video" in answer
     # an interrupted upload leaves no files, as the caller checks
@@ -276,10 +270,7 @@ def test_a_server_under_attack_answers_its_page_and_works_on(served, tmp_path):
     for thread in threads:
         thread.join()
     assert len(lists) == 50 and all(found["photos"] == [] for found in lists)
-    end = time.monotonic() + PATIENCE
-    while list((tmp_path / "library" / ".studio" / "uploads").iterdir()):
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    until(lambda: not list((tmp_path / "library" / ".studio" / "uploads").iterdir()))
 
     # events arrive in the meantime, and again after a pause
     (tmp_path / "library" / "captures" / "none").mkdir()

@@ -2,7 +2,6 @@
 
 import subprocess
 import threading
-import time
 
 import pytest
 
@@ -10,9 +9,7 @@ from gsplat_edu.studio import workers
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.worker import answer
 from gsplat_edu.studio.workers import Worker
-
-PATIENCE = 180.0
-"""Longest time that a test waits, seconds."""
+from waiting import PATIENCE, until
 
 
 @pytest.mark.own_process
@@ -87,13 +84,6 @@ def asking(worker):
     thread = threading.Thread(target=ask)
     thread.start()
     return thread, said
-
-
-def until(condition):
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "the awaited state did not occur"
-        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(

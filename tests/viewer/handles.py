@@ -1,11 +1,9 @@
 """Drags of the handle in the editor's picture, and where the page shows it."""
 
-import time
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from browsers import PATIENCE
+from waiting import until_in
 
 ARROW, RING = 88, 64
 """CSS pixels: length of the arrows and radius of the rings."""
@@ -61,9 +59,6 @@ def touch(session, kind, *points):
     session.send("Runtime.evaluate", {"expression": FRAME, "awaitPromise": True})
 
 
-def until(tab, expression, patience=PATIENCE / 1000):
-    """Wait until an expression is true. Playwright's function needs eval, which the pages' policies forbid."""
-    end = time.monotonic() + patience
-    while not tab.evaluate(expression):
-        assert time.monotonic() < end, f"never: {expression}"
-        tab.wait_for_timeout(20)
+def until(tab, expression):
+    """Wait until an expression is true in a page."""
+    until_in(tab, tab, expression)

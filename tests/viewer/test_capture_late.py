@@ -5,11 +5,11 @@ import time
 
 import pytest
 
-from browsers import PATIENCE
 from gsplat_edu.data.left_out import read_left_out
 from viewer.handles import until
 from viewer.test_capture_matches import DOTS
 from viewer.test_capture_page import folder, opened, served
+from waiting import PATIENCE
 
 __all__ = ["folder", "opened", "served"]
 
@@ -41,7 +41,7 @@ def first_held(tab, address):
 
 
 def waits_for(tab, held):
-    end = time.monotonic() + PATIENCE / 1000
+    end = time.monotonic() + PATIENCE
     while not held:
         assert time.monotonic() < end
         tab.wait_for_timeout(20)

@@ -5,12 +5,12 @@ import time
 import numpy as np
 import pytest
 
-from browsers import PATIENCE
 from gsplat_edu.base.content_policy import content_policy
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.viewer import page
 from viewer.handles import until
+from waiting import PATIENCE
 
 INJECTED = (
     "<script>window.ran = 'script'</script>"
@@ -49,7 +49,7 @@ def test_our_own_code_works_without_complaints(visit, tmp_path, write, random_ga
 
 def refuses(tab, logged, least):
     """Wait until the browser has logged that the policy refuses something, at least so often."""
-    end = time.monotonic() + PATIENCE / 1000
+    end = time.monotonic() + PATIENCE
     while sum("Content Security Policy" in text for text in logged) < least:
         assert time.monotonic() < end, logged
         tab.wait_for_timeout(20)

@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from accessibility import grave_faults_in_all_styles
-from browsers import PATIENCE
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.page_proof import Proof, ShownPhoto
 from viewer.handles import touch, until
+from waiting import PATIENCE
 
 SIZE = (640, 480)
 
@@ -74,7 +74,7 @@ def is_color(found, color):
 
 def becomes(seen, x, y, color):
     """Wait until the window shows a colour at a place; a photo is decoded after its address is set."""
-    end = time.monotonic() + PATIENCE / 1000
+    end = time.monotonic() + PATIENCE
     while not is_color(found := color_at(seen, x, y), color):
         assert time.monotonic() < end, found
 

@@ -1,0 +1,69 @@
+"""Waiting for a state of a thread, a program or a page. Nothing else in the tests sleeps (repo/test_waiting.py)."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+PATIENCE = 300.0
+"""Seconds until a state that does not come fails a test, long enough for a computer that runs other tests as well."""
+
+PAUSE = 0.01
+"""Seconds between two looks."""
+
+FRAMES = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))"
+"""Two frames of a page: what it planned for the next one is drawn."""
+
+
+def until(
+    condition: Callable[[], Any],
+    what: str = "the awaited state",
+    pause: Callable[[float], None] = time.sleep,
+) -> Any:
+    """Wait until a function returns a true value, and return that value.
+
+    Args:
+        condition: The function.
+        what: What is waited for, for the message of a failure.
+        pause: Lets some seconds pass; for a page, something that lets its events arrive.
+    """
+    end = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        assert time.monotonic() < end, f"{what} did not occur"
+        pause(PAUSE)
+    return found
+
+
+def awaited(tab: Any, condition: Callable[[], Any], what: str = "the awaited state") -> Any:
+    """Let a tab and its routes go on until a function returns a true value, and return that value."""
+    return until(condition, what, lambda seconds: tab.wait_for_timeout(1000 * seconds))
+
+
+def until_in(tab: Any, frame: Any, expression: str) -> None:
+    """Wait until an expression is true in a frame of a tab. Playwright's own function needs eval, which our policies
+    forbid."""
+    awaited(tab, lambda: _holds(frame, expression), expression)
+
+
+def pass_time(tab: Any, milliseconds: int) -> None:
+    """Move the clock of a page on, if the test has installed one: every timer in between fires at once, and what the
+    page asked its server for has been answered and drawn."""
+    tab.clock.run_for(milliseconds)
+    settle(tab)
+
+
+def settle(tab: Any) -> None:
+    """Let a page draw what has reached it, and what its server answers to the requests that it has made."""
+    tab.evaluate("fetch(location.href).then((answer) => answer.text())")
+    tab.evaluate(FRAMES)
+
+
+def _holds(frame: Any, expression: str) -> bool:
+    """Evaluate an expression; false in a frame that is navigating."""
+    from playwright.sync_api import Error
+
+    try:
+        return bool(frame.evaluate(expression))
+    except Error as error:
+        if "navigation" not in str(error):
+            raise
+        return False
