@@ -124,6 +124,7 @@ def answers(port):
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
+@pytest.mark.slow
 def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, serial, tmp_path):
     draw = random.Random(SEED)
     moments = sorted(draw.sample(range(5, 120), 2))  # a whole block is left
@@ -166,6 +167,7 @@ def test_the_bytes_survive_a_killed_worker_and_a_killed_scheduler(city, split, s
     assert {n: folder.record(n).stat().st_mtime_ns for n in finished} == finished, "trained once"
 
 
+@pytest.mark.slow
 def test_a_local_cluster_gives_the_same_bytes_and_names_the_missing_photo(city, split, serial, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(split, run)
@@ -197,6 +199,7 @@ def names_of(plan):
     return sorted({name for block in plan.blocks for name in block.train})
 
 
+@pytest.mark.slow
 def test_no_scheduler_no_workers_and_lost_workers_are_one_line(split, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(split, run)

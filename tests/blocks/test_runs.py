@@ -31,6 +31,7 @@ def run(split, tmp_path):
     return tmp_path / "run"
 
 
+@pytest.mark.slow
 def test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all(city, run, serial, capsys):
     for number in (2, 0, 3, 1):  # in any order
         assert main(["block", str(run), str(number)]) == 0

@@ -419,6 +419,7 @@ sys.exit(os.waitstatus_to_exitcode(status))
 """The training gets a small parent process, because Linux includes the parent's memory in the child's peak."""
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss is in KiB on Linux")
 def test_a_training_stays_below_its_memory_limit_as_the_system_counts_it(capture, tmp_path):

@@ -83,6 +83,7 @@ def test_transparent_photos_are_corrected_and_unknown_names_are_refused(tmp_path
     assert main([*words, "exposure", "--resume"]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("appearance", ["auto", "vignetting"])
 def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, tmp_path, capsys, appearance):
     run = tmp_path / "run"

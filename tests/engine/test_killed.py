@@ -96,6 +96,7 @@ def whole(capture, tmp_path_factory):
     return results(out)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 @pytest.mark.parametrize("disturb", [KILLED, ABORTED], ids=["killed", "aborted"])
 def test_a_process_that_ends_in_the_middle_is_resumed(capture, whole, tmp_path, disturb):
@@ -109,6 +110,7 @@ def test_a_process_that_ends_in_the_middle_is_resumed(capture, whole, tmp_path, 
     assert results(tmp_path / "run") == whole
 
 
+@pytest.mark.slow
 def test_a_run_whose_device_is_lost_says_so_and_goes_on(capture, whole, tmp_path):
     done = train(capture, tmp_path / "run", disturb=LOST)
     assert done.returncode == 0, done.stderr

@@ -37,6 +37,7 @@ def trained(views, device):
     return run, run.run().losses
 
 
+@pytest.mark.slow
 def test_a_training_is_reproducible(views, device, trained):
     run, losses = trained
     again = trainer(views, "cuda", device)
@@ -64,6 +65,7 @@ def test_a_training_follows_the_native_backend(views, trained):
         assert float((expected - start[name]).abs().max()) > 0.1 * reach, "training moved the parameters"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
 def test_checkpoints_resume_on_either_backend(views, device, tmp_path, strategy):
     config = TrainConfig().changed(

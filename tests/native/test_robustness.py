@@ -230,6 +230,7 @@ def test_several_cameras_give_stacked_views():
         render(gaussians, [camera(8, 8), camera(9, 8)], backend="cpu")
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 def test_memory_does_not_grow():
     """Render scenes of changing size in a new process: after 100 warm-up renders, 300 more may not add 16 MiB.

@@ -98,6 +98,7 @@ def run_installed(installed, *words, cwd):
     )
 
 
+@pytest.mark.slow
 def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
     done = run_installed(installed, "python", "-c", ONLY_INSTALLED, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -110,6 +111,7 @@ def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
     # this plugin fails the run if it tested another gsplat_edu
     lines = "".join(f"    {line}\n" for line in ONLY_INSTALLED.splitlines())
@@ -131,6 +133,7 @@ def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
 NEWER = {version: path for version, path in build_wheels.pythons().items() if version != "3.11"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not NEWER, reason="no Python 3.12 or newer is here, whose headers the stable ABI needs")
 def test_one_abi3_wheel_is_imported_by_every_newer_python(pure, tmp_path):
     """Only nanobind and the bindings depend on Python and are compiled again; other object files are the set-up's."""

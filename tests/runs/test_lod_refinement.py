@@ -29,6 +29,7 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
+@pytest.mark.slow
 def test_refined_levels_match_the_photos_better(run):
     source = open_source(run)
     root = build_levels(source.scene.gaussians, OPTIONS)

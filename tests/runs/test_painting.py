@@ -44,6 +44,7 @@ def reddest(mesh):
     return int((image[..., 0] - image[..., 1]).max())
 
 
+@pytest.mark.slow
 def test_masks_of_a_run_say_what_does_not_paint(taken, tmp_path):
     pytest.importorskip("xatlas")
     dataset, maps = taken
@@ -60,6 +61,7 @@ def test_masks_of_a_run_say_what_does_not_paint(taken, tmp_path):
     assert reddest(painted(WALL, dataset, maps)) > 30
 
 
+@pytest.mark.slow
 def test_photos_of_a_fisheye_paint_the_places_that_they_show(tmp_path):
     pytest.importorskip("xatlas")
     views, lens = [], Projection("fisheye", Distortion.of(k1=-0.02))

@@ -72,6 +72,7 @@ def chosen_for(folder, tmp_path, lens):
     return *chosen, len(steps) // pilot.PILOT_STEPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("k1", "kept"), [(-0.1, {"lens", "poses+lens"}), (0.0, {"none", "poses"})])
 def test_a_lens_is_learned_if_it_is_wrong(tmp_path, k1, kept):
     """One that does not gain is trained on from what it found, before it is left out.
@@ -86,6 +87,7 @@ def test_a_lens_is_learned_if_it_is_wrong(tmp_path, k1, kept):
     assert ("trained on" in reason) == (trained > len(trials.posed))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [12.0, 0.0])
 def test_a_shutter_is_learned_if_photos_have_one(tmp_path, pixels):
     """Photos without one give no sign of it, so no training with a motion is spent on them."""
@@ -97,6 +99,7 @@ def test_a_shutter_is_learned_if_photos_have_one(tmp_path, pixels):
     assert trained == len(trials.posed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [False, True])
 def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
     monkeypatch.setattr(pilot, "PILOT_STEPS", 250)

@@ -50,6 +50,7 @@ def given(request, tmp_path_factory):
     return request.param, options, CaptureReader(folder)
 
 
+@pytest.mark.slow
 def test_wrong_poses_shorten_a_training_and_exact_poses_do_not(given, monkeypatch):
     error, options, reader = given
     steps = []

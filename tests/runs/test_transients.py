@@ -44,6 +44,7 @@ class KilledError(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_a_killed_and_resumed_run_writes_the_same_bytes(capture, tmp_path):
     whole = run_of(capture, tmp_path / "whole")
     whole.train()

@@ -75,6 +75,7 @@ def round_photos(colmap, tmp_path_factory):
     return SimpleNamespace(folder=folder, capture=options.out, said=said, truth=truth, options=options)
 
 
+@pytest.mark.slow
 def test_poses_and_lens_are_found_beyond_ninety_degrees(round_photos):
     (line,) = [line for line in round_photos.said if "taken for" in line]
     assert line.startswith(
@@ -101,6 +102,7 @@ def _radius(projection, focal, ray):
     return float(np.hypot(u[0], v[0]))
 
 
+@pytest.mark.slow
 def test_photos_are_copied_whole_and_masked_outside_of_the_circle(round_photos):
     for name in ("f00.jpg", "f05.jpg"):
         copied = (round_photos.capture / "images" / name).read_bytes()
@@ -118,12 +120,14 @@ def test_photos_are_copied_whole_and_masked_outside_of_the_circle(round_photos):
         assert view.read().mask.mean() == pytest.approx(mask.mean(), abs=0.01), view.name
 
 
+@pytest.mark.slow
 def test_the_rim_is_reported(round_photos):
     (line,) = {line for line in round_photos.said if line.startswith("the lens")}
     degrees = float(line.partition("sees ")[2].partition(" ")[0])
     assert degrees == pytest.approx(190, abs=4) and "--lens native uses all of it" in line
 
 
+@pytest.mark.slow
 def test_features_lie_within_eighty_degrees(round_photos):
     with sqlite3.connect(round_photos.capture / "sfm" / "database.db") as reader:
         rows = reader.execute("SELECT rows, cols, data FROM keypoints").fetchall()
@@ -132,6 +136,7 @@ def test_features_lie_within_eighty_degrees(round_photos):
     assert 0.7 * CIRCLE.radius < radii.max() < 80 / 90 * CIRCLE.radius + 1.5
 
 
+@pytest.mark.slow
 def test_the_users_model_overrides(round_photos, tmp_path):
     """A pinhole's model makes no fisheyes; a fisheye's may name its field of view."""
     files = sorted((round_photos.folder / "photos").iterdir())
@@ -154,6 +159,7 @@ def test_wrong_choices_are_refused():
             lens_choice(text)
 
 
+@pytest.mark.slow
 def test_round_photos_among_others_of_their_size_are_another_camera(round_photos, tmp_path):
     rng = np.random.default_rng(0)
     files = sorted((round_photos.folder / "photos").iterdir())[:3]

@@ -6,9 +6,7 @@ import pytest
 
 from sfm.engine_check import printed
 
-pytestmark = [
-    pytest.mark.usefixtures("colmap"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("colmap")]
 
 SCENE = """
 import json

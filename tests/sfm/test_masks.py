@@ -131,6 +131,7 @@ def test_a_mask_that_cannot_be_decoded_is_named(tmp_path):
     assert not facts and reason.startswith(f"a.png: its mask {mask}: cannot be decoded")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("colmap")
 def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
     """Some photos have a mask, some are transparent at the same place, and one has neither."""

@@ -70,6 +70,7 @@ def room(colmap, tmp_path_factory):
     return SimpleNamespace(folder=folder, capture=folder / "capture", said=said)
 
 
+@pytest.mark.slow
 def test_panoramas_become_faces_with_one_centre_each(room):
     """All faces get poses, those of one panorama share a centre, and both agree with the truth."""
     assert any("7 panoramas cut into 8 faces each of 163x163 px" in line for line in room.said)
@@ -95,6 +96,7 @@ def test_panoramas_become_faces_with_one_centre_each(room):
         ), name
 
 
+@pytest.mark.slow
 def test_masks_of_panoramas_become_masks_of_faces(room):
     """A pixel of a face counts if its ray is less than 60 degrees below the horizon."""
     views = {view.name: view for view in load_dataset(room.capture, DataSettings(test_every=0)).train}
@@ -109,6 +111,7 @@ def test_masks_of_panoramas_become_masks_of_faces(room):
         assert (below > 61).any() == (number >= 4)  # only faces of the lower ring see so far down
 
 
+@pytest.mark.slow
 def test_whole_panoramas_are_held_out(room):
     """A face is never held out from a training on other faces from the same place."""
     dataset = load_dataset(room.capture, DataSettings(test_every=3))
@@ -272,11 +275,13 @@ def test_gps_reaches_the_faces(tmp_path):
     assert one.place == (48.5, -8.25, 120.5)
 
 
+@pytest.mark.slow
 def test_the_work_folder_lists_the_cut_panoramas(room):
     facts = json.loads((room.capture / "sfm" / "stages.json").read_text())["stages"]["faces"]["facts"]
     assert [one["name"] for one in facts["panoramas"]] == [f"p{i}.jpg" for i in range(COUNT)]
 
 
+@pytest.mark.slow
 def test_the_capture_has_the_panoramas_themselves(room):
     """One photo and one pose each, without a second lossy copy: `--lens native` trains through them."""
     for i in range(COUNT):
@@ -300,6 +305,7 @@ def test_the_capture_has_the_panoramas_themselves(room):
     assert not mask[below].any() and mask[~below].all()
 
 
+@pytest.mark.slow
 def test_points_are_seen_where_the_panoramas_show_them(room):
     """The tracks of the model are in pixels of the panoramas."""
     model = room.capture / "sparse" / "0"
@@ -310,6 +316,7 @@ def test_points_are_seen_where_the_panoramas_show_them(room):
     assert float(line.partition("mean reprojection error ")[2].partition(" ")[0]) < 1.0
 
 
+@pytest.mark.slow
 def test_faces_have_the_depth_of_their_panoramas_points(room):
     """`--depth points` finds a face's points in the tracks of the whole panorama."""
     views = load_dataset(room.capture, DataSettings(test_every=0)).train
@@ -319,6 +326,7 @@ def test_faces_have_the_depth_of_their_panoramas_points(room):
     assert found.report.photos == FACES * COUNT and found.report.used > 0.8 * FACES * COUNT
 
 
+@pytest.mark.slow
 def test_panoramas_of_what_is_far_away_are_warned_of(room):
     """In a room, matches move; if they had not, the next call with the same work folder would say so."""
     path = room.capture / "sfm" / "stages.json"

@@ -82,6 +82,7 @@ def test_masks_have_the_orientation_of_the_working_copies(tmp_path, name, orient
             np.testing.assert_array_equal(np.rot90(np.asarray(kept), -photo.turns) > 0, counts > 0)
 
 
+@pytest.mark.slow
 def test_photos_of_a_phone_become_an_upright_capture_in_srgb(colmap, tmp_path):
     """One camera took HEICs in Display P3 of all orientations, and a mirrored JPEG."""
     truth, written = {}, {}

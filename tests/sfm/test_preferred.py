@@ -18,9 +18,7 @@ from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.sfm import mapping
 from sfm.engine_check import printed
 
-pytestmark = [
-    pytest.mark.usefixtures("colmap"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("colmap")]
 
 SOUND, ALL = 26, 40
 

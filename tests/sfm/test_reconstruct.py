@@ -118,6 +118,7 @@ class StoppedError(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_resumes_after_the_last_completed_stage(done, phone, tmp_path):
     """With one thread, an interrupted run gives the bits of an uninterrupted one."""
     options = SfmOptions(phone.folder, tmp_path / "capture", max_features=LIMIT, threads=1)
@@ -230,6 +231,7 @@ def _stop_at_mapping(stage, count, total):
         raise StoppedError
 
 
+@pytest.mark.slow
 def test_the_global_mapper_with_selected_pairs_finds_the_poses(done, tmp_path):
     """Select pairs by appearance and sequence instead of matching all."""
     out = tmp_path / "capture"
@@ -240,6 +242,7 @@ def test_the_global_mapper_with_selected_pairs_finds_the_poses(done, tmp_path):
     assert "global mapper" in said[3]
 
 
+@pytest.mark.slow
 def test_unusable_photos_are_named_and_left_out(phone, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
@@ -308,6 +311,7 @@ def test_the_feature_limit_is_exact(done):
             assert all(length == size * count * columns for count, columns, length in rows)
 
 
+@pytest.mark.slow
 def test_focal_lengths_from_exif_separate_two_cameras(tmp_path):
     """The two cameras have different zooms and photo sizes."""
     folder, truth = tmp_path / "photos", {}

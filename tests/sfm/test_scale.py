@@ -93,6 +93,7 @@ def at_scale(camera):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("colmap")
 def test_gps_gives_scale_and_up_end_to_end(tmp_path):
     """Photos with GPS, in a world that is tilted relative to the cameras' mean up, give scale to 0.5 % and up to a

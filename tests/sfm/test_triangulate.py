@@ -29,6 +29,8 @@ from gsplat_edu.sfm.triangulate import LEAST_POINTS, STAGES, triangulate
 from gsplat_edu.train.config import recipe
 from waiting import PATIENCE
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("pycolmap")
 
 

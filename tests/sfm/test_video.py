@@ -74,6 +74,7 @@ def test_sharp_frames_are_chosen_at_equal_steps_of_motion(walk):
     assert steps.max() < 2 * 1.5 * walk.angles[-1] / 24
 
 
+@pytest.mark.slow
 def test_frames_become_a_capture(walk, colmap, tmp_path):
     said = []
     out = reconstruct(SfmOptions(walk.path, tmp_path / "capture", frames=24), said.append)

@@ -15,6 +15,7 @@ COARSER = 2
 """Factor by which the photos are smaller than those for which the tolerances hold."""
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("colmap")
 def test_photos_in_order_are_matched_in_sequence_and_all_get_a_pose(tmp_path):
     """Photos IMG_0 to IMG_59 are a lap, listed as IMG_0, IMG_1, IMG_10, so the order has to be found."""

@@ -13,9 +13,7 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from sfm.textured_box import cameras_of
 
-pytestmark = [
-    pytest.mark.usefixtures("colmap"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("colmap")]
 
 
 def captured(folder, photos, **options):

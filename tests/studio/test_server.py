@@ -147,6 +147,7 @@ def check_that_an_export_waits(server, training):
     assert server.client.post(f"/api/jobs/{late}/cancel").json()["attempts"] == 0
 
 
+@pytest.mark.slow
 def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, capture, tmp_path):
     """Upload, train, kill the server, find the job, kill both, rename, resume and export give the commands' bytes.
 

@@ -322,6 +322,7 @@ def test_options_that_contradict_a_batch_are_refused():
         together(3, lambda team: trainer(config(), team))
 
 
+@pytest.mark.slow
 def test_batches_learn_as_well_from_as_many_images():
     """Batches of 1, 2 and 4 gave 29.5, 29.3 and 29.3 dB; with unscaled rates 29.5, 28.5 and 27.3 dB."""
     views, points, colors = procedural_capture(24, 9, splats=300)

@@ -156,6 +156,7 @@ def error_of(trainer, capture):
     return np.median(np.concatenate(errors))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sparse", [False, True])
 def test_depth_makes_the_rendered_depth_better(bare, sparse):
     """From points 5 cm off the surface, exact depth lowers the median error by a fifth at least."""

@@ -46,6 +46,7 @@ def fitted(run, views):
     return summarize(scores)["psnr_fitted"]
 
 
+@pytest.mark.slow
 def test_exposures_are_recovered_and_held_out_quality_with_them(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]
@@ -76,6 +77,7 @@ def test_the_mean_correction_is_the_identity(capture):
     assert model.log_gains().mean(dim=0).abs().max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("at", "appearance"), [(1, "exposure"), (17, "exposure"), (17, "vignetting")])
 def test_a_resumed_run_has_the_same_bits_for_any_number_of_threads(capture, tmp_path, at, appearance):
     before = torch.get_num_threads()

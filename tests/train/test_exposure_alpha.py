@@ -57,6 +57,7 @@ def trained(capture, views, appearance):
     return run
 
 
+@pytest.mark.slow
 def test_exposures_of_transparent_photos_are_recovered(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]

@@ -57,6 +57,7 @@ def depth_error_of(gaussians, views):
     return float(np.median(np.concatenate(errors)))
 
 
+@pytest.mark.slow
 def test_depth_of_held_out_views_becomes_better(room):
     """With maps, the median error of held-out depth is a sixth smaller at least, and photos are hardly worse."""
     plain, guided = run(without_depth(room)), run(room)

@@ -64,6 +64,7 @@ def refined(data, refine, iterations=700):
     return refinement_of(trainer.view_model)
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_and_distortion_are_corrected():
     """Planted: 2 % of the focal length and k1 = -0.06, together 1.3 px."""
     lens = Projection(distortion=Distortion.of(k1=-0.06))
@@ -76,6 +77,7 @@ def test_a_wrong_focal_length_and_distortion_are_corrected():
     assert held_out.projection == found.refined(3, given[3]).projection
 
 
+@pytest.mark.slow
 def test_the_motion_of_a_rolling_shutter_is_found():
     """Planted: a turn that moves the image by 12 px from its first row to its last."""
     rng, truth = np.random.default_rng(1), []

@@ -72,6 +72,7 @@ def errors_of(gaussians, views):
     return float(np.concatenate(angles).mean()), float(np.median(np.concatenate(depths)))
 
 
+@pytest.mark.slow
 def test_normals_of_held_out_views_become_better(room):
     """The mean angle to the traced normals shrinks by a seventh at least, and depth becomes no worse."""
     plain, learned = (errors_of(run(room, surface=surface).gaussians, room.test) for surface in (False, True))

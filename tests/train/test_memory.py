@@ -16,6 +16,7 @@ IMAGE = 320 * 240 * 3 * 4
 """Bytes of a float image of 320 x 240 px. Photos of mixed sizes have at least as many pixels on average."""
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc")
 @pytest.mark.parametrize("case", soak.CASES)

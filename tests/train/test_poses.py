@@ -69,6 +69,7 @@ def pose_errors(cameras, views):
     return np.mean(angles), np.mean(shifts)
 
 
+@pytest.mark.slow
 def test_wrong_poses_are_corrected_and_held_out_quality_with_them(capture):
     views, wrong, *_ = capture
     best, lost, regained = (
@@ -88,6 +89,7 @@ def test_wrong_poses_are_corrected_and_held_out_quality_with_them(capture):
     assert ours - bad > 0.8 * (good - bad)
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_is_recovered(capture):
     views = capture[0][:HELD_OUT]
     off = []

@@ -87,6 +87,7 @@ def test_the_terms_of_the_true_surface_know_the_shutter(captures):
     assert known[0] < 1.15 * ignored[0] and known[1] < 0.7 * ignored[1]
 
 
+@pytest.mark.slow
 def test_the_learned_surface_is_better_if_the_shutter_is_known(captures):
     """The angle to the true normals shrinks by the terms of a surface, and depth is better than without the shutter."""
     known, ignored = captures

@@ -108,6 +108,7 @@ def box_normals(camera):
     return normals
 
 
+@pytest.mark.slow
 def test_normals_are_nearer_to_the_truth_with_a_surface():
     """On a textured box, the mean angle to the true normals falls by more than a fifth (11.0 to 7.9 degrees)."""
     capture = box_capture()

@@ -50,6 +50,7 @@ def quality(run, capture):
     return summarize(score_views(run.gaussians, capture[1], render, (0.0, 0.0, 0.0)))["psnr"]
 
 
+@pytest.mark.slow
 def test_found_masks_recover_most_of_the_quality_of_true_masks(capture):
     lost, ours, best = [], [], []
     for seed in SEEDS:

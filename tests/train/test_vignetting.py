@@ -43,6 +43,7 @@ def score(run, views):
     return summarize(score_views(run.gaussians, views, shown, (0.0, 0.0, 0.0)))["psnr_fitted"]
 
 
+@pytest.mark.slow
 def test_dark_corners_are_corrected_and_held_out_quality_with_them(capture):
     clean, dark, *_, ks = capture
     held_out = clean[HELD_OUT]
