@@ -35,8 +35,7 @@ from gsplat_edu.viewer.page_mesh import open_meshes
 from gsplat_edu.viewer.stream import folder_page
 from scene_files import small_levels
 from splats import splats_on
-from waiting import PATIENCE
-from waiting import until
+from waiting import PATIENCE, until
 
 COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
 ORIGIN = (512.0, -64.0, 8.0)
