@@ -1,5 +1,7 @@
 // The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives. Answers wait while a button is
-// pressed, because they change the page: `released` is of the viewer's press.js.
+// pressed, because they change the page.
+
+import { released } from "../../viewer/web/press.js";
 
 export class ApiError extends Error {
   constructor(line, status) {

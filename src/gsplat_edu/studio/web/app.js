@@ -1,5 +1,6 @@
 // The page: which screen the address names, keys, and what every screen shares.
 
+import { released } from "../../viewer/web/press.js";
 import { announce, keptFocus, put } from "./dom.js";
 import { Store } from "./store.js";
 import { library } from "./library.js";

@@ -1,5 +1,6 @@
 // Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
 
+import { released } from "../../viewer/web/press.js";
 import { at, get, remove } from "./api.js";
 import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put, versioned } from "./dom.js";
 import { hasDraft } from "./draft.js";

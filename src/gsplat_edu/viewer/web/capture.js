@@ -1,5 +1,17 @@
 // The page of a capture: unpacks its points, then draws whenever something changes.
-"use strict";
+
+import { fitted, View } from "./camera.js";
+import { Cameras, projected } from "./capture_cameras.js";
+import { CaptureRenderer } from "./capture_draw.js";
+import { MatchPanel, readMatches } from "./capture_matches.js";
+import { CapturePanel, numbered, tellFrame } from "./capture_panel.js";
+import { Photos } from "./capture_photos.js";
+import { RegionTool } from "./capture_region.js";
+import { element, fail, say, startPage } from "./common.js";
+import { Controls } from "./controls.js";
+import { FACTS } from "./facts.js";
+import { released } from "./press.js";
+import { inflated } from "./scene.js";
 
 const SLOW = 40; // milliseconds per frame above which fewer points are drawn while the view moves
 const FAST = 20; // below which more are
@@ -315,16 +327,6 @@ function rgbOf(text) {
   return [0, 1, 2].map((i) => (digits.length === 3 ? 17 * parseInt(digits[i], 16) : parseInt(digits.slice(2 * i, 2 * i + 2), 16)));
 }
 
-// Tells the page around this one, if it is from the same server, by an event of the frame: "started", or "left" with the
-// photo that was left out or taken back here.
-function tellFrame(name, detail = {}) {
-  window.frameElement?.dispatchEvent(new CustomEvent(name, { detail }));
-}
-
-function fail(error) {
-  say(error?.message || String(error));
-}
-
 async function start() {
   const points = await inflated(document.querySelectorAll("script.points"), 15 * FACTS.count);
   const matches = await readMatches(FACTS);
@@ -337,6 +339,4 @@ async function start() {
   say("");
 }
 
-addEventListener("error", (event) => fail(event.error));
-addEventListener("unhandledrejection", (event) => fail(event.reason));
-addEventListener("DOMContentLoaded", () => start().catch(fail));
+startPage(start);

@@ -1,13 +1,14 @@
 // The cameras of a capture: the lines that draw them, their colours, and which one is under the pointer.
-"use strict";
+
+import { dot, plus } from "./camera.js";
 
 const GRASP = 8; // CSS px: a line this near to the pointer is under it
 const MOST_FINDINGS = 6; // with colours of their own; further ones share the last
 const THIN = 1.5; // width of a line, CSS px
 const THICK = 3.5; // of the chosen camera's lines
-const BYTES = 8; // per line: RGBA, width in quarters of a px, whether it grows with the outlines, and two unused
+export const BYTES = 8; // per line: RGBA, width in quarters of a px, whether it grows with the outlines, and two unused
 
-class Cameras {
+export class Cameras {
   constructor({ cameras, shapes, size, gap }) {
     this.list = cameras.map((camera) => ({ ...camera, marks: [...camera.marks] }));
     this.shapes = shapes;
@@ -115,7 +116,7 @@ const inWorld = ({ R }, [x, y, z]) => [0, 1, 2].map((axis) => R[0][axis] * x + R
 const depthOf = (point, { R, eye }) => dot(R[2], plus(point, eye, -1));
 
 // Column and row at which a camera sees a point; null behind it.
-function projected(point, { R, eye, fx, fy, cx, cy }) {
+export function projected(point, { R, eye, fx, fy, cx, cy }) {
   const [x, y, z] = R.map((row) => dot(row, plus(point, eye, -1)));
   return z > 0 ? [(fx * x) / z + cx, (fy * y) / z + cy] : null;
 }

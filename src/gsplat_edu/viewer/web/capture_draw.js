@@ -1,11 +1,13 @@
 // Draws the points and cameras of a capture with WebGL2: the points in one call, all lines in another. Every line is a
 // rectangle with vertices of its own: drawn in software, an instance per line takes several times as long.
-"use strict";
+
+import { BYTES } from "./capture_cameras.js";
+import { linked } from "./common.js";
 
 const POINT = 2; // CSS px, side of a point
 const MATCHED = 4; // the same of a matched one
 
-class CaptureRenderer {
+export class CaptureRenderer {
   constructor(canvas, { count }, points, cameras) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error("This page draws with WebGL2, which this browser lacks or has switched off. The list of photos works without it.");

@@ -1,11 +1,13 @@
 // Everything around the picture of a capture: the legend, the list of photos, the chosen photo, and the one under the pointer.
-"use strict";
 
-const SMALL = "(max-width: 600px)"; // as in capture.css
+import { element } from "./common.js";
+import { released } from "./press.js";
+
+export const SMALL = "(max-width: 600px)"; // as in capture.css
 const HOVER_APART = 16; // CSS px between the pointer and the photo beside it
 const NOT_THERE = "cannot be shown";
 
-class CapturePanel {
+export class CapturePanel {
   // actions: choose(index), step(by), look(), leave(), size(factor), reset(), repaint().
   constructor(facts, cameras, photos, actions) {
     Object.assign(this, { facts, cameras, photos, actions, asked: 0, hovered: -1 });
@@ -163,4 +165,10 @@ async function decodedPhoto(address) {
   return picture;
 }
 
-const numbered = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
+export const numbered = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
+
+// Tells the page around this one, if it is from the same server, by an event of the frame: "started", or "left" with the
+// photo that was left out or taken back here.
+export function tellFrame(name, detail = {}) {
+  window.frameElement?.dispatchEvent(new CustomEvent(name, { detail }));
+}

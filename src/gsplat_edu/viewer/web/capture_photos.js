@@ -1,9 +1,8 @@
 // Photos from the server, on demand, and what the page changes in the capture: photos to leave out, and the region.
-"use strict";
 
 const MOST_KEPT = 200; // photos in memory
 
-class Photos {
+export class Photos {
   constructor() {
     this.known = new Map(); // addresses of photos in memory, oldest first
   }

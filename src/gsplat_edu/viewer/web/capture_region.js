@@ -2,7 +2,15 @@
 //
 // It has the members that `Gizmo` and `Overlay` need of an editor's tools. The box is in the page's coordinates; the
 // server's file has those of the capture, which differ by `facts.origin`.
-"use strict";
+
+import { plus } from "./camera.js";
+import { SMALL, tellFrame } from "./capture_panel.js";
+import { element } from "./common.js";
+import { Gizmo } from "./edit_gizmo.js";
+import { numberFields } from "./edit_gizmo_panel.js";
+import { Overlay } from "./edit_overlay.js";
+import { boxHandles, boxLines, sideAt, sideDragged } from "./edit_shapes.js";
+import { released } from "./press.js";
 
 const ELSEWHERE = {
   saved: "Another tab has saved a box. Yours is not saved yet; saving it replaces the other one.",
@@ -12,7 +20,7 @@ const ELSEWHERE = {
 // The numbers of a box as a text; empty without a box.
 const numbersOf = (region) => (region ? [region.center, region.rotation, region.half].flat(2).join() : "");
 
-class RegionTool {
+export class RegionTool {
   constructor(viewer) {
     Object.assign(this, { viewer, editor: this, tool: "box", stroke: null, shape: null, drawing: false, before: null });
     this.saved = null;

@@ -1,11 +1,15 @@
 // Photos beside the picture: the view is at a photo's camera, and a line across the picture has the photo on its left.
 // page_proof.py writes the photos; each has the pinhole of its camera in the page.
-"use strict";
+
+import { element } from "./common.js";
+import { STEPPING } from "./mesh.js";
+import { inflated } from "./scene.js";
+import { offer } from "./seen.js";
 
 const SLIDE = 5; // percent by a key
 const LINE_GRIP = 22; // half the width of the line's handle, CSS pixels
 
-class Compare {
+export class Compare {
   static async open(viewer) {
     const { photos } = viewer.facts;
     const bytes = await inflated(document.querySelectorAll("script.photos"), photos.reduce((sum, photo) => sum + photo.bytes, 0));

@@ -1,5 +1,4 @@
 // Moves the view by mouse, touch and keyboard.
-"use strict";
 
 const WHEEL = 0.0015; // logarithm of the distance per pixel of scrolling
 const LINE = 16; // pixels per line, for wheels that count lines
@@ -32,7 +31,7 @@ const ONCE = ["f", "h", "k", "p", "t", "c", "v"]; // keys that act once, however
 const EMBEDDED = location.hash === "#embedded";
 if (EMBEDDED) document.documentElement.classList.add("embedded");
 
-class Controls {
+export class Controls {
   // actions: moved() after every move, awake() when a held key starts to move, shown() for the camera on the screen,
   // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by), saveView(),
   // playPath(), guide(), compare(), seen(), slide(by), dismiss(). `cameras` is how many cameras the horizontal arrows

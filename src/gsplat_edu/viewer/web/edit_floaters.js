@@ -1,9 +1,11 @@
 // Groups of splats that the server proposes to delete, each with its reason; absent in a page without a server.
-"use strict";
+
+import { element } from "./common.js";
+import { released } from "./press.js";
 
 const ASK_EVERY = 500; // ms between questions to the server
 
-const FLOATERS_PANEL = `
+export const FLOATERS_PANEL = `
 <div id="edit-floaters" role="group" aria-label="proposed floaters" hidden>
 <p class="row"><button data-do="propose" title="Judge the scene, by its photos where there are some">propose floaters</button>
 <button data-do="stop-proposing" hidden>stop</button>
@@ -12,7 +14,7 @@ const FLOATERS_PANEL = `
 <ol id="edit-groups"></ol>
 </div>`;
 
-class EditFloaters {
+export class EditFloaters {
   // Shows what has been proposed before, or is being judged.
   constructor(editor, panel) {
     Object.assign(this, { editor, panel, url: editor.scene.floaters, timer: 0, questions: 0 });

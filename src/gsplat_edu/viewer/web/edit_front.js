@@ -1,6 +1,11 @@
 // Selections of only what is in front: the depths of the visible surface, measured once when the user draws, and their
 // comparison, which is exactly that of gsplat_edu/edits/front.py.
-"use strict";
+
+import { ratioBounds } from "./camera.js";
+import { SOLID } from "./draw.js";
+import { eachSeen, extent } from "./edit_member.js";
+import { alphaAt, footprintOf, splatsWithin } from "./edit_pixel.js";
+import { hundredths } from "./edit_shapes.js";
 
 const FRONT_CELLS = 48; // cells of the stored grid along each axis, at most
 const FRONT_CELL = 8; // CSS pixels: smallest side of a cell
@@ -9,13 +14,13 @@ const FRONT_THICKNESS = 3; // standard deviations in depth that a surface reache
 const FRONT_OPAQUE = 1e-4; // transmittance below which a pixel counts as opaque
 const STEEPEST_FRONT = 6; // depth per width of a surface seen at 80 degrees; a steeper step is an edge
 
-const FRONT_ROW = `
+export const FRONT_ROW = `
 <p class="row" data-for="rectangle lasso polygon brush">
 <button data-do="front" aria-pressed="false" title="5: select only what is in front, not what lies behind the visible surface">front only</button>
 </p>`;
 
 // Removes the splats that lie deeper than the cells of a selection allow. inside: 1 for those that the shape holds.
-function inFront(region, values, inside, work) {
+export function inFront(region, values, inside, work) {
   if (!region.front) return inside;
   const { bounds: [u0, v0, u1, v1], columns, rows, deepest } = region.front;
   work.add(inside.reduce((sum, one) => sum + one, 0));
@@ -33,7 +38,7 @@ function frontCell(value, low, high, count) {
 
 // The "front" of a selection drawn in a picture. region: its shape. scene: {values, flags, settings, near}. perPixel:
 // pixels of the picture per CSS pixel.
-function frontOf(region, camera, scene, perPixel) {
+export function frontOf(region, camera, scene, perPixel) {
   const bounds = frontBounds(region, camera);
   const [width, height] = [bounds[2] - bounds[0], bounds[3] - bounds[1]];
   const count = (length) => Math.min(Math.max(Math.ceil(length / (FRONT_CELL * perPixel)), 1), FRONT_CELLS);

@@ -1,12 +1,15 @@
 // The editor's bar chart of opacities, sizes or distances, on which a range of splats is selected.
-"use strict";
+
+import { element } from "./common.js";
+import { SELECTED } from "./edit_flags.js";
+import { shortNumber } from "./edit_shapes.js";
 
 const BAR_STEPS = 4; // steps of a handle per bar
 const RANGE_STEPS = 200; // steps of a handle over the whole chart
 const CHART_HEIGHT = 90; // CSS pixels
 const LEAST_DISTANCE = 1e-6; // of the largest one: smaller ones lie in the first bar
 
-const HISTOGRAM_PANEL = `
+export const HISTOGRAM_PANEL = `
 <details id="edit-histogram"><summary>by opacity, size or distance</summary>
 <p class="row"><label>of <select id="edit-quantity"><option value="opacity">opacity</option><option value="size">size</option>
 <option value="distance">distance to the pivot</option></select></label></p>
@@ -32,7 +35,7 @@ const QUANTITIES = {
   },
 };
 
-class EditHistogram {
+export class EditHistogram {
   constructor(editor) {
     this.editor = editor;
     this.root = element("edit-histogram");

@@ -1,5 +1,10 @@
 // Levels the scene by the directions of its cameras: people hold cameras level, so the images' x axes are horizontal.
-"use strict";
+
+import { cross, dot, plus, transposed, turned } from "./camera.js";
+import { element } from "./common.js";
+import { degrees } from "./edit_rotations.js";
+import { EDIT_UP, normalOf, rotated } from "./edit_shapes.js";
+import { unit } from "./region.js";
 
 const LEAST_CAMERAS = 3;
 const LEAST_SPREAD = 0.1; // root mean square of the x axes' second coordinate: 6 degrees from one common direction
@@ -66,7 +71,7 @@ function horizonOf(up, { R, fx, fy, cx, cy, W, H }) {
 }
 
 // The buttons and sliders of the tool "floor".
-class Leveller {
+export class Leveller {
   constructor(editor) {
     this.editor = editor;
     this.angles = ["edit-pitch", "edit-roll"].map(element);

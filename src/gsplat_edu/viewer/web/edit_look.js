@@ -1,5 +1,11 @@
 // How the picture shows the splats and the selection: tinted, by their centres, by rings, and with an outline.
-"use strict";
+
+import { linked } from "./common.js";
+import { ORDER, Renderer } from "./draw.js";
+import { HIGHLIGHT } from "./edit_draw.js";
+import { SELECTED } from "./edit_flags.js";
+import { reduced } from "./pace.js";
+import { layout } from "./scene.js";
 
 const LOOKS = ["tint", "centres", "rings"];
 const TINT = { tint: 0.6, centres: 0, rings: 0.75 }; // share of the highlight in the colour of a selected splat
@@ -10,7 +16,7 @@ const DOTS = [
 ];
 const OUTLINE_WIDTH = 2; // CSS pixels
 
-const LOOK_ROW = `
+export const LOOK_ROW = `
 <p class="row" role="group" aria-label="how the selection is shown">
 <button data-look="tint" aria-pressed="true" title="6: tint the selected splats">tint</button>
 <button data-look="centres" aria-pressed="false" title="7: show the centre of every splat">centres</button>
@@ -28,7 +34,7 @@ Renderer.prototype.setUniforms = function (camera, settings) {
   gl.uniform1f(gl.getUniformLocation(program, "ring_width"), rings);
 };
 
-class EditLook {
+export class EditLook {
   constructor(editor) {
     const { viewer } = editor;
     const { gl } = viewer.renderer;

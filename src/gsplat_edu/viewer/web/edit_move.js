@@ -1,5 +1,9 @@
 // Moves and turns the selected splats: their state, as gsplat_edu/edits/moves.py computes it, and how the page draws it.
-"use strict";
+
+import { dot, plus } from "./camera.js";
+import { element, nearestTexture } from "./common.js";
+import { SELECTED } from "./edit_flags.js";
+import { product3 } from "./edit_rotations.js";
 
 const EYE3 = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 const TURNS_ACROSS = 256; // rotations in a row of their texture
@@ -7,7 +11,7 @@ const TURNS_ACROSS = 256; // rotations in a row of their texture
 // The centres and rotations of splats after the operations "move". Means change in place, in the order that docs/EDITS.md
 // states, so that later selections see the same numbers as the command. Rotations are only drawn; splats that were moved
 // together share one.
-class Motion {
+export class Motion {
   constructor({ count, means }) {
     this.means = means;
     this.opened = means.slice();
@@ -74,7 +78,7 @@ const movedBy = (done, { R, t }) => ({ R: product3(R, done.R), t: [0, 1, 2].map(
 
 // What the moves of all splats that are left do together, {R, t}; and whether there were moves of some of them only. As
 // gsplat_edu/edits/apply.py computes it.
-function movedTogether({ motion }, flags) {
+export function movedTogether({ motion }, flags) {
   const left = new Set();
   if (motion) for (let i = 0; i < flags.length; ++i) if (flags[i] <= SELECTED) left.add(motion.turned[i]);
   const [first = [], ...others] = [...left].map((index) => motion.steps[index]);
@@ -94,12 +98,12 @@ function placesOf(flags, state) {
 }
 
 // The rotation of a splat since the scene was opened.
-function turnSince({ motion }, i) {
+export function turnSince({ motion }, i) {
   return motion ? motion.turns[motion.turned[i]] : EYE3;
 }
 
 // What the shader reads about moved splats: which rotation each has, the rotations, and the move under the pointer.
-class MotionTextures {
+export class MotionTextures {
   constructor(renderer) {
     const { gl, textures, textureWidth, facts } = renderer;
     Object.assign(this, { renderer, live: null, any: false, units: [textures.length + 3, textures.length + 4] }); // behind seen.js
@@ -183,7 +187,7 @@ function selectedBox({ count, means }, flags) {
 const moveOf = ({ rotation: R, from, center }) => ({ R, t: [0, 1, 2].map((i) => center[i] - dot(R[i], from)) });
 
 // The tool that moves the selection; the splats, and the mesh with all of them, follow the handle while it is dragged, in their order before the move.
-class Mover {
+export class Mover {
   constructor(editor) {
     this.editor = editor;
     const { renderer } = editor.viewer;

@@ -1,5 +1,7 @@
 // Splats near those of a set, by a hash of cells: exactly as in gsplat_edu/edits/neighbours.py, which says why.
-"use strict";
+
+import { SELECTED } from "./edit_flags.js";
+import { MOST_SAMPLED, shortNumber } from "./edit_shapes.js";
 
 const HALF_CELLS = 1 << 16; // along each axis on either side of the median
 const WIDER_CELLS = 1.001; // side of a cell, in radii
@@ -97,13 +99,13 @@ function withinRadius({ count, means }, isJudged, isOther, radius, work) {
 }
 
 // Applies "grow" or "shrink" to the states, in place; throws an Error, before anything is changed, if it is too much.
-function applyNear({ op, radius }, values, flags, work) {
+export function applyNear({ op, radius }, values, flags, work) {
   const [from, to] = op === "grow" ? [0, SELECTED] : [SELECTED, 0];
   for (const i of withinRadius(values, (i) => flags[i] === from, (i) => flags[i] === to, radius, work)) flags[i] = to;
 }
 
 // A radius for "grow" and "shrink" to begin with: a few times the median size of the splats, with two digits.
-function proposedRadius({ count, log_scales }) {
+export function proposedRadius({ count, log_scales }) {
   const every = Math.max(1, Math.floor(count / MOST_SAMPLED));
   const sizes = [];
   for (let i = 0; i < count; i += every) {
@@ -115,13 +117,13 @@ function proposedRadius({ count, log_scales }) {
 }
 
 // Whether a splat lies in runs of indices, [start, count, ...].
-function listMembers({ runs }, { count }) {
+export function listMembers({ runs }, { count }) {
   const inside = new Uint8Array(count);
   for (let k = 0; k < runs.length; k += 2) inside.fill(1, runs[k], runs[k] + runs[k + 1]);
   return inside;
 }
 
-const NEAR_PANEL = `
+export const NEAR_PANEL = `
 <p class="row" role="group" aria-label="neighbours"><label>radius <input id="edit-near" type="number" min="0" step="any"></label>
 <button data-do="grow" title=".: select also what lies within the radius of the selection">grow</button>
 <button data-do="shrink" title=",: deselect what lies within the radius of what is not selected">shrink</button></p>`;

@@ -1,10 +1,9 @@
 // Lines above the picture of a page: a canvas of their own.
-"use strict";
 
-const HANDLE = 7; // CSS pixels: radius of a dot to take hold of
+import { HANDLE, seenAt, seenLine } from "./edit_shapes.js";
 
 // Lines above the picture. Its methods take CSS pixels, or points of the scene.
-class Overlay {
+export class Overlay {
   constructor(viewer) {
     this.viewer = viewer;
     this.canvas = document.createElement("canvas");

@@ -1,5 +1,17 @@
 // The editor's panel: tools, their options, the list of operations.
-"use strict";
+
+import { plus } from "./camera.js";
+import { element, refill } from "./common.js";
+import { EditFloaters, FLOATERS_PANEL } from "./edit_floaters.js";
+import { FRONT_ROW } from "./edit_front.js";
+import { numberFields } from "./edit_gizmo_panel.js";
+import { EditHistogram, HISTOGRAM_PANEL } from "./edit_histogram.js";
+import { LOOK_ROW } from "./edit_look.js";
+import { NEAR_PANEL, proposedRadius } from "./edit_near.js";
+import { POLYGON_ROW } from "./edit_polygon.js";
+import { length3, shortNumber } from "./edit_shapes.js";
+import { POINTS_OF } from "./edit_tools.js";
+import { TOUR_ROW } from "./edit_tour.js";
 
 const EDIT_PANEL = `
 <section id="edit" aria-label="editor">
@@ -154,7 +166,7 @@ const EDIT_APPLIES = {
   measure: "measure",
 };
 
-class EditPanel {
+export class EditPanel {
   constructor(editor) {
     this.editor = editor;
     document.body.insertAdjacentHTML("beforeend", EDIT_PANEL);

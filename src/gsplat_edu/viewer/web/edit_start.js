@@ -1,5 +1,8 @@
 // Opens the editor in a page that `view --edit` serves.
-"use strict";
+
+import { startEditor } from "./edit.js";
+import { FACTS } from "./facts.js";
+import { inflated } from "./scene.js";
 
 // The exact parameters that the page's splats lack: sh0, then the logits of the opacities.
 async function unpackValues(count) {

@@ -1,7 +1,11 @@
 // The state of every splat after a list of operations, as gsplat_edu/edits/apply.py computes it, with undo and redo.
-"use strict";
 
-const [SELECTED, HIDDEN, DELETED] = [1, 2, 4]; // at most one at a time; 0 is a splat that is merely there
+import { EditWork } from "./edit_cells.js";
+import { DELETED, HIDDEN, SELECTED } from "./edit_flags.js";
+import { boxMembers, members } from "./edit_member.js";
+import { Motion } from "./edit_move.js";
+import { applyNear } from "./edit_near.js";
+
 const UNDO_BYTES = 128 << 20; // changes remembered for undo; older operations are undone by repeating those before
 
 // Applies one operation to the states, in place; returns what undoes a move of splats. Throws an Error, before anything is changed, if the work is too much.
@@ -48,7 +52,7 @@ function applySelect(how, inside, flags) {
   }
 }
 
-class EditHistory {
+export class EditHistory {
   // values: as for members(). operations: those of the opened file.
   constructor(values, operations) {
     this.values = values;

@@ -1,17 +1,32 @@
 // The editor's tools: what pointers and keys in the picture do.
-"use strict";
+
+import { plus, pointAt } from "./camera.js";
+import { frontOf } from "./edit_front.js";
+import { CURSOR_STEP, Gizmo } from "./edit_gizmo.js";
+import { depthAtPixel } from "./edit_pixel.js";
+import { EditPolygon } from "./edit_polygon.js";
+import {
+  boxAround,
+  boxHandles,
+  boxLines,
+  hundredths,
+  LEAST_DRAG,
+  length3,
+  MOST_STROKE,
+  pictureOf,
+  sideAt,
+  sideDragged,
+  sphereLines,
+  uprightAxes,
+} from "./edit_shapes.js";
 
 const LONG_FRONT = 50000; // splats from which the measure of a visible surface is announced
 const EDIT_TOOLS = ["navigate", "rectangle", "lasso", "polygon", "brush", "sphere", "box", "move", "color", "floor", "scale", "measure"];
-const POINTS_OF = { floor: 3, scale: 2, measure: 2 }; // points that a tool takes from the surface
+export const POINTS_OF = { floor: 3, scale: 2, measure: 2 }; // points that a tool takes from the surface
 const LEAST_STEP = 2; // CSS pixels between the points of a stroke
-const LEAST_DRAG = 3; // CSS pixels; a shorter drag is a click
-const MOST_STROKE = 20000; // points of a stroke, as in an edits file
 const CLICKED_SIZE = 0.15; // of the distance to the pivot: radius of a sphere that was only clicked
 
-const hundredths = (x) => Math.round(x * 100) / 100;
-
-class EditTools {
+export class EditTools {
   constructor(editor) {
     Object.assign(this, { editor, viewer: editor.viewer, tool: "navigate", stroke: null, shape: null, points: [] });
     this.gizmo = new Gizmo(this);
@@ -190,6 +205,10 @@ class EditTools {
 
   lassoEnds({ camera, points }, how) {
     if (points.length > 2) this.select(how, { by: "lasso", camera: pictureOf(camera), points }, camera);
+  }
+
+  polygonEnds(stroke, how) {
+    this.polygon.click(stroke, how);
   }
 
   brushEnds({ camera, points }, how) {

@@ -1,10 +1,13 @@
 // The order of the named views, and the guided tour as a visitor of the exported page walks through it.
-"use strict";
 
-const TOUR_ROW = `
+import { element } from "./common.js";
+import { Guide } from "./guide.js";
+import { readKeyframe } from "./keyframes.js";
+
+export const TOUR_ROW = `
 <p class="row"><button data-do="tour" aria-pressed="false" title="Walk through the guided tour as a visitor does; ← → are its steps, Escape ends it">preview the tour</button></p>`;
 
-class EditTour {
+export class EditTour {
   constructor(editor) {
     const { viewer, panel } = editor;
     Object.assign(this, { editor, viewer });

@@ -1,12 +1,14 @@
 // The capture's cameras over the scene: outlines of what they see, at a fixed depth. Those of held-out photos are dashed.
-"use strict";
+
+import { dot, plus, pointAt } from "./camera.js";
+import { element } from "./common.js";
 
 const OUTLINE_SHARE = 0.06; // depth of an outline, of the distance from the start view to the pivot
 const OUTLINE_NEAR = 1e-3; // of that depth: lines are cut this close to the eye
 const OUTLINE_COLORS = [["#000a", 3.5], ["#58c7ff", 1.5]]; // each line is drawn in all of them, widths in px
 const HELD_OUT = "#ffb54a";
 
-class Frustums {
+export class Frustums {
   constructor(viewer) {
     const { cameras, start } = viewer.facts;
     this.list = cameras.filter(({ saved }) => !saved);

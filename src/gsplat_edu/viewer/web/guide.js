@@ -1,9 +1,11 @@
 // The guided tour: the author's named views that have a text, one after the other.
-"use strict";
+
+import { element } from "./common.js";
+import { offer } from "./seen.js";
 
 const SWIPE = 40; // least pixels to the side
 
-class Guide {
+export class Guide {
   // The tour of a page; null if no view has a text. An editor makes its own.
   static of(viewer) {
     const { cameras, edit } = viewer.facts;

@@ -1,7 +1,11 @@
 // The camera path of the page: views that the user saves, or the path that came with the page.
-"use strict";
 
-class Keyframes {
+import { plus, radians, transposed } from "./camera.js";
+import { element, refill } from "./common.js";
+import { PathCurve } from "./path.js";
+import { restOf, Timeline } from "./timeline.js";
+
+export class Keyframes {
   // actions: view() for the current camera, goToView(camera), playPath() to start or stop, pathChanged().
   constructor(facts, actions) {
     Object.assign(this, { facts, actions });
@@ -136,6 +140,6 @@ class Keyframes {
   }
 }
 
-function readKeyframe({ position, rotation, fov, time, hold }) {
+export function readKeyframe({ position, rotation, fov, time, hold }) {
   return { eye: position, R: transposed(rotation), fov, time, hold };
 }

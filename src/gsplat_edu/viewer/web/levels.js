@@ -3,7 +3,10 @@
 //
 // A new level is written beside the old one, sorted, and only then shown in its place. So a picture is complete at any
 // time, and at most `budget` splats are drawn. Memory for one more batch is reserved.
-"use strict";
+
+import { dot } from "./camera.js";
+import { element, fail } from "./common.js";
+import { Sorter } from "./sorter.js";
 
 const SLOT = 32; // splats per piece of texture memory
 const BATCH = 65536; // most splats that are decoded and sorted at once, unless a run has more
@@ -13,14 +16,14 @@ const USUAL = 4e6;
 const OUTSIDE = 0.05; // weight of the error of a region outside the picture, to which the camera may turn
 
 // Budget of this machine: a phone's is a million; no more than its textures hold.
-function machineBudget(gl, degree) {
+export function machineBudget(gl, degree) {
   const phone = matchMedia("(pointer: coarse)").matches && !matchMedia("(any-pointer: fine)").matches;
   const usual = phone ? PHONE : (navigator.deviceMemory ?? 8) <= 4 ? MODEST : USUAL;
   const texels = gl.getParameter(gl.MAX_TEXTURE_SIZE) ** 2 / (degree + 1) ** 2;
   return Math.min(usual, Math.floor(texels / 2));
 }
 
-class Levels {
+export class Levels {
   // onChange() is called when other splats are shown.
   constructor(facts, budget, onChange) {
     const { regions, filenames } = facts.lod;

@@ -1,5 +1,9 @@
 // For browsers without WebGL2: the computer that serves the page renders, and the page shows its pictures.
-"use strict";
+
+import { fitted } from "./camera.js";
+import { element, say } from "./common.js";
+import { FACTS } from "./facts.js";
+import { Viewer } from "./viewer.js";
 
 const PICTURE_SIDE = 800; // longest side of a picture while the training runs, px
 const STILL_SIDE = 1600; // while it waits or is finished
@@ -71,7 +75,7 @@ const hasWebGL2 = () => {
   return gl !== null;
 };
 
-// This listener comes before that of main.js.
+// This listener comes before that of viewer.js.
 addEventListener("DOMContentLoaded", (event) => {
   if (hasWebGL2()) return;
   event.stopImmediatePropagation();

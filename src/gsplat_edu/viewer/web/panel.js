@@ -1,11 +1,12 @@
 // Everything around the picture: metadata, buttons, the capture's cameras, messages.
-"use strict";
+
+import { element } from "./common.js";
 
 const POINT_SHOWN = 800; // milliseconds
 
 const SMALL = "(max-width: 600px) and (orientation: portrait)"; // as in style.css
 
-class Panel {
+export class Panel {
   // actions: fly(), reset(), goTo(index), degree(value).
   constructor(facts, actions) {
     this.facts = facts;

@@ -1,5 +1,7 @@
 // The camera path as a strip of time: a marker for each view, and a playhead.
-"use strict";
+
+import { element } from "./common.js";
+import { PathCurve } from "./path.js";
 
 const PATH_GAP = 0.01; // least seconds between views that the page writes
 const NEAR_MARKER = 22; // CSS pixels beside a marker that still press it
@@ -10,7 +12,7 @@ const FINE_STEP = 0.1;
 const COARSE_STEP = 1; // seconds, with Shift
 
 const shortSeconds = (seconds) => `${Number(seconds.toFixed(2))} s`;
-const restOf = ({ hold }) => hold ?? 0;
+export const restOf = ({ hold }) => hold ?? 0;
 
 // The times at which a path meets its views, from 0; evenly if they are all at one place.
 function timesOf(path) {
@@ -42,7 +44,7 @@ function timed(path, change = (keyframe) => keyframe) {
   return { ...path, keyframes, duration: path.loop ? new PathCurve(path).seconds : null };
 }
 
-class Timeline {
+export class Timeline {
   // keyframes: the Keyframes whose path is shown.
   constructor(keyframes) {
     Object.assign(this, { keyframes, at: 0, chosen: 0, press: null, markers: [], bars: [] });
