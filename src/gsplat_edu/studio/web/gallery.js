@@ -73,7 +73,11 @@ export function gallery(entry, changed = () => {}, masked = () => {}, store = nu
       h("span", { class: "name" }, name),
       h("span", { class: problem ? "error" : "quiet" }, detail),
       h("span", { class: "mark" }),
-      isCapture ? leaving(entry, name, line, (out) => (left(name, out), changed(name, out))) : null,
+      isCapture ? leaving(entry, name, line, (out) => {
+            left(name, out);
+            changed(name, out);
+          })
+        : null,
       isCapture && !problem ? Object.assign(masking(store, entry, name, line, masked), { className: "leave masking" }) : null,
     );
   }

@@ -151,7 +151,11 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
     tip = null;
     show();
   });
-  svg.addEventListener("pointerup", (event) => points && !cross && event.isPrimary && (move(place(event)), release()));
+  svg.addEventListener("pointerup", (event) => {
+    if (!points || cross || !event.isPrimary) return;
+    move(place(event));
+    release();
+  });
   svg.addEventListener("pointercancel", drop);
   function resize(next) {
     radius = Math.min(Math.max(next, 1), Math.ceil(longest / MOST_RADIUS));
@@ -191,7 +195,12 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
     get undoable() {
       return past.length > 0;
     },
-    use: (next) => (drop(), (tool = next), show(), changed()),
+    use: (next) => {
+      drop();
+      tool = next;
+      show();
+      changed();
+    },
     resize,
     // [ and ] make the brush smaller and larger.
     press({ key, ctrlKey, metaKey, altKey }) {

@@ -119,7 +119,7 @@ export class RegionTool {
   }
 
   // Column and row of the picture at CSS pixels of the window.
-  pointOf(camera, x, y) {
+  pointOf(_camera, x, y) {
     const { left, top } = this.viewer.canvas.getBoundingClientRect();
     return { x, y, u: (x - left) * this.viewer.dense - 0.5, v: (y - top) * this.viewer.dense - 0.5 };
   }

@@ -18,8 +18,6 @@ ${GIZMO_PARTS.map(({ name }) => `<button data-handle="${name}">${name}</button>`
 <p class="row numbers" id="edit-angles" role="group" aria-label="turned, degrees"><span>turned, degrees: tilt, heading, roll</span></p>
 <p class="row" data-for="box"><button id="edit-level-box">level the box again</button></p>`;
 
-const ANGLE_NAMES = ["x", "y", "z"];
-
 // Adds three fields for numbers, x, y and z, to an element; returns them.
 export function numberFields(id) {
   return ["x", "y", "z"].map((axis) => {

@@ -112,7 +112,7 @@ export class EditHistogram {
     [this.all, this.selected] = [new Uint32Array(bars), new Uint32Array(bars)];
     const scale = bars / (high - low);
     for (let i = 0; i < values.count; ++i) {
-      if (places[i] !== places[i]) continue;
+      if (Number.isNaN(places[i])) continue;
       const bar = Math.min(Math.max(Math.floor((places[i] - low) * scale), 0), bars - 1);
       ++this.all[bar];
       if (flags[i] === SELECTED) ++this.selected[bar];

@@ -7,7 +7,6 @@ import { SELECTED } from "./edit_flags.js";
 import { reduced } from "./pace.js";
 import { layout } from "./scene.js";
 
-const LOOKS = ["tint", "centres", "rings"];
 const TINT = { tint: 0.6, centres: 0, rings: 0.75 }; // share of the highlight in the colour of a selected splat
 const MASK_SHARE = 0.5; // of the picture's size: the mask of the outline
 const DOTS = [

@@ -122,7 +122,7 @@ export function boxMembers({ center, rotation, half }, values) {
 }
 
 const isBetween = (value, low, high) =>
-  value === value && (low === undefined || value >= low) && (high === undefined || value <= high);
+  !Number.isNaN(value) && (low === undefined || value >= low) && (high === undefined || value <= high);
 
 // Returns 1 for every splat of the region that a "select" describes. values: {count, means, log_scales, logits, sh0}.
 // work: counts one test for each splat, and those of the edges of a lasso and the segments of a stroke.
@@ -154,7 +154,7 @@ export function members(region, values, work = new EditWork()) {
     case "color":
       return everyMember(values, (k) => [0, 1, 2].every((j) => isBetween(sh0[k + j], low[j], high[j])));
     case "opacity":
-      return everyMember(values, (k, i) => isBetween(logits[i], low, high));
+      return everyMember(values, (_k, i) => isBetween(logits[i], low, high));
     case "size":
       return everyMember(values, (k) =>
         isBetween(Math.max(Math.max(log_scales[k], log_scales[k + 1]), log_scales[k + 2]), low, high),

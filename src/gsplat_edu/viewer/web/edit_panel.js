@@ -195,18 +195,18 @@ export class EditPanel {
   listKeys() {
     const rows = [...this.root.querySelectorAll("[title]")].map(({ title }) => title.match(/^([^:]+): (.+)$/));
     const more = [
-      [, "Arrows", "move a cross in the picture; by single pixels with Shift"],
-      [, "Enter", "press at the cross, press again to release; then apply"],
-      [, "Space", "held: drags turn the view"],
-      [, "Escape", "drop what is drawn, then leave the tool"],
-      [, "[ ]", "size of the brush"],
-      [, "Shift X", "choose a part of the handle, which the arrows then move; finer with Shift"],
+      ["Arrows", "move a cross in the picture; by single pixels with Shift"],
+      ["Enter", "press at the cross, press again to release; then apply"],
+      ["Space", "held: drags turn the view"],
+      ["Escape", "drop what is drawn, then leave the tool"],
+      ["[ ]", "size of the brush"],
+      ["Shift X", "choose a part of the handle, which the arrows then move; finer with Shift"],
     ];
     const heading = document.createElement("h2");
     heading.textContent = "Editor";
     const table = document.createElement("table");
     heading.className = table.className = "mouse"; // not on a device that has only a touch screen
-    for (const [, key, what] of [...rows.filter(Boolean), ...more]) {
+    for (const [key, what] of [...rows.filter(Boolean).map((row) => row.slice(1)), ...more]) {
       const row = table.insertRow();
       row.insertCell().textContent = key;
       row.insertCell().textContent = what;

@@ -65,8 +65,6 @@ export function uprightAxes(up) {
   return transposed(shortestTurn(up, EDIT_UP));
 }
 
-const axesOf = ({ rotation }) => transposed(rotation);
-
 // A box around most of the splats that are there.
 export function boxAround({ count, means }, flags, up) {
   const rotation = uprightAxes(up);

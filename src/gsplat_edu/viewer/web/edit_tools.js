@@ -21,7 +21,6 @@ import {
 } from "./edit_shapes.js";
 
 const LONG_FRONT = 50000; // splats from which the measure of a visible surface is announced
-const EDIT_TOOLS = ["navigate", "rectangle", "lasso", "polygon", "brush", "sphere", "box", "move", "color", "floor", "scale", "measure"];
 export const POINTS_OF = { floor: 3, scale: 2, measure: 2 }; // points that a tool takes from the surface
 const LEAST_STEP = 2; // CSS pixels between the points of a stroke
 const CLICKED_SIZE = 0.15; // of the distance to the pivot: radius of a sphere that was only clicked
