@@ -34,7 +34,8 @@ async function ask(...question) {
 }
 
 async function answerTo(method, address, body) {
-  const given = body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
+  const given =
+    body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
   const answer = await fetch(address, { method, ...given }).catch(() => {
     throw new ApiError(GONE, 0);
   });
@@ -73,7 +74,9 @@ export function upload(address, file, progress, signal) {
       else reject(new ApiError(lineOf(status, text), status));
     });
     // the server closes the connection when it refuses a file before it has all of it
-    request.addEventListener("error", () => reject(new ApiError("The connection closed before the file was received.", 0)));
+    request.addEventListener("error", () =>
+      reject(new ApiError("The connection closed before the file was received.", 0)),
+    );
     request.addEventListener("abort", () => reject(new ApiError("Stopped.", 0)));
     signal.addEventListener("abort", () => request.abort());
     request.send(file);

@@ -98,7 +98,9 @@ function tell(id) {
 const usesKeys = () => localStorage.getItem("keys") !== "off";
 
 function onKey(event) {
-  const typing = event.target.closest?.("input:not([type=checkbox], [type=radio], [type=range]), select, textarea, dialog");
+  const typing = event.target.closest?.(
+    "input:not([type=checkbox], [type=radio], [type=range]), select, textarea, dialog",
+  );
   if (event.ctrlKey || event.metaKey || event.altKey || typing || !usesKeys()) return;
   const actions = {
     "?": () => keys.showModal(),

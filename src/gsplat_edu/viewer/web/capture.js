@@ -39,7 +39,10 @@ class CaptureView {
     this.controls = new Controls(this.canvas, this.view, this.actions(), facts.cameras.length);
     this.renderer = null;
     this.region = new RegionTool(this);
-    this.matchPanel = new MatchPanel(matches, this.cameras, { choose: (index) => this.choose(index), repaint: () => this.match() });
+    this.matchPanel = new MatchPanel(matches, this.cameras, {
+      choose: (index) => this.choose(index),
+      repaint: () => this.match(),
+    });
     this.listen();
     this.paint();
   }
@@ -221,7 +224,12 @@ class CaptureView {
         await released();
         this.mark(new Map(Object.entries(marks)));
         const count = this.cameras.list.filter((camera) => camera.marks.length).length;
-        return this.panel.doctor(trouble || (count ? `The doctor found something about ${numbered(count, "photo")}.` : "The doctor found nothing about single photos."));
+        return this.panel.doctor(
+          trouble ||
+            (count
+              ? `The doctor found something about ${numbered(count, "photo")}.`
+              : "The doctor found nothing about single photos."),
+        );
       }
       await new Promise((resolve) => setTimeout(resolve, ASK_AGAIN));
     }
@@ -293,7 +301,13 @@ class CaptureView {
 
   draw(camera, points) {
     const { near } = this.facts;
-    this.renderer.draw(camera, { near, dense: this.dense, ground: this.colors("ground"), mark: this.colors("match"), points: this.panel.showsPoints ? points : 0 });
+    this.renderer.draw(camera, {
+      near,
+      dense: this.dense,
+      ground: this.colors("ground"),
+      mark: this.colors("match"),
+      points: this.panel.showsPoints ? points : 0,
+    });
     this.region.paint(camera);
     this.stand(camera);
     if (this.through) this.lay(camera);
@@ -304,7 +318,8 @@ class CaptureView {
     const { gap } = this.facts;
     const place = gap && projected(gap[gap.length >> 1], camera);
     element("stand").hidden = !place;
-    if (place) [element("stand").style.left, element("stand").style.top] = place.map((px) => `${(px + 0.5) / this.dense}px`);
+    if (place)
+      [element("stand").style.left, element("stand").style.top] = place.map((px) => `${(px + 0.5) / this.dense}px`);
   }
 
   // Lays the photo over the place of its camera's image.
@@ -324,7 +339,9 @@ class CaptureView {
 // [R, G, B] of a colour #rgb or #rrggbb.
 function rgbOf(text) {
   const digits = text.slice(1);
-  return [0, 1, 2].map((i) => (digits.length === 3 ? 17 * parseInt(digits[i], 16) : parseInt(digits.slice(2 * i, 2 * i + 2), 16)));
+  return [0, 1, 2].map((i) =>
+    digits.length === 3 ? 17 * parseInt(digits[i], 16) : parseInt(digits.slice(2 * i, 2 * i + 2), 16),
+  );
 }
 
 async function start() {

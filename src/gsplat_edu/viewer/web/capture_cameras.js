@@ -55,14 +55,22 @@ export class Cameras {
     this.list.forEach((camera, i) => {
       const stands = i === this.chosen || i === this.over;
       const color = i === this.chosen ? colors("chosen") : colors(this.kindOf(camera));
-      this.style(this.firsts[i], this.firsts[i + 1] ?? this.path, color, camera.left_out && !stands ? 140 : 255, stands ? THICK : THIN, true);
+      this.style(
+        this.firsts[i],
+        this.firsts[i + 1] ?? this.path,
+        color,
+        camera.left_out && !stands ? 140 : 255,
+        stands ? THICK : THIN,
+        true,
+      );
     });
     this.style(this.path, this.arc, colors("way"), showsPath ? 200 : 0, 1, false);
     this.style(this.arc, this.count, colors("gap"), 255, THICK, false);
   }
 
   style(from, to, color, opacity, width, grows) {
-    for (let line = from; line < to; ++line) this.styles.set([...color, opacity, 4 * width, grows ? 1 : 0], BYTES * line);
+    for (let line = from; line < to; ++line)
+      this.styles.set([...color, opacity, 4 * width, grows ? 1 : 0], BYTES * line);
   }
 
   // The camera whose outline is at a place (CSS px): the nearest of those whose image holds it or whose lines are close;
@@ -76,7 +84,13 @@ export class Cameras {
       const reach = this.scale / Math.max(1e-12, Math.hypot(...plus(camera.eye, shown.eye, -1)) - this.scale);
       const middle = depth > 0 ? projected(camera.eye, shown) : null;
       // far from the pointer, whatever the shape
-      if (middle && reach > 0 && reach < 1 && Math.hypot(middle[0] - u, middle[1] - v) > 2 * reach * Math.max(shown.fx, shown.W) + GRASP * dense) return;
+      if (
+        middle &&
+        reach > 0 &&
+        reach < 1 &&
+        Math.hypot(middle[0] - u, middle[1] - v) > 2 * reach * Math.max(shown.fx, shown.W) + GRASP * dense
+      )
+        return;
       const held = this.holds(camera, outline, shown, u, v);
       if (!held && !this.touches(camera, lines, shown, u, v, GRASP * dense)) return;
       const rank = Math.hypot(...plus(camera.eye, shown.eye, -1)) + (i === this.chosen ? 1e-9 : 0);

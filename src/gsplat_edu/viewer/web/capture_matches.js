@@ -78,7 +78,9 @@ export class MatchPanel {
     const found = this.sharing(index);
     const number = numbered(found.length, "photo");
     const about = this.matches.thinned ? " (counted on a sample of the points)" : "";
-    const text = found.length ? `Shares points with ${number}${about}; most with` : "Shares points with no other photo.";
+    const text = found.length
+      ? `Shares points with ${number}${about}; most with`
+      : "Shares points with no other photo.";
     element("sharing-with").textContent = text;
     const items = found.slice(0, MOST_SHARING).map(({ other, common }) => {
       const [item, button, count] = ["li", "button", "small"].map((tag) => document.createElement(tag));

@@ -12,7 +12,10 @@ export class CapturePanel {
   constructor(facts, cameras, photos, actions) {
     Object.assign(this, { facts, cameras, photos, actions, asked: 0, hovered: -1 });
     const { count, all_points: all } = facts;
-    const points = count < all ? `${count.toLocaleString("en")} of ${all.toLocaleString("en")} points` : `${count.toLocaleString("en")} points`;
+    const points =
+      count < all
+        ? `${count.toLocaleString("en")} of ${all.toLocaleString("en")} points`
+        : `${count.toLocaleString("en")} points`;
     element("count").textContent = `${numbered(cameras.list.length, "photo")}, ${count ? points : "no points"}`;
     element("gap").textContent = facts.gap_sentence;
     element("show-points").parentElement.hidden = !count;
@@ -63,13 +66,18 @@ export class CapturePanel {
       return button;
     });
     element("cameras").querySelector("summary").textContent = `photos (${this.buttons.length})`;
-    element("cameras").querySelector("ol").append(...this.buttons.map((button) => button.parentElement));
+    element("cameras")
+      .querySelector("ol")
+      .append(...this.buttons.map((button) => button.parentElement));
   }
 
   // What is known of each photo has changed.
   tell() {
     this.cameras.list.forEach((camera, i) => {
-      this.buttons[i].querySelector("small").textContent = [...(camera.left_out ? ["left out"] : []), ...camera.marks].join(", ");
+      this.buttons[i].querySelector("small").textContent = [
+        ...(camera.left_out ? ["left out"] : []),
+        ...camera.marks,
+      ].join(", ");
     });
     const items = this.cameras.kinds().map(({ kind, name, cameras }) => {
       const item = document.createElement("li");
@@ -142,7 +150,10 @@ export class CapturePanel {
     box.hidden = index < 0;
     if (index < 0) return;
     const { name, photo, marks, left_out: out } = this.cameras.list[index];
-    const caption = (more) => (box.querySelector("figcaption").textContent = [name, ...(out ? ["left out"] : []), ...marks, ...more].join(" · "));
+    const caption = (more) =>
+      (box.querySelector("figcaption").textContent = [name, ...(out ? ["left out"] : []), ...marks, ...more].join(
+        " · ",
+      ));
     caption([]);
     const picture = box.querySelector("img");
     picture.hidden = true;

@@ -18,13 +18,18 @@ export class Photos {
     if (this.known.size > MOST_KEPT) {
       const [[oldest, address]] = this.known;
       this.known.delete(oldest);
-      address.then((url) => URL.revokeObjectURL(url), () => {});
+      address.then(
+        (url) => URL.revokeObjectURL(url),
+        () => {},
+      );
     }
     return found;
   }
 
   async fetched(name, side) {
-    const answer = await fetch(`thumbs/${name.split("/").map(encodeURIComponent).join("/")}?side=${side}`).catch(() => null);
+    const answer = await fetch(`thumbs/${name.split("/").map(encodeURIComponent).join("/")}?side=${side}`).catch(
+      () => null,
+    );
     if (!answer) throw new Error("The server of this page has ended.");
     if (!answer.ok) throw new Error(await reasonOf(answer));
     return URL.createObjectURL(await answer.blob());

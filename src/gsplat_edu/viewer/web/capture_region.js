@@ -38,7 +38,9 @@ export class RegionTool {
     listen("keydown", this.keyDown);
     const pressed = { draw: "draw", remove: "remove", save: "save", cancel: "close" };
     for (const [id, method] of Object.entries(pressed)) {
-      element(`region-${id}`).addEventListener("click", () => Promise.resolve(this[method]()).catch((error) => this.say(error.message)));
+      element(`region-${id}`).addEventListener("click", () =>
+        Promise.resolve(this[method]()).catch((error) => this.say(error.message)),
+      );
     }
     element("region-tools").addEventListener("input", ({ target }) => this.input(target));
     this.changed();
@@ -111,7 +113,11 @@ export class RegionTool {
 
   // Says something beside the box's numbers while it is drawn, else beside the button that draws it.
   say(text) {
-    for (const [id, is] of [["region-note", this.drawing], ["region-said", !this.drawing]]) element(id).textContent = is ? text : "";
+    for (const [id, is] of [
+      ["region-note", this.drawing],
+      ["region-said", !this.drawing],
+    ])
+      element(id).textContent = is ? text : "";
   }
 
   get perPixel() {
@@ -184,7 +190,14 @@ export class RegionTool {
     const { id, at } = this.stroke;
     this.shape = this.began;
     this.stroke = null;
-    this.viewer.controls.press({ pointerId: id, clientX: at.x, clientY: at.y, button: 0, shiftKey: false, preventDefault() {} });
+    this.viewer.controls.press({
+      pointerId: id,
+      clientX: at.x,
+      clientY: at.y,
+      button: 0,
+      shiftKey: false,
+      preventDefault() {},
+    });
     this.changed();
   }
 
@@ -235,7 +248,8 @@ export class RegionTool {
     this.gizmo.panel.update();
     for (const name of ["center", "half"]) {
       this[name].forEach((field, i) => {
-        if (field !== document.activeElement) field.value = this.shape ? Number(this.shape[name][i].toPrecision(4)) : "";
+        if (field !== document.activeElement)
+          field.value = this.shape ? Number(this.shape[name][i].toPrecision(4)) : "";
       });
     }
   }

@@ -37,7 +37,16 @@ export class Controls {
   // playPath(), guide(), compare(), seen(), slide(by), dismiss(). `cameras` is how many cameras the horizontal arrows
   // step through.
   constructor(canvas, view, actions, cameras = 0) {
-    Object.assign(this, { canvas, view, actions, cameras, flying: false, pointers: new Map(), held: new Set(), hurried: false });
+    Object.assign(this, {
+      canvas,
+      view,
+      actions,
+      cameras,
+      flying: false,
+      pointers: new Map(),
+      held: new Set(),
+      hurried: false,
+    });
     this.lastTap = null;
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
@@ -95,7 +104,8 @@ export class Controls {
   }
 
   turn(dx, dy) {
-    const angle = (this.flying ? Math.PI : this.view.turn) / Math.max(this.canvas.clientWidth, this.canvas.clientHeight);
+    const angle =
+      (this.flying ? Math.PI : this.view.turn) / Math.max(this.canvas.clientWidth, this.canvas.clientHeight);
     if (this.flying) this.view.look(dx * angle, dy * angle);
     else this.view.orbit(dx * angle, dy * angle);
   }

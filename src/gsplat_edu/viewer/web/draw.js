@@ -19,7 +19,10 @@ export const ORDER = { type: Uint32Array, channels: 1, texels: 1 }; // splats, f
 export class Renderer {
   constructor(canvas, splats, facts) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
-    if (!gl) throw new Error("This page draws with WebGL2, which this browser lacks or has switched off. Allow hardware acceleration, use another browser, or make a video: gsplat-edu render");
+    if (!gl)
+      throw new Error(
+        "This page draws with WebGL2, which this browser lacks or has switched off. Allow hardware acceleration, use another browser, or make a video: gsplat-edu render",
+      );
     if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
       throw new Error("This page needs half-float render targets, which this graphics processor does not support.");
     }

@@ -216,7 +216,11 @@ class Editor {
 
   selectOpacity(low, high) {
     const logit = (share) => Math.log(share / (1 - share));
-    this.selectRange("opacity", low > LEAST_SHARE ? logit(Math.min(low, 1 - LEAST_SHARE)) : null, high < 1 - LEAST_SHARE ? logit(Math.max(high, LEAST_SHARE)) : null);
+    this.selectRange(
+      "opacity",
+      low > LEAST_SHARE ? logit(Math.min(low, 1 - LEAST_SHARE)) : null,
+      high < 1 - LEAST_SHARE ? logit(Math.max(high, LEAST_SHARE)) : null,
+    );
   }
 
   // Selects by the largest standard deviation, as texts of world units; empty for no limit.
@@ -308,7 +312,10 @@ class Editor {
     gl.disable(gl.SCISSOR_TEST);
     if (!sorter.running) renderer.setOrder(new Uint32Array(sorter.order, 0, count)); // otherwise a new order comes
     this.texture.write(this.history.flags);
-    const byte = (value) => Math.round(255 * Math.min(Math.max(value, 0), 1)).toString(16).padStart(2, "0");
+    const byte = (value) =>
+      Math.round(255 * Math.min(Math.max(value, 0), 1))
+        .toString(16)
+        .padStart(2, "0");
     return `#${[...pixel.subarray(0, 3)].map(byte).join("")}`;
   }
 

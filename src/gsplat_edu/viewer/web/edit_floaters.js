@@ -53,7 +53,11 @@ export class EditFloaters {
 
   show({ state, done, total, groups = [], basis = "", error = "" }) {
     const running = state === "running";
-    const [button, stop, bar] = [this.panel.button("propose"), this.panel.button("stop-proposing"), element("edit-judged")];
+    const [button, stop, bar] = [
+      this.panel.button("propose"),
+      this.panel.button("stop-proposing"),
+      element("edit-judged"),
+    ];
     const focused = [button, stop].includes(document.activeElement);
     button.disabled = running;
     stop.hidden = bar.hidden = !running;
@@ -70,7 +74,9 @@ export class EditFloaters {
     const button = document.createElement("button");
     const count = runs.reduce((sum, x, k) => sum + (k % 2 ? x : 0), 0);
     button.textContent = `${count.toLocaleString("en")} · ${reason}`;
-    button.addEventListener("click", () => this.editor.perform({ op: "select", how: this.editor.how, by: "list", reason, runs }));
+    button.addEventListener("click", () =>
+      this.editor.perform({ op: "select", how: this.editor.how, by: "list", reason, runs }),
+    );
     const item = document.createElement("li");
     item.append(button);
     return item;

@@ -22,7 +22,12 @@ export const FRONT_ROW = `
 // Removes the splats that lie deeper than the cells of a selection allow. inside: 1 for those that the shape holds.
 export function inFront(region, values, inside, work) {
   if (!region.front) return inside;
-  const { bounds: [u0, v0, u1, v1], columns, rows, deepest } = region.front;
+  const {
+    bounds: [u0, v0, u1, v1],
+    columns,
+    rows,
+    deepest,
+  } = region.front;
   work.add(inside.reduce((sum, one) => sum + one, 0));
   eachSeen(region, values, (i, u, v, z) => {
     if (!inside[i]) return;
@@ -51,7 +56,9 @@ export function frontOf(region, camera, scene, perPixel) {
   for (let row = 0; row < rows; ++row) {
     for (let column = 0; column < columns; ++column) {
       const places = [0, 1, 2].flatMap((j) => [0, 1, 2].map((i) => (2 * row + j) * across + 2 * column + i));
-      deepest.push(deepestOf(places, surface, STEEPEST_FRONT * Math.max(lattice.du / camera.fx, lattice.dv / camera.fy)));
+      deepest.push(
+        deepestOf(places, surface, STEEPEST_FRONT * Math.max(lattice.du / camera.fx, lattice.dv / camera.fy)),
+      );
     }
   }
   return { bounds, columns, rows, deepest };
@@ -59,9 +66,16 @@ export function frontOf(region, camera, scene, perPixel) {
 
 // Where a shape lies in the picture.
 function frontBounds({ corners, points, radius = 0 }, { W, H }) {
-  const [us, vs] = points ? [0, 1].map((axis) => extent(points.map((point) => point[axis]))) : [[corners[0], corners[2]], [corners[1], corners[3]]];
+  const [us, vs] = points
+    ? [0, 1].map((axis) => extent(points.map((point) => point[axis])))
+    : [
+        [corners[0], corners[2]],
+        [corners[1], corners[3]],
+      ];
   const ends = ([low, high], most) => {
-    const [from, to] = [low - radius - 0.5, high + radius + 0.5].map((x) => hundredths(Math.min(Math.max(x, -0.5), most - 0.5)));
+    const [from, to] = [low - radius - 0.5, high + radius + 0.5].map((x) =>
+      hundredths(Math.min(Math.max(x, -0.5), most - 0.5)),
+    );
     return to - from < NARROWEST_FRONT ? [from - NARROWEST_FRONT, to + NARROWEST_FRONT] : [from, to];
   };
   const [[u0, u1], [v0, v1]] = [ends(us, W), ends(vs, H)];
@@ -95,7 +109,13 @@ function visibleSurface({ values, flags, settings, near }, camera, lattice) {
   };
   const bounds = ratioBounds(camera, settings);
   const prints = []; // of the splats that are not hidden by others, near to far
-  for (const { i, u, v, reach } of splatsWithin(values, flags, camera, [u0, v0, u0 + du * (across - 1), v0 + dv * (down - 1)], near)) {
+  for (const { i, u, v, reach } of splatsWithin(
+    values,
+    flags,
+    camera,
+    [u0, v0, u0 + du * (across - 1), v0 + dv * (down - 1)],
+    near,
+  )) {
     if (!someLeft(placesWithin(lattice, u, v, reach, reach), done, across)) continue;
     const print = footprintOf(values, i, camera, bounds, settings.antialiased);
     if (!print) continue;

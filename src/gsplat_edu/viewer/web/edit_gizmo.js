@@ -81,7 +81,11 @@ export class Gizmo {
     const faces = Math.abs(dot(sight, axes[axis])) > 0.98; // then all of it is at the same depth
     const offset = (i) => {
       const angle = (2 * Math.PI * i) / CIRCLE;
-      return plus(p.map((x) => x * Math.cos(angle)), q, Math.sin(angle));
+      return plus(
+        p.map((x) => x * Math.cos(angle)),
+        q,
+        Math.sin(angle),
+      );
     };
     return Array.from({ length: CIRCLE }, (_, i) => [offset(i), offset(i + 1)])
       .filter(([a, b]) => faces || dot(sight, plus(a, b)) < 0.1)
@@ -96,7 +100,8 @@ export class Gizmo {
     const far = ({ u, v }) => Math.hypot(u - at.u, v - at.v) / perPixel;
     const middle = far(seenAt(camera, this.shape.center));
     if (middle < Math.max(GIZMO_MIDDLE, reach)) return { ...GIZMO_PARTS.at(-1), apart: middle };
-    if (this.tools.tool === "box" && boxHandles(this.shape).some(({ point }) => far(seenAt(camera, point)) < HANDLE)) return null;
+    if (this.tools.tool === "box" && boxHandles(this.shape).some(({ point }) => far(seenAt(camera, point)) < HANDLE))
+      return null;
     let best = null;
     for (const part of this.parts()) {
       for (const [a, b] of this.lines(part, camera, scale)) {
@@ -202,8 +207,13 @@ export class Gizmo {
     if (part.kind === "ring") {
       const angle = radians(shiftKey ? TURN_FINE : TURN_STEP);
       this.take(this.turnedShape(shape, axis, (right - down) * angle));
-    } else if (part.kind === "arrow") this.take({ ...shape, center: plus(shape.center, axis, (right - down) * length) });
-    else this.take({ ...shape, center: plus(plus(shape.center, camera.R[0], right * length), camera.R[1], down * length) });
+    } else if (part.kind === "arrow")
+      this.take({ ...shape, center: plus(shape.center, axis, (right - down) * length) });
+    else
+      this.take({
+        ...shape,
+        center: plus(plus(shape.center, camera.R[0], right * length), camera.R[1], down * length),
+      });
     this.editor.changed();
     return true;
   }
@@ -215,7 +225,12 @@ export class Gizmo {
     for (const part of this.parts()) {
       const color = part.name === lit || part.name === this.chosen?.name ? GIZMO_HELD : GIZMO_COLORS[part.axis];
       const lines = this.lines(part, overlay.camera, scale);
-      if (part.kind === "middle") overlay.circle(seenAt(overlay.camera, this.shape.center), GIZMO_MIDDLE * this.tools.perPixel, part.name === lit ? GIZMO_HELD : "#ffd24a");
+      if (part.kind === "middle")
+        overlay.circle(
+          seenAt(overlay.camera, this.shape.center),
+          GIZMO_MIDDLE * this.tools.perPixel,
+          part.name === lit ? GIZMO_HELD : "#ffd24a",
+        );
       else if (lines.length) overlay.lines(lines, color);
       if (part.kind === "arrow" && lines.length) overlay.dot(lines[0][1], part.name.at(-1), color);
     }

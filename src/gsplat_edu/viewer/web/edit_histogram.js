@@ -24,13 +24,26 @@ export const HISTOGRAM_PANEL = `
 
 // The horizontal axis of each quantity: the coordinate of splat i, and the value at a coordinate.
 const QUANTITIES = {
-  opacity: { of: ({ logits }) => (i) => 1 / (1 + Math.exp(-logits[i])), value: (x) => x, fixed: [0, 1] },
+  opacity: {
+    of:
+      ({ logits }) =>
+      (i) =>
+        1 / (1 + Math.exp(-logits[i])),
+    value: (x) => x,
+    fixed: [0, 1],
+  },
   size: {
-    of: ({ log_scales: s }) => (i) => Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2]),
+    of:
+      ({ log_scales: s }) =>
+      (i) =>
+        Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2]),
     value: Math.exp,
   },
   distance: {
-    of: ({ means: m }, [x, y, z]) => (i) => Math.log(Math.sqrt((m[3 * i] - x) ** 2 + (m[3 * i + 1] - y) ** 2 + (m[3 * i + 2] - z) ** 2)),
+    of:
+      ({ means: m }, [x, y, z]) =>
+      (i) =>
+        Math.log(Math.sqrt((m[3 * i] - x) ** 2 + (m[3 * i + 1] - y) ** 2 + (m[3 * i + 2] - z) ** 2)),
     value: Math.exp,
   },
 };

@@ -91,7 +91,8 @@ export class EditLook {
     const hurried = viewer.pace.slow && viewer.isMoving();
     if (this.outlined && this.selected.length && !hurried) this.drawOutline(camera);
     this.stride = hurried ? Math.max(1, Math.ceil(this.editor.values.count / viewer.pace.detail.most)) : 1;
-    if (this.kind === "centres") for (const dots of DOTS) if (!dots.selected || this.selected.length) this.drawDots(camera, dots);
+    if (this.kind === "centres")
+      for (const dots of DOTS) if (!dots.selected || this.selected.length) this.drawDots(camera, dots);
   }
 
   // Draws on the canvas with a program of ours.
@@ -108,7 +109,10 @@ export class EditLook {
     const { gl, facts, flags } = renderer;
     const place = this.begin(this.dots);
     const means = layout(facts).findIndex(({ name }) => name === "means");
-    for (const [name, unit, texture] of [["means", means, renderer.textures[means]], ["flags", flags.unit, flags.texture]]) {
+    for (const [name, unit, texture] of [
+      ["means", means, renderer.textures[means]],
+      ["flags", flags.unit, flags.texture],
+    ]) {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(place(name), unit);
@@ -153,7 +157,12 @@ export class EditLook {
     const { framebuffer, image, width, height, begun, order, count, thinning } = renderer;
     Object.assign(renderer, this.mask, { order: this.order, count: this.selected.length, thinning: 0 });
     this.plainly(() => renderer.draw(reduced(camera, MASK_SHARE), settings, [0, 0, 0, 0]));
-    this.mask = { framebuffer: renderer.framebuffer, image: renderer.image, width: renderer.width, height: renderer.height };
+    this.mask = {
+      framebuffer: renderer.framebuffer,
+      image: renderer.image,
+      width: renderer.width,
+      height: renderer.height,
+    };
     Object.assign(renderer, { framebuffer, image, width, height, begun, order, count, thinning });
   }
 }

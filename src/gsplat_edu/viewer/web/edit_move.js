@@ -5,7 +5,11 @@ import { element, nearestTexture } from "./common.js";
 import { SELECTED } from "./edit_flags.js";
 import { product3 } from "./edit_rotations.js";
 
-const EYE3 = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+const EYE3 = [
+  [1, 0, 0],
+  [0, 1, 0],
+  [0, 0, 1],
+];
 const TURNS_ACROSS = 256; // rotations in a row of their texture
 
 // The centres and rotations of splats after the operations "move". Means change in place, in the order that docs/EDITS.md
@@ -25,9 +29,17 @@ export class Motion {
   apply({ rotation, translation: [tx, ty, tz], center: [cx, cy, cz] }, flags) {
     const at = placesOf(flags, SELECTED);
     const { means, turned } = this;
-    const record = { at, means: new Float32Array(3 * at.length), turned: new Uint32Array(at.length), turns: this.turns.length };
+    const record = {
+      at,
+      means: new Float32Array(3 * at.length),
+      turned: new Uint32Array(at.length),
+      turns: this.turns.length,
+    };
     record.bytes = 20 * at.length;
-    const step = { R: rotation, t: [0, 1, 2].map((i) => [cx, cy, cz][i] + [tx, ty, tz][i] - dot(rotation[i], [cx, cy, cz])) };
+    const step = {
+      R: rotation,
+      t: [0, 1, 2].map((i) => [cx, cy, cz][i] + [tx, ty, tz][i] - dot(rotation[i], [cx, cy, cz])),
+    };
     const [[r00, r01, r02], [r10, r11, r12], [r20, r21, r22]] = rotation;
     const next = new Map(); // indices of the rotations after this turn, by those before
     at.forEach((i, j) => {
@@ -171,7 +183,10 @@ export class MotionTextures {
 
 // A box around the selected splats, as the handle moves it: `from` is its centre before. Null if there are none.
 function selectedBox({ count, means }, flags) {
-  const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+  const [low, high] = [
+    [Infinity, Infinity, Infinity],
+    [-Infinity, -Infinity, -Infinity],
+  ];
   for (let i = 0; i < count; ++i) {
     if (flags[i] !== SELECTED) continue;
     const mean = [means[3 * i], means[3 * i + 1], means[3 * i + 2]];

@@ -65,7 +65,8 @@ function withinRadius({ count, means }, isJudged, isOther, radius, work) {
   const chosen = (wanted) => {
     const at = [];
     for (let i = 0, k = 0; i < count; ++i, k += 3) {
-      if (wanted(i) && Number.isFinite(means[k]) && Number.isFinite(means[k + 1]) && Number.isFinite(means[k + 2])) at.push(i);
+      if (wanted(i) && Number.isFinite(means[k]) && Number.isFinite(means[k + 1]) && Number.isFinite(means[k + 2]))
+        at.push(i);
     }
     return at;
   };
@@ -73,7 +74,10 @@ function withinRadius({ count, means }, isJudged, isOther, radius, work) {
   if (!judged.length || !others.length) return [];
   const hash = new CellHash(means, others, WIDER_CELLS * radius);
   const groups = [...hash.group(judged).values()].map((rows) => ({ rows, near: hash.around(rows[0]) }));
-  const pairs = groups.reduce((sum, { rows, near }) => sum + rows.length * near.reduce((n, list) => n + list.length, 0), 0);
+  const pairs = groups.reduce(
+    (sum, { rows, near }) => sum + rows.length * near.reduce((n, list) => n + list.length, 0),
+    0,
+  );
   if (pairs > MOST_PAIRS) {
     const number = (value) => value.toLocaleString("en");
     throw new Error(
@@ -101,7 +105,14 @@ function withinRadius({ count, means }, isJudged, isOther, radius, work) {
 // Applies "grow" or "shrink" to the states, in place; throws an Error, before anything is changed, if it is too much.
 export function applyNear({ op, radius }, values, flags, work) {
   const [from, to] = op === "grow" ? [0, SELECTED] : [SELECTED, 0];
-  for (const i of withinRadius(values, (i) => flags[i] === from, (i) => flags[i] === to, radius, work)) flags[i] = to;
+  for (const i of withinRadius(
+    values,
+    (i) => flags[i] === from,
+    (i) => flags[i] === to,
+    radius,
+    work,
+  ))
+    flags[i] = to;
 }
 
 // A radius for "grow" and "shrink" to begin with: a few times the median size of the splats, with two digits.

@@ -20,7 +20,12 @@ export class Overlay {
     const [across, down] = [Math.round(width * dense), Math.round(height * dense)];
     if (this.canvas.width !== across) this.canvas.width = across;
     if (this.canvas.height !== down) this.canvas.height = down;
-    Object.assign(this.canvas.style, { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${height}px` });
+    Object.assign(this.canvas.style, {
+      left: `${left}px`,
+      top: `${top}px`,
+      width: `${width}px`,
+      height: `${height}px`,
+    });
     this.camera = camera;
     this.scale = [across / camera.W, down / camera.H];
     this.dense = dense;
@@ -38,7 +43,10 @@ export class Overlay {
     const { context, dense } = this;
     this.canvas.hidden = false;
     context.setLineDash(dashed ? [6 * dense, 4 * dense] : []);
-    for (const [width, style] of [[3.5, "#000a"], [1.5, color]]) {
+    for (const [width, style] of [
+      [3.5, "#000a"],
+      [1.5, color],
+    ]) {
       context.lineWidth = width * dense;
       context.strokeStyle = style;
       context.stroke();

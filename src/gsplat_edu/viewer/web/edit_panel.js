@@ -228,7 +228,8 @@ export class EditPanel {
     else if (look) editor.look.choose(look);
     else if (button.dataset.do) this.act(button.dataset.do);
     // a disabled button loses the focus
-    if (button.disabled && document.activeElement !== editor.viewer.canvas) [this.button("undo"), this.button("redo"), this.button("all")].find((one) => !one.disabled).focus();
+    if (button.disabled && document.activeElement !== editor.viewer.canvas)
+      [this.button("undo"), this.button("redo"), this.button("all")].find((one) => !one.disabled).focus();
   }
 
   act(name) {
@@ -273,7 +274,9 @@ export class EditPanel {
   // Whether Enter applies something chosen before.
   get ready() {
     const { tool, shape, apart } = this.editor.tools;
-    return Boolean({ sphere: shape, box: shape, move: this.editor.mover.moved, color: true, scale: apart, measure: apart }[tool]);
+    return Boolean(
+      { sphere: shape, box: shape, move: this.editor.mover.moved, color: true, scale: apart, measure: apart }[tool],
+    );
   }
 
   apply() {
@@ -350,7 +353,11 @@ export class EditPanel {
 
   showCounts({ all, selected, hidden, deleted }) {
     const number = (value) => value.toLocaleString("en");
-    const parts = [`${number(selected)} selected`, hidden && `${number(hidden)} hidden`, `${number(all - hidden - deleted)} of ${number(all)} left`];
+    const parts = [
+      `${number(selected)} selected`,
+      hidden && `${number(hidden)} hidden`,
+      `${number(all - hidden - deleted)} of ${number(all)} left`,
+    ];
     element("edit-count").textContent = parts.filter(Boolean).join(" · ");
     for (const name of ["delete", "hide", "grow", "shrink"]) this.button(name).disabled = !selected;
     this.button("show").disabled = !hidden;

@@ -49,17 +49,23 @@ export function footprintOf(values, i, camera, bounds, antialiased) {
   footprintOf.constants ??= ["DILATION", "ALPHA_MIN", "DET_FLOOR"].map(shaderConstant);
   const [DILATION, LEAST, FLOOR] = footprintOf.constants;
   const { R, eye, fx, fy, cx, cy } = camera;
-  const [x, y, z] = rotated(R, [0, 1, 2].map((j) => means[3 * i + j] - eye[j]));
+  const [x, y, z] = rotated(
+    R,
+    [0, 1, 2].map((j) => means[3 * i + j] - eye[j]),
+  );
   if (Math.abs(x) > bounds.widest[0] * z || Math.abs(y) > bounds.widest[1] * z) return null;
   const q = [0, 1, 2, 3].map((j) => quats[4 * i + j]);
   const norm = Math.hypot(...q);
   if (!norm) return null;
   const turn = product3(turnSince(values, i), matrixOf(q.map((value) => value / norm)));
   const scales = [0, 1, 2].map((j) => Math.exp(log_scales[3 * i + j]));
-  const along = (axis) => scales.map((scale, k) => scale * (axis[0] * turn[0][k] + axis[1] * turn[1][k] + axis[2] * turn[2][k]));
+  const along = (axis) =>
+    scales.map((scale, k) => scale * (axis[0] * turn[0][k] + axis[1] * turn[1][k] + axis[2] * turn[2][k]));
   const ratio = [x / z, y / z].map((value, j) => Math.min(Math.max(value, bounds.low[j]), bounds.high[j]));
   // rows of J W R S
-  const [row0, row1] = [fx, fy].map((focal, j) => along(plus(R[j], R[2], -ratio[j]).map((value) => (value * focal) / z)));
+  const [row0, row1] = [fx, fy].map((focal, j) =>
+    along(plus(R[j], R[2], -ratio[j]).map((value) => (value * focal) / z)),
+  );
   const [a0, b, c0] = [dot(row0, row0), dot(row0, row1), dot(row1, row1)];
   const normal = cross(row0, row1);
   const det0 = dot(normal, normal);

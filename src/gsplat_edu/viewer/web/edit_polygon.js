@@ -24,7 +24,10 @@ export class EditPolygon {
     const { corners } = this;
     const apart = (corner) => (corner ? Math.hypot(corner.x - at.x, corner.y - at.y) : Infinity);
     const again = apart(corners.at(-1)) < LEAST_DRAG;
-    if (this.canClose && (again || apart(corners[0]) <= (matchMedia("(pointer: coarse)").matches ? CLOSES_FINGER : CLOSES))) {
+    if (
+      this.canClose &&
+      (again || apart(corners[0]) <= (matchMedia("(pointer: coarse)").matches ? CLOSES_FINGER : CLOSES))
+    ) {
       this.close(how);
     } else if (!again && corners.length < MOST_STROKE) {
       if (!corners.length) this.camera = camera;

@@ -6,7 +6,8 @@ import { unit } from "./region.js";
 const GIMBAL = 1 - 1e-12; // sine of the tilt beyond which heading and roll turn about the same axis
 
 export const degrees = (angle) => (angle * 180) / Math.PI;
-export const product3 = (a, b) => a.map((row) => [0, 1, 2].map((j) => row[0] * b[0][j] + row[1] * b[1][j] + row[2] * b[2][j]));
+export const product3 = (a, b) =>
+  a.map((row) => [0, 1, 2].map((j) => row[0] * b[0][j] + row[1] * b[1][j] + row[2] * b[2][j]));
 
 // The rotation closest to one that rounding has bent: its columns made orthonormal, the first one first.
 export function orthonormal(rows) {
@@ -23,7 +24,16 @@ export function turnedRows(rows, axis, angle) {
 
 // The rotation by three angles in radians: about z, then x, then y. With y vertical they are roll, tilt and heading.
 export function rowsOfAngles([tilt, heading, roll]) {
-  const about = (axis, angle) => transposed([0, 1, 2].map((j) => turned([0, 1, 2].map((i) => Number(i === j)), axis, angle)));
+  const about = (axis, angle) =>
+    transposed(
+      [0, 1, 2].map((j) =>
+        turned(
+          [0, 1, 2].map((i) => Number(i === j)),
+          axis,
+          angle,
+        ),
+      ),
+    );
   return orthonormal(product3(about([0, 1, 0], heading), product3(about([1, 0, 0], tilt), about([0, 0, 1], roll))));
 }
 

@@ -49,9 +49,18 @@ export function normalOf([a, b, c]) {
 // Shortest rotation from one direction to another; both of length 1. Opposite ones turn about the x axis.
 function shortestTurn(from, to) {
   const cosine = dot(from, to);
-  if (cosine < -1 + 1e-9) return [[1, 0, 0], [0, -1, 0], [0, 0, -1]];
+  if (cosine < -1 + 1e-9)
+    return [
+      [1, 0, 0],
+      [0, -1, 0],
+      [0, 0, -1],
+    ];
   const v = cross(from, to);
-  const across = [[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]];
+  const across = [
+    [0, -v[2], v[1]],
+    [v[2], 0, -v[0]],
+    [-v[1], v[0], 0],
+  ];
   return across.map((row, i) =>
     row.map((value, j) => {
       const square = row.reduce((sum, x, k) => sum + x * across[k][j], 0);
@@ -73,7 +82,8 @@ export function boxAround({ count, means }, flags, up) {
   const every = Math.max(1, Math.floor(count / MOST_SAMPLED));
   for (let i = 0; i < count; i += every) {
     const point = [means[3 * i], means[3 * i + 1], means[3 * i + 2]];
-    if (flags[i] <= SELECTED && point.every(Number.isFinite)) axes.forEach((axis, j) => places[j].push(dot(axis, point)));
+    if (flags[i] <= SELECTED && point.every(Number.isFinite))
+      axes.forEach((axis, j) => places[j].push(dot(axis, point)));
   }
   if (!places[0].length) return { center: [0, 0, 0], rotation, half: [1, 1, 1] };
   const ends = places.map((list) => {
@@ -134,7 +144,11 @@ export function sideDragged({ box, handle, camera, began, at }, distance) {
 // Three circles around a sphere, along the axes of the view.
 export function sphereLines({ center, radius }, R) {
   const lines = [];
-  for (const [a, b] of [[0, 1], [1, 2], [0, 2]]) {
+  for (const [a, b] of [
+    [0, 1],
+    [1, 2],
+    [0, 2],
+  ]) {
     const at = (i) => {
       const angle = (2 * Math.PI * i) / CIRCLE;
       return plus(plus(center, R[a], radius * Math.cos(angle)), R[b], radius * Math.sin(angle));

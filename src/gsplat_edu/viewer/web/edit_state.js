@@ -90,7 +90,12 @@ export class EditHistory {
   remember(before, moved = null) {
     let count = 0;
     for (let i = 0; i < before.length; ++i) if (before[i] !== this.flags[i]) ++count;
-    const change = { at: new Uint32Array(count), was: new Uint8Array(count), moved, bytes: 5 * count + (moved?.bytes ?? 0) };
+    const change = {
+      at: new Uint32Array(count),
+      was: new Uint8Array(count),
+      moved,
+      bytes: 5 * count + (moved?.bytes ?? 0),
+    };
     for (let i = 0, j = 0; j < count; ++i) {
       if (before[i] === this.flags[i]) continue;
       change.at[j] = i;

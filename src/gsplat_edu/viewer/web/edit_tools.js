@@ -223,7 +223,9 @@ export class EditTools {
       this.editor.say("");
       return { point: pointAt(camera, u, v, onMesh), depth: onMesh };
     }
-    const [column, row] = [Math.round(u), Math.round(v)].map((x, i) => Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1));
+    const [column, row] = [Math.round(u), Math.round(v)].map((x, i) =>
+      Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1),
+    );
     const depth = this.depthAt(camera, column, row);
     this.editor.say(depth === null ? "There is nothing at that point; choose one on the scene." : "");
     return depth === null ? null : { point: pointAt(camera, u, v, depth), depth };
@@ -316,15 +318,33 @@ export class EditTools {
       const { began: a, at: b } = stroke;
       overlay.polyline([a, { u: b.u, v: a.v }, b, { u: a.u, v: b.v }], true);
     }
-    if (stroke && tool === "lasso") overlay.polyline([...stroke.points, [stroke.at.u, stroke.at.v]].map(([u, v]) => ({ u, v })), true);
-    if (stroke && tool === "brush") overlay.band(stroke.points.map(([u, v]) => ({ u, v })), radius);
+    if (stroke && tool === "lasso")
+      overlay.polyline(
+        [...stroke.points, [stroke.at.u, stroke.at.v]].map(([u, v]) => ({ u, v })),
+        true,
+      );
+    if (stroke && tool === "brush")
+      overlay.band(
+        stroke.points.map(([u, v]) => ({ u, v })),
+        radius,
+      );
     this.polygon.draw(overlay);
     if (tool === "brush" && (stroke?.at || this.hover)) overlay.circle(stroke?.at ?? this.hover, radius);
     if (this.cursor) {
       const at = this.pointOf(overlay.camera, this.cursor.x, this.cursor.y);
       const arm = 12 * this.perPixel;
-      for (const [du, dv] of [[arm, 0], [0, arm]]) {
-        overlay.polyline([{ u: at.u - du, v: at.v - dv }, { u: at.u + du, v: at.v + dv }], false, "#fff");
+      for (const [du, dv] of [
+        [arm, 0],
+        [0, arm],
+      ]) {
+        overlay.polyline(
+          [
+            { u: at.u - du, v: at.v - dv },
+            { u: at.u + du, v: at.v + dv },
+          ],
+          false,
+          "#fff",
+        );
       }
     }
   }
@@ -343,7 +363,8 @@ export class EditTools {
     if (key.startsWith("Arrow") && target.closest?.("#strip")) return; // they move a view, or the playhead
     const onButton = target.closest?.("button, summary, a");
     if (code === "Space" && !onButton) this.space = true;
-    else if (key.startsWith("Arrow") && this.tool !== "navigate" && (!onButton || this.gizmo.chosen)) this.moveCursor(event);
+    else if (key.startsWith("Arrow") && this.tool !== "navigate" && (!onButton || this.gizmo.chosen))
+      this.moveCursor(event);
     else if (key === "Enter" && !onButton && this.tool !== "navigate") this.enter(event);
     else if (key === "Escape") this.escape();
     else if (key === "Backspace" && this.polygon.back()) this.cursorMoved = true;

@@ -20,7 +20,12 @@ export class EditTour {
     const { guide, viewer } = this;
     const named = [...views.named.values()].filter(({ text }) => text);
     const at = guide.steps[guide.at]?.name;
-    guide.steps = named.map((view) => ({ name: view.name, text: view.text, camera: viewer.keyframes.camera(readKeyframe(view)), index: -1 }));
+    guide.steps = named.map((view) => ({
+      name: view.name,
+      text: view.text,
+      camera: viewer.keyframes.camera(readKeyframe(view)),
+      index: -1,
+    }));
     guide.button.textContent = `preview the tour (${named.length})`;
     guide.button.disabled = !named.length;
     if (!guide.on) return;
@@ -39,7 +44,10 @@ export class EditTour {
   // Buttons that move a view within the list of names.
   buttons(name, names, button) {
     const at = names.indexOf(name);
-    return [["↑", "earlier", -1], ["↓", "later", 1]].map(([sign, when, by]) => {
+    return [
+      ["↑", "earlier", -1],
+      ["↓", "later", 1],
+    ].map(([sign, when, by]) => {
       const made = button(sign, `${name} ${when}`, () => this.move(names, at, by, when));
       made.dataset.order = `${when} ${name}`;
       made.setAttribute("aria-disabled", names[at + by] === undefined);

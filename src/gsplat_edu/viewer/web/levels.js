@@ -33,7 +33,9 @@ export class Levels {
     this.onChange = onChange;
     this.regions = regions.map((region) => ({
       ...region,
-      levels: Object.keys(region.runs).map(Number).sort((a, b) => b - a), // coarsest first
+      levels: Object.keys(region.runs)
+        .map(Number)
+        .sort((a, b) => b - a), // coarsest first
       shown: -1, // level
       wanted: -1,
       slots: [],
@@ -89,7 +91,9 @@ export class Levels {
       region.wanted = this.size(region, coarsest) <= left ? coarsest : -1;
       left -= this.size(region, region.wanted);
     }
-    const heap = order.filter(({ wanted }) => wanted >= 0).map((region) => [this.error(region, region.wanted, camera), region]);
+    const heap = order
+      .filter(({ wanted }) => wanted >= 0)
+      .map((region) => [this.error(region, region.wanted, camera), region]);
     heap.sort((a, b) => a[0] - b[0]); // the largest error comes last
     while (heap.length) {
       const [, region] = heap.pop();
@@ -121,7 +125,8 @@ export class Levels {
     let [group, level] = [finer, ({ wanted }) => wanted];
     if (nothing.length) [group, level] = [nothing, ({ levels }) => levels[0]];
     if (group === finer && coarser.length) group = coarser;
-    if (group === nothing && coarser.length && !this.fits(nothing, level)) [group, level] = [coarser, ({ wanted }) => wanted];
+    if (group === nothing && coarser.length && !this.fits(nothing, level))
+      [group, level] = [coarser, ({ wanted }) => wanted];
     group.sort((a, b) => near(a) - near(b));
     const batch = [];
     let [file, total] = [null, 0];

@@ -10,7 +10,10 @@ startPage(() => showScene(streamed(FACTS), null));
 // A viewer that loads levels of detail from the folder of this page's server.
 function streamed(facts) {
   const gl = document.createElement("canvas").getContext("webgl2");
-  if (!gl) throw new Error("This page draws with WebGL2, which this browser lacks or has switched off. Allow hardware acceleration, use another browser, or make a video: gsplat-edu render");
+  if (!gl)
+    throw new Error(
+      "This page draws with WebGL2, which this browser lacks or has switched off. Allow hardware acceleration, use another browser, or make a video: gsplat-edu render",
+    );
   const budget = facts.lod.budget ?? machineBudget(gl, facts.sh_degree);
   gl.getExtension("WEBGL_lose_context")?.loseContext();
   let viewer = null;

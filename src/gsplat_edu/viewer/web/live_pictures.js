@@ -52,7 +52,8 @@ class Pictures {
         this.context.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
         this.failure = "";
       } catch (error) {
-        this.failure = error instanceof TypeError ? "The program that draws the pictures cannot be reached." : error.message;
+        this.failure =
+          error instanceof TypeError ? "The program that draws the pictures cannot be reached." : error.message;
       }
       this.onResult(this.failure);
     }
@@ -81,7 +82,8 @@ addEventListener("DOMContentLoaded", (event) => {
   event.stopImmediatePropagation();
   const showResult = (line) => {
     say(line);
-    element("count").textContent = `${FACTS.count.toLocaleString("en")} splats, drawn by the program that serves this page: this browser has no WebGL2`;
+    element("count").textContent =
+      `${FACTS.count.toLocaleString("en")} splats, drawn by the program that serves this page: this browser has no WebGL2`;
   };
   class PictureViewer extends Viewer {
     makeRenderer() {

@@ -70,6 +70,7 @@ async function pixels(blob) {
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
   gl.deleteFramebuffer(framebuffer);
   gl.deleteTexture(texture);
-  if (gl.getError() !== gl.NO_ERROR) throw new Error("An image of the scene does not fit into this graphics processor.");
+  if (gl.getError() !== gl.NO_ERROR)
+    throw new Error("An image of the scene does not fit into this graphics processor.");
   return bytes;
 }

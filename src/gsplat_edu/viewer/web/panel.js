@@ -75,8 +75,16 @@ export class Panel {
       button.addEventListener("click", () => actions.goTo(index));
       return button;
     });
-    this.listed("views", "views", this.buttons.filter((_, i) => cameras[i].saved));
-    this.listed("cameras", shared ? "photos" : "cameras", this.buttons.filter((_, i) => !cameras[i].saved));
+    this.listed(
+      "views",
+      "views",
+      this.buttons.filter((_, i) => cameras[i].saved),
+    );
+    this.listed(
+      "cameras",
+      shared ? "photos" : "cameras",
+      this.buttons.filter((_, i) => !cameras[i].saved),
+    );
   }
 
   // Fills a list that can be closed.
@@ -88,7 +96,9 @@ export class Panel {
       item.append(button);
       return item;
     });
-    element(id).querySelector("ol").append(...items);
+    element(id)
+      .querySelector("ol")
+      .append(...items);
   }
 
   // Highlights the current camera; none once the view has moved away from it.

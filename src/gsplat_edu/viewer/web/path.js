@@ -125,15 +125,27 @@ export class PathCurve {
     if (timed) this.places = this.timed(times, keyframes, ease);
     else if (ease && this.length > 0) {
       const lengths = this.lengths.filter((_, i) => i % CHORDS === 0);
-      this.places = new Monotone(lengths.map((length) => this.seconds * (length / this.length)), lengths, loop, ease);
+      this.places = new Monotone(
+        lengths.map((length) => this.seconds * (length / this.length)),
+        lengths,
+        loop,
+        ease,
+      );
     }
   }
 
   // The distance covered over time, with keyframes at given times; a rest has two rows.
   timed(times, keyframes, ease) {
-    const rows = times.flatMap((time, i) => [0, ...(keyframes[i].hold ? [keyframes[i].hold] : [])].map((after) => [time + after, this.stops[i]]));
+    const rows = times.flatMap((time, i) =>
+      [0, ...(keyframes[i].hold ? [keyframes[i].hold] : [])].map((after) => [time + after, this.stops[i]]),
+    );
     if (this.loop) rows.push([this.seconds, this.length]);
-    return new Monotone(rows.map(([time]) => time), rows.map(([, place]) => place), this.loop, ease);
+    return new Monotone(
+      rows.map(([time]) => time),
+      rows.map(([, place]) => place),
+      this.loop,
+      ease,
+    );
   }
 
   // World units per radian: L / max(A, 2 pi) on a path of length L that turns by A.

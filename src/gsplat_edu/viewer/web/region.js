@@ -51,7 +51,9 @@ export class Region {
       }
     });
     // sparse cameras get a wider margin
-    const gaps = directions.map((a, i) => (nearest[i].length ? angleOf(dot(a, nearest[i][0])) : 0)).sort((a, b) => a - b);
+    const gaps = directions
+      .map((a, i) => (nearest[i].length ? angleOf(dot(a, nearest[i][0])) : 0))
+      .sort((a, b) => a - b);
     this.margin = Math.min(WIDEST_MARGIN, MARGIN + 0.5 * (gaps[gaps.length >> 1] ?? 0));
   }
 

@@ -58,12 +58,15 @@ export class Seen {
     element("seen").setAttribute("aria-pressed", this.on);
     element("legend").hidden = !this.on;
     const percent = share > 0 && share < 0.01 ? "less than 1" : Math.round(100 * share);
-    element("legend").lastElementChild.textContent = this.on ? `no photo or only one saw these: ${percent} % of the splats. Grey: two or more did.` : "";
+    element("legend").lastElementChild.textContent = this.on
+      ? `no photo or only one saw these: ${percent} % of the splats. Grey: two or more did.`
+      : "";
     this.viewer.refresh();
   }
 }
 
 // Shows a button of the panel, and its line in the help.
 export function offer(button) {
-  for (const hidden of [button, element("proof"), ...document.querySelectorAll(`#help [data-for=${button.id}]`)]) hidden.hidden = false;
+  for (const hidden of [button, element("proof"), ...document.querySelectorAll(`#help [data-for=${button.id}]`)])
+    hidden.hidden = false;
 }

@@ -351,7 +351,12 @@ export class Viewer {
   }
 
   isMoving() {
-    return this.journey !== null || this.flight !== null || this.controls.held.size > 0 || performance.now() - this.movedAt < STILL;
+    return (
+      this.journey !== null ||
+      this.flight !== null ||
+      this.controls.held.size > 0 ||
+      performance.now() - this.movedAt < STILL
+    );
   }
 
   async drawCoarse() {
@@ -437,10 +442,12 @@ export async function showScene(viewer, splats) {
   if (FACTS.seen) viewer.seen = await Seen.open(viewer);
   if (FACTS.photos) viewer.compare = await Compare.open(viewer);
   viewer.guide = Guide.of(viewer);
-  if (viewer.levels) await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
+  if (viewer.levels)
+    await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
   else {
     await viewer.gauge();
-    if (viewer.pace.slow) viewer.askFrame(); // the coarse picture is the first one
+    if (viewer.pace.slow)
+      viewer.askFrame(); // the coarse picture is the first one
     else await viewer.settled();
   }
   window.viewer = viewer;
