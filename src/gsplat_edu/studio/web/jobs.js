@@ -143,7 +143,7 @@ function waitingFor(store, others) {
 }
 
 // Progress is that of the present stage.
-function leftOf({ done, total, seconds_left: left, is_least: isLeast }, isStage) {
+export function leftOf({ done, total, seconds_left: left, is_least: isLeast }, isStage) {
   const share = `${Math.floor((100 * done) / total)} %`;
   return left === null || left === undefined
     ? share

@@ -3,7 +3,7 @@
 import { extent } from "./edit_member.js";
 
 const CELLS = 64; // along each axis
-const MOST_TESTS = 1e10; // of a splat, for a list of operations
+export const MOST_TESTS = 1e10; // of a splat, for a list of operations
 
 // Counts the tests of a list of operations.
 export class EditWork {

@@ -14,7 +14,7 @@ const LEAST_UP = 0.1; // mean of cos(angle between up and an image's up directio
 const LEAST_AGREEING = 0.8; // sum of these cosines, in that of their absolute values
 
 // Eigenvalues of a symmetric matrix, smallest first, with unit eigenvectors: [{value, vector}], by Jacobi's rotations.
-function eigenvectors(matrix) {
+export function eigenvectors(matrix) {
   const A = matrix.map((row) => [...row]);
   const V = [
     [1, 0, 0],
@@ -45,7 +45,7 @@ function eigenvectors(matrix) {
 // With r the x axes, up minimises the mean of (up . r)^2: it is the eigenvector of A = mean of r r' with the smallest
 // eigenvalue. Its error lies mainly along the second eigenvector. To first order it is the mean of (up . r) (second . r),
 // divided by l1 - l0; for independent rolls its standard deviation is sqrt(l0 l1 / n) / (l1 - l0).
-function upOfCameras(cameras) {
+export function upOfCameras(cameras) {
   const count = cameras.length;
   if (count < LEAST_CAMERAS)
     return {

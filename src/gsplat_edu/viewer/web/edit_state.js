@@ -9,7 +9,7 @@ import { applyNear } from "./edit_near.js";
 const UNDO_BYTES = 128 << 20; // changes remembered for undo; older operations are undone by repeating those before
 
 // Applies one operation to the states, in place; returns what undoes a move of splats. Throws an Error, before anything is changed, if the work is too much.
-function applyOperation(operation, values, flags, work) {
+export function applyOperation(operation, values, flags, work) {
   const change = (next) => {
     if (operation.op !== "crop") work.add(flags.length);
     for (let i = 0; i < flags.length; ++i) flags[i] = next(flags[i], i);
