@@ -7,6 +7,7 @@ OUT ?= out/sphere.png
 WORKERS ?= $(shell n=$$(nproc 2> /dev/null || echo 1); [ $$n -lt 3 ] && echo $$((n + 1)) || echo 4)
 # Bytecode is written even where the environment forbids it: the tests start Python a hundred times.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+BIOME := tests/npm/node_modules/@biomejs/biome/bin/biome
 BENCH := $(if $(SMOKE),--smoke)
 export PYTHON
 
@@ -82,6 +83,9 @@ check:
 	@$(BIN)/ruff format --check .
 	@echo "== check: clang-format"
 	@$(BIN)/clang-format --dry-run --Werror native/*.h native/*.cpp benchmarks/ladder/*.h benchmarks/ladder/*.cpp
+	@echo "== check: biome, lint and format of the pages' scripts"
+	@if command -v node > /dev/null && [ -f $(BIOME) ]; then node $(BIOME) ci --error-on-warnings; else \
+		echo "== check: biome is not installed, the scripts are not checked; install it with: npm ci --prefix tests/npm"; fi
 	@echo "== check: mypy, strict over src"
 	@$(BIN)/mypy
 	@echo "== check: import-linter, who may import whom"

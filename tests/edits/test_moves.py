@@ -13,6 +13,7 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at
+from js.random_edits import gaussians_at, parsed, random_moves, witness
 
 ALL = ops.Select("replace", ops.Everything())
 
@@ -81,3 +82,15 @@ def test_infinite_and_missing_centres_move_without_a_warning():
     far = move((0.0, 0.0, 0.7), (1e30, 0.0, 0.0), (0.0, 0.0, 0.0))
     result = edited(Scene(gaussians), [ALL, far]).gaussians
     assert torch.isnan(result.means[0, 0]) and torch.isfinite(result.means[2:]).all()
+
+
+@pytest.mark.parametrize("case", range(3))
+def test_random_operations_agree_with_a_witness_on_every_bit(case):
+    """The page's JavaScript agrees with the same witness: tests/js/edits.test.js."""
+    means, cases = random_moves()
+    flags, after = witness(cases[case], means)
+    operations = parsed(cases[case], len(means)).operations
+    np.testing.assert_array_equal(flags_after(operations, gaussians_at(means)), flags)
+    left = edited(Scene(gaussians_at(means)), operations).gaussians
+    np.testing.assert_array_equal(left.means.double().numpy(), after[flags <= SELECTED])
+    assert np.abs(after - means).max() > 0.1 and (flags <= SELECTED).any()

@@ -85,6 +85,7 @@ def test_every_answer_has_the_headers_that_keep_other_pages_out(page, stranger):
         "/web/%2e%2e/app.py",
         "/web/..%2fapp.py",
         "/viewer/__init__.py",
+        "/viewer/web/__init__.py",
         "/web/nothing.js",
         "/web/",
     ],
@@ -94,9 +95,9 @@ def test_only_the_files_of_the_page_are_served(page, path):
 
 
 def test_the_scripts_of_the_viewer_are_served(page):
-    answer = page.get("/viewer/scene.js")
+    answer = page.get("/viewer/web/press.js")
     assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/javascript")
-    again = page.get("/viewer/scene.js", headers={"If-None-Match": answer.headers["etag"]})
+    again = page.get("/viewer/web/press.js", headers={"If-None-Match": answer.headers["etag"]})
     assert again.status_code == 304
 
 

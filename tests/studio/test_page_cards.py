@@ -1,4 +1,4 @@
-"""Cards of the library and of jobs: what a training takes before it starts, and a time left that never rises."""
+"""Cards of the library: what a training takes before it starts."""
 
 import re
 
@@ -6,62 +6,6 @@ from accessibility import grave_faults_in_all_styles
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from studio.pages import waiting
-
-SHOWN = """async (events) => {
-  const { Store } = await import("/web/store.js");
-  const { jobCard } = await import("/web/jobs.js");
-  const store = new Store();
-  const work = { command: "train", inputs: ["captures/a"], outputs: ["runs/a"], options: {} };
-  const named = { id: "1", title: "training of a", subject: "runs/a", command: "" };
-  const view = store.put({ ...named, state: "running", waits_for: [], work });
-  const card = jobCard(store, "1");
-  const shown = [];
-  for (const [number, event] of events.entries()) {
-    view.take({ ...event, number: number + 1 });
-    card.update();
-    shown.push(card.element.querySelector(".left").textContent);
-  }
-  return shown;
-}"""
-"""Feeds the events of a job to its card; returns what it says of the time left after each."""
-
-
-def log(stage, *left):
-    """Planted events of a stage: its forecasts of the time left, s, at equal steps."""
-    steps = [
-        {"event": "progress", "stage": stage, "done": i, "total": len(left), "seconds_left": s}
-        for i, s in enumerate(left)
-    ]
-    return [{"event": "stage", "name": stage}, *steps]
-
-
-def seconds(text):
-    found = re.search(r"(?:(\d+) h )?(\d+) (s|min) left", text)
-    return (
-        None if found is None else (int(found[1] or 0) * 60 + int(found[2])) * (1 if found[3] == "s" else 60)
-    )
-
-
-def test_the_time_left_never_rises_in_a_stage(visitor):
-    tab = visitor().tab
-    # densification makes iterations slower than the pace of the first ones; one forecast is missing
-    forecasts = (50, 40, 42, 90, 100, None, 80, 39, 20, 21, 19, 3)
-    shown = tab.evaluate(SHOWN, log("training", *forecasts))[1:]
-    assert [seconds(text) for text in shown] == [50, 40, 40, 40, 40, 40, 40, 39, 20, 20, 19, 3]
-    # a forecast that is clearly larger makes the figure a least time
-    assert ["at least" in text for text in shown] == [i in (3, 4, 5, 6) for i in range(12)]
-
-
-def test_another_stage_or_attempt_has_a_time_of_its_own(visitor):
-    tab = visitor().tab
-    events = [
-        *log("matching", 10, 5),
-        *log("training", 600, 500),
-        {"event": "started"},
-        *log("training", 700, 650),
-    ]
-    found = [seconds(text) for text in tab.evaluate(SHOWN, events) if "left" in text]
-    assert found == [10, 5, 600, 480, 720, 660]  # minutes are rounded
 
 
 def test_a_card_says_what_a_training_takes_before_it_starts(visitor, library):

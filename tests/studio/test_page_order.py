@@ -352,17 +352,3 @@ KEYED = """async () => {
 
 def test_the_focus_stays_when_a_list_changes(visitor):
     assert visitor().tab.evaluate(KEYED) == ["c", "c", "c", "c"]
-
-
-REUSED = """async () => {
-  const { Store } = await import("/web/store.js");
-  const { startJob } = await import("/web/jobs.js");
-  const store = new Store();
-  store.heard.set("000007", 3); // of a job that was removed; a new job gets its id
-  window.fetch = async () => Response.json({ id: "000007", state: "queued", subject: "runs/a" });
-  return (await startJob(store, {})).job.state;
-}"""
-
-
-def test_a_new_job_with_the_id_of_a_removed_one_is_known_before_the_stream_tells_of_it(visitor):
-    assert visitor().tab.evaluate(REUSED) == "queued"

@@ -172,27 +172,6 @@ def test_a_finger_drags_the_handle_and_a_second_one_takes_it_back(edit_page, ran
     np.testing.assert_array_equal(shape(shown)["rotation"], rotation)
 
 
-ANGLES = "(list) => list.map((angles) => [rowsOfAngles(angles), anglesOfRows(rowsOfAngles(angles))])"
-
-
-def test_angles_are_tilt_heading_and_roll(edit_page, random_gaussians):
-    """Roll about z comes first, then tilt about x, then heading about y."""
-    rng = np.random.default_rng(3)
-    angles = rng.uniform((-1.5, -3.1, -3.1), (1.5, 3.1, 3.1), (40, 3))
-    shown = edit_page(random_gaussians(5))
-    for (tilt, heading, roll), (rows, back) in zip(
-        angles, shown.tab.evaluate(ANGLES, angles.tolist()), strict=True
-    ):
-        np.testing.assert_allclose(
-            rows, Rotation.from_euler("YXZ", [heading, tilt, roll]).as_matrix(), atol=1e-14
-        )
-        np.testing.assert_allclose(back, (tilt, heading, roll), atol=1e-12)
-    up = [np.pi / 2, 0.4, 0.3]  # roll and heading turn about one axis
-    rows, back = shown.tab.evaluate(ANGLES, [up])[0]
-    assert back[2] == 0
-    np.testing.assert_allclose(shown.tab.evaluate(ANGLES, [back])[0][0], rows, atol=1e-7)
-
-
 def test_numbers_turn_the_box_and_a_button_levels_it(edit_page, random_gaussians):
     shown, _, _ = opened_box(edit_page, random_gaussians, (0.0, 0.0, 0.0))
     upright = np.array(shown.tab.evaluate("uprightAxes(viewer.view.up)"))

@@ -8,104 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from gsplat_edu.edits.apply import upright_rotation, views_after
 from gsplat_edu.edits.document import parse_edits
-from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.camera import Camera
+from js.tilted_cameras import UP, around
 from viewer.handles import until
-
-TILT = Rotation.from_rotvec((0.2, 0.1, -0.35)).as_matrix()
-"""From the level world to the scene's."""
-
-UP = TILT @ (0.0, -1.0, 0.0)
-
-
-def rolled(R, angle):
-    """Turn a camera about its line of sight."""
-    return Rotation.from_rotvec((0.0, 0.0, angle)).as_matrix() @ R
-
-
-def around(n, turn=2 * np.pi, height=-0.8, rolls=None):
-    """Return cameras in an arc about the middle, looking down a little, in the tilted scene."""
-    angles = np.linspace(0, turn, n, endpoint=False)
-    rolls = np.zeros(n) if rolls is None else rolls
-    found = []
-    for angle, roll in zip(angles, rolls, strict=True):
-        eye = np.array((3 * np.sin(angle), height, -3 * np.cos(angle)))
-        found.append((rolled(look_at(eye, np.zeros(3)), roll) @ TILT.T, TILT @ eye))
-    return found
-
-
-def found_by(shown, cameras):
-    return shown.tab.evaluate("(cameras) => upOfCameras(cameras)", [{"R": R.tolist()} for R, _ in cameras])
 
 
 def angle(a, b):
     return float(np.degrees(np.arccos(np.clip(np.dot(a, b), -1, 1))))
-
-
-def test_level_cameras_give_the_exact_tilt(edit_page, random_gaussians):
-    shown = edit_page(random_gaussians(5))
-    for cameras in (around(12), around(40, 1.0), around(9, height=-2.9), around(5, 3.0)):
-        result = found_by(shown, cameras)
-        np.testing.assert_allclose(result["up"], UP, atol=1e-7)
-        assert result["count"] == len(cameras)
-
-
-def test_the_error_of_rolled_photos_is_as_large_as_stated(edit_page, random_gaussians):
-    """Rolls are normal with 4 degrees. In an arc the error lies along one direction, so its root mean square is the
-    standard error; all around, both horizontal directions have that error."""
-    shown = edit_page(random_gaussians(5))
-    rng = np.random.default_rng(2)
-    for n, turn, directions in ((60, 2 * np.pi, 2), (60, 1.6, 1)):
-        errors, stated = [], []
-        for _ in range(60):
-            result = found_by(shown, around(n, turn, rolls=rng.normal(0, np.radians(4), n)))
-            errors.append(angle(result["up"], UP))
-            stated.append(np.degrees(result["error"]))
-        ratio = np.sqrt(np.mean(np.square(errors)) / directions) / np.mean(stated)
-        assert 0.7 < ratio < 1.4
-
-
-def test_a_few_portrait_photos_do_not_matter_and_many_are_refused(edit_page, random_gaussians):
-    shown = edit_page(random_gaussians(5))
-    rng = np.random.default_rng(4)
-
-    def photos(n, share, turn=2 * np.pi):
-        rolls = rng.normal(0, np.radians(1), n)
-        rolls[rng.permutation(n)[: round(share * n)]] += np.pi / 2
-        return around(n, turn, rolls=rolls)
-
-    assert angle(found_by(shown, photos(200, 0.05))["up"], UP) < 3
-    for share, turn in ((0.5, 2 * np.pi), (0.5, 0.3), (0.35, 2 * np.pi)):
-        assert "rolled too differently" in found_by(shown, photos(200, share, turn))["refused"]
-    upside = around(40, rolls=np.where(np.arange(40) % 2, 0, np.pi))
-    assert "rolled too differently" in found_by(shown, upside)["refused"], (
-        "half of the photos are upside down"
-    )
-
-
-def test_cameras_that_leave_the_tilt_open_are_refused(edit_page, random_gaussians):
-    shown = edit_page(random_gaussians(5))
-    R = look_at(np.array((0.0, 0.0, -3.0)), np.zeros(3)) @ TILT.T
-    row = [(R, np.array((x, 0.0, 0.0))) for x in range(20)]
-    assert "nearly one direction" in found_by(shown, row)["refused"]
-    assert "at least 3" in found_by(shown, around(2))["refused"]
-    # from straight above, whether the camera looks up or down is undecided
-    down = [(rolled(look_at((0.0, -3.0, 1e-6), np.zeros(3)), x) @ TILT.T, np.zeros(3)) for x in range(6)]
-    assert "rolled too differently" in found_by(shown, down)["refused"]
-
-
-EIGEN = "(list) => list.map((matrix) => eigenvectors(matrix))"
-
-
-def test_eigenvectors_are_those_of_numpy(edit_page, random_gaussians):
-    rng = np.random.default_rng(1)
-    matrices = [a @ a.T for a in rng.normal(size=(30, 3, 3))] + [np.diag([3.0, 1.0, 2.0]), np.zeros((3, 3))]
-    found = edit_page(random_gaussians(5)).tab.evaluate(EIGEN, [matrix.tolist() for matrix in matrices])
-    for matrix, pairs in zip(matrices, found, strict=True):
-        np.testing.assert_allclose([pair["value"] for pair in pairs], np.linalg.eigvalsh(matrix), atol=1e-12)
-        for pair in pairs:
-            v = np.array(pair["vector"])
-            np.testing.assert_allclose(matrix @ v, pair["value"] * v, atol=1e-12)
-            assert v @ v == pytest.approx(1.0)
 
 
 def test_the_button_levels_the_scene_for_page_and_command(edit_page, random_gaussians):

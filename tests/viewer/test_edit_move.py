@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.edits.apply import DELETED, SELECTED, edited, flags_after
+from gsplat_edu.edits.apply import SELECTED, edited
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, look_at
+from js.random_edits import moved_one_by_one, random_operations
 from viewer.handles import ARROW, RING, Scale, about, drag, shape, touch
 
 CHOOSE = """([center, radius]) => {
@@ -23,18 +24,6 @@ def means_of(shown):
 
 def edits_of(shown):
     return parse_edits(shown.tab.evaluate("editor.text()").encode(), "e.json")
-
-
-def moved_one_by_one(operation, mean):
-    """Return a moved mean, by the order of operations in docs/EDITS.md."""
-    offset = [float(x) - c for x, c in zip(mean, operation["center"], strict=True)]
-    result = []
-    for row, c, t in zip(operation["rotation"], operation["center"], operation["translation"], strict=True):
-        total = row[0] * offset[0]
-        total = total + row[1] * offset[1]
-        total = total + row[2] * offset[2]
-        result.append(float(np.float32((total + c) + t)))
-    return result
 
 
 def test_the_handle_moves_the_selection_on_release(edit_page, random_gaussians):
@@ -114,85 +103,7 @@ def test_a_finger_turns_the_selection(edit_page, random_gaussians):
     np.testing.assert_allclose(last["rotation"], about(axes[k], np.radians(40)), atol=5e-3)
 
 
-STEPS = 40
-
-
-def random_operations(seed):
-    """Return selections, moves and deletions; later selections see moved splats. Some turn by 1e-9 about a point at
-    1e9, so that float64 rounds in digits of the float32 means, and another order of the sums gives other means."""
-    rng = np.random.default_rng(seed)
-    made = []
-    for _ in range(STEPS):
-        center = rng.normal(0, 0.6, 3).tolist()
-        region = {"by": "sphere", "center": center, "radius": float(rng.uniform(0.2, 0.8))}
-        made.append({"op": "select", "how": str(rng.choice(["replace", "add", "intersect"])), **region})
-        rotation = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix().tolist()
-        by = rng.normal(0, 0.3, 3).tolist()
-        if rng.random() < 0.3:
-            rotation = Rotation.from_rotvec(rng.normal(0, 1e-9, 3)).as_matrix().tolist()
-            center = rng.normal(0, 1e9, 3).tolist()
-        made.append({"op": "move", "rotation": rotation, "translation": by, "center": center})
-        if rng.random() < 0.15:
-            made.append({"op": str(rng.choice(["delete", "hide", "invert", "show"]))})
-    return made
-
-
 PERFORM = "(operations) => operations.forEach((operation) => editor.perform(operation))"
-
-
-def witness(operations, means):
-    """Return states and means after selections by spheres, moves and changes of states, splat by splat."""
-    means = [[float(x) for x in mean] for mean in means]
-    flags = [0] * len(means)
-    for operation in operations:
-        for i, (flag, (x, y, z)) in enumerate(zip(list(flags), list(means), strict=True)):
-            op = operation["op"]
-            if op == "select" and flag <= SELECTED:
-                (a, b, c), r = operation["center"], operation["radius"]
-                inside = ((x - a) * (x - a) + (y - b) * (y - b)) + (z - c) * (z - c) <= r * r
-                old = bool(flag)
-                flags[i] = int(
-                    {"replace": inside, "add": old or inside, "intersect": old and inside}[operation["how"]]
-                )
-            elif op == "move" and flag == SELECTED:
-                means[i] = moved_one_by_one(operation, means[i])
-            elif op == "delete" and flag == SELECTED:
-                flags[i] = DELETED
-            elif op == "hide" and flag == SELECTED:
-                flags[i] = 2
-            elif op == "invert" and flag <= SELECTED:
-                flags[i] = 1 - flag
-            elif op == "show" and flag == 2:
-                flags[i] = 0
-    return np.array(flags), np.array(means)
-
-
-@pytest.mark.parametrize("forgets", [False, True])
-def test_page_command_and_a_witness_agree_on_every_bit(edit_page, random_gaussians, forgets):
-    gaussians = random_gaussians(250)
-    shown = edit_page(gaussians)
-    opened = shown.tab.evaluate("editor.text()")
-    for seed in range(3):
-        operations = random_operations(seed)
-        shown.tab.evaluate(PERFORM, operations)
-        flags, means = witness(operations, gaussians.means.numpy())
-        np.testing.assert_array_equal(np.array(shown.tab.evaluate("[...editor.history.flags]")), flags)
-        np.testing.assert_array_equal(means_of(shown), means)
-        edits = edits_of(shown)
-        np.testing.assert_array_equal(flags_after(edits.operations, gaussians), flags)
-        left = edited(Scene(gaussians), edits.operations).gaussians
-        np.testing.assert_array_equal(left.means.double().numpy(), means[flags <= SELECTED])
-        assert np.abs(means - gaussians.means.numpy()).max() > 0.1 and (flags <= SELECTED).any()
-        if forgets:
-            shown.tab.evaluate("editor.history.changes.forEach((_, i) => editor.history.forget(i))")
-            assert shown.tab.evaluate("editor.history.bytes") == 0
-        shown.tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(operations))
-        assert shown.tab.evaluate("editor.text()") == opened
-        np.testing.assert_array_equal(means_of(shown), gaussians.means.double().numpy())
-        assert shown.tab.evaluate("[...editor.values.motion.turned].every((i) => i === 0)")
-        shown.tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.redo(); }", len(operations))
-        np.testing.assert_array_equal(means_of(shown), means)
-        shown.tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(operations))
 
 
 def place_of(eye):

@@ -116,27 +116,6 @@ def test_equal_depths_keep_the_order_of_the_input(show, camera):
     assert visit.picture(camera).reshape(-1, 3).max(axis=0).argmax() == 0
 
 
-def test_splats_are_sorted_by_float32_depth(show, random_gaussians, camera):
-    gaussians = random_gaussians(20_000, 0)
-    means = gaussians.means.numpy()
-    means[:] = np.round(means * 8) / 8  # many equal depths
-    # and nearly equal ones
-    means[:5000] = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32) * 1e-3
-    straight = Camera(np.eye(3), (0.0, 0.0, -0.5), 100.0, 100.0, 50.0, 40.0, 80, 100)
-    visit = show(gaussians, [("first", straight)], PLAIN)
-    encoded = visit.tab.evaluate(
-        """async (camera) => {
-          await viewer.sorter.sort(camera);
-          return Array.from(new Uint32Array(viewer.sorter.order, 0, viewer.renderer.count));
-        }""",
-        {"R": straight.R.tolist(), "eye": straight.eye.tolist()},
-    )
-    depths = (means[:, 2].astype(np.float64) + 0.5).astype(np.float32)
-    seen = np.flatnonzero(depths > 0.05)
-    near_to_far = seen[np.argsort(depths[seen], kind="stable")]
-    np.testing.assert_array_equal(encoded, near_to_far[::-1])
-
-
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_splat_or_one_splat(show, random_gaussians, camera, count):
     settings = RenderSettings(background=(0.25, 0.5, 1.0))

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.main import main
-from gsplat_edu.edits.apply import moved_together
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.io.edit import IDENTITY, Similarity
@@ -397,39 +396,6 @@ def test_a_mesh_follows_a_move_of_all_splats(visit, opened, tmp_path, random_gau
     assert visit().open(path).ready().tab.locator("#mesh-stays").is_visible()
     tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(WHOLE) + len(PART))
     assert note.is_hidden() and (drawn(shown) == before).all()
-
-
-def test_page_and_command_agree_on_what_moves_together(visit, tmp_path, random_gaussians):
-    gaussians = random_gaussians(40)
-    shown, _ = editor_of(visit, tmp_path, gaussians, ball())
-    rng = np.random.default_rng(5)
-    found = []
-    for _ in range(12):
-        operations = []
-        for _ in range(5):
-            wide = float(rng.choice([0.8, 50.0], p=[0.3, 0.7]))
-            region = {"by": "sphere", "center": rng.normal(0, 0.3, 3).tolist(), "radius": wide}
-            R = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix().tolist()
-            operations += [{"op": "select", "how": "replace", **region}]
-            operations += [{"op": str(rng.choice(["hide", "delete", "show"]))}] if wide < 1 else []
-            by, center = rng.normal(0, 0.2, 3).tolist(), rng.normal(0, 1, 3).tolist()
-            operations += [{"op": "move", "rotation": R, "translation": by, "center": center}]
-        whole, some = shown.tab.evaluate(
-            """(operations) => {
-              operations.forEach((operation) => editor.perform(operation));
-              const { whole, some } = movedTogether(editor.values, editor.history.flags);
-              return [whole, some];
-            }""",
-            operations,
-        )
-        edits = parse_edits(shown.tab.evaluate("editor.text()").encode(), "e.json")
-        move, partly = moved_together(edits.operations, gaussians)
-        np.testing.assert_allclose(whole["R"], move.R, atol=1e-12)
-        np.testing.assert_allclose(whole["t"], move.t, atol=1e-12)
-        assert some == partly
-        found.append((move is IDENTITY, some))
-        shown.tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(operations))
-    assert {(False, True), (False, False)} <= set(found)
 
 
 def test_convert_moves_the_mesh_and_says_where_it_stays(tmp_path, random_gaussians, capsys):

@@ -1,6 +1,5 @@
 """On a slow computer, a page draws fewer splats while the view moves, and then the whole picture in parts."""
 
-import numpy as np
 import pytest
 
 from gsplat_edu.render.settings import RenderSettings
@@ -38,16 +37,6 @@ PARTS = """async () => {
     equal: inParts.length === atOnce.length && inParts.every((value, i) => value === atOnce[i]),
     shown: inParts.some((value) => value > 0.1),
   };
-}"""
-
-SAMPLE = """async (most) => {
-  const camera = viewer.camera();
-  await viewer.sorter.sort(camera, most);
-  const first = Array.from(new Uint32Array(viewer.sorter.order, 0, viewer.renderer.count));
-  await viewer.sorter.sort(camera);
-  await viewer.sorter.sort(camera, most);
-  const second = Array.from(new Uint32Array(viewer.sorter.order, 0, viewer.renderer.count));
-  return { first, second, thinning: viewer.renderer.thinning };
 }"""
 
 
@@ -90,23 +79,6 @@ def test_the_whole_picture_in_parts_is_the_same_to_the_bit(slow, interrupt):
     assert whole[-1][1] < 15_000 and sum(count for _, count, _ in whole) >= 15_000, (
         "the whole picture has several parts"
     )
-
-
-def test_a_sample_is_the_same_each_time_and_covers_as_much(slow):
-    visit, gaussians = slow
-    found = visit.tab.evaluate(SAMPLE, 2000)
-    assert found["first"] == found["second"] and len(set(found["first"])) == 2000
-    scales = np.exp(gaussians.log_scales.numpy().astype(float))
-    area = scales.prod(axis=1) / scales.min(axis=1)
-    weight = np.sqrt(area / (1 + np.exp(-gaussians.logit_opacities.numpy().astype(float))))
-    chance = np.minimum(1, found["thinning"] * weight)
-    chosen = np.asarray(found["first"])
-    # the number of sampled splats is within 4 sqrt(2000) = 180 of its mean of 2000
-    assert chance.sum() == pytest.approx(2000, abs=180)
-    # the estimate of the total is unbiased, with variance the sum of area² (1 / chance - 1)
-    spread = np.sqrt((area**2 * (1 / chance - 1)).sum())
-    assert (area[chosen] / chance[chosen]).sum() == pytest.approx(area.sum(), abs=4 * spread)
-    assert spread < 0.1 * area.sum(), "a sharp picture follows"
 
 
 def test_a_slow_page_draws_rarely_while_a_training_runs(slow):

@@ -66,7 +66,8 @@ def application(
     routes: list[BaseRoute] = [
         act("/", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio", "index.html")),
         act("/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio")),
-        act("/viewer/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.viewer")),
+        # with the path that it has in the package, so that an import leads to the same file here and in node
+        act("/viewer/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.viewer")),
         *job_routes.routes(),
         *live_routes.routes(),
         *run_routes.routes(),

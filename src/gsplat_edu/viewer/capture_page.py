@@ -16,28 +16,10 @@ import re
 
 from gsplat_edu.base.content_policy import content_policy, policy_element
 from gsplat_edu.viewer.capture_data import CaptureFacts
-from gsplat_edu.viewer.page_parts import web
+from gsplat_edu.viewer.modules import script, web
 
-SCRIPTS = (
-    "common.js",
-    "press.js",
-    "scene.js",
-    "region.js",
-    "camera.js",
-    "controls.js",
-    "edit_shapes.js",
-    "edit_overlay.js",
-    "edit_gizmo.js",
-    "edit_gizmo_panel.js",
-    "capture_cameras.js",
-    "capture_draw.js",
-    "capture_photos.js",
-    "capture_matches.js",
-    "capture_panel.js",
-    "capture_region.js",
-    "capture.js",
-)
-"""Scripts of the page in loading order; they share one scope."""
+ENTRIES = ("capture.js",)
+"""See `gsplat_edu.viewer.page_parts.Kind`."""
 
 STYLES = ("style.css", "capture.css")
 
@@ -46,7 +28,7 @@ SHADERS = ("capture_lines.vert", "capture_lines.frag", "capture_points.vert", "c
 
 def policy() -> str:
     """Return the Content-Security-Policy of the page."""
-    return content_policy([web(name) for name in SCRIPTS], [_style()], own_server=True)
+    return content_policy([script(ENTRIES)], [_style()], own_server=True)
 
 
 def html(capture: CaptureFacts, findings: str = "") -> bytes:
@@ -70,7 +52,7 @@ def html(capture: CaptureFacts, findings: str = "") -> bytes:
         ),
         "points": _packed("points", capture.points),
         "matches": _packed("matches", capture.matches),
-        "scripts": "\n".join(f"<script>{web(name)}</script>" for name in SCRIPTS),
+        "script": f"<script>{script(ENTRIES)}</script>",
     }
     # One pass over the template only: placeholders inside inserted text stay unchanged.
     page = re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], web("capture.html"))

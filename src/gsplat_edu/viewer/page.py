@@ -37,8 +37,9 @@ from gsplat_edu.scene.frame import ORIGIN, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.rig import stand_in, through_lenses
 from gsplat_edu.viewer import page_data, page_mesh
+from gsplat_edu.viewer.modules import web
 from gsplat_edu.viewer.page_mesh import Meshes
-from gsplat_edu.viewer.page_parts import filled, web
+from gsplat_edu.viewer.page_parts import filled
 from gsplat_edu.viewer.page_proof import Proof
 from gsplat_edu.viewer.page_start import (
     Start,

@@ -8,37 +8,11 @@ import json
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 from gsplat_edu.base import constants
 from gsplat_edu.base.content_policy import content_policy, policy_element
-
-SCRIPTS = (
-    "common.js",
-    "press.js",
-    "scene.js",
-    "region.js",
-    "camera.js",
-    "path.js",
-    "draw.js",
-    "mesh_rays.js",
-    "mesh.js",
-    "sorter.js",
-    "pace.js",
-    "controls.js",
-    "panel.js",
-    "timeline.js",
-    "keyframes.js",
-    "flight.js",
-    "seen.js",
-    "compare.js",
-    "guide.js",
-    "frustums.js",
-)
-"""Scripts of every page in loading order; they share one scope."""
-
-LAST_SCRIPT = "main.js"
+from gsplat_edu.viewer.modules import script, web
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "mesh.vert", "mesh.frag")
 
@@ -67,7 +41,7 @@ class Kind:
 
     Args:
         fact: Entry of the page's facts that only this kind has; empty for the plain page.
-        scripts: Its scripts, loaded before `LAST_SCRIPT`.
+        entries: Its modules that others do not import, in the order in which they run; see `gsplat_edu.viewer.modules`.
         styles: Its style sheets, after the common one.
         workers: Its workers, in addition to the one that sorts.
         own_server: Whether it may load from its own server, and save there.
@@ -76,7 +50,7 @@ class Kind:
     """
 
     fact: str = ""
-    scripts: tuple[str, ...] = ()
+    entries: tuple[str, ...] = ("main.js",)
     styles: tuple[str, ...] = ()
     workers: tuple[str, ...] = ()
     own_server: bool = False
@@ -85,35 +59,12 @@ class Kind:
 
 
 PLAIN = Kind()
-LEVELS = Kind("lod", ("levels.js",), workers=("lod_worker",), own_server=True)
-LIVE = Kind("live", ("live_curves.js", "live_pictures.js", "live.js"), ("live.css",), own_server=True)
-PICTURED = Kind("pictures", ("live_pictures.js",), own_server=True)
+LEVELS = Kind("lod", ("levels_main.js",), workers=("lod_worker",), own_server=True)
+LIVE = Kind("live", ("live_pictures.js", "live.js", "main.js"), ("live.css",), own_server=True)
+PICTURED = Kind("pictures", ("live_pictures.js", "main.js"), own_server=True)
 EDITOR = Kind(
     "edit",
-    (
-        "edit_cells.js",
-        "edit_member.js",
-        "edit_near.js",
-        "edit_front.js",
-        "edit_state.js",
-        "edit_shapes.js",
-        "edit_pixel.js",
-        "edit_overlay.js",
-        "edit_draw.js",
-        "edit_move.js",
-        "edit_gizmo.js",
-        "edit_gizmo_panel.js",
-        "edit_level.js",
-        "edit_look.js",
-        "edit_tools.js",
-        "edit_polygon.js",
-        "edit_histogram.js",
-        "edit_tour.js",
-        "edit_floaters.js",
-        "edit_panel.js",
-        "edit.js",
-        "edit_start.js",
-    ),
+    ("edit_start.js", "main.js"),
     ("edit.css",),
     own_server=True,
     define="EDITING",
@@ -123,7 +74,7 @@ EDITOR = Kind(
 
 def policy(kind: Kind = PLAIN) -> str:
     """Return the Content-Security-Policy of every page of a kind: its scripts, its style, and its workers."""
-    return content_policy(_scripts(kind), [_style(kind)], workers=True, own_server=kind.own_server)
+    return content_policy([script(kind.entries)], [_style(kind)], workers=True, own_server=kind.own_server)
 
 
 def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b"") -> str:
@@ -148,20 +99,13 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
         "shaders": "\n".join(
             _text_element(name, _shader(name, defined)) for name in (*SHADERS, *kind.shaders)
         ),
-        "worker": "\n".join(_text_element(name.replace("_", "-"), web(f"{name}.js")) for name in workers),
-        "scripts": "\n".join(f"<script>{script}</script>" for script in _scripts(kind)),
+        "worker": "\n".join(
+            _text_element(name.replace("_", "-"), script((f"{name}.js",))) for name in workers
+        ),
+        "script": f"<script>{script(kind.entries)}</script>",
     }
     # One pass over the template only: placeholders inside inserted text stay unchanged.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], template)
-
-
-def web(name: str) -> str:
-    """Return the text of a file in `viewer/web`."""
-    return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
-
-
-def _scripts(kind: Kind) -> list[str]:
-    return [web(name) for name in (*SCRIPTS, *kind.scripts, LAST_SCRIPT)]
 
 
 def _style(kind: Kind) -> str:

@@ -1,5 +1,7 @@
 // The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives. Answers wait while a button is
-// pressed, because they change the page: `released` is of the viewer's press.js.
+// pressed, because they change the page.
+
+import { released } from "../../viewer/web/press.js";
 
 export class ApiError extends Error {
   constructor(line, status) {
@@ -32,7 +34,8 @@ async function ask(...question) {
 }
 
 async function answerTo(method, address, body) {
-  const given = body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
+  const given =
+    body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
   const answer = await fetch(address, { method, ...given }).catch(() => {
     throw new ApiError(GONE, 0);
   });
@@ -71,7 +74,9 @@ export function upload(address, file, progress, signal) {
       else reject(new ApiError(lineOf(status, text), status));
     });
     // the server closes the connection when it refuses a file before it has all of it
-    request.addEventListener("error", () => reject(new ApiError("The connection closed before the file was received.", 0)));
+    request.addEventListener("error", () =>
+      reject(new ApiError("The connection closed before the file was received.", 0)),
+    );
     request.addEventListener("abort", () => reject(new ApiError("Stopped.", 0)));
     signal.addEventListener("abort", () => request.abort());
     request.send(file);

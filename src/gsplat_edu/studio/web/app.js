@@ -1,5 +1,6 @@
 // The page: which screen the address names, keys, and what every screen shares.
 
+import { released } from "../../viewer/web/press.js";
 import { announce, keptFocus, put } from "./dom.js";
 import { Store } from "./store.js";
 import { library } from "./library.js";
@@ -97,7 +98,9 @@ function tell(id) {
 const usesKeys = () => localStorage.getItem("keys") !== "off";
 
 function onKey(event) {
-  const typing = event.target.closest?.("input:not([type=checkbox], [type=radio], [type=range]), select, textarea, dialog");
+  const typing = event.target.closest?.(
+    "input:not([type=checkbox], [type=radio], [type=range]), select, textarea, dialog",
+  );
   if (event.ctrlKey || event.metaKey || event.altKey || typing || !usesKeys()) return;
   const actions = {
     "?": () => keys.showModal(),

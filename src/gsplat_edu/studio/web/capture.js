@@ -35,9 +35,17 @@ export function capture(given) {
 // A capture that has no poses: its search runs, or was stopped, or failed.
 function search({ main, store }, entry) {
   const head = entryHead(store, entry, "Capture");
-  const job = [...store.jobs.values()].filter(({ job: { work } }) => work.command === "sfm" && work.outputs[0] === entry.entry).at(-1);
-  const said = h("p", {}, "This capture has no poses yet. They come from its photos, where the search for them runs, or can be tried again.");
-  const photos = job ? h("p", { class: "next" }, link("Go to the photos", `#/${at(job.job.subject).slice(5)}`, { class: "button" })) : null;
+  const job = [...store.jobs.values()]
+    .filter(({ job: { work } }) => work.command === "sfm" && work.outputs[0] === entry.entry)
+    .at(-1);
+  const said = h(
+    "p",
+    {},
+    "This capture has no poses yet. They come from its photos, where the search for them runs, or can be tried again.",
+  );
+  const photos = job
+    ? h("p", { class: "next" }, link("Go to the photos", `#/${at(job.job.subject).slice(5)}`, { class: "button" }))
+    : null;
   const parts = [head.element, said, photos, management(store, entry)].filter(Boolean);
   main.append(...parts);
   return { unfinished: true, update: (now) => head.update(now), clear: () => parts.forEach((part) => part.remove()) };
@@ -47,14 +55,23 @@ function search({ main, store }, entry) {
 function training({ main, store }, entry) {
   const head = entryHead(store, entry, "Capture");
   const line = errorLine();
-  const pictures = gallery(entry.entry, (photo, out) => {
-    taken.left(new Map([[photo, out]]));
-    store.refresh();
-  }, () => store.refresh(), store);
-  const taken = places(entry, (photo, out) => {
-    pictures.left(photo, out);
-    store.refresh();
-  }, (drawn) => start.drawn(drawn));
+  const pictures = gallery(
+    entry.entry,
+    (photo, out) => {
+      taken.left(new Map([[photo, out]]));
+      store.refresh();
+    },
+    () => store.refresh(),
+    store,
+  );
+  const taken = places(
+    entry,
+    (photo, out) => {
+      pictures.left(photo, out);
+      store.refresh();
+    },
+    (drawn) => start.drawn(drawn),
+  );
   const checked = doctor(
     store,
     entry.entry,
@@ -86,9 +103,15 @@ function training({ main, store }, entry) {
       pictures.read(now).then(shown, (error) => put(line, error.message));
       const own = store.entries("runs").filter((run) => store.captureOf(run)?.entry === entry.entry);
       past.hidden = !own.length;
-      keyed(runs, own, ({ name }) => name, (run) => h("li", { class: "row" }, link(run.name, addressOf(run)), h("span", { class: "quiet" })), (item, run) => {
-        item.lastChild.textContent = factsOf(run).filter(Boolean).join(" · ");
-      });
+      keyed(
+        runs,
+        own,
+        ({ name }) => name,
+        (run) => h("li", { class: "row" }, link(run.name, addressOf(run)), h("span", { class: "quiet" })),
+        (item, run) => {
+          item.lastChild.textContent = factsOf(run).filter(Boolean).join(" · ");
+        },
+      );
     },
   };
 }
@@ -105,7 +128,12 @@ function startForm(store, entry, draw) {
     return h("label", { class: "choice" }, input, h("strong", {}, title), h("span", { class: "quiet" }, hint), facts);
   });
   const more = choices(draw);
-  const name = h("input", { id: "run-name", type: "text", autocomplete: "off", placeholder: "a free one after the capture" });
+  const name = h("input", {
+    id: "run-name",
+    type: "text",
+    autocomplete: "off",
+    placeholder: "a free one after the capture",
+  });
   const go = h("button", { "data-own": "" }, "Start training");
   const measure = button("Forecast time and memory", () => forecast());
 
@@ -149,13 +177,7 @@ function startForm(store, entry, draw) {
       },
       h("fieldset", {}, h("legend", {}, "Quality"), h("div", { class: "choices" }, qualities)),
       forecastLine,
-      h(
-        "details",
-        {},
-        h("summary", {}, "More"),
-        h("label", { class: "wide" }, "Name of the run", name),
-        more.element,
-      ),
+      h("details", {}, h("summary", {}, "More"), h("label", { class: "wide" }, "Name of the run", name), more.element),
       h("div", { class: "row" }, go, measure),
       line,
     ),
@@ -190,4 +212,3 @@ function startForm(store, entry, draw) {
     },
   };
 }
-

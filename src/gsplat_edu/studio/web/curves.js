@@ -12,7 +12,13 @@ export function curve(title, shown) {
   const name = h("span", {}, title);
   const value = h("output", {}, "–");
   const [high, low, right] = [h("span", { class: "high" }), h("span", { class: "low" }), h("span", { class: "last" })];
-  const axis = h("div", { class: "axis quiet", "aria-hidden": "true" }, h("span", {}, "0"), h("span", {}, "iteration"), right);
+  const axis = h(
+    "div",
+    { class: "axis quiet", "aria-hidden": "true" },
+    h("span", {}, "0"),
+    h("span", {}, "iteration"),
+    right,
+  );
   const element = h(
     "figure",
     { class: "curve" },

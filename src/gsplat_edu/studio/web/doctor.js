@@ -12,9 +12,7 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
   const line = errorLine();
   const found = h("div", { class: "found" });
   const job = jobPlace(store, entry, ["doctor"]);
-  const ask = button("Examine", () =>
-    attempt(ask, line, () => startJob(store, { command: "doctor", subject: entry })),
-  );
+  const ask = button("Examine", () => attempt(ask, line, () => startJob(store, { command: "doctor", subject: entry })));
   const again = h("p", { class: "row", hidden: true });
   let request = null;
 
@@ -50,13 +48,27 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
     return begin;
   }
 
-  const findings = versioned(line, () => get(at(entry, "findings")), (answer) => {
-    request = answer.again;
-    marked(showFindings(found, offer, heard, answer));
-  });
+  const findings = versioned(
+    line,
+    () => get(at(entry, "findings")),
+    (answer) => {
+      request = answer.again;
+      marked(showFindings(found, offer, heard, answer));
+    },
+  );
 
   return {
-    element: h("section", { "aria-label": "doctor" }, heading(2, "Doctor"), h("p", { class: "quiet" }, hint), ask, line, job.element, again, found),
+    element: h(
+      "section",
+      { "aria-label": "doctor" },
+      heading(2, "Doctor"),
+      h("p", { class: "quiet" }, hint),
+      ask,
+      line,
+      job.element,
+      again,
+      found,
+    ),
     update(now) {
       job.update();
       const view = job.view;

@@ -24,7 +24,10 @@ function storedDraft(scene) {
 
 // Writes down what an editor has not saved, and forgets it once everything is saved. Returns a line if it cannot be kept.
 export function writeDown(editor) {
-  const { scene: { sha256: scene }, stored: base } = editor;
+  const {
+    scene: { sha256: scene },
+    stored: base,
+  } = editor;
   const text = editor.text();
   const unsaved = text === base ? null : text;
   if (editor.undecided || editor.written === unsaved) return "";
@@ -55,7 +58,10 @@ function offerStored(editor, place) {
   };
   const time = new Date(draft.time).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
   const since = draft.base === editor.stored ? "" : ", but other edits were saved since";
-  const restore = button("Restore", end(() => load(editor, draft)));
+  const restore = button(
+    "Restore",
+    end(() => load(editor, draft)),
+  );
   place.replaceChildren(`There are unsaved changes from ${time}${since}. `, restore, " ", button("Forget", end()));
 }
 
@@ -73,7 +79,8 @@ export function follow(entry, made) {
 export function keep(entry, editor) {
   if (!editor) return;
   const text = editor.text();
-  if (text !== editor.stored) drafts.set(renamed.get(entry) ?? entry, { text, base: editor.stored, scene: editor.scene.sha256 });
+  if (text !== editor.stored)
+    drafts.set(renamed.get(entry) ?? entry, { text, base: editor.stored, scene: editor.scene.sha256 });
 }
 
 // Replaces an editor's operations by those of a draft, which can be undone.
@@ -88,7 +95,10 @@ function load(editor, { text }) {
 }
 
 function download({ text }) {
-  const made = h("a", { href: URL.createObjectURL(new Blob([text], { type: "application/json" })), download: "edits.json" });
+  const made = h("a", {
+    href: URL.createObjectURL(new Blob([text], { type: "application/json" })),
+    download: "edits.json",
+  });
   made.click();
   setTimeout(() => URL.revokeObjectURL(made.href), 60000); // the browser may still be reading
 }
@@ -108,9 +118,22 @@ export function bringBack(entry, editor, place, changed) {
   const discard = button("Discard them", end());
   editor.undecided = true;
   if (draft.scene !== editor.scene.sha256) {
-    place.replaceChildren("There are unsaved edits of an earlier state of this scene, which do not fit this one. ", button("Download them", () => download(draft)), " ", discard);
+    place.replaceChildren(
+      "There are unsaved edits of an earlier state of this scene, which do not fit this one. ",
+      button("Download them", () => download(draft)),
+      " ",
+      discard,
+    );
   } else if (draft.base !== editor.stored) {
-    place.replaceChildren("There are unsaved edits in this tab, but other edits were saved since. ", button("Use mine", end(() => load(editor, draft))), " ", discard);
+    place.replaceChildren(
+      "There are unsaved edits in this tab, but other edits were saved since. ",
+      button(
+        "Use mine",
+        end(() => load(editor, draft)),
+      ),
+      " ",
+      discard,
+    );
   } else {
     end(() => load(editor, draft))();
   }

@@ -137,7 +137,11 @@ export function beside(scene, captureOf) {
     if (chosen !== view) return; // another view was chosen meanwhile, or the user moved
     const name = photoOf(photos, camera.name);
     range.disabled = scene.photo.hidden = !name;
-    note.textContent = name ? (camera.held_out ? "held out of the training" : "") : "The photo of this view is not in the library.";
+    note.textContent = name
+      ? camera.held_out
+        ? "held out of the training"
+        : ""
+      : "The photo of this view is not in the library.";
     if (!name) return;
     scene.photo.src = `${at(entry.entry, "thumbs", name)}?side=1024`;
     cut();

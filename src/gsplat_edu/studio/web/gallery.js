@@ -32,10 +32,14 @@ function leaving(entry, name, line, changed) {
 
 // A button that draws on the mask of a photo; changed(isMasked) comes after each mask that was saved.
 function masking(store, entry, name, line, changed) {
-  const pressed = button("Mask this", () => attempt(pressed, line, () => drawMask(store, entry, name, name.split("/").at(-1), (is) => {
-    tellMasked(pressed, name, is);
-    changed(is);
-  })));
+  const pressed = button("Mask this", () =>
+    attempt(pressed, line, () =>
+      drawMask(store, entry, name, name.split("/").at(-1), (is) => {
+        tellMasked(pressed, name, is);
+        changed(is);
+      }),
+    ),
+  );
   pressed.className = "leave";
   return pressed;
 }
@@ -69,12 +73,26 @@ export function gallery(entry, changed = () => {}, masked = () => {}, store = nu
       { title: `${name}: ${detail}` },
       problem
         ? h("span", { class: "thumb" }, "cannot be read")
-        : h("img", { src: thumbOf(entry, name), alt: name, loading: "lazy", width: 160, height: 120, onerror: damaged }),
+        : h("img", {
+            src: thumbOf(entry, name),
+            alt: name,
+            loading: "lazy",
+            width: 160,
+            height: 120,
+            onerror: damaged,
+          }),
       h("span", { class: "name" }, name),
       h("span", { class: problem ? "error" : "quiet" }, detail),
       h("span", { class: "mark" }),
-      isCapture ? leaving(entry, name, line, (out) => (left(name, out), changed(name, out))) : null,
-      isCapture && !problem ? Object.assign(masking(store, entry, name, line, masked), { className: "leave masking" }) : null,
+      isCapture
+        ? leaving(entry, name, line, (out) => {
+            left(name, out);
+            changed(name, out);
+          })
+        : null,
+      isCapture && !problem
+        ? Object.assign(masking(store, entry, name, line, masked), { className: "leave masking" })
+        : null,
     );
   }
 
@@ -87,12 +105,22 @@ export function gallery(entry, changed = () => {}, masked = () => {}, store = nu
 
   function show() {
     const some = photos.slice(0, shown);
-    keyed(list, some, ({ name }) => name, item, (element, { name, left_out: out, masked: drawn }) => {
-      element.querySelector(".mark").textContent = [...(out ? ["left out"] : []), ...(drawn ? ["masked"] : []), ...(marks.get(name) ?? [])].join(", ");
-      if (isCapture) tellLeft(element, element.querySelector(".leave"), name, out);
-      const mask = element.querySelector(".masking");
-      if (mask) tellMasked(mask, name, drawn);
-    });
+    keyed(
+      list,
+      some,
+      ({ name }) => name,
+      item,
+      (element, { name, left_out: out, masked: drawn }) => {
+        element.querySelector(".mark").textContent = [
+          ...(out ? ["left out"] : []),
+          ...(drawn ? ["masked"] : []),
+          ...(marks.get(name) ?? []),
+        ].join(", ");
+        if (isCapture) tellLeft(element, element.querySelector(".leave"), name, out);
+        const mask = element.querySelector(".masking");
+        if (mask) tellMasked(mask, name, drawn);
+      },
+    );
     more.hidden = photos.length <= shown;
     more.textContent = `Show all ${photos.length} photos`;
   }
@@ -103,7 +131,10 @@ export function gallery(entry, changed = () => {}, masked = () => {}, store = nu
     const all = [...sizes].sort((a, b) => b[1] - a[1]);
     const parts = all.slice(0, 3).map(([size, number]) => (all.length > 1 ? `${number} of ${size} px` : `${size} px`));
     if (all.length > 3) parts.push(`${all.length - 3} other sizes`);
-    const [bad, out] = [photos.filter(({ problem }) => problem).length, photos.filter(({ left_out: gone }) => gone).length];
+    const [bad, out] = [
+      photos.filter(({ problem }) => problem).length,
+      photos.filter(({ left_out: gone }) => gone).length,
+    ];
     if (bad) parts.push(`${bad} cannot be read`);
     if (out) parts.push(`${out} left out`);
     const none = videos ? "The next step takes sharp frames of the video as photos." : "";
@@ -149,42 +180,82 @@ const SEVERITIES = { note: "note", warning: "warning", fatal: "serious" };
 export function showFindings(place, offer, { store, left, drawn }, { findings, facts, fine, advice, state, stale }) {
   const marks = new Map();
   const line = errorLine();
-  const items = findings.map(({ name, severity, sentence, advice: what, images, values, photos, left_out: gone, masked, proposals }) => {
-    const pictures = images.map((image, index) => {
-      const [kind, entry, ...rest] = (photos?.[index] ?? "").split("/");
-      const photo = rest.join("/");
-      if (photo) marks.set(photo, [...(marks.get(photo) ?? []), name]);
-      const caption = h("figcaption", {}, values[index] ? `${image}: ${values[index]}` : image);
-      const src = photo && thumbOf(`${kind}/${entry}`, photo, 128);
-      const figure = h("figure", {}, photo ? h("img", { src, alt: "", loading: "lazy", width: 96, height: 72 }) : null, caption);
-      if (photo) {
-        const pressed = leaving(`${kind}/${entry}`, photo, line, (out) => {
-          tellLeft(figure, pressed, image, out);
-          left(photo, out);
-        });
-        tellLeft(figure, pressed, image, gone[index]);
-        const mask = masking(store, `${kind}/${entry}`, photo, line, drawn);
-        tellMasked(mask, image, masked[index]);
-        figure.append(pressed, mask);
-      }
-      return figure;
-    });
-    return h(
-      "li",
-      { class: `finding ${severity}` },
-      h("p", {}, h("span", { class: `badge ${severity}` }, SEVERITIES[severity] ?? severity), " ", h("strong", {}, name)),
-      h("p", {}, sentence),
-      what && h("p", { class: "quiet" }, what),
-      pictures.length ? h("div", { class: "figures" }, pictures) : null,
-      proposals.length ? h("p", { class: "row" }, proposals.map(offer)) : null,
-    );
-  });
-  const said = state === "done" && !findings.length ? [h("p", { class: "good" }, "The doctor found nothing wrong.")] : [];
+  const items = findings.map(
+    ({ name, severity, sentence, advice: what, images, values, photos, left_out: gone, masked, proposals }) => {
+      const pictures = images.map((image, index) => {
+        const [kind, entry, ...rest] = (photos?.[index] ?? "").split("/");
+        const photo = rest.join("/");
+        if (photo) marks.set(photo, [...(marks.get(photo) ?? []), name]);
+        const caption = h("figcaption", {}, values[index] ? `${image}: ${values[index]}` : image);
+        const src = photo && thumbOf(`${kind}/${entry}`, photo, 128);
+        const figure = h(
+          "figure",
+          {},
+          photo ? h("img", { src, alt: "", loading: "lazy", width: 96, height: 72 }) : null,
+          caption,
+        );
+        if (photo) {
+          const pressed = leaving(`${kind}/${entry}`, photo, line, (out) => {
+            tellLeft(figure, pressed, image, out);
+            left(photo, out);
+          });
+          tellLeft(figure, pressed, image, gone[index]);
+          const mask = masking(store, `${kind}/${entry}`, photo, line, drawn);
+          tellMasked(mask, image, masked[index]);
+          figure.append(pressed, mask);
+        }
+        return figure;
+      });
+      return h(
+        "li",
+        { class: `finding ${severity}` },
+        h(
+          "p",
+          {},
+          h("span", { class: `badge ${severity}` }, SEVERITIES[severity] ?? severity),
+          " ",
+          h("strong", {}, name),
+        ),
+        h("p", {}, sentence),
+        what && h("p", { class: "quiet" }, what),
+        pictures.length ? h("div", { class: "figures" }, pictures) : null,
+        proposals.length ? h("p", { class: "row" }, proposals.map(offer)) : null,
+      );
+    },
+  );
+  const said =
+    state === "done" && !findings.length ? [h("p", { class: "good" }, "The doctor found nothing wrong.")] : [];
   const old = stale ? [h("p", { class: "error" }, "This has changed since the doctor looked; examine it again.")] : [];
   const table = facts.length
-    ? [h("details", {}, h("summary", {}, "Facts"), h("table", {}, h("tbody", {}, facts.map(([key, value]) => h("tr", {}, h("th", { scope: "row" }, key), h("td", {}, value))))), fine.length ? h("p", { class: "quiet" }, `Nothing wrong with: ${fine.join(", ")}.`) : null)]
+    ? [
+        h(
+          "details",
+          {},
+          h("summary", {}, "Facts"),
+          h(
+            "table",
+            {},
+            h(
+              "tbody",
+              {},
+              facts.map(([key, value]) => h("tr", {}, h("th", { scope: "row" }, key), h("td", {}, value))),
+            ),
+          ),
+          fine.length ? h("p", { class: "quiet" }, `Nothing wrong with: ${fine.join(", ")}.`) : null,
+        ),
+      ]
     : [];
-  const lead = advice.length > 1 ? [h("p", {}, "Most useful first:"), h("ol", {}, advice.map((one) => h("li", {}, one)))] : [];
+  const lead =
+    advice.length > 1
+      ? [
+          h("p", {}, "Most useful first:"),
+          h(
+            "ol",
+            {},
+            advice.map((one) => h("li", {}, one)),
+          ),
+        ]
+      : [];
   renew(place, ...old, ...said, line, h("ul", { class: "findings" }, items), ...lead, ...table);
   return marks;
 }

@@ -194,8 +194,17 @@ export function intake(store, into = null) {
   const element = h(
     "section",
     { class: "drop", "aria-label": into ? "Add photos" : "Add photos, a video or a scene" },
-    h("p", { class: "hint" }, into ? "Drop more photos here, or" : "Drop photos, folders, a zip file, a video or a scene here, or"),
-    h("div", { class: "row" }, choose({}, "Choose files", { "data-key-u": "" }), into ? null : choose({ webkitdirectory: true }, "Choose a folder")),
+    h(
+      "p",
+      { class: "hint" },
+      into ? "Drop more photos here, or" : "Drop photos, folders, a zip file, a video or a scene here, or",
+    ),
+    h(
+      "div",
+      { class: "row" },
+      choose({}, "Choose files", { "data-key-u": "" }),
+      into ? null : choose({ webkitdirectory: true }, "Choose a folder"),
+    ),
     into ? null : h("p", { class: "row" }, h("label", { for: "take-as" }, "Take them in as "), kind),
     into ? null : pathForm(store),
     line,

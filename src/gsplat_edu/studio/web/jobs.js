@@ -40,7 +40,9 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const pause = button("Pause", change("pause"));
   const resume = button("Resume", change("resume"), { class: "primary" });
   const stop = button("Stop", change("cancel"), { title: "A training writes a checkpoint and can be resumed." });
-  const forget = button("Remove from the list", (event) => attempt(event.currentTarget, line, () => remove(at("jobs", id))));
+  const forget = button("Remove from the list", (event) =>
+    attempt(event.currentTarget, line, () => remove(at("jobs", id))),
+  );
   if (main) {
     pause.dataset.keyP = "";
     resume.dataset.keyP = "";
@@ -51,14 +53,19 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     "details",
     {
       ontoggle: async () => {
-        if (more.open) output.textContent = (await get(at("jobs", id, "output")).catch((error) => error.message)) || "nothing yet";
+        if (more.open)
+          output.textContent = (await get(at("jobs", id, "output")).catch((error) => error.message)) || "nothing yet";
       },
     },
     h("summary", {}, "Output"),
     output,
   );
   const waits = h("p", { class: "waits quiet" });
-  const ask = h("p", {}, "An earlier start of the studio left this job waiting. It runs this command once you start it:");
+  const ask = h(
+    "p",
+    {},
+    "An earlier start of the studio left this job waiting. It runs this command once you start it:",
+  );
   const label = h("p", { class: "label" });
   const command = h("div", {});
   const element = h(
@@ -129,14 +136,18 @@ function waitingFor(store, others) {
   const places = [...new Set(others.map(({ place }) => place))];
   const [have, use] = others.length > 1 ? ["have", "they use"] : ["has", "it uses"];
   if (others.length) return `Waits until ${titles.join(" and ")} ${have} ended: ${use} ${places.join(" and ")} too.`;
-  const running = [...store.jobs.values()].filter(({ job }) => job.state === "running" || job.state === "paused").length;
+  const running = [...store.jobs.values()].filter(
+    ({ job }) => job.state === "running" || job.state === "paused",
+  ).length;
   return running ? `Waits for its turn: ${running === 1 ? "1 job is" : `${running} jobs are`} running.` : "";
 }
 
 // Progress is that of the present stage.
-function leftOf({ done, total, seconds_left: left, is_least: isLeast }, isStage) {
+export function leftOf({ done, total, seconds_left: left, is_least: isLeast }, isStage) {
   const share = `${Math.floor((100 * done) / total)} %`;
-  return left === null || left === undefined ? share : `${share}, ${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
+  return left === null || left === undefined
+    ? share
+    : `${share}, ${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
 }
 
 // The newest job about an entry; the card is replaced when another job begins.
@@ -170,15 +181,31 @@ export function jobs({ main, store }) {
     update() {
       const all = [...store.jobs.values()].sort((a, b) => b.job.id.localeCompare(a.job.id));
       empty.hidden = all.length + store.damaged.size > 0;
-      keyed(broken, [...store.damaged.values()], ({ id }) => id, ({ id, line }) => {
-        const fault = errorLine();
-        const forget = button("Remove from the list", () => attempt(forget, fault, () => remove(at("jobs", id))));
-        return h("li", {}, line, " ", forget, fault);
-      });
-      keyed(list, all, ({ job }) => job.id, ({ job }) => {
-        cards.set(job.id, jobCard(store, job.id, { level: 2 }));
-        return h("div", {}, link(job.subject, `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`), cards.get(job.id).element);
-      }, (_, { job }) => cards.get(job.id).update());
+      keyed(
+        broken,
+        [...store.damaged.values()],
+        ({ id }) => id,
+        ({ id, line }) => {
+          const fault = errorLine();
+          const forget = button("Remove from the list", () => attempt(forget, fault, () => remove(at("jobs", id))));
+          return h("li", {}, line, " ", forget, fault);
+        },
+      );
+      keyed(
+        list,
+        all,
+        ({ job }) => job.id,
+        ({ job }) => {
+          cards.set(job.id, jobCard(store, job.id, { level: 2 }));
+          return h(
+            "div",
+            {},
+            link(job.subject, `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`),
+            cards.get(job.id).element,
+          );
+        },
+        (_, { job }) => cards.get(job.id).update(),
+      );
     },
   };
 }

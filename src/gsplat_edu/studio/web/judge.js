@@ -11,7 +11,13 @@ const previewOf = (entry, index, what) => at(entry, "views", String(index), `${w
 
 // Two pictures on top of each other; a slider shows more of one or the other.
 export function slider(left, right, names, label, { W, H }) {
-  const range = h("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": `${label}: ${names.join(" or ")}` });
+  const range = h("input", {
+    type: "range",
+    min: 0,
+    max: 100,
+    value: 50,
+    "aria-label": `${label}: ${names.join(" or ")}`,
+  });
   const size = { width: W, height: H }; // they keep the place until they are there
   const top = h("img", { class: "top", src: left, alt: `${names[0]} of ${label}`, ...size });
   const stack = h("div", { class: "stack" }, h("img", { src: right, alt: `${names[1]} of ${label}`, ...size }), top);
@@ -21,7 +27,12 @@ export function slider(left, right, names, label, { W, H }) {
   };
   range.addEventListener("input", cut);
   cut();
-  return h("figure", { class: "slider" }, stack, h("figcaption", {}, h("span", {}, names[0]), range, h("span", {}, names[1])));
+  return h(
+    "figure",
+    { class: "slider" },
+    stack,
+    h("figcaption", {}, h("span", {}, names[0]), range, h("span", {}, names[1])),
+  );
 }
 
 export function judge({ place, store, entry, where }) {
@@ -32,19 +43,36 @@ export function judge({ place, store, entry, where }) {
   const order = h(
     "select",
     { id: "order", onchange: () => show() },
-    [["worst", "worst first"], ["best", "best first"], ["name", "by name"]].map(([value, text]) => h("option", { value }, text)),
+    [
+      ["worst", "worst first"],
+      ["best", "best first"],
+      ["name", "by name"],
+    ].map(([value, text]) => h("option", { value }, text)),
   );
   const checked = doctor(store, entry.entry, "Says what may be wrong with this run, and what to change.");
   const others = h("select", {
     id: "other",
-    onchange: () => others.value && (location.hash = `#/runs/${encodeURIComponent(entry.name)}/compare/${encodeURIComponent(others.value)}`),
+    onchange: () =>
+      others.value &&
+      (location.hash = `#/runs/${encodeURIComponent(entry.name)}/compare/${encodeURIComponent(others.value)}`),
   });
-  const choice = h("p", { class: "row" }, h("label", { for: "order" }, "Order"), order, h("label", { for: "other" }, "Compare with"), others);
+  const choice = h(
+    "p",
+    { class: "row" },
+    h("label", { for: "order" }, "Order"),
+    order,
+    h("label", { for: "other" }, "Compare with"),
+    others,
+  );
   place.append(
     h("section", { "aria-label": "held-out views" }, heading(2, "Held-out views"), facts, line, large, choice, list),
     checked.element,
   );
-  const report = h("p", { hidden: true }, link("Open the report", at(entry.entry, "report"), { class: "button", target: "_blank" }));
+  const report = h(
+    "p",
+    { hidden: true },
+    link("Open the report", at(entry.entry, "report"), { class: "button", target: "_blank" }),
+  );
   list.after(report);
   choice.hidden = checked.element.hidden = true; // until what is above them is there
   let [views, version, now, opened] = [[], "", entry, where.query.get("view")];
@@ -54,13 +82,28 @@ export function judge({ place, store, entry, where }) {
     const ordered = [...views];
     if (order.value === "best") ordered.reverse();
     if (order.value === "name") ordered.sort((a, b) => a.name.localeCompare(b.name));
-    keyed(list, ordered, ({ index }) => `${index} ${version}`, ({ index, name, psnr, ssim }) => {
-      const pictures = PICTURES.map((what) => {
-        return h("figure", {}, h("img", { src: previewOf(entry.entry, index, what), alt: `${what} of ${name}`, loading: "lazy" }), h("figcaption", {}, what));
-      });
-      const score = `${decibels(psnr)}${typeof ssim === "number" ? `, SSIM ${ssim.toFixed(3)}` : ""}`;
-      return h("li", {}, h("p", { class: "row" }, link(name, `${base}?view=${index}`), h("span", { class: "quiet" }, score)), h("div", { class: "triple" }, pictures));
-    });
+    keyed(
+      list,
+      ordered,
+      ({ index }) => `${index} ${version}`,
+      ({ index, name, psnr, ssim }) => {
+        const pictures = PICTURES.map((what) => {
+          return h(
+            "figure",
+            {},
+            h("img", { src: previewOf(entry.entry, index, what), alt: `${what} of ${name}`, loading: "lazy" }),
+            h("figcaption", {}, what),
+          );
+        });
+        const score = `${decibels(psnr)}${typeof ssim === "number" ? `, SSIM ${ssim.toFixed(3)}` : ""}`;
+        return h(
+          "li",
+          {},
+          h("p", { class: "row" }, link(name, `${base}?view=${index}`), h("span", { class: "quiet" }, score)),
+          h("div", { class: "triple" }, pictures),
+        );
+      },
+    );
     open();
   }
 
@@ -71,7 +114,11 @@ export function judge({ place, store, entry, where }) {
     large.replaceChildren();
     if (!view) return;
     const pictures = ["photo", "render"].map((what) => pictureOf(entry.entry, view.index, what));
-    large.append(heading(3, view.name), slider(...pictures, ["photo", "render"], view.name, view), link("Close", base, { class: "button" }));
+    large.append(
+      heading(3, view.name),
+      slider(...pictures, ["photo", "render"], view.name, view),
+      link("Close", base, { class: "button" }),
+    );
   }
 
   function reveal() {
@@ -81,8 +128,13 @@ export function judge({ place, store, entry, where }) {
 
   function showViews({ views: found }) {
     views = found;
-    const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
-    facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";
+    const mean =
+      now.psnr === null
+        ? ""
+        : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
+    facts.textContent = found.length
+      ? `${mean} Differences are shown 4 times as strong.`
+      : "There are no held-out views yet. They are rendered when the training ends.";
     show();
   }
 
@@ -102,7 +154,10 @@ export function judge({ place, store, entry, where }) {
       const names = runs.map(({ name }) => name).join("\n");
       if (others.dataset.names !== names) {
         others.dataset.names = names;
-        others.replaceChildren(h("option", { value: "" }, runs.length ? "another run" : "no other run"), ...runs.map(({ name }) => h("option", { value: name }, name)));
+        others.replaceChildren(
+          h("option", { value: "" }, runs.length ? "another run" : "no other run"),
+          ...runs.map(({ name }) => h("option", { value: name }, name)),
+        );
       }
       version = `${now.finished} ${now.psnr} ${now.iterations}`;
       held.read(version);
@@ -128,21 +183,65 @@ export function compare({ place, entry, where }) {
   const facts = h("p", { class: "facts" });
   const list = h("ul", { class: "views", "aria-label": "views of both runs" });
   const back = `#/runs/${encodeURIComponent(entry.name)}/judge`;
-  place.append(h("section", { "aria-label": "comparison" }, heading(2, `${entry.name} and ${other}`), h("p", {}, link("Close", back, { class: "button" })), facts, line, list));
+  place.append(
+    h(
+      "section",
+      { "aria-label": "comparison" },
+      heading(2, `${entry.name} and ${other}`),
+      h("p", {}, link("Close", back, { class: "button" })),
+      facts,
+      line,
+      list,
+    ),
+  );
   const [a, b] = [entry.entry, `runs/${other}`];
-  get(`/api/compare?a=${encodeURIComponent(entry.name)}&b=${encodeURIComponent(other)}`).then(({ views, only_a: onlyA, only_b: onlyB }) => {
-    const rest = onlyA.length + onlyB.length ? ` ${onlyA.length + onlyB.length} views are held out of one of them only.` : "";
-    facts.textContent = views.length ? `${verdict(entry.name, other, views)}${rest}` : "These runs hold out no common view.";
-    list.append(...views.map(({ name, a: one, b: two, gain }) => {
-      const pictures = [[a, one, "photo", "photo"], [a, one, "render", entry.name], [b, two, "render", other]].map(([from, view, what, title]) => {
-        const score = what === "render" ? ` ${decibels(view.psnr)}` : "";
-        return h("figure", {}, h("img", { src: previewOf(from, view.index, what), alt: `${what} of ${name}, ${title}`, loading: "lazy" }), h("figcaption", {}, `${title}${score}`));
-      });
-      const change = typeof gain === "number" ? `${gain > 0 ? "+" : ""}${gain.toFixed(2)} dB` : "";
-      const sides = ["render", "render"].map((what, i) => pictureOf(i ? b : a, (i ? two : one).index, what));
-      const more = h("details", { ontoggle: () => more.open && more.children.length === 1 && more.append(slider(...sides, [entry.name, other], name)) }, h("summary", {}, "Slide between both"));
-      return h("li", {}, h("p", { class: "row" }, h("strong", {}, name), h("span", { class: "quiet" }, change)), h("div", { class: "triple" }, pictures), more);
-    }));
-  }, (error) => put(line, error.message));
+  get(`/api/compare?a=${encodeURIComponent(entry.name)}&b=${encodeURIComponent(other)}`).then(
+    ({ views, only_a: onlyA, only_b: onlyB }) => {
+      const rest =
+        onlyA.length + onlyB.length ? ` ${onlyA.length + onlyB.length} views are held out of one of them only.` : "";
+      facts.textContent = views.length
+        ? `${verdict(entry.name, other, views)}${rest}`
+        : "These runs hold out no common view.";
+      list.append(
+        ...views.map(({ name, a: one, b: two, gain }) => {
+          const pictures = [
+            [a, one, "photo", "photo"],
+            [a, one, "render", entry.name],
+            [b, two, "render", other],
+          ].map(([from, view, what, title]) => {
+            const score = what === "render" ? ` ${decibels(view.psnr)}` : "";
+            return h(
+              "figure",
+              {},
+              h("img", {
+                src: previewOf(from, view.index, what),
+                alt: `${what} of ${name}, ${title}`,
+                loading: "lazy",
+              }),
+              h("figcaption", {}, `${title}${score}`),
+            );
+          });
+          const change = typeof gain === "number" ? `${gain > 0 ? "+" : ""}${gain.toFixed(2)} dB` : "";
+          const sides = ["render", "render"].map((what, i) => pictureOf(i ? b : a, (i ? two : one).index, what));
+          const more = h(
+            "details",
+            {
+              ontoggle: () =>
+                more.open && more.children.length === 1 && more.append(slider(...sides, [entry.name, other], name)),
+            },
+            h("summary", {}, "Slide between both"),
+          );
+          return h(
+            "li",
+            {},
+            h("p", { class: "row" }, h("strong", {}, name), h("span", { class: "quiet" }, change)),
+            h("div", { class: "triple" }, pictures),
+            more,
+          );
+        }),
+      );
+    },
+    (error) => put(line, error.message),
+  );
   return { follows: (next) => next.more === other };
 }

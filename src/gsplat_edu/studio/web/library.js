@@ -1,7 +1,21 @@
 // The library: everything in the folder, with pictures and states.
 
 import { at, get, post, remove } from "./api.js";
-import { announce, attempt, bytes, button, count, decibels, errorLine, h, heading, keyed, link, put, whole } from "./dom.js";
+import {
+  announce,
+  attempt,
+  bytes,
+  button,
+  count,
+  decibels,
+  errorLine,
+  h,
+  heading,
+  keyed,
+  link,
+  put,
+  whole,
+} from "./dom.js";
 import { follow } from "./draft.js";
 import { intake } from "./intake.js";
 import { badge } from "./jobs.js";
@@ -18,12 +32,24 @@ export function factsOf(entry) {
     const videos = entry.videos ? count(entry.videos, "video") : "";
     const photos = entry.photos || !videos ? count(entry.photos, "photo") : "";
     if (entry.unfinished) return [bytes(entry.bytes)];
-    return [photos, videos, kind === "captures" ? (entry.layout ?? "no poses found") : "", searchOf(entry), bytes(entry.bytes)];
+    return [
+      photos,
+      videos,
+      kind === "captures" ? (entry.layout ?? "no poses found") : "",
+      searchOf(entry),
+      bytes(entry.bytes),
+    ];
   }
   if (kind === "scenes") return [entry.file ? entry.file.split(".").at(-1) : "no scene file", bytes(entry.scene_bytes)];
   const done = entry.iterations ?? 0;
   return [
-    entry.training ? "in training" : entry.finished ? `${whole(done)} iterations` : entry.planned ? `${whole(done)} of ${whole(entry.planned)} iterations` : "no iterations yet",
+    entry.training
+      ? "in training"
+      : entry.finished
+        ? `${whole(done)} iterations`
+        : entry.planned
+          ? `${whole(done)} of ${whole(entry.planned)} iterations`
+          : "no iterations yet",
     entry.psnr === null ? "" : decibels(entry.psnr),
     entry.num_gaussians ? `${whole(entry.num_gaussians)} splats` : "",
     entry.edited ? "edited" : "",
@@ -33,7 +59,10 @@ export function factsOf(entry) {
 // What the search for a capture's poses found; empty if they come from another program.
 export function searchOf({ search }) {
   if (!search) return "";
-  const all = search.photos === null ? "" : `${whole(search.posed)} of ${count(search.photos, "photo")} ${search.photos === 1 ? "has" : "have"} a pose`;
+  const all =
+    search.photos === null
+      ? ""
+      : `${whole(search.posed)} of ${count(search.photos, "photo")} ${search.photos === 1 ? "has" : "have"} a pose`;
   return [all, `mean error ${search.error.toFixed(2)} px`].filter(Boolean).join(", ");
 }
 
@@ -53,12 +82,30 @@ async function pictureOf(entry) {
 // A project's card: its picture, timeline and next step, and a list of everything in it.
 function card(store, project) {
   const image = h("img", { alt: "", loading: "lazy", hidden: true, onerror: () => (image.hidden = true) });
-  const [name, facts, states] = [heading(2, "", { class: "name" }), h("span", { class: "facts quiet" }), h("span", { class: "states" })];
-  const top = h("a", { class: "card" }, h("span", { class: "thumb", "aria-hidden": "true" }, image), name, facts, states);
+  const [name, facts, states] = [
+    heading(2, "", { class: "name" }),
+    h("span", { class: "facts quiet" }),
+    h("span", { class: "states" }),
+  ];
+  const top = h(
+    "a",
+    { class: "card" },
+    h("span", { class: "thumb", "aria-hidden": "true" }, image),
+    name,
+    facts,
+    states,
+  );
   top.image = image;
   const [stages, next] = [timeline(), nextStep(store, project.name)];
   const [summary, list] = [h("summary", {}), h("ul", { class: "plain" })];
-  const element = h("article", { class: "project" }, top, stages.element, next.element, h("details", {}, summary, list));
+  const element = h(
+    "article",
+    { class: "project" },
+    top,
+    stages.element,
+    next.element,
+    h("details", {}, summary, list),
+  );
   element.show = (now) => {
     const entries = now.entries.map((entry) => store.entry(...entry.split("/"))).filter(Boolean);
     const present = entries.filter(({ unfinished }) => !unfinished).at(-1) ?? entries[0];
@@ -72,10 +119,23 @@ function card(store, project) {
     stages.update(now);
     next.update(now, now.next);
     summary.textContent = `Everything in it (${entries.length})`;
-    keyed(list, entries, ({ entry }) => entry, (entry) => h("li", {}, link(`${KINDS[entry.kind]} ${entry.name}`, addressOf(entry)), h("span", { class: "quiet" }), h("span", {})), (item, entry) => {
-      item.children[1].textContent = ` ${factsOf(entry).filter(Boolean).join(" · ")} `;
-      showState(item.lastChild, stateOf(store, entry));
-    });
+    keyed(
+      list,
+      entries,
+      ({ entry }) => entry,
+      (entry) =>
+        h(
+          "li",
+          {},
+          link(`${KINDS[entry.kind]} ${entry.name}`, addressOf(entry)),
+          h("span", { class: "quiet" }),
+          h("span", {}),
+        ),
+      (item, entry) => {
+        item.children[1].textContent = ` ${factsOf(entry).filter(Boolean).join(" · ")} `;
+        showState(item.lastChild, stateOf(store, entry));
+      },
+    );
     const shown = entries.find(({ entry }) => entry === now.picture);
     if (shown) picture(top, shown);
     else image.hidden = true;
@@ -126,7 +186,11 @@ function picture(element, entry) {
 export function library({ main, store }) {
   const list = h("div", { class: "projects" });
   const section = h("section", { "aria-label": "Projects" }, list);
-  const first = h("p", { class: "first" }, "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then press Next.");
+  const first = h(
+    "p",
+    { class: "first" },
+    "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then press Next.",
+  );
   first.hidden = true;
   const trash = link("Trash", "#/trash");
   const foot = h("p", { class: "quiet" });
@@ -143,7 +207,13 @@ export function library({ main, store }) {
       section.hidden = !projects.length;
       first.hidden = projects.length > 0;
       add.querySelector("[data-key-u]").classList.toggle("primary", !projects.length);
-      keyed(list, projects, ({ entries }) => entries[0], (project) => card(store, project), (element, project) => element.show(project));
+      keyed(
+        list,
+        projects,
+        ({ entries }) => entries[0],
+        (project) => card(store, project),
+        (element, project) => element.show(project),
+      );
       foot.textContent = `${all.folder} · ${bytes(all.used_bytes)} used, ${bytes(all.free_bytes)} free`;
       trash.textContent = all.trash_bytes ? `Trash (${bytes(all.trash_bytes)})` : "Trash";
     },
@@ -200,7 +270,15 @@ export function management(store, entry) {
     said.textContent = ` rename what came from it, too: ${others.map(({ kind, name: other }) => `${KINDS[kind].toLowerCase()} ${other}`).join(", ")}`;
   };
   const ontoggle = ({ target }) => target.open && tell();
-  return h("details", { ontoggle }, h("summary", {}, "Rename or remove"), h("p", { class: "quiet" }, entry.path), form, too, line);
+  return h(
+    "details",
+    { ontoggle },
+    h("summary", {}, "Rename or remove"),
+    h("p", { class: "quiet" }, entry.path),
+    form,
+    too,
+    line,
+  );
 }
 
 // The top of an entry's screen.
@@ -209,7 +287,16 @@ export function entryHead(store, entry, kindTitle) {
   const from = h("span", { class: "from", hidden: true }, " · Trained from the capture ", link("", "#/"));
   const line = h("p", { class: "quiet facts" }, facts, from);
   const [stages, next] = [timeline(), nextStep(store)];
-  const element = h("div", { class: "head" }, h("p", { class: "kind" }, kindTitle), heading(1, entry.name), line, stages.element, next.element, problem);
+  const element = h(
+    "div",
+    { class: "head" },
+    h("p", { class: "kind" }, kindTitle),
+    heading(1, entry.name),
+    line,
+    stages.element,
+    next.element,
+    problem,
+  );
   return {
     element,
     // source: the entry that this one was made from, or null

@@ -39,7 +39,8 @@ export function simplified(points, slack) {
 // A shape from where the pointer was pressed, moved and released; null if it covers nothing.
 function shapeOf(points, tool, slack, radius) {
   const [[x0, y0], [x1, y1]] = [points[0], points.at(-1)];
-  if (tool === "rectangle") return x0 === x1 || y0 === y1 ? null : [Math.min(x0, x1), Math.min(y0, y1), Math.max(x0, x1), Math.max(y0, y1)];
+  if (tool === "rectangle")
+    return x0 === x1 || y0 === y1 ? null : [Math.min(x0, x1), Math.min(y0, y1), Math.max(x0, x1), Math.max(y0, y1)];
   if (tool === "brush") return { brush: radius, points: simplified(points, Math.min(slack, radius / 8)).flat() };
   const outline = simplified(points, slack);
   return outline.length < 3 ? null : outline.flat();
@@ -67,7 +68,21 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
   const [done, trace, mark] = ["done", "trace", "cross"].map((kind) => h("path", { class: kind }));
   const [strokes, stroke] = ["strokes", "strokes trace"].map((kind) => h("g", { class: kind }));
   const circle = h("circle", { class: "tip" });
-  const svg = h("svg", { viewBox: `0 0 ${W} ${H}`, tabindex: "0", role: "application", "aria-label": `${name}: draw what is not used. Arrow keys move a cross, Enter presses and releases.` }, done, strokes, trace, stroke, mark, circle);
+  const svg = h(
+    "svg",
+    {
+      viewBox: `0 0 ${W} ${H}`,
+      tabindex: "0",
+      role: "application",
+      "aria-label": `${name}: draw what is not used. Arrow keys move a cross, Enter presses and releases.`,
+    },
+    done,
+    strokes,
+    trace,
+    stroke,
+    mark,
+    circle,
+  );
   let [shapes, past, tool, points, cross, tip] = [given, [], "rectangle", null, null, null];
   let shown = null; // the shapes that are in the picture
   let radius = Math.max(1, Math.round(longest / BRUSH));
@@ -81,7 +96,13 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
 
   function show() {
     if (shown !== shapes) {
-      done.setAttribute("d", shapes.filter(({ brush }) => !brush).map(pathOf).join(""));
+      done.setAttribute(
+        "d",
+        shapes
+          .filter(({ brush }) => !brush)
+          .map(pathOf)
+          .join(""),
+      );
       strokes.replaceChildren(...shapes.filter(({ brush }) => brush).map(strokeOf));
       shown = shapes;
     }
@@ -89,11 +110,15 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
     const begun = points && !paints && (tool === "rectangle" ? shapeOf(points, tool, 0) : points.flat());
     trace.setAttribute("d", begun ? pathOf(begun) : "");
     stroke.replaceChildren(...(points && paints ? [strokeOf({ brush: radius, points: points.flat() })] : []));
-    const middle = paints ? cross ?? tip : null;
+    const middle = paints ? (cross ?? tip) : null;
     circle.style.display = middle ? "" : "none";
-    for (const [key, value] of Object.entries(middle ? { cx: middle[0], cy: middle[1], r: radius } : {})) circle.setAttribute(key, value);
+    for (const [key, value] of Object.entries(middle ? { cx: middle[0], cy: middle[1], r: radius } : {}))
+      circle.setAttribute(key, value);
     const arm = longest / 40;
-    mark.setAttribute("d", cross ? `M${cross[0] - arm} ${cross[1]}h${2 * arm}M${cross[0]} ${cross[1] - arm}v${2 * arm}` : "");
+    mark.setAttribute(
+      "d",
+      cross ? `M${cross[0] - arm} ${cross[1]}h${2 * arm}M${cross[0]} ${cross[1] - arm}v${2 * arm}` : "",
+    );
   }
 
   function become(next) {
@@ -151,7 +176,11 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
     tip = null;
     show();
   });
-  svg.addEventListener("pointerup", (event) => points && !cross && event.isPrimary && (move(place(event)), release()));
+  svg.addEventListener("pointerup", (event) => {
+    if (!points || cross || !event.isPrimary) return;
+    move(place(event));
+    release();
+  });
   svg.addEventListener("pointercancel", drop);
   function resize(next) {
     radius = Math.min(Math.max(next, 1), Math.ceil(longest / MOST_RADIUS));
@@ -191,7 +220,12 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
     get undoable() {
       return past.length > 0;
     },
-    use: (next) => (drop(), (tool = next), show(), changed()),
+    use: (next) => {
+      drop();
+      tool = next;
+      show();
+      changed();
+    },
     resize,
     // [ and ] make the brush smaller and larger.
     press({ key, ctrlKey, metaKey, altKey }) {
@@ -238,26 +272,49 @@ export async function drawMask(store, entry, photo, name, saved) {
   let [newer, questions] = [null, 0]; // newer: the mask as it was saved elsewhere, with shapes that are not here
   const paper = sheet(`${at(entry, "thumbs", photo)}?side=1024`, name, facts, tell);
   const tools = ["rectangle", "outline", "brush"].map((tool, index) => {
-    const pick = h("input", { type: "radio", name: "mask-tool", value: tool, checked: index === 0, onchange: () => paper.use(tool) });
+    const pick = h("input", {
+      type: "radio",
+      name: "mask-tool",
+      value: tool,
+      checked: index === 0,
+      onchange: () => paper.use(tool),
+    });
     return h("label", { class: "check" }, pick, ` ${tool}`);
   });
-  const size = h("input", { type: "range", min: 1, max: paper.most, "aria-label": "radius of the brush, px", title: "[ and ]", oninput: () => paper.resize(Number(size.value)) });
+  const size = h("input", {
+    type: "range",
+    min: 1,
+    max: paper.most,
+    "aria-label": "radius of the brush, px",
+    title: "[ and ]",
+    oninput: () => paper.resize(Number(size.value)),
+  });
   const width = h("span", { class: "quiet" });
   const brush = h("span", { class: "row brush" }, size, width);
   const undo = button("Undo", () => paper.undo());
-  const clear = button("Remove all", () => paper.clear(), { title: "The mask is then as it was before, once you save." });
+  const clear = button("Remove all", () => paper.clear(), {
+    title: "The mask is then as it was before, once you save.",
+  });
   const save = button("Save", () => attempt(save, line, keep).then(tell), { class: "primary" });
-  const load = button("Load the other shapes", () => {
-    adopt(newer);
-    paper.focus();
-  }, { hidden: true, title: "They come beneath yours." });
+  const load = button(
+    "Load the other shapes",
+    () => {
+      adopt(newer);
+      paper.focus();
+    },
+    { hidden: true, title: "They come beneath yours." },
+  );
   const close = button("Close", () => dialog.close());
   const own = facts.own ? " This photo has a mask of its own; it stays, and what you draw is added to it." : "";
   const dialog = h(
     "dialog",
     { class: "mask", "aria-labelledby": "mask-title" },
     heading(2, `Mask ${name}`, { id: "mask-title" }),
-    h("p", { class: "quiet" }, `Draw around what does not belong to the scene. Trainings do not use those pixels.${own}`),
+    h(
+      "p",
+      { class: "quiet" },
+      `Draw around what does not belong to the scene. Trainings do not use those pixels.${own}`,
+    ),
     h("fieldset", { class: "row" }, h("legend", { class: "aside" }, "shape"), tools, brush, undo, clear),
     paper.element,
     line,
@@ -285,7 +342,9 @@ export async function drawMask(store, entry, photo, name, saved) {
   function adopt(found) {
     newer = null;
     put(line, "");
-    stored = found.shapes.length ? `${count(found.shapes.length, "shape")}, saved in another tab.` : "Another tab has removed the shapes.";
+    stored = found.shapes.length
+      ? `${count(found.shapes.length, "shape")}, saved in another tab.`
+      : "Another tab has removed the shapes.";
     const before = base;
     [base, version] = [found.shapes, found.version];
     paper.load(before, found.shapes);
@@ -315,11 +374,14 @@ export async function drawMask(store, entry, photo, name, saved) {
     });
     questions += 1;
     [base, version] = [answer.shapes, answer.version];
-    if (newer?.version === version) { // it was looked at before this answer came
+    if (newer?.version === version) {
+      // it was looked at before this answer came
       newer = null;
       put(line, "");
     }
-    stored = answer.shapes.length ? "Saved. Trainings that begin from now on use it." : "Removed. The mask is as it was before.";
+    stored = answer.shapes.length
+      ? "Saved. Trainings that begin from now on use it."
+      : "Removed. The mask is as it was before.";
     printed.replaceChildren(h("p", { class: "quiet" }, "The same as a command"), commandLine(answer.command));
     saved(answer.shapes.length > 0);
   }

@@ -6,16 +6,28 @@ import { frame } from "./frame.js";
 import { jobPlace, startJob } from "./jobs.js";
 
 // The newest exported file of a format; null without one.
-export const newestOf = (exports, format) => exports.filter((one) => one.format === format).sort((a, b) => b.modified - a.modified)[0] ?? null;
+export const newestOf = (exports, format) =>
+  exports.filter((one) => one.format === format).sort((a, b) => b.modified - a.modified)[0] ?? null;
 
 export function meshes(store, entry) {
   const line = errorLine();
   const fields = {
     voxel: h("input", { id: "voxel", type: "number", min: 0, step: "any", placeholder: "by the photos" }),
-    faces: h("input", { id: "faces", type: "number", min: 4, inputmode: "numeric", placeholder: "as many as there are" }),
+    faces: h("input", {
+      id: "faces",
+      type: "number",
+      min: 4,
+      inputmode: "numeric",
+      placeholder: "as many as there are",
+    }),
   };
   const texture = h("input", { type: "checkbox" });
-  const painted = h("label", { class: "check", hidden: entry.kind !== "runs" }, texture, " texture of the photos instead of a colour per vertex");
+  const painted = h(
+    "label",
+    { class: "check", hidden: entry.kind !== "runs" },
+    texture,
+    " texture of the photos instead of a colour per vertex",
+  );
   const make = h("button", {}, "Make a mesh");
   const coarse = button("Make a collider", () => attempt(coarse, line, () => start("collider.glb")), {
     title: "A coarse mesh for collisions in a game engine",
@@ -35,8 +47,13 @@ export function meshes(store, entry) {
 
   // The address says which files are shown and of when, so that a new mesh replaces an old one.
   function open() {
-    const files = [["surface", surface], ["collider", collider]].filter(([, found]) => found);
-    const query = files.map(([name, { file, modified }]) => `${name}=${encodeURIComponent(file)}&${name}-of=${modified}`);
+    const files = [
+      ["surface", surface],
+      ["collider", collider],
+    ].filter(([, found]) => found);
+    const query = files.map(
+      ([name, { file, modified }]) => `${name}=${encodeURIComponent(file)}&${name}-of=${modified}`,
+    );
     preview.hidden = false;
     scene.show(`${at(entry.entry, "page")}?${query.join("&")}`, "Loading the mesh ...");
   }
@@ -53,14 +70,29 @@ export function meshes(store, entry) {
       "details",
       {},
       h("summary", {}, "More"),
-      h("div", { class: "grid" }, h("label", {}, "Edge of a voxel, in units of the scene", fields.voxel), h("label", {}, "Triangles", fields.faces)),
+      h(
+        "div",
+        { class: "grid" },
+        h("label", {}, "Edge of a voxel, in units of the scene", fields.voxel),
+        h("label", {}, "Triangles", fields.faces),
+      ),
       painted,
     ),
     h("div", { class: "row" }, make, coarse, look),
   );
-  const hint = "Triangles of the surfaces, as a GLB for Blender, Unity and other programs. Training a scene for a mesh makes it smoother: an option of the capture's screen.";
+  const hint =
+    "Triangles of the surfaces, as a GLB for Blender, Unity and other programs. Training a scene for a mesh makes it smoother: an option of the capture's screen.";
   return {
-    element: h("section", { "aria-label": "mesh" }, heading(2, "Mesh"), h("p", { class: "quiet" }, hint), form, line, job.element, preview),
+    element: h(
+      "section",
+      { "aria-label": "mesh" },
+      heading(2, "Mesh"),
+      h("p", { class: "quiet" }, hint),
+      form,
+      line,
+      job.element,
+      preview,
+    ),
     close: () => scene.close(),
     show(exports) {
       const before = `${surface?.file} ${surface?.modified} ${collider?.file} ${collider?.modified}`;

@@ -19,7 +19,11 @@ export function photos(given) {
     const pictures = gallery(entry.entry);
     const line = errorLine();
     const job = jobPlace(store, entry.entry, ["sfm"], { main: true });
-    const matcher = h("select", { id: "matcher" }, MATCHERS.map(([value, text]) => h("option", { value }, text)));
+    const matcher = h(
+      "select",
+      { id: "matcher" },
+      MATCHERS.map(([value, text]) => h("option", { value }, text)),
+    );
     const frames = h("input", { id: "frames", type: "number", min: 3, max: 5000, inputmode: "numeric" });
     const exact = h("input", { type: "checkbox" });
     const find = h("button", { "data-own": "" }, "Find the poses");
@@ -32,7 +36,11 @@ export function photos(given) {
         onsubmit: (event) => {
           event.preventDefault();
           attempt(find, line, () => {
-            const options = { matcher: matcher.value || null, frames: entry.videos && frames.value ? Number(frames.value) : null, threads: exact.checked ? 1 : null };
+            const options = {
+              matcher: matcher.value || null,
+              frames: entry.videos && frames.value ? Number(frames.value) : null,
+              threads: exact.checked ? 1 : null,
+            };
             return startJob(store, { command: "sfm", subject: entry.entry, options });
           });
         },
@@ -47,7 +55,12 @@ export function photos(given) {
         h("label", { class: "check" }, exact, " the same poses to the bit every time (one thread, slower)"),
       ),
     );
-    const later = h("div", { class: "later", hidden: true }, entry.adopted ? null : intake(store, { kind: "photos", name: entry.name }), management(store, entry));
+    const later = h(
+      "div",
+      { class: "later", hidden: true },
+      entry.adopted ? null : intake(store, { kind: "photos", name: entry.name }),
+      management(store, entry),
+    );
     main.append(
       head.element,
       h(
@@ -68,12 +81,19 @@ export function photos(given) {
       update(now) {
         job.update();
         head.update(now);
-        pictures.read(now).then(() => (later.hidden = false), (error) => put(line, error.message));
+        pictures.read(now).then(
+          () => (later.hidden = false),
+          (error) => put(line, error.message),
+        );
         form.hidden = Boolean(job.view?.active);
         const made = store.madeBy(job.view);
         if (made && next.dataset.shown !== made.entry) {
           next.dataset.shown = made.entry;
-          next.replaceChildren(link(`Continue with the capture ${made.name}`, addressOf(made), { class: "button" }), " ", h("span", {}));
+          next.replaceChildren(
+            link(`Continue with the capture ${made.name}`, addressOf(made), { class: "button" }),
+            " ",
+            h("span", {}),
+          );
         }
         if (made) put(next.lastElementChild, searchOf(made)); // the link stays: a press on it would be lost with it
         next.hidden = !made;

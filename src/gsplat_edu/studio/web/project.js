@@ -24,7 +24,10 @@ export function timeline() {
       element.replaceChildren(
         ...project.steps.map(({ stage, place }, index) => {
           const title = STAGES[stage];
-          const more = { class: index < present && place ? "done" : null, "aria-current": index === present ? "step" : null };
+          const more = {
+            class: index < present && place ? "done" : null,
+            "aria-current": index === present ? "step" : null,
+          };
           return h("li", more, place ? link(title, hashOf(place)) : h("span", {}, title));
         }),
       );
@@ -76,7 +79,11 @@ export function nextStep(store, of = "") {
       put(takes, "There is no forecast.");
       put(line, error.message);
     }
-    const begin = h("button", { ...more, "aria-label": `Next: Start it, ${of}`, type: "button", onclick: () => ask(request, begin) }, "Next: Start it");
+    const begin = h(
+      "button",
+      { ...more, "aria-label": `Next: Start it, ${of}`, type: "button", onclick: () => ask(request, begin) },
+      "Next: Start it",
+    );
     const later = button("Not now", () => {
       put(takes, "");
       put(line, "");
@@ -106,12 +113,15 @@ export function nextStep(store, of = "") {
     element,
     update(project, step) {
       const active = [...store.jobs.values()].some(
-        ({ active: runs, job: { work } }) => runs && STEPS.has(work.command) && project?.entries.includes(work.inputs[0]),
+        ({ active: runs, job: { work } }) =>
+          runs && STEPS.has(work.command) && project?.entries.includes(work.inputs[0]),
       );
       let found = of ? step : onward(step);
       if (found?.request && active) found = null; // the list of the library is older than the job
       const screen = of ? null : element.closest("main");
-      const waits = [...(screen?.querySelectorAll(".job [data-key-p].primary") ?? [])].some((one) => one.checkVisibility());
+      const waits = [...(screen?.querySelectorAll(".job [data-key-p].primary") ?? [])].some((one) =>
+        one.checkVisibility(),
+      );
       if (waits) found = null; // a job that stopped has a button of its own
       const asks = found?.request && `${found.request.command} ${found.request.subject}`;
       const forms = [...(screen?.querySelectorAll("form[data-next]") ?? [])];

@@ -1,7 +1,21 @@
 // Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
 
+import { released } from "../../viewer/web/press.js";
 import { at, get, remove } from "./api.js";
-import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put, versioned } from "./dom.js";
+import {
+  attempt,
+  bytes,
+  button,
+  commandLine,
+  decibels,
+  errorLine,
+  h,
+  heading,
+  keyed,
+  link,
+  put,
+  versioned,
+} from "./dom.js";
 import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
@@ -27,8 +41,19 @@ export function share({ place, store, entry }) {
   const surface = h("input", { type: "checkbox" });
   const withMesh = h("label", { class: "check", hidden: true }, surface, h("span", {}));
   const proof = h("input", { type: "checkbox" });
-  const withProof = h("label", { class: "check", hidden: true }, proof, " let visitors check the scene: 12 of your photos (480 px, without file names or other data) beside the picture, and a switch that colours what fewer than two photos saw");
-  const unsaved = h("p", { class: "notice", hidden: true }, "Edits that are not saved yet are not exported. Save them under ", link("Edit", `${addressOf(entry)}/edit`), ".");
+  const withProof = h(
+    "label",
+    { class: "check", hidden: true },
+    proof,
+    " let visitors check the scene: 12 of your photos (480 px, without file names or other data) beside the picture, and a switch that colours what fewer than two photos saw",
+  );
+  const unsaved = h(
+    "p",
+    { class: "notice", hidden: true },
+    "Edits that are not saved yet are not exported. Save them under ",
+    link("Edit", `${addressOf(entry)}/edit`),
+    ".",
+  );
   const note = h("p", { class: "quiet" });
   const choices = FORMATS.map(([value, name, hint], index) => {
     const input = h("input", { type: "radio", name: "format", value, checked: index === 0, onchange: () => explain() });
@@ -56,7 +81,12 @@ export function share({ place, store, entry }) {
     const page = isPage();
     withMesh.hidden = !page || !shown.surface;
     withProof.hidden = !page || entry.kind !== "runs";
-    put(note, page ? "The title is the page's heading. Start view, named views, guided tour (views with a text) and camera path come from the edits: set them under Edit and save." : "");
+    put(
+      note,
+      page
+        ? "The title is the page's heading. Start view, named views, guided tour (views with a text) and camera path come from the edits: set them under Edit and save."
+        : "",
+    );
   }
 
   form.append(
@@ -70,9 +100,17 @@ export function share({ place, store, entry }) {
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     const format = new FormData(form).get("format");
-    const files = isPage() && shown.surface && surface.checked ? Object.entries(shown).filter(([, found]) => found) : [];
+    const files =
+      isPage() && shown.surface && surface.checked ? Object.entries(shown).filter(([, found]) => found) : [];
     const along = Object.fromEntries(files.map(([name, { file }]) => [name, file]));
-    attempt(make, line, () => start({ command: "convert", format, ...along, ...(isPage() && !withProof.hidden && proof.checked ? { options: { verify: "photos" } } : {}) }));
+    attempt(make, line, () =>
+      start({
+        command: "convert",
+        format,
+        ...along,
+        ...(isPage() && !withProof.hidden && proof.checked ? { options: { verify: "photos" } } : {}),
+      }),
+    );
   });
   explain();
   place.append(
@@ -95,7 +133,14 @@ export function share({ place, store, entry }) {
     return h(
       "li",
       {},
-      h("div", { class: "row" }, h("strong", { class: "name" }, file), h("span", { class: "quiet facts" }), link("Download", address, { class: "button", download: file }), away),
+      h(
+        "div",
+        { class: "row" },
+        h("strong", { class: "name" }, file),
+        h("span", { class: "quiet facts" }),
+        link("Download", address, { class: "button", download: file }),
+        away,
+      ),
       command ? h("details", {}, h("summary", {}, "The same as a command"), commandLine(command)) : null,
     );
   }
@@ -109,13 +154,25 @@ export function share({ place, store, entry }) {
     put(withMesh.lastChild, ` show the ${what} beside the splats (about ${bytes(size)} more)`);
     explain();
     const newest = [...exports].sort((a, b) => b.modified - a.modified);
-    keyed(list, newest, ({ file, modified, job: by }) => `${file} ${modified} ${by}`, item, (element, { file, bytes: size, psnr }) => {
-      const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
-      element.querySelector(".facts").textContent = [bytes(size), isVideo(file) ? "" : exact].filter(Boolean).join(" · ");
-    });
+    keyed(
+      list,
+      newest,
+      ({ file, modified, job: by }) => `${file} ${modified} ${by}`,
+      item,
+      (element, { file, bytes: size, psnr }) => {
+        const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
+        element.querySelector(".facts").textContent = [bytes(size), isVideo(file) ? "" : exact]
+          .filter(Boolean)
+          .join(" · ");
+      },
+    );
   }
 
-  const exported = versioned(line, () => get(at(entry.entry, "exports")), ({ exports }) => show(exports));
+  const exported = versioned(
+    line,
+    () => get(at(entry.entry, "exports")),
+    ({ exports }) => show(exports),
+  );
 
   return {
     close: () => mesh.close(),
@@ -126,7 +183,9 @@ export function share({ place, store, entry }) {
       job.update();
       mesh.update(now);
       make.disabled = film.disabled = entry.kind === "runs" && !now.files;
-      const states = store.jobsOf(entry.entry, "convert", "render", "mesh").map(({ job: { id, state } }) => `${id} ${state}`);
+      const states = store
+        .jobsOf(entry.entry, "convert", "render", "mesh")
+        .map(({ job: { id, state } }) => `${id} ${state}`);
       exported.read(`${states} ${now.modified} ${now.files}`);
     },
   };
@@ -150,11 +209,13 @@ function cleaning(store, entry, entryNow) {
     job.update();
     const { view } = job;
     const said = view?.job.state === "done" ? view.messages.filter((text) => !/^wrote /.test(text)) : [];
-    if (found.dataset.said !== said.join()) found.replaceChildren(...said.map((text) => h("li", {}, text.trim().replace(/\s+/g, " "))));
+    if (found.dataset.said !== said.join())
+      found.replaceChildren(...said.map((text) => h("li", {}, text.trim().replace(/\s+/g, " "))));
     found.dataset.said = said.join();
     found.hidden = !said.length;
     const made = store.madeBy(view);
-    if (made && next.dataset.made !== made.name) next.replaceChildren(link(`Open the scene ${made.name}`, addressOf(made), { class: "button" }));
+    if (made && next.dataset.made !== made.name)
+      next.replaceChildren(link(`Open the scene ${made.name}`, addressOf(made), { class: "button" }));
     if (made) next.dataset.made = made.name;
     next.hidden = !made;
     return undefined;
@@ -166,7 +227,11 @@ function cleaning(store, entry, entryNow) {
     "section",
     { "aria-label": "cleaning" },
     heading(2, "Clean"),
-    h("p", { class: "quiet" }, "Removes specks that float in the air and splats that no photo needs, and makes a new scene with the same edits. It renders each photo's view, which takes about a minute. The run stays as it is."),
+    h(
+      "p",
+      { class: "quiet" },
+      "Removes specks that float in the air and splats that no photo needs, and makes a new scene with the same edits. It renders each photo's view, which takes about a minute. The run stays as it is.",
+    ),
     clean,
     line,
     job.element,
@@ -181,6 +246,10 @@ function noCleaning() {
     "section",
     { "aria-label": "cleaning" },
     heading(2, "Clean"),
-    h("p", { class: "quiet" }, "Cleaning needs the photos and their cameras, which a scene file does not have: clean the run that made it. To remove splats by hand, open Edit."),
+    h(
+      "p",
+      { class: "quiet" },
+      "Cleaning needs the photos and their cameras, which a scene file does not have: clean the run that made it. To remove splats by hand, open Edit.",
+    ),
   );
 }

@@ -59,7 +59,15 @@ function runOf({ subject, created }) {
 export class Store extends EventTarget {
   constructor() {
     super();
-    Object.assign(this, { library: null, jobs: new Map(), damaged: new Map(), heard: new Map(), connected: null, trouble: "", read: false });
+    Object.assign(this, {
+      library: null,
+      jobs: new Map(),
+      damaged: new Map(),
+      heard: new Map(),
+      connected: null,
+      trouble: "",
+      read: false,
+    });
     Object.assign(this, { questions: 0, latest: 0 }); // about the library: how many, and which one was answered last
   }
 
@@ -78,7 +86,12 @@ export class Store extends EventTarget {
     if (kind !== "runs" || !this.library) return found;
     const names = new Set(found.map(({ entry }) => entry));
     const coming = [...this.jobs.values()].filter(({ job, active }) => {
-      return job.subject.startsWith("runs/") && job.work.command === "train" && !names.has(job.subject) && (active || job.line || job.state === "held");
+      return (
+        job.subject.startsWith("runs/") &&
+        job.work.command === "train" &&
+        !names.has(job.subject) &&
+        (active || job.line || job.state === "held")
+      );
     });
     return [...found, ...new Map(coming.map(({ job }) => [job.subject, runOf(job)])).values()];
   }
@@ -117,7 +130,13 @@ export class Store extends EventTarget {
     const all = ["captures", "runs", "scenes"].flatMap((kind) => this.library?.[kind] ?? []);
     const isFrom = (one, depth = 0) => {
       if (!one?.made_from || depth > 9) return false;
-      return one.made_from === entry || isFrom(all.find((other) => other.entry === one.made_from), depth + 1);
+      return (
+        one.made_from === entry ||
+        isFrom(
+          all.find((other) => other.entry === one.made_from),
+          depth + 1,
+        )
+      );
     };
     return all.filter((one) => isFrom(one) && (one.name === name || one.name.startsWith(`${name}-`)));
   }
@@ -132,7 +151,10 @@ export class Store extends EventTarget {
   // Reads the library. An answer that comes after that to a later question is older, and dropped.
   async refresh() {
     const question = ++this.questions;
-    const [library, trouble] = await get("/api/library").then((found) => [found, found.trouble.join(" ")], (error) => [null, error.message]);
+    const [library, trouble] = await get("/api/library").then(
+      (found) => [found, found.trouble.join(" ")],
+      (error) => [null, error.message],
+    );
     if (question < this.latest) return;
     this.latest = question;
     if (library) this.library = library;

@@ -25,7 +25,12 @@ function tabbed(given, title, tabs) {
     );
     const place = h("div", { class: "tab" });
     const begun = undoBegun(store, entry);
-    main.append(head.element, begun.element, h("nav", { class: "tabs", "aria-label": `parts of ${entry.name}` }, [...links.values()]), place);
+    main.append(
+      head.element,
+      begun.element,
+      h("nav", { class: "tabs", "aria-label": `parts of ${entry.name}` }, [...links.values()]),
+      place,
+    );
     const manage = management(store, entry);
     main.append(manage);
     let [part, now] = [null, entry];

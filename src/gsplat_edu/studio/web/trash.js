@@ -23,17 +23,28 @@ export function trash({ main, store }) {
     if (asked !== questions) return; // the answer is older than that to a later question
     empty.hidden = found.length > 0;
     clear.hidden = !found.length;
-    keyed(list, found, ({ id }) => id, ({ id, kind, name, removed }) => {
-      const back = button("Restore", () =>
-        attempt(back, line, async () => {
-          await post(at("trash", id, "restore"));
-          await read();
-          store.refresh();
-        }),
-      );
-      const when = new Date(1000 * removed).toLocaleString("en");
-      return h("li", { class: "row" }, h("span", {}, `${kind}/${name}`), h("span", { class: "quiet" }, `removed ${when}`), back);
-    });
+    keyed(
+      list,
+      found,
+      ({ id }) => id,
+      ({ id, kind, name, removed }) => {
+        const back = button("Restore", () =>
+          attempt(back, line, async () => {
+            await post(at("trash", id, "restore"));
+            await read();
+            store.refresh();
+          }),
+        );
+        const when = new Date(1000 * removed).toLocaleString("en");
+        return h(
+          "li",
+          { class: "row" },
+          h("span", {}, `${kind}/${name}`),
+          h("span", { class: "quiet" }, `removed ${when}`),
+          back,
+        );
+      },
+    );
   }
 
   main.append(heading(1, "Trash"), empty, list, clear, line, h("p", {}, link("Back to the library", "#/")));

@@ -72,7 +72,11 @@ export function watch({ place, store, entry }) {
       "section",
       { "aria-label": "curves" },
       heading(2, "Curves"),
-      h("div", { class: "curves" }, Object.values(curves).map(({ element }) => element)),
+      h(
+        "div",
+        { class: "curves" },
+        Object.values(curves).map(({ element }) => element),
+      ),
     ),
   );
   const data = { points: [[], [], []], scores: [[], []], live: [[], []], next: "" };
@@ -135,7 +139,8 @@ export function watch({ place, store, entry }) {
         seen = phase;
         readCurves();
       }
-      const waits = view?.job.state === "queued" ? "This training waits for other jobs." : "The training has not begun yet.";
+      const waits =
+        view?.job.state === "queued" ? "This training waits for other jobs." : "The training has not begun yet.";
       page.element.hidden = active;
       if (active && view.job.state !== "queued" && now.files) scene.show(at(entry.entry, "live", "page"), waits);
       else if (active) scene.show(null, waits);
@@ -165,4 +170,3 @@ function showFigures(list, now, view, { points }) {
   list.dataset.text = text;
   list.replaceChildren(...rows.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
 }
-

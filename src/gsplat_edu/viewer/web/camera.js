@@ -1,19 +1,20 @@
 // Cameras: {R, eye, fx, fy, cx, cy, W, H} as in gsplat_edu/scene/camera.py, R from world to camera with rows (right, down,
 // forward).
-"use strict";
+
+import { Region } from "./region.js";
 
 const ORBIT_STEP = Math.PI / 180;
 const NEAREST = 0.01; // distance to the pivot, in initial distances
 const FARTHEST = 3; // the same, and of the pivot from the initial one, in distances of the farthest camera
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const plus = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
-const transposed = (rows) => [0, 1, 2].map((i) => rows.map((row) => row[i]));
-const radians = (degrees) => (degrees * Math.PI) / 180;
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+export const plus = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
+export const transposed = (rows) => [0, 1, 2].map((i) => rows.map((row) => row[i]));
+export const radians = (degrees) => (degrees * Math.PI) / 180;
 
 // Rotates a vector about an axis of length 1 by the right-hand rule (Rodrigues' formula).
-function turned(vector, axis, angle) {
+export function turned(vector, axis, angle) {
   const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
   const around = cross(axis, vector);
   const along = dot(axis, vector) * (1 - cos);
@@ -33,7 +34,7 @@ const LEAST_FREE = 0.2;
 // and the sides are cropped, since no camera saw anything above and below the image, but as much as `subject` (left, top,
 // right, bottom in px of the image) stays in view. A wide window shows some more at the sides and crops a little of the
 // height, but not the subject. The centre of the image, or of the subject, is in the middle of the part without a panel.
-function fitted(camera, width, height, covered = 0) {
+export function fitted(camera, width, height, covered = 0) {
   const { subject, ...rest } = camera;
   const free = height - covered < LEAST_FREE * height ? height : height - covered;
   const [across, down] = [width / camera.W, free / camera.H];
@@ -67,13 +68,13 @@ function within(middle, image, shown) {
 }
 
 // The point at a given depth that a camera sees at column u and row v.
-function pointAt(camera, u, v, depth) {
+export function pointAt(camera, u, v, depth) {
   const ray = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1];
   return ray.reduce((at, step, i) => plus(at, camera.R[i], step * depth), camera.eye);
 }
 
 // Bounds of x/z and y/z in the Jacobian, as in Camera.jacobian_bounds; without a limit, the largest float.
-function ratioBounds(camera, { jacobian_limit: limit, beyond }) {
+export function ratioBounds(camera, { jacobian_limit: limit, beyond }) {
   const edges = [
     Math.max(0.5 + camera.cx, camera.W - 0.5 - camera.cx) / camera.fx,
     Math.max(0.5 + camera.cy, camera.H - 0.5 - camera.cy) / camera.fy,
@@ -88,7 +89,7 @@ function ratioBounds(camera, { jacobian_limit: limit, beyond }) {
 }
 
 // The user's viewpoint and the pivot of orbits.
-class View {
+export class View {
   // start: camera, pivot and up of the initial view. eyes: centres of the capture's cameras.
   constructor({ camera, pivot, up }, eyes) {
     this.start = camera;

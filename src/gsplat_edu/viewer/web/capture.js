@@ -1,5 +1,17 @@
 // The page of a capture: unpacks its points, then draws whenever something changes.
-"use strict";
+
+import { fitted, View } from "./camera.js";
+import { Cameras, projected } from "./capture_cameras.js";
+import { CaptureRenderer } from "./capture_draw.js";
+import { MatchPanel, readMatches } from "./capture_matches.js";
+import { CapturePanel, numbered, tellFrame } from "./capture_panel.js";
+import { Photos } from "./capture_photos.js";
+import { RegionTool } from "./capture_region.js";
+import { element, fail, say, startPage } from "./common.js";
+import { Controls } from "./controls.js";
+import { FACTS } from "./facts.js";
+import { released } from "./press.js";
+import { inflated } from "./scene.js";
 
 const SLOW = 40; // milliseconds per frame above which fewer points are drawn while the view moves
 const FAST = 20; // below which more are
@@ -27,7 +39,10 @@ class CaptureView {
     this.controls = new Controls(this.canvas, this.view, this.actions(), facts.cameras.length);
     this.renderer = null;
     this.region = new RegionTool(this);
-    this.matchPanel = new MatchPanel(matches, this.cameras, { choose: (index) => this.choose(index), repaint: () => this.match() });
+    this.matchPanel = new MatchPanel(matches, this.cameras, {
+      choose: (index) => this.choose(index),
+      repaint: () => this.match(),
+    });
     this.listen();
     this.paint();
   }
@@ -209,7 +224,12 @@ class CaptureView {
         await released();
         this.mark(new Map(Object.entries(marks)));
         const count = this.cameras.list.filter((camera) => camera.marks.length).length;
-        return this.panel.doctor(trouble || (count ? `The doctor found something about ${numbered(count, "photo")}.` : "The doctor found nothing about single photos."));
+        return this.panel.doctor(
+          trouble ||
+            (count
+              ? `The doctor found something about ${numbered(count, "photo")}.`
+              : "The doctor found nothing about single photos."),
+        );
       }
       await new Promise((resolve) => setTimeout(resolve, ASK_AGAIN));
     }
@@ -281,7 +301,13 @@ class CaptureView {
 
   draw(camera, points) {
     const { near } = this.facts;
-    this.renderer.draw(camera, { near, dense: this.dense, ground: this.colors("ground"), mark: this.colors("match"), points: this.panel.showsPoints ? points : 0 });
+    this.renderer.draw(camera, {
+      near,
+      dense: this.dense,
+      ground: this.colors("ground"),
+      mark: this.colors("match"),
+      points: this.panel.showsPoints ? points : 0,
+    });
     this.region.paint(camera);
     this.stand(camera);
     if (this.through) this.lay(camera);
@@ -292,7 +318,8 @@ class CaptureView {
     const { gap } = this.facts;
     const place = gap && projected(gap[gap.length >> 1], camera);
     element("stand").hidden = !place;
-    if (place) [element("stand").style.left, element("stand").style.top] = place.map((px) => `${(px + 0.5) / this.dense}px`);
+    if (place)
+      [element("stand").style.left, element("stand").style.top] = place.map((px) => `${(px + 0.5) / this.dense}px`);
   }
 
   // Lays the photo over the place of its camera's image.
@@ -312,17 +339,9 @@ class CaptureView {
 // [R, G, B] of a colour #rgb or #rrggbb.
 function rgbOf(text) {
   const digits = text.slice(1);
-  return [0, 1, 2].map((i) => (digits.length === 3 ? 17 * parseInt(digits[i], 16) : parseInt(digits.slice(2 * i, 2 * i + 2), 16)));
-}
-
-// Tells the page around this one, if it is from the same server, by an event of the frame: "started", or "left" with the
-// photo that was left out or taken back here.
-function tellFrame(name, detail = {}) {
-  window.frameElement?.dispatchEvent(new CustomEvent(name, { detail }));
-}
-
-function fail(error) {
-  say(error?.message || String(error));
+  return [0, 1, 2].map((i) =>
+    digits.length === 3 ? 17 * parseInt(digits[i], 16) : parseInt(digits.slice(2 * i, 2 * i + 2), 16),
+  );
 }
 
 async function start() {
@@ -337,6 +356,4 @@ async function start() {
   say("");
 }
 
-addEventListener("error", (event) => fail(event.error));
-addEventListener("unhandledrejection", (event) => fail(event.reason));
-addEventListener("DOMContentLoaded", () => start().catch(fail));
+startPage(start);

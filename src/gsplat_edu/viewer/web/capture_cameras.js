@@ -1,13 +1,14 @@
 // The cameras of a capture: the lines that draw them, their colours, and which one is under the pointer.
-"use strict";
+
+import { dot, plus } from "./camera.js";
 
 const GRASP = 8; // CSS px: a line this near to the pointer is under it
 const MOST_FINDINGS = 6; // with colours of their own; further ones share the last
 const THIN = 1.5; // width of a line, CSS px
 const THICK = 3.5; // of the chosen camera's lines
-const BYTES = 8; // per line: RGBA, width in quarters of a px, whether it grows with the outlines, and two unused
+export const BYTES = 8; // per line: RGBA, width in quarters of a px, whether it grows with the outlines, and two unused
 
-class Cameras {
+export class Cameras {
   constructor({ cameras, shapes, size, gap }) {
     this.list = cameras.map((camera) => ({ ...camera, marks: [...camera.marks] }));
     this.shapes = shapes;
@@ -54,14 +55,22 @@ class Cameras {
     this.list.forEach((camera, i) => {
       const stands = i === this.chosen || i === this.over;
       const color = i === this.chosen ? colors("chosen") : colors(this.kindOf(camera));
-      this.style(this.firsts[i], this.firsts[i + 1] ?? this.path, color, camera.left_out && !stands ? 140 : 255, stands ? THICK : THIN, true);
+      this.style(
+        this.firsts[i],
+        this.firsts[i + 1] ?? this.path,
+        color,
+        camera.left_out && !stands ? 140 : 255,
+        stands ? THICK : THIN,
+        true,
+      );
     });
     this.style(this.path, this.arc, colors("way"), showsPath ? 200 : 0, 1, false);
     this.style(this.arc, this.count, colors("gap"), 255, THICK, false);
   }
 
   style(from, to, color, opacity, width, grows) {
-    for (let line = from; line < to; ++line) this.styles.set([...color, opacity, 4 * width, grows ? 1 : 0], BYTES * line);
+    for (let line = from; line < to; ++line)
+      this.styles.set([...color, opacity, 4 * width, grows ? 1 : 0], BYTES * line);
   }
 
   // The camera whose outline is at a place (CSS px): the nearest of those whose image holds it or whose lines are close;
@@ -75,7 +84,13 @@ class Cameras {
       const reach = this.scale / Math.max(1e-12, Math.hypot(...plus(camera.eye, shown.eye, -1)) - this.scale);
       const middle = depth > 0 ? projected(camera.eye, shown) : null;
       // far from the pointer, whatever the shape
-      if (middle && reach > 0 && reach < 1 && Math.hypot(middle[0] - u, middle[1] - v) > 2 * reach * Math.max(shown.fx, shown.W) + GRASP * dense) return;
+      if (
+        middle &&
+        reach > 0 &&
+        reach < 1 &&
+        Math.hypot(middle[0] - u, middle[1] - v) > 2 * reach * Math.max(shown.fx, shown.W) + GRASP * dense
+      )
+        return;
       const held = this.holds(camera, outline, shown, u, v);
       if (!held && !this.touches(camera, lines, shown, u, v, GRASP * dense)) return;
       const rank = Math.hypot(...plus(camera.eye, shown.eye, -1)) + (i === this.chosen ? 1e-9 : 0);
@@ -115,7 +130,7 @@ const inWorld = ({ R }, [x, y, z]) => [0, 1, 2].map((axis) => R[0][axis] * x + R
 const depthOf = (point, { R, eye }) => dot(R[2], plus(point, eye, -1));
 
 // Column and row at which a camera sees a point; null behind it.
-function projected(point, { R, eye, fx, fy, cx, cy }) {
+export function projected(point, { R, eye, fx, fy, cx, cy }) {
   const [x, y, z] = R.map((row) => dot(row, plus(point, eye, -1)));
   return z > 0 ? [(fx * x) / z + cx, (fy * y) / z + cy] : null;
 }

@@ -1,14 +1,19 @@
 // Draws the points and cameras of a capture with WebGL2: the points in one call, all lines in another. Every line is a
 // rectangle with vertices of its own: drawn in software, an instance per line takes several times as long.
-"use strict";
+
+import { BYTES } from "./capture_cameras.js";
+import { linked } from "./common.js";
 
 const POINT = 2; // CSS px, side of a point
 const MATCHED = 4; // the same of a matched one
 
-class CaptureRenderer {
+export class CaptureRenderer {
   constructor(canvas, { count }, points, cameras) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
-    if (!gl) throw new Error("This page draws with WebGL2, which this browser lacks or has switched off. The list of photos works without it.");
+    if (!gl)
+      throw new Error(
+        "This page draws with WebGL2, which this browser lacks or has switched off. The list of photos works without it.",
+      );
     Object.assign(this, { gl, canvas, count, cameras });
     [this.pointProgram, this.lineProgram] = ["capture_points", "capture_lines"].map((name) => linked(gl, name));
     this.points = gl.createVertexArray();
@@ -33,7 +38,8 @@ class CaptureRenderer {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(cameras.count), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    if (gl.getError() !== gl.NO_ERROR) throw new Error("This capture does not fit into the graphics processor's memory.");
+    if (gl.getError() !== gl.NO_ERROR)
+      throw new Error("This capture does not fit into the graphics processor's memory.");
   }
 
   // A new buffer with these numbers, bound.
@@ -139,6 +145,10 @@ function fourfold(values, width) {
 // The corners of the two triangles of each rectangle.
 function cornersOf(count) {
   const corners = new Uint32Array(6 * count);
-  for (let i = 0; i < count; ++i) corners.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * i + corner), 6 * i);
+  for (let i = 0; i < count; ++i)
+    corners.set(
+      [0, 1, 2, 2, 1, 3].map((corner) => 4 * i + corner),
+      6 * i,
+    );
   return corners;
 }

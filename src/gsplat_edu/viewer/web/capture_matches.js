@@ -1,12 +1,15 @@
 // The matched points of the chosen photo: in space, on the photo, and which other photos have them too.
-"use strict";
+
+import { numbered } from "./capture_panel.js";
+import { element, refill } from "./common.js";
+import { inflated } from "./scene.js";
 
 const MOST_SHARING = 6; // photos in the list
 const DOT = 1.5; // CSS px, radius of a matched point on the photo
 const WIDEST_PLACE = 65535; // the right or lower border of a photo
 
 // The matched points of all photos, as capture_matches.py packs them; null if the capture has none.
-async function readMatches({ matches }) {
+export async function readMatches({ matches }) {
   if (!matches) return null;
   const { points, pairs, thinned } = matches;
   const count = pairs.reduce((sum, some) => sum + some, 0);
@@ -22,7 +25,7 @@ async function readMatches({ matches }) {
   };
 }
 
-class MatchPanel {
+export class MatchPanel {
   // matches: from readMatches. actions: choose(index), repaint().
   constructor(matches, cameras, actions) {
     Object.assign(this, { matches, cameras, actions, chosen: -1, positions: new Float32Array(0) });
@@ -75,7 +78,9 @@ class MatchPanel {
     const found = this.sharing(index);
     const number = numbered(found.length, "photo");
     const about = this.matches.thinned ? " (counted on a sample of the points)" : "";
-    const text = found.length ? `Shares points with ${number}${about}; most with` : "Shares points with no other photo.";
+    const text = found.length
+      ? `Shares points with ${number}${about}; most with`
+      : "Shares points with no other photo.";
     element("sharing-with").textContent = text;
     const items = found.slice(0, MOST_SHARING).map(({ other, common }) => {
       const [item, button, count] = ["li", "button", "small"].map((tag) => document.createElement(tag));

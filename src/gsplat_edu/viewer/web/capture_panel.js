@@ -1,16 +1,21 @@
 // Everything around the picture of a capture: the legend, the list of photos, the chosen photo, and the one under the pointer.
-"use strict";
 
-const SMALL = "(max-width: 600px)"; // as in capture.css
+import { element } from "./common.js";
+import { released } from "./press.js";
+
+export const SMALL = "(max-width: 600px)"; // as in capture.css
 const HOVER_APART = 16; // CSS px between the pointer and the photo beside it
 const NOT_THERE = "cannot be shown";
 
-class CapturePanel {
+export class CapturePanel {
   // actions: choose(index), step(by), look(), leave(), size(factor), reset(), repaint().
   constructor(facts, cameras, photos, actions) {
     Object.assign(this, { facts, cameras, photos, actions, asked: 0, hovered: -1 });
     const { count, all_points: all } = facts;
-    const points = count < all ? `${count.toLocaleString("en")} of ${all.toLocaleString("en")} points` : `${count.toLocaleString("en")} points`;
+    const points =
+      count < all
+        ? `${count.toLocaleString("en")} of ${all.toLocaleString("en")} points`
+        : `${count.toLocaleString("en")} points`;
     element("count").textContent = `${numbered(cameras.list.length, "photo")}, ${count ? points : "no points"}`;
     element("gap").textContent = facts.gap_sentence;
     element("show-points").parentElement.hidden = !count;
@@ -61,13 +66,18 @@ class CapturePanel {
       return button;
     });
     element("cameras").querySelector("summary").textContent = `photos (${this.buttons.length})`;
-    element("cameras").querySelector("ol").append(...this.buttons.map((button) => button.parentElement));
+    element("cameras")
+      .querySelector("ol")
+      .append(...this.buttons.map((button) => button.parentElement));
   }
 
   // What is known of each photo has changed.
   tell() {
     this.cameras.list.forEach((camera, i) => {
-      this.buttons[i].querySelector("small").textContent = [...(camera.left_out ? ["left out"] : []), ...camera.marks].join(", ");
+      this.buttons[i].querySelector("small").textContent = [
+        ...(camera.left_out ? ["left out"] : []),
+        ...camera.marks,
+      ].join(", ");
     });
     const items = this.cameras.kinds().map(({ kind, name, cameras }) => {
       const item = document.createElement("li");
@@ -140,7 +150,10 @@ class CapturePanel {
     box.hidden = index < 0;
     if (index < 0) return;
     const { name, photo, marks, left_out: out } = this.cameras.list[index];
-    const caption = (more) => (box.querySelector("figcaption").textContent = [name, ...(out ? ["left out"] : []), ...marks, ...more].join(" · "));
+    const caption = (more) =>
+      (box.querySelector("figcaption").textContent = [name, ...(out ? ["left out"] : []), ...marks, ...more].join(
+        " · ",
+      ));
     caption([]);
     const picture = box.querySelector("img");
     picture.hidden = true;
@@ -163,4 +176,10 @@ async function decodedPhoto(address) {
   return picture;
 }
 
-const numbered = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
+export const numbered = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
+
+// Tells the page around this one, if it is from the same server, by an event of the frame: "started", or "left" with the
+// photo that was left out or taken back here.
+export function tellFrame(name, detail = {}) {
+  window.frameElement?.dispatchEvent(new CustomEvent(name, { detail }));
+}

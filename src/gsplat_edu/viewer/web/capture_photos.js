@@ -1,9 +1,8 @@
 // Photos from the server, on demand, and what the page changes in the capture: photos to leave out, and the region.
-"use strict";
 
 const MOST_KEPT = 200; // photos in memory
 
-class Photos {
+export class Photos {
   constructor() {
     this.known = new Map(); // addresses of photos in memory, oldest first
   }
@@ -19,13 +18,18 @@ class Photos {
     if (this.known.size > MOST_KEPT) {
       const [[oldest, address]] = this.known;
       this.known.delete(oldest);
-      address.then((url) => URL.revokeObjectURL(url), () => {});
+      address.then(
+        (url) => URL.revokeObjectURL(url),
+        () => {},
+      );
     }
     return found;
   }
 
   async fetched(name, side) {
-    const answer = await fetch(`thumbs/${name.split("/").map(encodeURIComponent).join("/")}?side=${side}`).catch(() => null);
+    const answer = await fetch(`thumbs/${name.split("/").map(encodeURIComponent).join("/")}?side=${side}`).catch(
+      () => null,
+    );
     if (!answer) throw new Error("The server of this page has ended.");
     if (!answer.ok) throw new Error(await reasonOf(answer));
     return URL.createObjectURL(await answer.blob());

@@ -2,7 +2,15 @@
 //
 // It has the members that `Gizmo` and `Overlay` need of an editor's tools. The box is in the page's coordinates; the
 // server's file has those of the capture, which differ by `facts.origin`.
-"use strict";
+
+import { plus } from "./camera.js";
+import { SMALL, tellFrame } from "./capture_panel.js";
+import { element } from "./common.js";
+import { Gizmo } from "./edit_gizmo.js";
+import { numberFields } from "./edit_gizmo_panel.js";
+import { Overlay } from "./edit_overlay.js";
+import { boxHandles, boxLines, sideAt, sideDragged } from "./edit_shapes.js";
+import { released } from "./press.js";
 
 const ELSEWHERE = {
   saved: "Another tab has saved a box. Yours is not saved yet; saving it replaces the other one.",
@@ -12,7 +20,7 @@ const ELSEWHERE = {
 // The numbers of a box as a text; empty without a box.
 const numbersOf = (region) => (region ? [region.center, region.rotation, region.half].flat(2).join() : "");
 
-class RegionTool {
+export class RegionTool {
   constructor(viewer) {
     Object.assign(this, { viewer, editor: this, tool: "box", stroke: null, shape: null, drawing: false, before: null });
     this.saved = null;
@@ -30,7 +38,9 @@ class RegionTool {
     listen("keydown", this.keyDown);
     const pressed = { draw: "draw", remove: "remove", save: "save", cancel: "close" };
     for (const [id, method] of Object.entries(pressed)) {
-      element(`region-${id}`).addEventListener("click", () => Promise.resolve(this[method]()).catch((error) => this.say(error.message)));
+      element(`region-${id}`).addEventListener("click", () =>
+        Promise.resolve(this[method]()).catch((error) => this.say(error.message)),
+      );
     }
     element("region-tools").addEventListener("input", ({ target }) => this.input(target));
     this.changed();
@@ -103,7 +113,11 @@ class RegionTool {
 
   // Says something beside the box's numbers while it is drawn, else beside the button that draws it.
   say(text) {
-    for (const [id, is] of [["region-note", this.drawing], ["region-said", !this.drawing]]) element(id).textContent = is ? text : "";
+    for (const [id, is] of [
+      ["region-note", this.drawing],
+      ["region-said", !this.drawing],
+    ])
+      element(id).textContent = is ? text : "";
   }
 
   get perPixel() {
@@ -111,7 +125,7 @@ class RegionTool {
   }
 
   // Column and row of the picture at CSS pixels of the window.
-  pointOf(camera, x, y) {
+  pointOf(_camera, x, y) {
     const { left, top } = this.viewer.canvas.getBoundingClientRect();
     return { x, y, u: (x - left) * this.viewer.dense - 0.5, v: (y - top) * this.viewer.dense - 0.5 };
   }
@@ -176,7 +190,14 @@ class RegionTool {
     const { id, at } = this.stroke;
     this.shape = this.began;
     this.stroke = null;
-    this.viewer.controls.press({ pointerId: id, clientX: at.x, clientY: at.y, button: 0, shiftKey: false, preventDefault() {} });
+    this.viewer.controls.press({
+      pointerId: id,
+      clientX: at.x,
+      clientY: at.y,
+      button: 0,
+      shiftKey: false,
+      preventDefault() {},
+    });
     this.changed();
   }
 
@@ -227,7 +248,8 @@ class RegionTool {
     this.gizmo.panel.update();
     for (const name of ["center", "half"]) {
       this[name].forEach((field, i) => {
-        if (field !== document.activeElement) field.value = this.shape ? Number(this.shape[name][i].toPrecision(4)) : "";
+        if (field !== document.activeElement)
+          field.value = this.shape ? Number(this.shape[name][i].toPrecision(4)) : "";
       });
     }
   }

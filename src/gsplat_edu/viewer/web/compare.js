@@ -1,17 +1,30 @@
 // Photos beside the picture: the view is at a photo's camera, and a line across the picture has the photo on its left.
 // page_proof.py writes the photos; each has the pinhole of its camera in the page.
-"use strict";
+
+import { element } from "./common.js";
+import { STEPPING } from "./mesh.js";
+import { inflated } from "./scene.js";
+import { offer } from "./seen.js";
 
 const SLIDE = 5; // percent by a key
 const LINE_GRIP = 22; // half the width of the line's handle, CSS pixels
 
-class Compare {
+export class Compare {
   static async open(viewer) {
     const { photos } = viewer.facts;
-    const bytes = await inflated(document.querySelectorAll("script.photos"), photos.reduce((sum, photo) => sum + photo.bytes, 0));
+    const bytes = await inflated(
+      document.querySelectorAll("script.photos"),
+      photos.reduce((sum, photo) => sum + photo.bytes, 0),
+    );
     let begin = 0;
-    const urls = photos.map((photo) => URL.createObjectURL(new Blob([bytes.subarray(begin, (begin += photo.bytes))], { type: "image/jpeg" })));
-    return new Compare(viewer, photos.map(({ index }) => index), urls);
+    const urls = photos.map((photo) =>
+      URL.createObjectURL(new Blob([bytes.subarray(begin, (begin += photo.bytes))], { type: "image/jpeg" })),
+    );
+    return new Compare(
+      viewer,
+      photos.map(({ index }) => index),
+      urls,
+    );
   }
 
   // indices: of the photos' cameras. urls: of the photos.
@@ -69,7 +82,8 @@ class Compare {
   describe() {
     const { name, held_out: heldOut } = this.viewer.facts.cameras[this.indices[this.at]];
     const use = heldOut ? "held out, not used for training" : "used for training";
-    element("compare-card").querySelector("strong").textContent = `${name}: ${use} (${this.at + 1} of ${this.urls.length})`;
+    element("compare-card").querySelector("strong").textContent =
+      `${name}: ${use} (${this.at + 1} of ${this.urls.length})`;
     element("photo").alt = `${name}, ${use}`;
   }
 
@@ -112,7 +126,13 @@ class Compare {
     const at = this.span[0] + this.share * (this.span[1] - this.span[0]);
     const photo = element("photo");
     const clip = `inset(0 ${Math.max(0, x + across - at)}px 0 0)`;
-    Object.assign(photo.style, { left: `${x}px`, top: `${y}px`, width: `${across}px`, height: `${down}px`, clipPath: clip });
+    Object.assign(photo.style, {
+      left: `${x}px`,
+      top: `${y}px`,
+      width: `${across}px`,
+      height: `${down}px`,
+      clipPath: clip,
+    });
     element("photo-line").style.left = `${Math.min(Math.max(at, left + LINE_GRIP), left + width - LINE_GRIP)}px`;
     photo.hidden = element("photo-line").hidden = false;
     const percent = Math.round(100 * this.share);

@@ -1,5 +1,4 @@
 // Moves the view by mouse, touch and keyboard.
-"use strict";
 
 const WHEEL = 0.0015; // logarithm of the distance per pixel of scrolling
 const LINE = 16; // pixels per line, for wheels that count lines
@@ -32,13 +31,22 @@ const ONCE = ["f", "h", "k", "p", "t", "c", "v"]; // keys that act once, however
 const EMBEDDED = location.hash === "#embedded";
 if (EMBEDDED) document.documentElement.classList.add("embedded");
 
-class Controls {
+export class Controls {
   // actions: moved() after every move, awake() when a held key starts to move, shown() for the camera on the screen,
   // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by), saveView(),
   // playPath(), guide(), compare(), seen(), slide(by), dismiss(). `cameras` is how many cameras the horizontal arrows
   // step through.
   constructor(canvas, view, actions, cameras = 0) {
-    Object.assign(this, { canvas, view, actions, cameras, flying: false, pointers: new Map(), held: new Set(), hurried: false });
+    Object.assign(this, {
+      canvas,
+      view,
+      actions,
+      cameras,
+      flying: false,
+      pointers: new Map(),
+      held: new Set(),
+      hurried: false,
+    });
     this.lastTap = null;
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
@@ -96,7 +104,8 @@ class Controls {
   }
 
   turn(dx, dy) {
-    const angle = (this.flying ? Math.PI : this.view.turn) / Math.max(this.canvas.clientWidth, this.canvas.clientHeight);
+    const angle =
+      (this.flying ? Math.PI : this.view.turn) / Math.max(this.canvas.clientWidth, this.canvas.clientHeight);
     if (this.flying) this.view.look(dx * angle, dy * angle);
     else this.view.orbit(dx * angle, dy * angle);
   }

@@ -2,20 +2,27 @@
 //
 // Eight bits are too few for blending a hundred faint splats: the rounding would be visible. The renderer may stop once
 // the transmittance is below 1e-4; drawing does not stop here, and the difference is invisible.
-"use strict";
 
-const SOLID = 0.15; // smallest half of the opacity of a pixel that shows a surface
+import { ratioBounds } from "./camera.js";
+import { linked, nearestTexture } from "./common.js";
+import { layout } from "./scene.js";
+import { SeenTexture } from "./seen.js";
+
+export const SOLID = 0.15; // smallest half of the opacity of a pixel that shows a surface
 const BATCH_SPLATS = 4096; // splats per instance: one each would cost a software rasteriser 20 µs per splat
 const SURFACE_STEPS = 10; // bisections of log depth, starting from a factor of 2: accurate to 0.07 %
 
 const POLL = 4; // milliseconds between two looks whether a picture is drawn
 const QUAD = [0, 1, 2, 2, 1, 3]; // corners of the two triangles
-const ORDER = { type: Uint32Array, channels: 1, texels: 1 }; // splats, far to near
+export const ORDER = { type: Uint32Array, channels: 1, texels: 1 }; // splats, far to near
 
-class Renderer {
+export class Renderer {
   constructor(canvas, splats, facts) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
-    if (!gl) throw new Error("This page draws with WebGL2, which this browser lacks or has switched off. Allow hardware acceleration, use another browser, or make a video: gsplat-edu render");
+    if (!gl)
+      throw new Error(
+        "This page draws with WebGL2, which this browser lacks or has switched off. Allow hardware acceleration, use another browser, or make a video: gsplat-edu render",
+      );
     if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
       throw new Error("This page needs half-float render targets, which this graphics processor does not support.");
     }
@@ -296,18 +303,4 @@ class Renderer {
     }
     return rgb;
   }
-}
-
-function nearestTexture(gl) {
-  const texture = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, texture);
-  for (const [name, value] of [
-    [gl.TEXTURE_MIN_FILTER, gl.NEAREST],
-    [gl.TEXTURE_MAG_FILTER, gl.NEAREST],
-    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE],
-    [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
-  ]) {
-    gl.texParameteri(gl.TEXTURE_2D, name, value);
-  }
-  return texture;
 }

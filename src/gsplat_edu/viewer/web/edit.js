@@ -1,5 +1,20 @@
 // The editor: a list of operations on a scene, its state, and everything that the tools and the panel can do.
-"use strict";
+
+import { cross, dot, plus } from "./camera.js";
+import { element } from "./common.js";
+import { FlagTexture } from "./edit_draw.js";
+import { SELECTED } from "./edit_flags.js";
+import { Leveller } from "./edit_level.js";
+import { EditLook } from "./edit_look.js";
+import { movedTogether, Mover } from "./edit_move.js";
+import { Overlay } from "./edit_overlay.js";
+import { EditPanel } from "./edit_panel.js";
+import { splatsAt } from "./edit_pixel.js";
+import { boxLines, length3, levelled, normalOf, shortNumber, storedView } from "./edit_shapes.js";
+import { EditHistory } from "./edit_state.js";
+import { EditTools } from "./edit_tools.js";
+import { EditTour } from "./edit_tour.js";
+import { Keyframes, readKeyframe } from "./keyframes.js";
 
 const EDIT_FORMAT = { format: "gsplat_edu edits", version: 1 };
 const [SH_C0, SH_HALF] = [0.28209479177387814, 0.5]; // colour = SH_C0 sh0 + SH_HALF
@@ -13,7 +28,7 @@ const LEAST_SHARE = 1e-6; // opacities at or beyond this from 0 and 1 leave the 
 // edits: the parsed content of an edits file of this scene, or null.
 // save: async (text) => anything, which stores the content of an edits file or throws an Error with one line; null for
 //   no button.
-function startEditor({ viewer, scene, edits, save }) {
+export function startEditor({ viewer, scene, edits, save }) {
   return new Editor(viewer, scene, edits?.operations ?? [], save);
 }
 
@@ -201,7 +216,11 @@ class Editor {
 
   selectOpacity(low, high) {
     const logit = (share) => Math.log(share / (1 - share));
-    this.selectRange("opacity", low > LEAST_SHARE ? logit(Math.min(low, 1 - LEAST_SHARE)) : null, high < 1 - LEAST_SHARE ? logit(Math.max(high, LEAST_SHARE)) : null);
+    this.selectRange(
+      "opacity",
+      low > LEAST_SHARE ? logit(Math.min(low, 1 - LEAST_SHARE)) : null,
+      high < 1 - LEAST_SHARE ? logit(Math.max(high, LEAST_SHARE)) : null,
+    );
   }
 
   // Selects by the largest standard deviation, as texts of world units; empty for no limit.
@@ -293,7 +312,10 @@ class Editor {
     gl.disable(gl.SCISSOR_TEST);
     if (!sorter.running) renderer.setOrder(new Uint32Array(sorter.order, 0, count)); // otherwise a new order comes
     this.texture.write(this.history.flags);
-    const byte = (value) => Math.round(255 * Math.min(Math.max(value, 0), 1)).toString(16).padStart(2, "0");
+    const byte = (value) =>
+      Math.round(255 * Math.min(Math.max(value, 0), 1))
+        .toString(16)
+        .padStart(2, "0");
     return `#${[...pixel.subarray(0, 3)].map(byte).join("")}`;
   }
 

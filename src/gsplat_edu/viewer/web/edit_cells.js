@@ -1,11 +1,12 @@
 // Points of a picture in the cells of a grid, and a budget of tests, exactly as in gsplat_edu/edits/cells.py.
-"use strict";
+
+import { extent } from "./edit_member.js";
 
 const CELLS = 64; // along each axis
-const MOST_TESTS = 1e10; // of a splat, for a list of operations
+export const MOST_TESTS = 1e10; // of a splat, for a list of operations
 
 // Counts the tests of a list of operations.
-class EditWork {
+export class EditWork {
   constructor(most = MOST_TESTS) {
     this.left = most;
   }
@@ -23,7 +24,7 @@ class EditWork {
 }
 
 // Points by the cell of a grid over their bounds. u, v: Float64Array of finite columns and rows.
-class Cells {
+export class Cells {
   constructor(u, v, work) {
     this.work = work;
     this.axes = [cellAxis(u), cellAxis(v)];

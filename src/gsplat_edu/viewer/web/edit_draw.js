@@ -1,10 +1,13 @@
 // What the editor draws: the state of the splats inside the picture, and lines above it.
-"use strict";
 
-const HIGHLIGHT = [1, 0.75, 0.1]; // colour of selected splats
+import { nearestTexture } from "./common.js";
+import { Renderer } from "./draw.js";
+import { MotionTextures } from "./edit_move.js";
+
+export const HIGHLIGHT = [1, 0.75, 0.1]; // colour of selected splats
 
 // The states as a texture that the shader reads: hidden and deleted splats are not drawn, selected ones are coloured.
-class FlagTexture {
+export class FlagTexture {
   constructor(renderer) {
     const gl = renderer.gl;
     this.renderer = renderer;

@@ -1,9 +1,11 @@
 // Groups of splats that the server proposes to delete, each with its reason; absent in a page without a server.
-"use strict";
+
+import { element } from "./common.js";
+import { released } from "./press.js";
 
 const ASK_EVERY = 500; // ms between questions to the server
 
-const FLOATERS_PANEL = `
+export const FLOATERS_PANEL = `
 <div id="edit-floaters" role="group" aria-label="proposed floaters" hidden>
 <p class="row"><button data-do="propose" title="Judge the scene, by its photos where there are some">propose floaters</button>
 <button data-do="stop-proposing" hidden>stop</button>
@@ -12,7 +14,7 @@ const FLOATERS_PANEL = `
 <ol id="edit-groups"></ol>
 </div>`;
 
-class EditFloaters {
+export class EditFloaters {
   // Shows what has been proposed before, or is being judged.
   constructor(editor, panel) {
     Object.assign(this, { editor, panel, url: editor.scene.floaters, timer: 0, questions: 0 });
@@ -51,7 +53,11 @@ class EditFloaters {
 
   show({ state, done, total, groups = [], basis = "", error = "" }) {
     const running = state === "running";
-    const [button, stop, bar] = [this.panel.button("propose"), this.panel.button("stop-proposing"), element("edit-judged")];
+    const [button, stop, bar] = [
+      this.panel.button("propose"),
+      this.panel.button("stop-proposing"),
+      element("edit-judged"),
+    ];
     const focused = [button, stop].includes(document.activeElement);
     button.disabled = running;
     stop.hidden = bar.hidden = !running;
@@ -68,7 +74,9 @@ class EditFloaters {
     const button = document.createElement("button");
     const count = runs.reduce((sum, x, k) => sum + (k % 2 ? x : 0), 0);
     button.textContent = `${count.toLocaleString("en")} · ${reason}`;
-    button.addEventListener("click", () => this.editor.perform({ op: "select", how: this.editor.how, by: "list", reason, runs }));
+    button.addEventListener("click", () =>
+      this.editor.perform({ op: "select", how: this.editor.how, by: "list", reason, runs }),
+    );
     const item = document.createElement("li");
     item.append(button);
     return item;

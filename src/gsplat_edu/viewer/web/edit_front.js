@@ -1,6 +1,11 @@
 // Selections of only what is in front: the depths of the visible surface, measured once when the user draws, and their
 // comparison, which is exactly that of gsplat_edu/edits/front.py.
-"use strict";
+
+import { ratioBounds } from "./camera.js";
+import { SOLID } from "./draw.js";
+import { eachSeen, extent } from "./edit_member.js";
+import { alphaAt, footprintOf, splatsWithin } from "./edit_pixel.js";
+import { hundredths } from "./edit_shapes.js";
 
 const FRONT_CELLS = 48; // cells of the stored grid along each axis, at most
 const FRONT_CELL = 8; // CSS pixels: smallest side of a cell
@@ -9,15 +14,20 @@ const FRONT_THICKNESS = 3; // standard deviations in depth that a surface reache
 const FRONT_OPAQUE = 1e-4; // transmittance below which a pixel counts as opaque
 const STEEPEST_FRONT = 6; // depth per width of a surface seen at 80 degrees; a steeper step is an edge
 
-const FRONT_ROW = `
+export const FRONT_ROW = `
 <p class="row" data-for="rectangle lasso polygon brush">
 <button data-do="front" aria-pressed="false" title="5: select only what is in front, not what lies behind the visible surface">front only</button>
 </p>`;
 
 // Removes the splats that lie deeper than the cells of a selection allow. inside: 1 for those that the shape holds.
-function inFront(region, values, inside, work) {
+export function inFront(region, values, inside, work) {
   if (!region.front) return inside;
-  const { bounds: [u0, v0, u1, v1], columns, rows, deepest } = region.front;
+  const {
+    bounds: [u0, v0, u1, v1],
+    columns,
+    rows,
+    deepest,
+  } = region.front;
   work.add(inside.reduce((sum, one) => sum + one, 0));
   eachSeen(region, values, (i, u, v, z) => {
     if (!inside[i]) return;
@@ -33,7 +43,7 @@ function frontCell(value, low, high, count) {
 
 // The "front" of a selection drawn in a picture. region: its shape. scene: {values, flags, settings, near}. perPixel:
 // pixels of the picture per CSS pixel.
-function frontOf(region, camera, scene, perPixel) {
+export function frontOf(region, camera, scene, perPixel) {
   const bounds = frontBounds(region, camera);
   const [width, height] = [bounds[2] - bounds[0], bounds[3] - bounds[1]];
   const count = (length) => Math.min(Math.max(Math.ceil(length / (FRONT_CELL * perPixel)), 1), FRONT_CELLS);
@@ -46,7 +56,9 @@ function frontOf(region, camera, scene, perPixel) {
   for (let row = 0; row < rows; ++row) {
     for (let column = 0; column < columns; ++column) {
       const places = [0, 1, 2].flatMap((j) => [0, 1, 2].map((i) => (2 * row + j) * across + 2 * column + i));
-      deepest.push(deepestOf(places, surface, STEEPEST_FRONT * Math.max(lattice.du / camera.fx, lattice.dv / camera.fy)));
+      deepest.push(
+        deepestOf(places, surface, STEEPEST_FRONT * Math.max(lattice.du / camera.fx, lattice.dv / camera.fy)),
+      );
     }
   }
   return { bounds, columns, rows, deepest };
@@ -54,9 +66,16 @@ function frontOf(region, camera, scene, perPixel) {
 
 // Where a shape lies in the picture.
 function frontBounds({ corners, points, radius = 0 }, { W, H }) {
-  const [us, vs] = points ? [0, 1].map((axis) => extent(points.map((point) => point[axis]))) : [[corners[0], corners[2]], [corners[1], corners[3]]];
+  const [us, vs] = points
+    ? [0, 1].map((axis) => extent(points.map((point) => point[axis])))
+    : [
+        [corners[0], corners[2]],
+        [corners[1], corners[3]],
+      ];
   const ends = ([low, high], most) => {
-    const [from, to] = [low - radius - 0.5, high + radius + 0.5].map((x) => hundredths(Math.min(Math.max(x, -0.5), most - 0.5)));
+    const [from, to] = [low - radius - 0.5, high + radius + 0.5].map((x) =>
+      hundredths(Math.min(Math.max(x, -0.5), most - 0.5)),
+    );
     return to - from < NARROWEST_FRONT ? [from - NARROWEST_FRONT, to + NARROWEST_FRONT] : [from, to];
   };
   const [[u0, u1], [v0, v1]] = [ends(us, W), ends(vs, H)];
@@ -90,7 +109,13 @@ function visibleSurface({ values, flags, settings, near }, camera, lattice) {
   };
   const bounds = ratioBounds(camera, settings);
   const prints = []; // of the splats that are not hidden by others, near to far
-  for (const { i, u, v, reach } of splatsWithin(values, flags, camera, [u0, v0, u0 + du * (across - 1), v0 + dv * (down - 1)], near)) {
+  for (const { i, u, v, reach } of splatsWithin(
+    values,
+    flags,
+    camera,
+    [u0, v0, u0 + du * (across - 1), v0 + dv * (down - 1)],
+    near,
+  )) {
     if (!someLeft(placesWithin(lattice, u, v, reach, reach), done, across)) continue;
     const print = footprintOf(values, i, camera, bounds, settings.antialiased);
     if (!print) continue;

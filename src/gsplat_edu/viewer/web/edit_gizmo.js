@@ -2,7 +2,12 @@
 //
 // What it moves is the shape of the tool: {center, rotation, ...} with the columns of `rotation` as axes. A sphere has no
 // rotation, so its handle has no rings.
-"use strict";
+
+import { cross, dot, plus, pointAt, radians, transposed } from "./camera.js";
+import { GIZMO_PARTS, GizmoPanel } from "./edit_gizmo_panel.js";
+import { turnedRows } from "./edit_rotations.js";
+import { boxHandles, CIRCLE, HANDLE, seenAt, seenLine, uprightAxes } from "./edit_shapes.js";
+import { unit } from "./region.js";
 
 const [GIZMO_ARROW, GIZMO_RING, GIZMO_MIDDLE] = [88, 64, 9]; // CSS pixels: an arrow's length, the radii of rings and middle
 const GIZMO_REACH = { mouse: 9, pen: 12, touch: 22 }; // CSS pixels within which a pointer takes hold of a part
@@ -10,46 +15,8 @@ const GIZMO_COLORS = ["#ff7a7a", "#7be08a", "#7ab8ff"];
 const GIZMO_HELD = "#fff";
 const GIZMO_LEAST = 12; // CSS pixels: an arrow that is seen shorter, along the line of sight, is left out
 const EDGE_ON = 0.2; // cosine of the angle between line of sight and a ring's axis below which the ring is seen as a line
-const CURSOR_STEP = 8; // CSS pixels per key; 1 with Shift
+export const CURSOR_STEP = 8; // CSS pixels per key; 1 with Shift
 const [TURN_STEP, TURN_FINE] = [5, 0.5]; // degrees per key
-const GIMBAL = 1 - 1e-12; // sine of the tilt beyond which heading and roll turn about the same axis
-
-// The parts in the order in which the key goes through them.
-const GIZMO_PARTS = [
-  ...["x", "y", "z"].map((name, axis) => ({ kind: "arrow", axis, name: `move ${name}` })),
-  ...["x", "y", "z"].map((name, axis) => ({ kind: "ring", axis, name: `turn ${name}` })),
-  { kind: "middle", axis: 0, name: "move freely" },
-];
-
-const degrees = (angle) => (angle * 180) / Math.PI;
-const product3 = (a, b) => a.map((row) => [0, 1, 2].map((j) => row[0] * b[0][j] + row[1] * b[1][j] + row[2] * b[2][j]));
-
-// The rotation closest to one that rounding has bent: its columns made orthonormal, the first one first.
-function orthonormal(rows) {
-  const [first, second] = transposed(rows);
-  const x = unit(first);
-  const y = unit(plus(second, x, -dot(x, second)));
-  return transposed([x, y, cross(x, y)]);
-}
-
-// A rotation, given by its rows, after a further turn about an axis of length 1.
-function turnedRows(rows, axis, angle) {
-  return orthonormal(transposed(transposed(rows).map((column) => turned(column, axis, angle))));
-}
-
-// The rotation by three angles in radians: about z, then x, then y. With y vertical they are roll, tilt and heading.
-function rowsOfAngles([tilt, heading, roll]) {
-  const about = (axis, angle) => transposed([0, 1, 2].map((j) => turned([0, 1, 2].map((i) => Number(i === j)), axis, angle)));
-  return orthonormal(product3(about([0, 1, 0], heading), product3(about([1, 0, 0], tilt), about([0, 0, 1], roll))));
-}
-
-// The angles [tilt, heading, roll] of a rotation; at a tilt of +-90 degrees, where heading and roll
-// turn about the same axis, the roll is 0.
-function anglesOfRows(rows) {
-  const sine = Math.min(Math.max(-rows[1][2], -1), 1);
-  if (Math.abs(sine) > GIMBAL) return [Math.asin(sine), Math.atan2(-rows[2][0], rows[0][0]), 0];
-  return [Math.asin(sine), Math.atan2(rows[0][2], rows[2][2]), Math.atan2(rows[1][0], rows[1][1])];
-}
 
 // How far along the line through `point` with a direction of length 1 a ray passes closest; null if they are parallel.
 function alongLine(point, direction, eye, ray) {
@@ -65,7 +32,7 @@ function onPlane(center, normal, eye, ray) {
   return length > 0 && Number.isFinite(length) ? plus(plus(eye, ray, length), center, -1) : null;
 }
 
-class Gizmo {
+export class Gizmo {
   constructor(tools) {
     Object.assign(this, { tools, viewer: tools.viewer, hover: null, chosen: null });
     this.panel = new GizmoPanel(this);
@@ -114,7 +81,11 @@ class Gizmo {
     const faces = Math.abs(dot(sight, axes[axis])) > 0.98; // then all of it is at the same depth
     const offset = (i) => {
       const angle = (2 * Math.PI * i) / CIRCLE;
-      return plus(p.map((x) => x * Math.cos(angle)), q, Math.sin(angle));
+      return plus(
+        p.map((x) => x * Math.cos(angle)),
+        q,
+        Math.sin(angle),
+      );
     };
     return Array.from({ length: CIRCLE }, (_, i) => [offset(i), offset(i + 1)])
       .filter(([a, b]) => faces || dot(sight, plus(a, b)) < 0.1)
@@ -129,7 +100,8 @@ class Gizmo {
     const far = ({ u, v }) => Math.hypot(u - at.u, v - at.v) / perPixel;
     const middle = far(seenAt(camera, this.shape.center));
     if (middle < Math.max(GIZMO_MIDDLE, reach)) return { ...GIZMO_PARTS.at(-1), apart: middle };
-    if (this.tools.tool === "box" && boxHandles(this.shape).some(({ point }) => far(seenAt(camera, point)) < HANDLE)) return null;
+    if (this.tools.tool === "box" && boxHandles(this.shape).some(({ point }) => far(seenAt(camera, point)) < HANDLE))
+      return null;
     let best = null;
     for (const part of this.parts()) {
       for (const [a, b] of this.lines(part, camera, scale)) {
@@ -235,8 +207,13 @@ class Gizmo {
     if (part.kind === "ring") {
       const angle = radians(shiftKey ? TURN_FINE : TURN_STEP);
       this.take(this.turnedShape(shape, axis, (right - down) * angle));
-    } else if (part.kind === "arrow") this.take({ ...shape, center: plus(shape.center, axis, (right - down) * length) });
-    else this.take({ ...shape, center: plus(plus(shape.center, camera.R[0], right * length), camera.R[1], down * length) });
+    } else if (part.kind === "arrow")
+      this.take({ ...shape, center: plus(shape.center, axis, (right - down) * length) });
+    else
+      this.take({
+        ...shape,
+        center: plus(plus(shape.center, camera.R[0], right * length), camera.R[1], down * length),
+      });
     this.editor.changed();
     return true;
   }
@@ -248,7 +225,12 @@ class Gizmo {
     for (const part of this.parts()) {
       const color = part.name === lit || part.name === this.chosen?.name ? GIZMO_HELD : GIZMO_COLORS[part.axis];
       const lines = this.lines(part, overlay.camera, scale);
-      if (part.kind === "middle") overlay.circle(seenAt(overlay.camera, this.shape.center), GIZMO_MIDDLE * this.tools.perPixel, part.name === lit ? GIZMO_HELD : "#ffd24a");
+      if (part.kind === "middle")
+        overlay.circle(
+          seenAt(overlay.camera, this.shape.center),
+          GIZMO_MIDDLE * this.tools.perPixel,
+          part.name === lit ? GIZMO_HELD : "#ffd24a",
+        );
       else if (lines.length) overlay.lines(lines, color);
       if (part.kind === "arrow" && lines.length) overlay.dot(lines[0][1], part.name.at(-1), color);
     }

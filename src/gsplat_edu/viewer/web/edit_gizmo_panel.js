@@ -1,5 +1,15 @@
 // The part of the editor's panel that belongs to the handle: its buttons for the keyboard, and angles as numbers.
-"use strict";
+
+import { radians, transposed } from "./camera.js";
+import { element } from "./common.js";
+import { anglesOfRows, degrees, orthonormal, product3, rowsOfAngles } from "./edit_rotations.js";
+
+// The parts in the order in which the key goes through them.
+export const GIZMO_PARTS = [
+  ...["x", "y", "z"].map((name, axis) => ({ kind: "arrow", axis, name: `move ${name}` })),
+  ...["x", "y", "z"].map((name, axis) => ({ kind: "ring", axis, name: `turn ${name}` })),
+  { kind: "middle", axis: 0, name: "move freely" },
+];
 
 const GIZMO_PANEL = `
 <p class="row" role="group" aria-label="part of the handle that the arrow keys move">
@@ -8,10 +18,8 @@ ${GIZMO_PARTS.map(({ name }) => `<button data-handle="${name}">${name}</button>`
 <p class="row numbers" id="edit-angles" role="group" aria-label="turned, degrees"><span>turned, degrees: tilt, heading, roll</span></p>
 <p class="row" data-for="box"><button id="edit-level-box">level the box again</button></p>`;
 
-const ANGLE_NAMES = ["x", "y", "z"];
-
 // Adds three fields for numbers, x, y and z, to an element; returns them.
-function numberFields(id) {
+export function numberFields(id) {
   return ["x", "y", "z"].map((axis) => {
     const label = document.createElement("label");
     const input = document.createElement("input");
@@ -22,7 +30,7 @@ function numberFields(id) {
   });
 }
 
-class GizmoPanel {
+export class GizmoPanel {
   constructor(gizmo) {
     this.gizmo = gizmo;
     this.root = element("edit-handle");

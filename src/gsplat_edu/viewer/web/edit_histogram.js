@@ -1,12 +1,15 @@
 // The editor's bar chart of opacities, sizes or distances, on which a range of splats is selected.
-"use strict";
+
+import { element } from "./common.js";
+import { SELECTED } from "./edit_flags.js";
+import { shortNumber } from "./edit_shapes.js";
 
 const BAR_STEPS = 4; // steps of a handle per bar
 const RANGE_STEPS = 200; // steps of a handle over the whole chart
 const CHART_HEIGHT = 90; // CSS pixels
 const LEAST_DISTANCE = 1e-6; // of the largest one: smaller ones lie in the first bar
 
-const HISTOGRAM_PANEL = `
+export const HISTOGRAM_PANEL = `
 <details id="edit-histogram"><summary>by opacity, size or distance</summary>
 <p class="row"><label>of <select id="edit-quantity"><option value="opacity">opacity</option><option value="size">size</option>
 <option value="distance">distance to the pivot</option></select></label></p>
@@ -21,18 +24,31 @@ const HISTOGRAM_PANEL = `
 
 // The horizontal axis of each quantity: the coordinate of splat i, and the value at a coordinate.
 const QUANTITIES = {
-  opacity: { of: ({ logits }) => (i) => 1 / (1 + Math.exp(-logits[i])), value: (x) => x, fixed: [0, 1] },
+  opacity: {
+    of:
+      ({ logits }) =>
+      (i) =>
+        1 / (1 + Math.exp(-logits[i])),
+    value: (x) => x,
+    fixed: [0, 1],
+  },
   size: {
-    of: ({ log_scales: s }) => (i) => Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2]),
+    of:
+      ({ log_scales: s }) =>
+      (i) =>
+        Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2]),
     value: Math.exp,
   },
   distance: {
-    of: ({ means: m }, [x, y, z]) => (i) => Math.log(Math.sqrt((m[3 * i] - x) ** 2 + (m[3 * i + 1] - y) ** 2 + (m[3 * i + 2] - z) ** 2)),
+    of:
+      ({ means: m }, [x, y, z]) =>
+      (i) =>
+        Math.log(Math.sqrt((m[3 * i] - x) ** 2 + (m[3 * i + 1] - y) ** 2 + (m[3 * i + 2] - z) ** 2)),
     value: Math.exp,
   },
 };
 
-class EditHistogram {
+export class EditHistogram {
   constructor(editor) {
     this.editor = editor;
     this.root = element("edit-histogram");
@@ -109,7 +125,7 @@ class EditHistogram {
     [this.all, this.selected] = [new Uint32Array(bars), new Uint32Array(bars)];
     const scale = bars / (high - low);
     for (let i = 0; i < values.count; ++i) {
-      if (places[i] !== places[i]) continue;
+      if (Number.isNaN(places[i])) continue;
       const bar = Math.min(Math.max(Math.floor((places[i] - low) * scale), 0), bars - 1);
       ++this.all[bar];
       if (flags[i] === SELECTED) ++this.selected[bar];

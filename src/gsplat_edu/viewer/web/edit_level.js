@@ -1,5 +1,10 @@
 // Levels the scene by the directions of its cameras: people hold cameras level, so the images' x axes are horizontal.
-"use strict";
+
+import { cross, dot, plus, transposed, turned } from "./camera.js";
+import { element } from "./common.js";
+import { degrees } from "./edit_rotations.js";
+import { EDIT_UP, normalOf, rotated } from "./edit_shapes.js";
+import { unit } from "./region.js";
 
 const LEAST_CAMERAS = 3;
 const LEAST_SPREAD = 0.1; // root mean square of the x axes' second coordinate: 6 degrees from one common direction
@@ -9,11 +14,19 @@ const LEAST_UP = 0.1; // mean of cos(angle between up and an image's up directio
 const LEAST_AGREEING = 0.8; // sum of these cosines, in that of their absolute values
 
 // Eigenvalues of a symmetric matrix, smallest first, with unit eigenvectors: [{value, vector}], by Jacobi's rotations.
-function eigenvectors(matrix) {
+export function eigenvectors(matrix) {
   const A = matrix.map((row) => [...row]);
-  const V = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]; // its columns become the eigenvectors
+  const V = [
+    [1, 0, 0],
+    [0, 1, 0],
+    [0, 0, 1],
+  ]; // its columns become the eigenvectors
   for (let sweep = 0; sweep < 30; ++sweep) {
-    for (const [p, q] of [[0, 1], [0, 2], [1, 2]]) {
+    for (const [p, q] of [
+      [0, 1],
+      [0, 2],
+      [1, 2],
+    ]) {
       if (A[p][q] === 0) continue;
       const angle = 0.5 * Math.atan2(2 * A[p][q], A[q][q] - A[p][p]);
       const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
@@ -32,19 +45,30 @@ function eigenvectors(matrix) {
 // With r the x axes, up minimises the mean of (up . r)^2: it is the eigenvector of A = mean of r r' with the smallest
 // eigenvalue. Its error lies mainly along the second eigenvector. To first order it is the mean of (up . r) (second . r),
 // divided by l1 - l0; for independent rolls its standard deviation is sqrt(l0 l1 / n) / (l1 - l0).
-function upOfCameras(cameras) {
+export function upOfCameras(cameras) {
   const count = cameras.length;
-  if (count < LEAST_CAMERAS) return { refused: `The scene has ${count} cameras; at least ${LEAST_CAMERAS} are needed. Choose three points of the floor.` };
-  const moment = [0, 1, 2].map((i) => [0, 1, 2].map((j) => cameras.reduce((sum, { R: [right] }) => sum + right[i] * right[j], 0) / count));
+  if (count < LEAST_CAMERAS)
+    return {
+      refused: `The scene has ${count} cameras; at least ${LEAST_CAMERAS} are needed. Choose three points of the floor.`,
+    };
+  const moment = [0, 1, 2].map((i) =>
+    [0, 1, 2].map((j) => cameras.reduce((sum, { R: [right] }) => sum + right[i] * right[j], 0) / count),
+  );
   const [least, second] = eigenvectors(moment);
   const [l0, l1] = [Math.max(least.value, 0), Math.max(second.value, 0)];
-  if (Math.sqrt(l1) < LEAST_SPREAD) return { refused: "The cameras look in nearly one direction, which leaves the tilt open. Choose three points of the floor." };
+  if (Math.sqrt(l1) < LEAST_SPREAD)
+    return {
+      refused:
+        "The cameras look in nearly one direction, which leaves the tilt open. Choose three points of the floor.",
+    };
   const error = Math.sqrt((Math.max(l0, USUAL_ROLL ** 2) * l1) / count) / (l1 - l0);
   const cosines = cameras.map(({ R }) => -dot(least.vector, R[1]));
   const sum = cosines.reduce((total, cosine) => total + cosine, 0);
   const agreeing = Math.abs(sum) / cosines.reduce((total, cosine) => total + Math.abs(cosine), 0);
   if (!(error < MOST_ERROR) || !(Math.abs(sum) / count > LEAST_UP) || !(agreeing > LEAST_AGREEING)) {
-    return { refused: "The cameras are rolled too differently to agree on one up direction. Choose three points of the floor." };
+    return {
+      refused: "The cameras are rolled too differently to agree on one up direction. Choose three points of the floor.",
+    };
   }
   return { up: least.vector.map((x) => (sum < 0 ? -x : x)), error, count };
 }
@@ -66,7 +90,7 @@ function horizonOf(up, { R, fx, fy, cx, cy, W, H }) {
 }
 
 // The buttons and sliders of the tool "floor".
-class Leveller {
+export class Leveller {
   constructor(editor) {
     this.editor = editor;
     this.angles = ["edit-pitch", "edit-roll"].map(element);
@@ -133,7 +157,8 @@ class Leveller {
     const points = floorOf(up, pivot, distance);
     editor.perform({ op: "upright", points });
     const turn = degrees(Math.acos(Math.min(Math.max(dot(normalOf(points), EDIT_UP), -1), 1)));
-    element("edit-turned").textContent = `${count} cameras turn the scene as opened by ${turn.toFixed(1)}°; standard error ${degrees(error).toFixed(1)}°.`;
+    element("edit-turned").textContent =
+      `${count} cameras turn the scene as opened by ${turn.toFixed(1)}°; standard error ${degrees(error).toFixed(1)}°.`;
     return undefined;
   }
 }

@@ -1,7 +1,12 @@
 // How the picture shows the splats and the selection: tinted, by their centres, by rings, and with an outline.
-"use strict";
 
-const LOOKS = ["tint", "centres", "rings"];
+import { linked } from "./common.js";
+import { ORDER, Renderer } from "./draw.js";
+import { HIGHLIGHT } from "./edit_draw.js";
+import { SELECTED } from "./edit_flags.js";
+import { reduced } from "./pace.js";
+import { layout } from "./scene.js";
+
 const TINT = { tint: 0.6, centres: 0, rings: 0.75 }; // share of the highlight in the colour of a selected splat
 const MASK_SHARE = 0.5; // of the picture's size: the mask of the outline
 const DOTS = [
@@ -10,7 +15,7 @@ const DOTS = [
 ];
 const OUTLINE_WIDTH = 2; // CSS pixels
 
-const LOOK_ROW = `
+export const LOOK_ROW = `
 <p class="row" role="group" aria-label="how the selection is shown">
 <button data-look="tint" aria-pressed="true" title="6: tint the selected splats">tint</button>
 <button data-look="centres" aria-pressed="false" title="7: show the centre of every splat">centres</button>
@@ -28,7 +33,7 @@ Renderer.prototype.setUniforms = function (camera, settings) {
   gl.uniform1f(gl.getUniformLocation(program, "ring_width"), rings);
 };
 
-class EditLook {
+export class EditLook {
   constructor(editor) {
     const { viewer } = editor;
     const { gl } = viewer.renderer;
@@ -86,7 +91,8 @@ class EditLook {
     const hurried = viewer.pace.slow && viewer.isMoving();
     if (this.outlined && this.selected.length && !hurried) this.drawOutline(camera);
     this.stride = hurried ? Math.max(1, Math.ceil(this.editor.values.count / viewer.pace.detail.most)) : 1;
-    if (this.kind === "centres") for (const dots of DOTS) if (!dots.selected || this.selected.length) this.drawDots(camera, dots);
+    if (this.kind === "centres")
+      for (const dots of DOTS) if (!dots.selected || this.selected.length) this.drawDots(camera, dots);
   }
 
   // Draws on the canvas with a program of ours.
@@ -103,7 +109,10 @@ class EditLook {
     const { gl, facts, flags } = renderer;
     const place = this.begin(this.dots);
     const means = layout(facts).findIndex(({ name }) => name === "means");
-    for (const [name, unit, texture] of [["means", means, renderer.textures[means]], ["flags", flags.unit, flags.texture]]) {
+    for (const [name, unit, texture] of [
+      ["means", means, renderer.textures[means]],
+      ["flags", flags.unit, flags.texture],
+    ]) {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(place(name), unit);
@@ -148,7 +157,12 @@ class EditLook {
     const { framebuffer, image, width, height, begun, order, count, thinning } = renderer;
     Object.assign(renderer, this.mask, { order: this.order, count: this.selected.length, thinning: 0 });
     this.plainly(() => renderer.draw(reduced(camera, MASK_SHARE), settings, [0, 0, 0, 0]));
-    this.mask = { framebuffer: renderer.framebuffer, image: renderer.image, width: renderer.width, height: renderer.height };
+    this.mask = {
+      framebuffer: renderer.framebuffer,
+      image: renderer.image,
+      width: renderer.width,
+      height: renderer.height,
+    };
     Object.assign(renderer, { framebuffer, image, width, height, begun, order, count, thinning });
   }
 }

@@ -2,12 +2,15 @@
 //
 // Both sides compute with the float32 parameters as float64 numbers, by +, -, *, / and comparisons only, in the order
 // written here, so both find the same splats to the last one. NaN belongs to no region.
-"use strict";
+
+import { Cells, EditWork } from "./edit_cells.js";
+import { inFront } from "./edit_front.js";
+import { listMembers } from "./edit_near.js";
 
 const EDIT_NEAR = 0.05; // world units: splats at this camera depth or closer are not seen in a picture
 
 // Calls found(i, u, v, z) for every splat in front of a picture's camera: u = (fx x) / z + cx, v = (fy y) / z + cy.
-function eachSeen({ camera }, { count, means }, found) {
+export function eachSeen({ camera }, { count, means }, found) {
   const [ex, ey, ez] = camera.position;
   const [[r00, r01, r02], [r10, r11, r12], [r20, r21, r22]] = camera.rotation; // camera to world: columns are the axes
   const { fx, fy, cx, cy } = camera;
@@ -91,7 +94,7 @@ function brushMembers(region, values, work) {
   return inside;
 }
 
-function extent(numbers) {
+export function extent(numbers) {
   return numbers.reduce(([low, high], x) => [Math.min(low, x), Math.max(high, x)], [Infinity, -Infinity]);
 }
 
@@ -103,7 +106,7 @@ function everyMember({ count }, test) {
 }
 
 // |axis . (mean - centre)| <= half extent along each axis.
-function boxMembers({ center, rotation, half }, values) {
+export function boxMembers({ center, rotation, half }, values) {
   const { means } = values;
   const [cx, cy, cz] = center;
   const axes = [0, 1, 2].map((i) => rotation.map((row) => row[i]));
@@ -119,11 +122,11 @@ function boxMembers({ center, rotation, half }, values) {
 }
 
 const isBetween = (value, low, high) =>
-  value === value && (low === undefined || value >= low) && (high === undefined || value <= high);
+  !Number.isNaN(value) && (low === undefined || value >= low) && (high === undefined || value <= high);
 
 // Returns 1 for every splat of the region that a "select" describes. values: {count, means, log_scales, logits, sh0}.
 // work: counts one test for each splat, and those of the edges of a lasso and the segments of a stroke.
-function members(region, values, work = new EditWork()) {
+export function members(region, values, work = new EditWork()) {
   work.add(values.count);
   const { means, log_scales, logits, sh0 } = values;
   const { low, high } = region;
@@ -151,7 +154,7 @@ function members(region, values, work = new EditWork()) {
     case "color":
       return everyMember(values, (k) => [0, 1, 2].every((j) => isBetween(sh0[k + j], low[j], high[j])));
     case "opacity":
-      return everyMember(values, (k, i) => isBetween(logits[i], low, high));
+      return everyMember(values, (_k, i) => isBetween(logits[i], low, high));
     case "size":
       return everyMember(values, (k) =>
         isBetween(Math.max(Math.max(log_scales[k], log_scales[k + 1]), log_scales[k + 2]), low, high),

@@ -1,13 +1,21 @@
 // Moves and turns the selected splats: their state, as gsplat_edu/edits/moves.py computes it, and how the page draws it.
-"use strict";
 
-const EYE3 = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+import { dot, plus } from "./camera.js";
+import { element, nearestTexture } from "./common.js";
+import { SELECTED } from "./edit_flags.js";
+import { product3 } from "./edit_rotations.js";
+
+const EYE3 = [
+  [1, 0, 0],
+  [0, 1, 0],
+  [0, 0, 1],
+];
 const TURNS_ACROSS = 256; // rotations in a row of their texture
 
 // The centres and rotations of splats after the operations "move". Means change in place, in the order that docs/EDITS.md
 // states, so that later selections see the same numbers as the command. Rotations are only drawn; splats that were moved
 // together share one.
-class Motion {
+export class Motion {
   constructor({ count, means }) {
     this.means = means;
     this.opened = means.slice();
@@ -21,9 +29,17 @@ class Motion {
   apply({ rotation, translation: [tx, ty, tz], center: [cx, cy, cz] }, flags) {
     const at = placesOf(flags, SELECTED);
     const { means, turned } = this;
-    const record = { at, means: new Float32Array(3 * at.length), turned: new Uint32Array(at.length), turns: this.turns.length };
+    const record = {
+      at,
+      means: new Float32Array(3 * at.length),
+      turned: new Uint32Array(at.length),
+      turns: this.turns.length,
+    };
     record.bytes = 20 * at.length;
-    const step = { R: rotation, t: [0, 1, 2].map((i) => [cx, cy, cz][i] + [tx, ty, tz][i] - dot(rotation[i], [cx, cy, cz])) };
+    const step = {
+      R: rotation,
+      t: [0, 1, 2].map((i) => [cx, cy, cz][i] + [tx, ty, tz][i] - dot(rotation[i], [cx, cy, cz])),
+    };
     const [[r00, r01, r02], [r10, r11, r12], [r20, r21, r22]] = rotation;
     const next = new Map(); // indices of the rotations after this turn, by those before
     at.forEach((i, j) => {
@@ -74,7 +90,7 @@ const movedBy = (done, { R, t }) => ({ R: product3(R, done.R), t: [0, 1, 2].map(
 
 // What the moves of all splats that are left do together, {R, t}; and whether there were moves of some of them only. As
 // gsplat_edu/edits/apply.py computes it.
-function movedTogether({ motion }, flags) {
+export function movedTogether({ motion }, flags) {
   const left = new Set();
   if (motion) for (let i = 0; i < flags.length; ++i) if (flags[i] <= SELECTED) left.add(motion.turned[i]);
   const [first = [], ...others] = [...left].map((index) => motion.steps[index]);
@@ -94,12 +110,12 @@ function placesOf(flags, state) {
 }
 
 // The rotation of a splat since the scene was opened.
-function turnSince({ motion }, i) {
+export function turnSince({ motion }, i) {
   return motion ? motion.turns[motion.turned[i]] : EYE3;
 }
 
 // What the shader reads about moved splats: which rotation each has, the rotations, and the move under the pointer.
-class MotionTextures {
+export class MotionTextures {
   constructor(renderer) {
     const { gl, textures, textureWidth, facts } = renderer;
     Object.assign(this, { renderer, live: null, any: false, units: [textures.length + 3, textures.length + 4] }); // behind seen.js
@@ -167,7 +183,10 @@ class MotionTextures {
 
 // A box around the selected splats, as the handle moves it: `from` is its centre before. Null if there are none.
 function selectedBox({ count, means }, flags) {
-  const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+  const [low, high] = [
+    [Infinity, Infinity, Infinity],
+    [-Infinity, -Infinity, -Infinity],
+  ];
   for (let i = 0; i < count; ++i) {
     if (flags[i] !== SELECTED) continue;
     const mean = [means[3 * i], means[3 * i + 1], means[3 * i + 2]];
@@ -183,7 +202,7 @@ function selectedBox({ count, means }, flags) {
 const moveOf = ({ rotation: R, from, center }) => ({ R, t: [0, 1, 2].map((i) => center[i] - dot(R[i], from)) });
 
 // The tool that moves the selection; the splats, and the mesh with all of them, follow the handle while it is dragged, in their order before the move.
-class Mover {
+export class Mover {
   constructor(editor) {
     this.editor = editor;
     const { renderer } = editor.viewer;

@@ -1,5 +1,7 @@
 // Splats near those of a set, by a hash of cells: exactly as in gsplat_edu/edits/neighbours.py, which says why.
-"use strict";
+
+import { SELECTED } from "./edit_flags.js";
+import { MOST_SAMPLED, shortNumber } from "./edit_shapes.js";
 
 const HALF_CELLS = 1 << 16; // along each axis on either side of the median
 const WIDER_CELLS = 1.001; // side of a cell, in radii
@@ -63,7 +65,8 @@ function withinRadius({ count, means }, isJudged, isOther, radius, work) {
   const chosen = (wanted) => {
     const at = [];
     for (let i = 0, k = 0; i < count; ++i, k += 3) {
-      if (wanted(i) && Number.isFinite(means[k]) && Number.isFinite(means[k + 1]) && Number.isFinite(means[k + 2])) at.push(i);
+      if (wanted(i) && Number.isFinite(means[k]) && Number.isFinite(means[k + 1]) && Number.isFinite(means[k + 2]))
+        at.push(i);
     }
     return at;
   };
@@ -71,7 +74,10 @@ function withinRadius({ count, means }, isJudged, isOther, radius, work) {
   if (!judged.length || !others.length) return [];
   const hash = new CellHash(means, others, WIDER_CELLS * radius);
   const groups = [...hash.group(judged).values()].map((rows) => ({ rows, near: hash.around(rows[0]) }));
-  const pairs = groups.reduce((sum, { rows, near }) => sum + rows.length * near.reduce((n, list) => n + list.length, 0), 0);
+  const pairs = groups.reduce(
+    (sum, { rows, near }) => sum + rows.length * near.reduce((n, list) => n + list.length, 0),
+    0,
+  );
   if (pairs > MOST_PAIRS) {
     const number = (value) => value.toLocaleString("en");
     throw new Error(
@@ -97,13 +103,20 @@ function withinRadius({ count, means }, isJudged, isOther, radius, work) {
 }
 
 // Applies "grow" or "shrink" to the states, in place; throws an Error, before anything is changed, if it is too much.
-function applyNear({ op, radius }, values, flags, work) {
+export function applyNear({ op, radius }, values, flags, work) {
   const [from, to] = op === "grow" ? [0, SELECTED] : [SELECTED, 0];
-  for (const i of withinRadius(values, (i) => flags[i] === from, (i) => flags[i] === to, radius, work)) flags[i] = to;
+  for (const i of withinRadius(
+    values,
+    (i) => flags[i] === from,
+    (i) => flags[i] === to,
+    radius,
+    work,
+  ))
+    flags[i] = to;
 }
 
 // A radius for "grow" and "shrink" to begin with: a few times the median size of the splats, with two digits.
-function proposedRadius({ count, log_scales }) {
+export function proposedRadius({ count, log_scales }) {
   const every = Math.max(1, Math.floor(count / MOST_SAMPLED));
   const sizes = [];
   for (let i = 0; i < count; i += every) {
@@ -115,13 +128,13 @@ function proposedRadius({ count, log_scales }) {
 }
 
 // Whether a splat lies in runs of indices, [start, count, ...].
-function listMembers({ runs }, { count }) {
+export function listMembers({ runs }, { count }) {
   const inside = new Uint8Array(count);
   for (let k = 0; k < runs.length; k += 2) inside.fill(1, runs[k], runs[k] + runs[k + 1]);
   return inside;
 }
 
-const NEAR_PANEL = `
+export const NEAR_PANEL = `
 <p class="row" role="group" aria-label="neighbours"><label>radius <input id="edit-near" type="number" min="0" step="any"></label>
 <button data-do="grow" title=".: select also what lies within the radius of the selection">grow</button>
 <button data-do="shrink" title=",: deselect what lies within the radius of what is not selected">shrink</button></p>`;

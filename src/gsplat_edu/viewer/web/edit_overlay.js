@@ -1,10 +1,9 @@
 // Lines above the picture of a page: a canvas of their own.
-"use strict";
 
-const HANDLE = 7; // CSS pixels: radius of a dot to take hold of
+import { HANDLE, seenAt, seenLine } from "./edit_shapes.js";
 
 // Lines above the picture. Its methods take CSS pixels, or points of the scene.
-class Overlay {
+export class Overlay {
   constructor(viewer) {
     this.viewer = viewer;
     this.canvas = document.createElement("canvas");
@@ -21,7 +20,12 @@ class Overlay {
     const [across, down] = [Math.round(width * dense), Math.round(height * dense)];
     if (this.canvas.width !== across) this.canvas.width = across;
     if (this.canvas.height !== down) this.canvas.height = down;
-    Object.assign(this.canvas.style, { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${height}px` });
+    Object.assign(this.canvas.style, {
+      left: `${left}px`,
+      top: `${top}px`,
+      width: `${width}px`,
+      height: `${height}px`,
+    });
     this.camera = camera;
     this.scale = [across / camera.W, down / camera.H];
     this.dense = dense;
@@ -39,7 +43,10 @@ class Overlay {
     const { context, dense } = this;
     this.canvas.hidden = false;
     context.setLineDash(dashed ? [6 * dense, 4 * dense] : []);
-    for (const [width, style] of [[3.5, "#000a"], [1.5, color]]) {
+    for (const [width, style] of [
+      [3.5, "#000a"],
+      [1.5, color],
+    ]) {
       context.lineWidth = width * dense;
       context.strokeStyle = style;
       context.stroke();

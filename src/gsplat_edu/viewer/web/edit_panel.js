@@ -1,5 +1,17 @@
 // The editor's panel: tools, their options, the list of operations.
-"use strict";
+
+import { plus } from "./camera.js";
+import { element, refill } from "./common.js";
+import { EditFloaters, FLOATERS_PANEL } from "./edit_floaters.js";
+import { FRONT_ROW } from "./edit_front.js";
+import { numberFields } from "./edit_gizmo_panel.js";
+import { EditHistogram, HISTOGRAM_PANEL } from "./edit_histogram.js";
+import { LOOK_ROW } from "./edit_look.js";
+import { NEAR_PANEL, proposedRadius } from "./edit_near.js";
+import { POLYGON_ROW } from "./edit_polygon.js";
+import { length3, shortNumber } from "./edit_shapes.js";
+import { POINTS_OF } from "./edit_tools.js";
+import { TOUR_ROW } from "./edit_tour.js";
 
 const EDIT_PANEL = `
 <section id="edit" aria-label="editor">
@@ -154,7 +166,7 @@ const EDIT_APPLIES = {
   measure: "measure",
 };
 
-class EditPanel {
+export class EditPanel {
   constructor(editor) {
     this.editor = editor;
     document.body.insertAdjacentHTML("beforeend", EDIT_PANEL);
@@ -183,18 +195,18 @@ class EditPanel {
   listKeys() {
     const rows = [...this.root.querySelectorAll("[title]")].map(({ title }) => title.match(/^([^:]+): (.+)$/));
     const more = [
-      [, "Arrows", "move a cross in the picture; by single pixels with Shift"],
-      [, "Enter", "press at the cross, press again to release; then apply"],
-      [, "Space", "held: drags turn the view"],
-      [, "Escape", "drop what is drawn, then leave the tool"],
-      [, "[ ]", "size of the brush"],
-      [, "Shift X", "choose a part of the handle, which the arrows then move; finer with Shift"],
+      ["Arrows", "move a cross in the picture; by single pixels with Shift"],
+      ["Enter", "press at the cross, press again to release; then apply"],
+      ["Space", "held: drags turn the view"],
+      ["Escape", "drop what is drawn, then leave the tool"],
+      ["[ ]", "size of the brush"],
+      ["Shift X", "choose a part of the handle, which the arrows then move; finer with Shift"],
     ];
     const heading = document.createElement("h2");
     heading.textContent = "Editor";
     const table = document.createElement("table");
     heading.className = table.className = "mouse"; // not on a device that has only a touch screen
-    for (const [, key, what] of [...rows.filter(Boolean), ...more]) {
+    for (const [key, what] of [...rows.filter(Boolean).map((row) => row.slice(1)), ...more]) {
       const row = table.insertRow();
       row.insertCell().textContent = key;
       row.insertCell().textContent = what;
@@ -216,7 +228,8 @@ class EditPanel {
     else if (look) editor.look.choose(look);
     else if (button.dataset.do) this.act(button.dataset.do);
     // a disabled button loses the focus
-    if (button.disabled && document.activeElement !== editor.viewer.canvas) [this.button("undo"), this.button("redo"), this.button("all")].find((one) => !one.disabled).focus();
+    if (button.disabled && document.activeElement !== editor.viewer.canvas)
+      [this.button("undo"), this.button("redo"), this.button("all")].find((one) => !one.disabled).focus();
   }
 
   act(name) {
@@ -261,7 +274,9 @@ class EditPanel {
   // Whether Enter applies something chosen before.
   get ready() {
     const { tool, shape, apart } = this.editor.tools;
-    return Boolean({ sphere: shape, box: shape, move: this.editor.mover.moved, color: true, scale: apart, measure: apart }[tool]);
+    return Boolean(
+      { sphere: shape, box: shape, move: this.editor.mover.moved, color: true, scale: apart, measure: apart }[tool],
+    );
   }
 
   apply() {
@@ -338,7 +353,11 @@ class EditPanel {
 
   showCounts({ all, selected, hidden, deleted }) {
     const number = (value) => value.toLocaleString("en");
-    const parts = [`${number(selected)} selected`, hidden && `${number(hidden)} hidden`, `${number(all - hidden - deleted)} of ${number(all)} left`];
+    const parts = [
+      `${number(selected)} selected`,
+      hidden && `${number(hidden)} hidden`,
+      `${number(all - hidden - deleted)} of ${number(all)} left`,
+    ];
     element("edit-count").textContent = parts.filter(Boolean).join(" · ");
     for (const name of ["delete", "hide", "grow", "shrink"]) this.button(name).disabled = !selected;
     this.button("show").disabled = !hidden;

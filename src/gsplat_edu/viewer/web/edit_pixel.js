@@ -1,5 +1,11 @@
 // What is at one pixel, found by the processor: a click need not wait until the pictures before it are drawn.
-"use strict";
+
+import { cross, dot, plus, ratioBounds } from "./camera.js";
+import { SOLID } from "./draw.js";
+import { SELECTED } from "./edit_flags.js";
+import { turnSince } from "./edit_move.js";
+import { product3 } from "./edit_rotations.js";
+import { length3, rotated } from "./edit_shapes.js";
 
 const DEVIATIONS = 3.4; // beyond these, a splat of any opacity is below 1/255
 
@@ -11,7 +17,7 @@ function shaderConstant(name) {
 
 // The splats that may cover a part of the picture, near to far, as {i, depth, u, v, reach}: those whose reach from their
 // centre, which is overestimated, touches it.
-function splatsWithin({ count, means, log_scales }, flags, camera, [u0, v0, u1, v1], near) {
+export function splatsWithin({ count, means, log_scales }, flags, camera, [u0, v0, u1, v1], near) {
   const found = [];
   const { R, eye, fx, fy, cx, cy } = camera;
   const focal = Math.max(fx, fy);
@@ -31,29 +37,35 @@ function splatsWithin({ count, means, log_scales }, flags, camera, [u0, v0, u1, 
 }
 
 // The splats that may cover a pixel, far to near.
-function splatsAt(values, flags, camera, column, row, near) {
+export function splatsAt(values, flags, camera, column, row, near) {
   const found = splatsWithin(values, flags, camera, [column, row, column, row], near);
   return Uint32Array.from(found.reverse(), ({ i }) => i);
 }
 
 // What a splat covers, as in splat.vert.glsl: centre, half extents and inverse covariance in the picture, opacity, camera
 // depth, and its standard deviation in depth; null if it is not drawn. bounds: of x/z and y/z in the Jacobian.
-function footprintOf(values, i, camera, bounds, antialiased) {
+export function footprintOf(values, i, camera, bounds, antialiased) {
   const { means, log_scales, quats, logits } = values;
   footprintOf.constants ??= ["DILATION", "ALPHA_MIN", "DET_FLOOR"].map(shaderConstant);
   const [DILATION, LEAST, FLOOR] = footprintOf.constants;
   const { R, eye, fx, fy, cx, cy } = camera;
-  const [x, y, z] = rotated(R, [0, 1, 2].map((j) => means[3 * i + j] - eye[j]));
+  const [x, y, z] = rotated(
+    R,
+    [0, 1, 2].map((j) => means[3 * i + j] - eye[j]),
+  );
   if (Math.abs(x) > bounds.widest[0] * z || Math.abs(y) > bounds.widest[1] * z) return null;
   const q = [0, 1, 2, 3].map((j) => quats[4 * i + j]);
   const norm = Math.hypot(...q);
   if (!norm) return null;
   const turn = product3(turnSince(values, i), matrixOf(q.map((value) => value / norm)));
   const scales = [0, 1, 2].map((j) => Math.exp(log_scales[3 * i + j]));
-  const along = (axis) => scales.map((scale, k) => scale * (axis[0] * turn[0][k] + axis[1] * turn[1][k] + axis[2] * turn[2][k]));
+  const along = (axis) =>
+    scales.map((scale, k) => scale * (axis[0] * turn[0][k] + axis[1] * turn[1][k] + axis[2] * turn[2][k]));
   const ratio = [x / z, y / z].map((value, j) => Math.min(Math.max(value, bounds.low[j]), bounds.high[j]));
   // rows of J W R S
-  const [row0, row1] = [fx, fy].map((focal, j) => along(plus(R[j], R[2], -ratio[j]).map((value) => (value * focal) / z)));
+  const [row0, row1] = [fx, fy].map((focal, j) =>
+    along(plus(R[j], R[2], -ratio[j]).map((value) => (value * focal) / z)),
+  );
   const [a0, b, c0] = [dot(row0, row0), dot(row0, row1), dot(row1, row1)];
   const normal = cross(row0, row1);
   const det0 = dot(normal, normal);
@@ -79,7 +91,7 @@ function footprintOf(values, i, camera, bounds, antialiased) {
 }
 
 // Alpha of a footprint at a place of the picture, as in splat.frag.glsl.
-function alphaAt({ u, v, conicA, conicB, conicC, opacity, level }, column, row) {
+export function alphaAt({ u, v, conicA, conicB, conicC, opacity, level }, column, row) {
   alphaAt.constants ??= ["ALPHA_MIN", "ALPHA_MAX"].map(shaderConstant);
   const dx = column - u;
   const dy = row - v;
@@ -100,7 +112,7 @@ function matrixOf([w, x, y, z]) {
 
 // Camera depth of the visible surface at a pixel, as Renderer.surface finds it by drawing: where half of the pixel's
 // opacity is reached; null if there is little.
-function depthAtPixel(values, flags, camera, settings, column, row, near) {
+export function depthAtPixel(values, flags, camera, settings, column, row, near) {
   const bounds = ratioBounds(camera, settings);
   const reached = []; // opacity up to each splat, near to far
   let clear = 1;

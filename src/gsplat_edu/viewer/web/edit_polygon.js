@@ -1,15 +1,16 @@
 // The polygon tool: corner after corner by clicks, taps or the keyboard's cross; it selects as a lasso does.
-"use strict";
+
+import { LEAST_DRAG, MOST_STROKE, pictureOf } from "./edit_shapes.js";
 
 const CLOSES = 10; // CSS pixels from the first corner within which a click closes the polygon
 const CLOSES_FINGER = 22; // the same for a finger
 const LEAST_CORNERS = 3;
 
-const POLYGON_ROW = `
+export const POLYGON_ROW = `
 <p class="row" data-for="polygon"><button data-do="close-polygon" title="Enter">close</button>
 <button data-do="corner-back" title="Backspace: take the last corner of a polygon back">take back</button></p>`;
 
-class EditPolygon {
+export class EditPolygon {
   constructor(tools) {
     Object.assign(this, { tools, corners: [], camera: null });
   }
@@ -23,7 +24,10 @@ class EditPolygon {
     const { corners } = this;
     const apart = (corner) => (corner ? Math.hypot(corner.x - at.x, corner.y - at.y) : Infinity);
     const again = apart(corners.at(-1)) < LEAST_DRAG;
-    if (this.canClose && (again || apart(corners[0]) <= (matchMedia("(pointer: coarse)").matches ? CLOSES_FINGER : CLOSES))) {
+    if (
+      this.canClose &&
+      (again || apart(corners[0]) <= (matchMedia("(pointer: coarse)").matches ? CLOSES_FINGER : CLOSES))
+    ) {
       this.close(how);
     } else if (!again && corners.length < MOST_STROKE) {
       if (!corners.length) this.camera = camera;
@@ -88,7 +92,3 @@ class EditPolygon {
     for (const [i, corner] of corners.entries()) overlay.circle(corner, (i ? 3 : 6) * tools.perPixel, "#fff");
   }
 }
-
-EditTools.prototype.polygonEnds = function (stroke, how) {
-  this.polygon.click(stroke, how);
-};

@@ -1,32 +1,39 @@
 // Geometry of the editor: cameras, boxes and lines as an edits file describes them.
-"use strict";
 
-const EDIT_UP = [0, -1, 0]; // the world's up direction
+import { cross, dot, plus, transposed } from "./camera.js";
+import { SELECTED } from "./edit_flags.js";
+import { unit } from "./region.js";
+
+export const EDIT_UP = [0, -1, 0]; // the world's up direction
 const [BOX_LOW, BOX_HIGH] = [0.02, 0.98]; // quantiles of the splats that a new box encloses
-const MOST_SAMPLED = 20000; // splats that these are taken from
-const CIRCLE = 48; // corners of a drawn circle
+export const MOST_SAMPLED = 20000; // splats that these are taken from
+export const CIRCLE = 48; // corners of a drawn circle
+export const HANDLE = 7; // CSS pixels: radius of a dot to take hold of
+export const LEAST_DRAG = 3; // CSS pixels; a shorter drag is a click
+export const MOST_STROKE = 20000; // points of a stroke, as in an edits file
 
-const rotated = (rows, vector) => rows.map((row) => dot(row, vector)); // rows of a matrix times a vector
-const length3 = (a) => Math.hypot(...a);
+export const rotated = (rows, vector) => rows.map((row) => dot(row, vector)); // rows of a matrix times a vector
+export const hundredths = (x) => Math.round(x * 100) / 100;
+export const length3 = (a) => Math.hypot(...a);
 
 // The camera of a picture as a "select" stores it.
-function pictureOf({ R, eye, fx, fy, cx, cy, W, H }) {
+export function pictureOf({ R, eye, fx, fy, cx, cy, W, H }) {
   return { position: [...eye], rotation: transposed(R), fx, fy, cx, cy, width: W, height: H };
 }
 
 // A view as "start" and "view" store it.
-function storedView({ R, eye, H, fy }) {
+export function storedView({ R, eye, H, fy }) {
   return { position: [...eye], rotation: transposed(R), fov: (2 * Math.atan((0.5 * H) / fy) * 180) / Math.PI };
 }
 
 // Column and row at which a camera sees a point, and its depth.
-function seenAt(camera, point) {
+export function seenAt(camera, point) {
   const [x, y, z] = rotated(camera.R, plus(point, camera.eye, -1));
   return { u: (camera.fx * x) / z + camera.cx, v: (camera.fy * y) / z + camera.cy, depth: z };
 }
 
 // The part of a line in front of the camera, as two pixels; null if there is none.
-function seenLine(camera, a, b, near) {
+export function seenLine(camera, a, b, near) {
   const [za, zb] = [a, b].map((point) => dot(camera.R[2], plus(point, camera.eye, -1)));
   if (!(za > near || zb > near)) return null;
   const cut = (from, to, zFrom, zTo) =>
@@ -35,16 +42,25 @@ function seenLine(camera, a, b, near) {
 }
 
 // Normal of the plane through three points, of length 1, counterclockwise as seen from its side.
-function normalOf([a, b, c]) {
+export function normalOf([a, b, c]) {
   return unit(cross(plus(b, a, -1), plus(c, a, -1)));
 }
 
 // Shortest rotation from one direction to another; both of length 1. Opposite ones turn about the x axis.
 function shortestTurn(from, to) {
   const cosine = dot(from, to);
-  if (cosine < -1 + 1e-9) return [[1, 0, 0], [0, -1, 0], [0, 0, -1]];
+  if (cosine < -1 + 1e-9)
+    return [
+      [1, 0, 0],
+      [0, -1, 0],
+      [0, 0, -1],
+    ];
   const v = cross(from, to);
-  const across = [[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]];
+  const across = [
+    [0, -v[2], v[1]],
+    [v[2], 0, -v[0]],
+    [-v[1], v[0], 0],
+  ];
   return across.map((row, i) =>
     row.map((value, j) => {
       const square = row.reduce((sum, x, k) => sum + x * across[k][j], 0);
@@ -54,21 +70,20 @@ function shortestTurn(from, to) {
 }
 
 // Axes of a box that stands upright, as columns.
-function uprightAxes(up) {
+export function uprightAxes(up) {
   return transposed(shortestTurn(up, EDIT_UP));
 }
 
-const axesOf = ({ rotation }) => transposed(rotation);
-
 // A box around most of the splats that are there.
-function boxAround({ count, means }, flags, up) {
+export function boxAround({ count, means }, flags, up) {
   const rotation = uprightAxes(up);
   const axes = transposed(rotation);
   const places = [[], [], []];
   const every = Math.max(1, Math.floor(count / MOST_SAMPLED));
   for (let i = 0; i < count; i += every) {
     const point = [means[3 * i], means[3 * i + 1], means[3 * i + 2]];
-    if (flags[i] <= SELECTED && point.every(Number.isFinite)) axes.forEach((axis, j) => places[j].push(dot(axis, point)));
+    if (flags[i] <= SELECTED && point.every(Number.isFinite))
+      axes.forEach((axis, j) => places[j].push(dot(axis, point)));
   }
   if (!places[0].length) return { center: [0, 0, 0], rotation, half: [1, 1, 1] };
   const ends = places.map((list) => {
@@ -81,7 +96,7 @@ function boxAround({ count, means }, flags, up) {
 }
 
 // Corners and edges of a box.
-function boxLines({ center, rotation, half }) {
+export function boxLines({ center, rotation, half }) {
   const axes = transposed(rotation);
   const corner = (k) => axes.reduce((at, axis, j) => plus(at, axis, k & (1 << j) ? half[j] : -half[j]), center);
   const lines = [];
@@ -90,7 +105,7 @@ function boxLines({ center, rotation, half }) {
 }
 
 // The middle of each side of a box, with its axis and direction.
-function boxHandles({ center, rotation, half }) {
+export function boxHandles({ center, rotation, half }) {
   return transposed(rotation).flatMap((axis, j) =>
     [-1, 1].map((side) => ({ axis: j, side, direction: axis, point: plus(center, axis, side * half[j]) })),
   );
@@ -105,7 +120,7 @@ function withSideMoved(box, { axis, side, direction }, by) {
 }
 
 // The side of a box whose dot a stroke begins on; null if there is none.
-function sideAt(box, { camera, began }, perPixel, near) {
+export function sideAt(box, { camera, began }, perPixel, near) {
   const apart = ({ point }) => {
     const { u, v, depth } = seenAt(camera, point);
     return depth > near ? Math.hypot(u - began.u, v - began.v) / perPixel : Infinity;
@@ -116,7 +131,7 @@ function sideAt(box, { camera, began }, perPixel, near) {
 
 // The box of a stroke after one of its sides was dragged, by the pixels along the side's axis as it is seen; null along
 // the line of sight. `distance` is that of the view from its pivot.
-function sideDragged({ box, handle, camera, began, at }, distance) {
+export function sideDragged({ box, handle, camera, began, at }, distance) {
   const step = 1e-3 * distance;
   const [from, to] = [handle.point, plus(handle.point, handle.direction, step)].map((point) => seenAt(camera, point));
   const axis = [to.u - from.u, to.v - from.v];
@@ -127,9 +142,13 @@ function sideDragged({ box, handle, camera, began, at }, distance) {
 }
 
 // Three circles around a sphere, along the axes of the view.
-function sphereLines({ center, radius }, R) {
+export function sphereLines({ center, radius }, R) {
   const lines = [];
-  for (const [a, b] of [[0, 1], [1, 2], [0, 2]]) {
+  for (const [a, b] of [
+    [0, 1],
+    [1, 2],
+    [0, 2],
+  ]) {
     const at = (i) => {
       const angle = (2 * Math.PI * i) / CIRCLE;
       return plus(plus(center, R[a], radius * Math.cos(angle)), R[b], radius * Math.sin(angle));
@@ -140,7 +159,7 @@ function sphereLines({ center, radius }, R) {
 }
 
 // Turns a camera about its line of sight until its picture is level.
-function levelled(camera, up) {
+export function levelled(camera, up) {
   const forward = camera.R[2];
   const right = cross(forward, up);
   if (length3(right) < 1e-3) return camera;
@@ -149,7 +168,7 @@ function levelled(camera, up) {
 }
 
 // A number as text, short.
-function shortNumber(value) {
+export function shortNumber(value) {
   if (value === 0) return "0";
   const size = Math.abs(value);
   return size >= 1e5 || size < 1e-3 ? value.toExponential(2) : String(Number(value.toPrecision(4)));

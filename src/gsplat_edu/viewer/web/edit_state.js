@@ -1,11 +1,15 @@
 // The state of every splat after a list of operations, as gsplat_edu/edits/apply.py computes it, with undo and redo.
-"use strict";
 
-const [SELECTED, HIDDEN, DELETED] = [1, 2, 4]; // at most one at a time; 0 is a splat that is merely there
+import { EditWork } from "./edit_cells.js";
+import { DELETED, HIDDEN, SELECTED } from "./edit_flags.js";
+import { boxMembers, members } from "./edit_member.js";
+import { Motion } from "./edit_move.js";
+import { applyNear } from "./edit_near.js";
+
 const UNDO_BYTES = 128 << 20; // changes remembered for undo; older operations are undone by repeating those before
 
 // Applies one operation to the states, in place; returns what undoes a move of splats. Throws an Error, before anything is changed, if the work is too much.
-function applyOperation(operation, values, flags, work) {
+export function applyOperation(operation, values, flags, work) {
   const change = (next) => {
     if (operation.op !== "crop") work.add(flags.length);
     for (let i = 0; i < flags.length; ++i) flags[i] = next(flags[i], i);
@@ -48,7 +52,7 @@ function applySelect(how, inside, flags) {
   }
 }
 
-class EditHistory {
+export class EditHistory {
   // values: as for members(). operations: those of the opened file.
   constructor(values, operations) {
     this.values = values;
@@ -86,7 +90,12 @@ class EditHistory {
   remember(before, moved = null) {
     let count = 0;
     for (let i = 0; i < before.length; ++i) if (before[i] !== this.flags[i]) ++count;
-    const change = { at: new Uint32Array(count), was: new Uint8Array(count), moved, bytes: 5 * count + (moved?.bytes ?? 0) };
+    const change = {
+      at: new Uint32Array(count),
+      was: new Uint8Array(count),
+      moved,
+      bytes: 5 * count + (moved?.bytes ?? 0),
+    };
     for (let i = 0, j = 0; j < count; ++i) {
       if (before[i] === this.flags[i]) continue;
       change.at[j] = i;

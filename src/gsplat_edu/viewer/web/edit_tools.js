@@ -1,17 +1,31 @@
 // The editor's tools: what pointers and keys in the picture do.
-"use strict";
+
+import { plus, pointAt } from "./camera.js";
+import { frontOf } from "./edit_front.js";
+import { CURSOR_STEP, Gizmo } from "./edit_gizmo.js";
+import { depthAtPixel } from "./edit_pixel.js";
+import { EditPolygon } from "./edit_polygon.js";
+import {
+  boxAround,
+  boxHandles,
+  boxLines,
+  hundredths,
+  LEAST_DRAG,
+  length3,
+  MOST_STROKE,
+  pictureOf,
+  sideAt,
+  sideDragged,
+  sphereLines,
+  uprightAxes,
+} from "./edit_shapes.js";
 
 const LONG_FRONT = 50000; // splats from which the measure of a visible surface is announced
-const EDIT_TOOLS = ["navigate", "rectangle", "lasso", "polygon", "brush", "sphere", "box", "move", "color", "floor", "scale", "measure"];
-const POINTS_OF = { floor: 3, scale: 2, measure: 2 }; // points that a tool takes from the surface
+export const POINTS_OF = { floor: 3, scale: 2, measure: 2 }; // points that a tool takes from the surface
 const LEAST_STEP = 2; // CSS pixels between the points of a stroke
-const LEAST_DRAG = 3; // CSS pixels; a shorter drag is a click
-const MOST_STROKE = 20000; // points of a stroke, as in an edits file
 const CLICKED_SIZE = 0.15; // of the distance to the pivot: radius of a sphere that was only clicked
 
-const hundredths = (x) => Math.round(x * 100) / 100;
-
-class EditTools {
+export class EditTools {
   constructor(editor) {
     Object.assign(this, { editor, viewer: editor.viewer, tool: "navigate", stroke: null, shape: null, points: [] });
     this.gizmo = new Gizmo(this);
@@ -192,6 +206,10 @@ class EditTools {
     if (points.length > 2) this.select(how, { by: "lasso", camera: pictureOf(camera), points }, camera);
   }
 
+  polygonEnds(stroke, how) {
+    this.polygon.click(stroke, how);
+  }
+
   brushEnds({ camera, points }, how) {
     const radius = hundredths(this.editor.radius * this.perPixel);
     this.select(how, { by: "brush", camera: pictureOf(camera), radius, points }, camera);
@@ -205,7 +223,9 @@ class EditTools {
       this.editor.say("");
       return { point: pointAt(camera, u, v, onMesh), depth: onMesh };
     }
-    const [column, row] = [Math.round(u), Math.round(v)].map((x, i) => Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1));
+    const [column, row] = [Math.round(u), Math.round(v)].map((x, i) =>
+      Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1),
+    );
     const depth = this.depthAt(camera, column, row);
     this.editor.say(depth === null ? "There is nothing at that point; choose one on the scene." : "");
     return depth === null ? null : { point: pointAt(camera, u, v, depth), depth };
@@ -298,15 +318,33 @@ class EditTools {
       const { began: a, at: b } = stroke;
       overlay.polyline([a, { u: b.u, v: a.v }, b, { u: a.u, v: b.v }], true);
     }
-    if (stroke && tool === "lasso") overlay.polyline([...stroke.points, [stroke.at.u, stroke.at.v]].map(([u, v]) => ({ u, v })), true);
-    if (stroke && tool === "brush") overlay.band(stroke.points.map(([u, v]) => ({ u, v })), radius);
+    if (stroke && tool === "lasso")
+      overlay.polyline(
+        [...stroke.points, [stroke.at.u, stroke.at.v]].map(([u, v]) => ({ u, v })),
+        true,
+      );
+    if (stroke && tool === "brush")
+      overlay.band(
+        stroke.points.map(([u, v]) => ({ u, v })),
+        radius,
+      );
     this.polygon.draw(overlay);
     if (tool === "brush" && (stroke?.at || this.hover)) overlay.circle(stroke?.at ?? this.hover, radius);
     if (this.cursor) {
       const at = this.pointOf(overlay.camera, this.cursor.x, this.cursor.y);
       const arm = 12 * this.perPixel;
-      for (const [du, dv] of [[arm, 0], [0, arm]]) {
-        overlay.polyline([{ u: at.u - du, v: at.v - dv }, { u: at.u + du, v: at.v + dv }], false, "#fff");
+      for (const [du, dv] of [
+        [arm, 0],
+        [0, arm],
+      ]) {
+        overlay.polyline(
+          [
+            { u: at.u - du, v: at.v - dv },
+            { u: at.u + du, v: at.v + dv },
+          ],
+          false,
+          "#fff",
+        );
       }
     }
   }
@@ -325,7 +363,8 @@ class EditTools {
     if (key.startsWith("Arrow") && target.closest?.("#strip")) return; // they move a view, or the playhead
     const onButton = target.closest?.("button, summary, a");
     if (code === "Space" && !onButton) this.space = true;
-    else if (key.startsWith("Arrow") && this.tool !== "navigate" && (!onButton || this.gizmo.chosen)) this.moveCursor(event);
+    else if (key.startsWith("Arrow") && this.tool !== "navigate" && (!onButton || this.gizmo.chosen))
+      this.moveCursor(event);
     else if (key === "Enter" && !onButton && this.tool !== "navigate") this.enter(event);
     else if (key === "Escape") this.escape();
     else if (key === "Backspace" && this.polygon.back()) this.cursorMoved = true;

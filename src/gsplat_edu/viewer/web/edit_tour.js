@@ -1,10 +1,13 @@
 // The order of the named views, and the guided tour as a visitor of the exported page walks through it.
-"use strict";
 
-const TOUR_ROW = `
+import { element } from "./common.js";
+import { Guide } from "./guide.js";
+import { readKeyframe } from "./keyframes.js";
+
+export const TOUR_ROW = `
 <p class="row"><button data-do="tour" aria-pressed="false" title="Walk through the guided tour as a visitor does; ← → are its steps, Escape ends it">preview the tour</button></p>`;
 
-class EditTour {
+export class EditTour {
   constructor(editor) {
     const { viewer, panel } = editor;
     Object.assign(this, { editor, viewer });
@@ -17,7 +20,12 @@ class EditTour {
     const { guide, viewer } = this;
     const named = [...views.named.values()].filter(({ text }) => text);
     const at = guide.steps[guide.at]?.name;
-    guide.steps = named.map((view) => ({ name: view.name, text: view.text, camera: viewer.keyframes.camera(readKeyframe(view)), index: -1 }));
+    guide.steps = named.map((view) => ({
+      name: view.name,
+      text: view.text,
+      camera: viewer.keyframes.camera(readKeyframe(view)),
+      index: -1,
+    }));
     guide.button.textContent = `preview the tour (${named.length})`;
     guide.button.disabled = !named.length;
     if (!guide.on) return;
@@ -36,7 +44,10 @@ class EditTour {
   // Buttons that move a view within the list of names.
   buttons(name, names, button) {
     const at = names.indexOf(name);
-    return [["↑", "earlier", -1], ["↓", "later", 1]].map(([sign, when, by]) => {
+    return [
+      ["↑", "earlier", -1],
+      ["↓", "later", 1],
+    ].map(([sign, when, by]) => {
       const made = button(sign, `${name} ${when}`, () => this.move(names, at, by, when));
       made.dataset.order = `${when} ${name}`;
       made.setAttribute("aria-disabled", names[at + by] === undefined);

@@ -1,11 +1,10 @@
 // A smooth movement of the view from one camera to another.
-"use strict";
+
+import { mixedStates, rotationOf, statesOf } from "./path.js";
 
 const FLIGHT = 900; // milliseconds
 
-const STILL_PREFERRED = matchMedia("(prefers-reduced-motion: reduce)"); // the view then jumps
-
-class Flight {
+export class Flight {
   constructor(from, to) {
     this.to = to;
     const stateOf = ({ R, eye, fy, H }) => ({ R, eye, fov: (2 * Math.atan((0.5 * H) / fy) * 180) / Math.PI });

@@ -1,12 +1,17 @@
 // The capture's cameras over the scene: outlines of what they see, at a fixed depth. Those of held-out photos are dashed.
-"use strict";
+
+import { dot, plus, pointAt } from "./camera.js";
+import { element } from "./common.js";
 
 const OUTLINE_SHARE = 0.06; // depth of an outline, of the distance from the start view to the pivot
 const OUTLINE_NEAR = 1e-3; // of that depth: lines are cut this close to the eye
-const OUTLINE_COLORS = [["#000a", 3.5], ["#58c7ff", 1.5]]; // each line is drawn in all of them, widths in px
+const OUTLINE_COLORS = [
+  ["#000a", 3.5],
+  ["#58c7ff", 1.5],
+]; // each line is drawn in all of them, widths in px
 const HELD_OUT = "#ffb54a";
 
-class Frustums {
+export class Frustums {
   constructor(viewer) {
     const { cameras, start } = viewer.facts;
     this.list = cameras.filter(({ saved }) => !saved);
@@ -23,8 +28,16 @@ class Frustums {
   // The ends of a camera's lines in the world: from its centre to the corners of its image, and around the image.
   lines(camera) {
     const { W, H } = camera;
-    const corners = [[-0.5, -0.5], [W - 0.5, -0.5], [W - 0.5, H - 0.5], [-0.5, H - 0.5]].map(([u, v]) => pointAt(camera, u, v, this.depth));
-    return corners.flatMap((corner, i) => [[camera.eye, corner], [corner, corners[(i + 1) % 4]]]);
+    const corners = [
+      [-0.5, -0.5],
+      [W - 0.5, -0.5],
+      [W - 0.5, H - 0.5],
+      [-0.5, H - 0.5],
+    ].map(([u, v]) => pointAt(camera, u, v, this.depth));
+    return corners.flatMap((corner, i) => [
+      [camera.eye, corner],
+      [corner, corners[(i + 1) % 4]],
+    ]);
   }
 
   // A line as a camera sees it: [u, v, u, v] in px, cut in front of the eye; null behind it.
@@ -32,7 +45,8 @@ class Frustums {
     const near = OUTLINE_NEAR * this.depth;
     const [p, q] = [a, b].map((point) => R.map((row) => dot(row, plus(point, eye, -1))));
     if (p[2] <= near && q[2] <= near) return null;
-    const cut = (from, to) => (from[2] > near ? from : plus(from, plus(to, from, -1), (near - from[2]) / (to[2] - from[2])));
+    const cut = (from, to) =>
+      from[2] > near ? from : plus(from, plus(to, from, -1), (near - from[2]) / (to[2] - from[2]));
     return [cut(p, q), cut(q, p)].flatMap(([x, y, z]) => [(fx * x) / z + cx, (fy * y) / z + cy]);
   }
 
@@ -45,7 +59,8 @@ class Frustums {
     const paths = [false, true].map((held) => {
       const path = new Path2D();
       for (const camera of this.list) {
-        if (Boolean(camera.held_out) !== held || Math.hypot(...plus(camera.eye, shown.eye, -1)) < 0.1 * this.depth) continue;
+        if (Boolean(camera.held_out) !== held || Math.hypot(...plus(camera.eye, shown.eye, -1)) < 0.1 * this.depth)
+          continue;
         for (const line of this.lines(camera)) {
           const ends = this.seen(line, shown);
           if (!ends) continue;

@@ -1,13 +1,17 @@
 // The guided tour: the author's named views that have a text, one after the other.
-"use strict";
+
+import { element } from "./common.js";
+import { offer } from "./seen.js";
 
 const SWIPE = 40; // least pixels to the side
 
-class Guide {
+export class Guide {
   // The tour of a page; null if no view has a text. An editor makes its own.
   static of(viewer) {
     const { cameras, edit } = viewer.facts;
-    const steps = cameras.map((camera, index) => ({ name: camera.name, text: camera.text, camera, index })).filter(({ text }) => text);
+    const steps = cameras
+      .map((camera, index) => ({ name: camera.name, text: camera.text, camera, index }))
+      .filter(({ text }) => text);
     if (edit || !steps.length) return null;
     offer(element("tour"));
     element("tour").textContent = `guided tour (${steps.length})`;
@@ -26,7 +30,10 @@ class Guide {
       button.checkVisibility() ? button.focus() : viewer.canvas.focus();
     });
     const card = element("guide");
-    card.addEventListener("pointerdown", ({ pointerType, clientX }) => (this.touched = pointerType === "touch" ? clientX : null));
+    card.addEventListener(
+      "pointerdown",
+      ({ pointerType, clientX }) => (this.touched = pointerType === "touch" ? clientX : null),
+    );
     card.addEventListener("pointerup", ({ clientX }) => {
       const by = this.touched === null ? 0 : clientX - this.touched;
       this.touched = null;

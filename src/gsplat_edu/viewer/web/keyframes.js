@@ -1,13 +1,22 @@
 // The camera path of the page: views that the user saves, or the path that came with the page.
-"use strict";
 
-class Keyframes {
+import { plus, radians, transposed } from "./camera.js";
+import { element, refill } from "./common.js";
+import { PathCurve } from "./path.js";
+import { restOf, Timeline } from "./timeline.js";
+
+export class Keyframes {
   // actions: view() for the current camera, goToView(camera), playPath() to start or stop, pathChanged().
   constructor(facts, actions) {
     Object.assign(this, { facts, actions });
     const { loop, duration = null, ease = null, keyframes } = facts.path ?? { loop: false, keyframes: [] };
     // a visitor removes none of the author's views
-    this.path = { loop, duration, ease, keyframes: keyframes.map((entry) => ({ ...readKeyframe(entry), given: Boolean(facts.shared) })) };
+    this.path = {
+      loop,
+      duration,
+      ease,
+      keyframes: keyframes.map((entry) => ({ ...readKeyframe(entry), given: Boolean(facts.shared) })),
+    };
     this.timeline = new Timeline(this);
     element("save-view").addEventListener("click", () => this.save());
     element("play").addEventListener("click", () => actions.playPath());
@@ -21,7 +30,8 @@ class Keyframes {
     const { keyframes } = this.path;
     const view = this.current();
     const [first, last] = [keyframes[0], keyframes[keyframes.length - 1]];
-    if (last?.time !== undefined) view.time = last.time + restOf(last) + (last.time - first.time) / (keyframes.length - 1);
+    if (last?.time !== undefined)
+      view.time = last.time + restOf(last) + (last.time - first.time) / (keyframes.length - 1);
     this.edited({ keyframes: [...keyframes, view] });
     element("path").open = true;
   }
@@ -59,9 +69,13 @@ class Keyframes {
     const [first, last] = [keyframes[0], keyframes[keyframes.length - 1]];
     const segments = (of) => of.keyframes.length - (of.loop ? 0 : 1);
     if (last?.time === undefined) {
-      const pace = this.path.keyframes[0]?.time === undefined && segments(this.path) > 0 ? this.path.duration / segments(this.path) : 0;
+      const pace =
+        this.path.keyframes[0]?.time === undefined && segments(this.path) > 0
+          ? this.path.duration / segments(this.path)
+          : 0;
       path.duration = pace * segments(path) || null;
-    } else if (loop) path.duration = last.time + restOf(last) - first.time + (last.time - first.time) / (keyframes.length - 1);
+    } else if (loop)
+      path.duration = last.time + restOf(last) - first.time + (last.time - first.time) / (keyframes.length - 1);
     return path;
   }
 
@@ -136,6 +150,6 @@ class Keyframes {
   }
 }
 
-function readKeyframe({ position, rotation, fov, time, hold }) {
+export function readKeyframe({ position, rotation, fov, time, hold }) {
   return { eye: position, R: transposed(rotation), fov, time, hold };
 }

@@ -3,7 +3,10 @@
 //
 // A new level is written beside the old one, sorted, and only then shown in its place. So a picture is complete at any
 // time, and at most `budget` splats are drawn. Memory for one more batch is reserved.
-"use strict";
+
+import { dot } from "./camera.js";
+import { element, fail } from "./common.js";
+import { Sorter } from "./sorter.js";
 
 const SLOT = 32; // splats per piece of texture memory
 const BATCH = 65536; // most splats that are decoded and sorted at once, unless a run has more
@@ -13,14 +16,14 @@ const USUAL = 4e6;
 const OUTSIDE = 0.05; // weight of the error of a region outside the picture, to which the camera may turn
 
 // Budget of this machine: a phone's is a million; no more than its textures hold.
-function machineBudget(gl, degree) {
+export function machineBudget(gl, degree) {
   const phone = matchMedia("(pointer: coarse)").matches && !matchMedia("(any-pointer: fine)").matches;
   const usual = phone ? PHONE : (navigator.deviceMemory ?? 8) <= 4 ? MODEST : USUAL;
   const texels = gl.getParameter(gl.MAX_TEXTURE_SIZE) ** 2 / (degree + 1) ** 2;
   return Math.min(usual, Math.floor(texels / 2));
 }
 
-class Levels {
+export class Levels {
   // onChange() is called when other splats are shown.
   constructor(facts, budget, onChange) {
     const { regions, filenames } = facts.lod;
@@ -30,7 +33,9 @@ class Levels {
     this.onChange = onChange;
     this.regions = regions.map((region) => ({
       ...region,
-      levels: Object.keys(region.runs).map(Number).sort((a, b) => b - a), // coarsest first
+      levels: Object.keys(region.runs)
+        .map(Number)
+        .sort((a, b) => b - a), // coarsest first
       shown: -1, // level
       wanted: -1,
       slots: [],
@@ -86,7 +91,9 @@ class Levels {
       region.wanted = this.size(region, coarsest) <= left ? coarsest : -1;
       left -= this.size(region, region.wanted);
     }
-    const heap = order.filter(({ wanted }) => wanted >= 0).map((region) => [this.error(region, region.wanted, camera), region]);
+    const heap = order
+      .filter(({ wanted }) => wanted >= 0)
+      .map((region) => [this.error(region, region.wanted, camera), region]);
     heap.sort((a, b) => a[0] - b[0]); // the largest error comes last
     while (heap.length) {
       const [, region] = heap.pop();
@@ -118,7 +125,8 @@ class Levels {
     let [group, level] = [finer, ({ wanted }) => wanted];
     if (nothing.length) [group, level] = [nothing, ({ levels }) => levels[0]];
     if (group === finer && coarser.length) group = coarser;
-    if (group === nothing && coarser.length && !this.fits(nothing, level)) [group, level] = [coarser, ({ wanted }) => wanted];
+    if (group === nothing && coarser.length && !this.fits(nothing, level))
+      [group, level] = [coarser, ({ wanted }) => wanted];
     group.sort((a, b) => near(a) - near(b));
     const batch = [];
     let [file, total] = [null, 0];

@@ -1,5 +1,11 @@
 // Shows a training: its state, as often as the server tells it, and its newest splats, whenever the last ones are drawn.
-"use strict";
+
+import { element, fail, say } from "./common.js";
+import { Renderer } from "./draw.js";
+import { FACTS } from "./facts.js";
+import { created, Curve } from "./live_curves.js";
+import { released } from "./press.js";
+import { arraysIn } from "./scene.js";
 
 // Drawing other splats takes this computer's time, which the training needs as well. So the page waits this many times
 // as long as it worked before it asks for the next ones.

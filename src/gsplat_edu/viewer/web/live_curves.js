@@ -1,10 +1,9 @@
 // Small curves of a training: loss, PSNR and the number of splats over the iterations.
-"use strict";
 
 const CURVE_WIDTH = 100; // units of the drawing, which is stretched to its place
 const CURVE_HEIGHT = 24;
 
-function created(name, attributes = {}, ...children) {
+export function created(name, attributes = {}, ...children) {
   const svg = ["svg", "polyline"].includes(name);
   const made = svg ? document.createElementNS("http://www.w3.org/2000/svg", name) : document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -13,7 +12,7 @@ function created(name, attributes = {}, ...children) {
 }
 
 // One curve with its name and newest value.
-class Curve {
+export class Curve {
   // shown(value) makes the text of a value. weight: that of the newest value in a moving mean, at most 1.
   constructor(name, shown, weight) {
     Object.assign(this, { name, shown, weight });

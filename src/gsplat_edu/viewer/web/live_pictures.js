@@ -1,5 +1,9 @@
 // For browsers without WebGL2: the computer that serves the page renders, and the page shows its pictures.
-"use strict";
+
+import { fitted } from "./camera.js";
+import { element, say } from "./common.js";
+import { FACTS } from "./facts.js";
+import { Viewer } from "./viewer.js";
 
 const PICTURE_SIDE = 800; // longest side of a picture while the training runs, px
 const STILL_SIDE = 1600; // while it waits or is finished
@@ -48,7 +52,8 @@ class Pictures {
         this.context.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
         this.failure = "";
       } catch (error) {
-        this.failure = error instanceof TypeError ? "The program that draws the pictures cannot be reached." : error.message;
+        this.failure =
+          error instanceof TypeError ? "The program that draws the pictures cannot be reached." : error.message;
       }
       this.onResult(this.failure);
     }
@@ -71,13 +76,14 @@ const hasWebGL2 = () => {
   return gl !== null;
 };
 
-// This listener comes before that of main.js.
+// This listener comes before that of viewer.js.
 addEventListener("DOMContentLoaded", (event) => {
   if (hasWebGL2()) return;
   event.stopImmediatePropagation();
   const showResult = (line) => {
     say(line);
-    element("count").textContent = `${FACTS.count.toLocaleString("en")} splats, drawn by the program that serves this page: this browser has no WebGL2`;
+    element("count").textContent =
+      `${FACTS.count.toLocaleString("en")} splats, drawn by the program that serves this page: this browser has no WebGL2`;
   };
   class PictureViewer extends Viewer {
     makeRenderer() {

@@ -1,14 +1,22 @@
 // Meshes beside the splats: a line across the picture has the splats on its left and the surface on its right. A
 // collider lies translucent over both. page_mesh.py writes the data.
-"use strict";
+
+import { plus } from "./camera.js";
+import { element, linked, nearestTexture } from "./common.js";
+import { edgesOf, rayMeets } from "./mesh_rays.js";
+import { inflated } from "./scene.js";
 
 const COLORINGS = { tint: 0, vertices: 1, texture: 2, lines: 3 }; // as in mesh.frag.glsl
 const CLAY = [0.75, 0.74, 0.72, 1]; // of a surface without colours
 const COLLIDER = [0.25, 0.6, 1, 0.3];
-const [DARK_EDGE, LIGHT_EDGE, COLLIDER_EDGE] = [[0, 0, 0, 0.6], [0.9, 0.9, 0.9, 1], [0.1, 0.35, 0.8, 0.9]];
+const [DARK_EDGE, LIGHT_EDGE, COLLIDER_EDGE] = [
+  [0, 0, 0, 0.6],
+  [0.9, 0.9, 0.9, 1],
+  [0.1, 0.35, 0.8, 0.9],
+];
 const SAMPLES = 4; // per pixel, where the graphics processor has as many
 const GRIP = 22; // half the width of the line's handle, CSS pixels
-const STEPPING = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "PageUp", "PageDown"];
+export const STEPPING = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "PageUp", "PageDown"];
 
 // The meshes of the page as typed arrays, without their images' pixels.
 async function unpackMeshes(entries) {
@@ -152,10 +160,10 @@ class Layer {
   }
 }
 
-class Meshes {
+export class Meshes {
   static async open(viewer) {
     const { gl } = viewer.renderer;
-    const meshes = await unpackMeshes(FACTS.meshes);
+    const meshes = await unpackMeshes(viewer.facts.meshes);
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     const images = await Promise.all(meshes.map((mesh) => decodedImage(mesh, most)));
     return new Meshes(viewer, meshes, images);
@@ -166,7 +174,14 @@ class Meshes {
     Object.assign(this, { viewer, gl, program: linked(gl, "mesh"), surface, collider });
     this.buffers = [surface, collider].map((mesh, i) => mesh && new MeshBuffers(gl, mesh, images[i]));
     [this.below, this.above] = [new Layer(gl), new Layer(gl)]; // the surface, and the collider over everything
-    this.placed = { R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], t: [0, 0, 0] }; // where edits have moved the whole scene
+    this.placed = {
+      R: [
+        [1, 0, 0],
+        [0, 1, 0],
+        [0, 0, 1],
+      ],
+      t: [0, 0, 0],
+    }; // where edits have moved the whole scene
     this.style = "surface"; // or "edges" on it, or "wireframe"
     this.showsCollider = collider !== null;
     this.share = viewer.facts.edit ? 1 : 0.5; // of the picture's width, from the left, that shows the splats

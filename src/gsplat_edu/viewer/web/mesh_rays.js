@@ -1,9 +1,8 @@
 // Where a ray meets a mesh, in float64 on the stored float32 coordinates.
-"use strict";
 
 // The smallest t above `near` at which origin + t direction lies in a face; Infinity if there is none. Faces are seen
 // from both sides (Möller and Trumbore, 1997).
-function rayMeets({ positions, faces }, origin, direction, near = 0) {
+export function rayMeets({ positions, faces }, origin, direction, near = 0) {
   const [ox, oy, oz] = origin;
   const [dx, dy, dz] = direction;
   let nearest = Infinity;
@@ -28,7 +27,7 @@ function rayMeets({ positions, faces }, origin, direction, near = 0) {
 }
 
 // The edges of a mesh, each once: two vertices after each other.
-function edgesOf({ positions, faces }) {
+export function edgesOf({ positions, faces }) {
   const count = positions.length / 3;
   const keys = new Float64Array(faces.length); // smaller vertex times count, plus the larger one
   for (let i = 0; i < faces.length; ++i) {

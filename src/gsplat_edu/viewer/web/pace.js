@@ -3,17 +3,16 @@
 // A whole picture of a large scene takes such a computer seconds. While the view moves, the page therefore draws fewer
 // splats, a sample in which large ones are likelier, into a smaller image. Once the view rests, the whole picture is
 // drawn in parts, so that the next movement never waits for it.
-"use strict";
 
 const FRAME = 100; // milliseconds that a frame may take while the view moves
 const LATE_FRAMES = 2; // in a row that take longer, before less is drawn
 const QUICK_FRAMES = 4; // in a row that take less than a third of it, before more is drawn
 const PART = 60; // milliseconds that a part of a whole picture should take
 const LEAST_PART = 2048; // splats
-const STILL = 200; // milliseconds without a movement until the whole picture is drawn
+export const STILL = 200; // milliseconds without a movement until the whole picture is drawn
 
 // From everything to very little; `share` is that of the width and of the height.
-const DETAILS = [
+export const DETAILS = [
   { most: Infinity, share: 1 },
   { most: 400000, share: 0.5 },
   { most: 200000, share: 0.5 },
@@ -24,9 +23,9 @@ const DETAILS = [
 ];
 
 // What is drawn of a training that runs on the same processor.
-const SPARING = { most: 25000, share: 0.4 };
+export const SPARING = { most: 25000, share: 0.4 };
 
-class Pace {
+export class Pace {
   constructor() {
     this.level = 0; // of DETAILS
     this.quick = this.late = 0; // frames in a row
@@ -74,7 +73,7 @@ class Pace {
 }
 
 // A camera with a share of the pixels of each side.
-function reduced(camera, share) {
+export function reduced(camera, share) {
   const [W, H] = [camera.W, camera.H].map((side) => Math.max(1, Math.round(share * side)));
   const [across, down] = [W / camera.W, H / camera.H];
   const [cx, cy] = [(camera.cx + 0.5) * across - 0.5, (camera.cy + 0.5) * down - 0.5];

@@ -1,11 +1,12 @@
 // Everything around the picture: metadata, buttons, the capture's cameras, messages.
-"use strict";
+
+import { element } from "./common.js";
 
 const POINT_SHOWN = 800; // milliseconds
 
 const SMALL = "(max-width: 600px) and (orientation: portrait)"; // as in style.css
 
-class Panel {
+export class Panel {
   // actions: fly(), reset(), goTo(index), degree(value).
   constructor(facts, actions) {
     this.facts = facts;
@@ -74,8 +75,16 @@ class Panel {
       button.addEventListener("click", () => actions.goTo(index));
       return button;
     });
-    this.listed("views", "views", this.buttons.filter((_, i) => cameras[i].saved));
-    this.listed("cameras", shared ? "photos" : "cameras", this.buttons.filter((_, i) => !cameras[i].saved));
+    this.listed(
+      "views",
+      "views",
+      this.buttons.filter((_, i) => cameras[i].saved),
+    );
+    this.listed(
+      "cameras",
+      shared ? "photos" : "cameras",
+      this.buttons.filter((_, i) => !cameras[i].saved),
+    );
   }
 
   // Fills a list that can be closed.
@@ -87,7 +96,9 @@ class Panel {
       item.append(button);
       return item;
     });
-    element(id).querySelector("ol").append(...items);
+    element(id)
+      .querySelector("ol")
+      .append(...items);
   }
 
   // Highlights the current camera; none once the view has moved away from it.

@@ -1,5 +1,6 @@
 // Smooth camera motion through keyframes: the formulas of gsplat_edu/evaluate/path_curve.py, which explains them.
-"use strict";
+
+import { plus, radians } from "./camera.js";
 
 const CHORDS = 64; // per segment; their sum approximates its length
 const SAME = 1e-9; // fraction of the length below which consecutive keyframes count as one place
@@ -23,7 +24,7 @@ function quaternionOf(R) {
 }
 
 // The rotation from world to camera.
-function rotationOf([w, x, y, z]) {
+export function rotationOf([w, x, y, z]) {
   return [
     [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
     [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
@@ -50,7 +51,7 @@ function slerp(a, b, share) {
 }
 
 // States have the centre, the quaternion, and zoom = ln tan(fov / 2).
-function mixedStates(a, b, share) {
+export function mixedStates(a, b, share) {
   return {
     eye: a.eye.map((value, i) => (1 - share) * value + share * b.eye[i]),
     quat: slerp(a.quat, b.quat, share),
@@ -103,7 +104,7 @@ function sums(steps) {
   return [0, ...steps.map((step) => (sum += step))];
 }
 
-class PathCurve {
+export class PathCurve {
   // path: {loop, duration or null, ease: "ends", "views" or none, keyframes: [{eye, R, fov, time, hold}]}, at least two
   // keyframes; time and hold may be undefined.
   constructor({ loop, duration, ease, keyframes }) {
@@ -124,15 +125,27 @@ class PathCurve {
     if (timed) this.places = this.timed(times, keyframes, ease);
     else if (ease && this.length > 0) {
       const lengths = this.lengths.filter((_, i) => i % CHORDS === 0);
-      this.places = new Monotone(lengths.map((length) => this.seconds * (length / this.length)), lengths, loop, ease);
+      this.places = new Monotone(
+        lengths.map((length) => this.seconds * (length / this.length)),
+        lengths,
+        loop,
+        ease,
+      );
     }
   }
 
   // The distance covered over time, with keyframes at given times; a rest has two rows.
   timed(times, keyframes, ease) {
-    const rows = times.flatMap((time, i) => [0, ...(keyframes[i].hold ? [keyframes[i].hold] : [])].map((after) => [time + after, this.stops[i]]));
+    const rows = times.flatMap((time, i) =>
+      [0, ...(keyframes[i].hold ? [keyframes[i].hold] : [])].map((after) => [time + after, this.stops[i]]),
+    );
     if (this.loop) rows.push([this.seconds, this.length]);
-    return new Monotone(rows.map(([time]) => time), rows.map(([, place]) => place), this.loop, ease);
+    return new Monotone(
+      rows.map(([time]) => time),
+      rows.map(([, place]) => place),
+      this.loop,
+      ease,
+    );
   }
 
   // World units per radian: L / max(A, 2 pi) on a path of length L that turns by A.
@@ -216,7 +229,7 @@ class PathCurve {
 const quaternionDot = (a, b) => a.quat.reduce((sum, value, i) => sum + value * b.quat[i], 0);
 
 // The keyframes' states; each quaternion has the sign that is nearer to the one before.
-function statesOf(keyframes) {
+export function statesOf(keyframes) {
   const states = keyframes.map(({ eye, R, fov }) => ({
     eye,
     quat: quaternionOf(R),

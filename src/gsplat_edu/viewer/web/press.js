@@ -1,6 +1,5 @@
 // What arrives by itself waits while something is pressed: a button that moves or is replaced between press and release is
-// not clicked. The studio's page has this script too.
-"use strict";
+// not clicked. The studio's page imports this module too.
 
 const CONTROL = "button, a, summary, label, input, select, textarea";
 const PRESSABLE = "button, a, summary, label, [type=checkbox], [type=radio]"; // not what is dragged, or opens a list
@@ -30,6 +29,6 @@ addEventListener("pointerdown", (event) => event.isPrimary && event.button === 0
 addEventListener("keydown", (event) => event.key === " " && holdChanges(event), true);
 
 // Resolves once nothing is pressed.
-async function released() {
+export async function released() {
   while (pressing) await pressing;
 }

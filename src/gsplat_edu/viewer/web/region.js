@@ -1,6 +1,7 @@
 // The directions from which a scene was captured, as seen from the pivot. A drag beyond them is damped because no photo
 // shows what lies there.
-"use strict";
+
+import { dot, plus } from "./camera.js";
 
 const MOST_EYES = 300; // cameras; more are subsampled evenly
 const NEIGHBOURS = 3; // per camera: directions on the way to each count as captured
@@ -12,13 +13,13 @@ const COVERED = 1.5; // a drag across the window turns by this multiple of the c
 const LEAST_TURN = Math.PI / 4;
 const MOST_TURN = Math.PI;
 
-const unit = (a) => {
+export const unit = (a) => {
   const length = Math.hypot(...a);
   return a.map((value) => value / length);
 };
 const angleOf = (cosine) => Math.acos(Math.min(1, Math.max(-1, cosine)));
 
-class Region {
+export class Region {
   constructor(eyes) {
     const every = Math.max(1, Math.ceil(eyes.length / MOST_EYES));
     this.eyes = eyes.filter((_, i) => i % every === 0);
@@ -50,7 +51,9 @@ class Region {
       }
     });
     // sparse cameras get a wider margin
-    const gaps = directions.map((a, i) => (nearest[i].length ? angleOf(dot(a, nearest[i][0])) : 0)).sort((a, b) => a - b);
+    const gaps = directions
+      .map((a, i) => (nearest[i].length ? angleOf(dot(a, nearest[i][0])) : 0))
+      .sort((a, b) => a - b);
     this.margin = Math.min(WIDEST_MARGIN, MARGIN + 0.5 * (gaps[gaps.length >> 1] ?? 0));
   }
 

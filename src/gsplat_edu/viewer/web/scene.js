@@ -1,10 +1,7 @@
-// Reads the scene embedded in this file, in the format written by page.py.
-"use strict";
-
-const FACTS = JSON.parse(document.getElementById("facts").textContent);
+// Unpacks the scene embedded in a page, in the format written by page.py.
 
 // Arrays of the binary data in their order; `page_data.py` has the same list.
-function layout(facts) {
+export function layout(facts) {
   const coefficients = (facts.sh_degree + 1) ** 2;
   return [
     { name: "means", type: Float32Array, channels: 3, texels: 1 },
@@ -17,7 +14,7 @@ function layout(facts) {
 
 // Returns the splats as typed arrays by name. The text is removed from the page piece by piece, so that it and the
 // numbers are never in memory together.
-async function unpackSplats(facts) {
+export async function unpackSplats(facts) {
   const total = layout(facts).reduce((sum, part) => sum + lengthOf(part, facts) * part.type.BYTES_PER_ELEMENT, 0);
   const bytes = await inflated(document.querySelectorAll("script.splats"), total);
   return arraysIn(bytes.buffer, 0, facts);
@@ -28,7 +25,7 @@ function lengthOf({ channels, texels }, facts) {
 }
 
 // The arrays of packed splats that begin at a byte of a buffer.
-function arraysIn(buffer, begin, facts) {
+export function arraysIn(buffer, begin, facts) {
   const arrays = {};
   for (const part of layout(facts)) {
     arrays[part.name] = new part.type(buffer, begin, lengthOf(part, facts));
@@ -37,7 +34,7 @@ function arraysIn(buffer, begin, facts) {
   return arrays;
 }
 
-async function inflated(elements, total) {
+export async function inflated(elements, total) {
   if (typeof DecompressionStream === "undefined") {
     throw new Error("This browser cannot unpack the scene: it lacks DecompressionStream; use a newer version.");
   }

@@ -1,10 +1,12 @@
 // Which splats few photos saw: page_proof.py counts the photos, one byte per splat, and the shader tints such splats.
-"use strict";
+
+import { element, nearestTexture } from "./common.js";
+import { inflated } from "./scene.js";
 
 const UNSEEN = [230 / 255, 159 / 255, 0]; // orange on grey: told apart with any colour vision (Okabe and Ito)
 
 // The counts as a texture that the shader reads; zeros until they are unpacked.
-class SeenTexture {
+export class SeenTexture {
   constructor(renderer) {
     const { gl, textureWidth, facts } = renderer;
     Object.assign(this, { renderer, fewest: 0, unit: renderer.textures.length + 2 }); // behind the order and the flags
@@ -35,7 +37,7 @@ class SeenTexture {
 }
 
 // The switch and its legend.
-class Seen {
+export class Seen {
   static async open(viewer) {
     const counts = await inflated(document.querySelectorAll("script.seen"), viewer.facts.count);
     return new Seen(viewer, counts);
@@ -56,12 +58,15 @@ class Seen {
     element("seen").setAttribute("aria-pressed", this.on);
     element("legend").hidden = !this.on;
     const percent = share > 0 && share < 0.01 ? "less than 1" : Math.round(100 * share);
-    element("legend").lastElementChild.textContent = this.on ? `no photo or only one saw these: ${percent} % of the splats. Grey: two or more did.` : "";
+    element("legend").lastElementChild.textContent = this.on
+      ? `no photo or only one saw these: ${percent} % of the splats. Grey: two or more did.`
+      : "";
     this.viewer.refresh();
   }
 }
 
 // Shows a button of the panel, and its line in the help.
-function offer(button) {
-  for (const hidden of [button, element("proof"), ...document.querySelectorAll(`#help [data-for=${button.id}]`)]) hidden.hidden = false;
+export function offer(button) {
+  for (const hidden of [button, element("proof"), ...document.querySelectorAll(`#help [data-for=${button.id}]`)])
+    hidden.hidden = false;
 }

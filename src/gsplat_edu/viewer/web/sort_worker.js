@@ -1,107 +1,15 @@
-// Sorts splats by camera depth of the mean, far to near, in its own thread.
-//
-// Positive float32 values sort like their bits, so two counting sorts of 16 bits each, low half first, give the exact
-// order. Among equal depths the last index comes first: drawn far to near, this matches the renderer's near-to-far
-// order. NaN counts as behind the camera.
-"use strict";
+// Sorts the splats of a page in its own thread. One order travels to it and back; see sorter.js.
 
-const OFFSET = 256; // makes all values positive, so that their bits sort as they do
+import { SortedSplats } from "./sorted_splats.js";
 
-let means, scales, logits, near, keys, byLow;
-let ranked, values; // all splats by rank, and the value that ranks each
+let splats = null;
 
 self.onmessage = ({ data }) => {
-  if (data.splats) {
-    [[means, scales, logits], near] = [data.splats, data.near];
-    keys = new Uint32Array(means.length / 3);
-    byLow = new Uint32Array(means.length / 3);
-    ranked = values = null;
-    return;
+  if (data.splats) splats = new SortedSplats(data.splats, data.near);
+  else if (data.replaced) splats.replace(data.replaced, data.at);
+  else {
+    const order = new Uint32Array(data.order);
+    const { count, thinning } = splats.sort(data.axis, data.eye, order, data.most);
+    self.postMessage({ order: order.buffer, count, thinning }, [order.buffer]);
   }
-  if (data.replaced) {
-    means.set(data.replaced, 3 * data.at);
-    return;
-  }
-  const order = new Uint32Array(data.order);
-  const thins = data.most < keys.length;
-  if (thins && !ranked) rank();
-  const count = sort(data.axis, data.eye, order, thins ? ranked.slice(0, data.most).sort() : null);
-  const thinning = thins ? Math.exp(OFFSET - values[ranked[data.most - 1]]) : 0;
-  self.postMessage({ order: order.buffer, count, thinning }, [order.buffer]);
 };
-
-// Fills the first entries of `order` and returns the number of splats in front of the camera, of all or of some, whose
-// indices rise.
-function sort(axis, eye, order, some) {
-  const depths = new Float32Array(keys.buffer);
-  const [ax, ay, az] = axis;
-  const [ex, ey, ez] = eye;
-  const total = some ? some.length : keys.length;
-  for (let j = 0; j < total; ++j) {
-    const k = 3 * (some ? some[j] : j);
-    const depth = ax * (means[k] - ex) + ay * (means[k + 1] - ey) + az * (means[k + 2] - ez);
-    depths[j] = depth > near ? depth : 0;
-  }
-  return byKeys(total, order, some);
-}
-
-// Writes the places of the keys that are not 0, or what `some` has at these places, to `order`, largest key first.
-function byKeys(total, order, some) {
-  const low = new Uint32Array(65536);
-  const high = new Uint32Array(65536);
-  let count = 0;
-  for (let j = 0; j < total; ++j) {
-    if (keys[j] === 0) continue;
-    ++low[keys[j] & 65535];
-    ++high[keys[j] >>> 16];
-    ++count;
-  }
-  startsOf(low);
-  startsOf(high);
-  for (let j = 0; j < total; ++j) if (keys[j] !== 0) byLow[low[keys[j] & 65535]++] = j;
-  for (let j = 0; j < count; ++j) {
-    const place = byLow[j];
-    order[count - 1 - high[keys[place] >>> 16]++] = some ? some[place] : place;
-  }
-  return count;
-}
-
-// Ranks the splats such that the first n are a random sample, in which splats of large opacity and area are likelier:
-// with u uniform in (0, 1) and the weight w = sqrt(opacity area), the largest values log(w / u) come first. With v the
-// last value that is taken, a splat is taken with probability min(1, w / exp(v)): exp(-v) is the sample's thinning, by
-// which the shader enlarges what is drawn.
-function rank() {
-  values = new Float32Array(keys.buffer.slice(0));
-  for (let i = 0; i < keys.length; ++i) {
-    const [a, b, c] = [scales[3 * i], scales[3 * i + 1], scales[3 * i + 2]];
-    const weight = 0.5 * (a + b + c - Math.min(a, b, c) - Math.log1p(Math.exp(-half(logits[i]))));
-    values[i] = OFFSET + Math.max(weight - Math.log(random(i)), 1 - OFFSET);
-  }
-  keys.set(new Uint32Array(values.buffer));
-  ranked = new Uint32Array(keys.length);
-  byKeys(keys.length, ranked, null);
-}
-
-// A number in (0, 1) that looks random, the same for an index at any time.
-function random(index) {
-  let bits = Math.imul(index ^ (index >>> 16), 0x45d9f3b);
-  bits = Math.imul(bits ^ (bits >>> 16), 0x45d9f3b);
-  return (((bits ^ (bits >>> 16)) >>> 0) + 0.5) / 2 ** 32;
-}
-
-// The value of a float16.
-function half(bits) {
-  const [exponent, fraction] = [(bits >> 10) & 31, bits & 1023];
-  const size = exponent ? 2 ** (exponent - 25) * (1024 + fraction) : 2 ** -24 * fraction;
-  return bits & 0x8000 ? -size : size;
-}
-
-// Turns counts into the start of each bucket.
-function startsOf(counts) {
-  let sum = 0;
-  for (let b = 0; b < counts.length; ++b) {
-    const here = counts[b];
-    counts[b] = sum;
-    sum += here;
-  }
-}

@@ -1,8 +1,7 @@
 // The page's side of the sorting worker. One sort runs at a time because a single buffer travels to the worker and
 // back.
-"use strict";
 
-class Sorter {
+export class Sorter {
   // onOrder(order, thinning) is called after each sort, before the next one takes the buffer away.
   constructor(splats, near, onOrder) {
     const source = document.getElementById("sort-worker").textContent;
@@ -64,7 +63,7 @@ class Sorter {
     if (this.camera) await this.sort(this.camera);
   }
 
-  // Sorts the splats for a camera: all, or a sample of so many, see sort_worker.js.
+  // Sorts the splats for a camera: all, or a sample of so many, see sorted_splats.js.
   async sort(camera, most = Infinity) {
     while (this.running) await this.running;
     if (this.fits(camera, most)) return;

@@ -14,7 +14,7 @@ uniform highp usampler2D order;  // splats, far to near
 uniform int first;               // where in the sorted order this draw call begins
 uniform int end;                 // place behind the last one
 uniform int batch_splats;        // per instance
-uniform float thinning;          // of a sample of the splats, see sort_worker.js; 0 if all are drawn
+uniform float thinning;          // of a sample of the splats, see sorted_splats.js; 0 if all are drawn
 #ifdef EDITING
 uniform highp usampler2D flags;  // 0, 1: selected; above: hidden or deleted
 uniform vec3 highlight;          // colour of selected splats

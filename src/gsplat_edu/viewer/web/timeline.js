@@ -1,5 +1,7 @@
 // The camera path as a strip of time: a marker for each view, and a playhead.
-"use strict";
+
+import { element } from "./common.js";
+import { PathCurve } from "./path.js";
 
 const PATH_GAP = 0.01; // least seconds between views that the page writes
 const NEAR_MARKER = 22; // CSS pixels beside a marker that still press it
@@ -10,7 +12,7 @@ const FINE_STEP = 0.1;
 const COARSE_STEP = 1; // seconds, with Shift
 
 const shortSeconds = (seconds) => `${Number(seconds.toFixed(2))} s`;
-const restOf = ({ hold }) => hold ?? 0;
+export const restOf = ({ hold }) => hold ?? 0;
 
 // The times at which a path meets its views, from 0; evenly if they are all at one place.
 function timesOf(path) {
@@ -42,7 +44,7 @@ function timed(path, change = (keyframe) => keyframe) {
   return { ...path, keyframes, duration: path.loop ? new PathCurve(path).seconds : null };
 }
 
-class Timeline {
+export class Timeline {
   // keyframes: the Keyframes whose path is shown.
   constructor(keyframes) {
     Object.assign(this, { keyframes, at: 0, chosen: 0, press: null, markers: [], bars: [] });
@@ -57,11 +59,19 @@ class Timeline {
       this.draw();
     });
     listen("keydown", this.key);
-    const fields = { "path-seconds": (value) => this.last(value), "view-time": (value) => this.setTime(this.chosen, value), "view-rest": (value) => this.rest(value) };
+    const fields = {
+      "path-seconds": (value) => this.last(value),
+      "view-time": (value) => this.setTime(this.chosen, value),
+      "view-rest": (value) => this.rest(value),
+    };
     for (const [id, set] of Object.entries(fields)) {
-      element(id).addEventListener("change", ({ target: { value } }) => (value !== "" && value >= 0 ? set(Number(value)) : this.draw()));
+      element(id).addEventListener("change", ({ target: { value } }) =>
+        value !== "" && value >= 0 ? set(Number(value)) : this.draw(),
+      );
     }
-    element("path-ease").addEventListener("change", ({ target: { value } }) => this.set({ ...this.path, ease: value || null }));
+    element("path-ease").addEventListener("change", ({ target: { value } }) =>
+      this.set({ ...this.path, ease: value || null }),
+    );
     element("insert-view").addEventListener("click", () => this.insert());
     element("replace-view").addEventListener("click", () => this.replace());
     element("view-earlier").addEventListener("click", () => this.swap(-1));
@@ -122,7 +132,9 @@ class Timeline {
   // Moves a view to a time, in seconds from the first; others stay, or are pushed later. Returns the path and the view's
   // place in it.
   moved(index, seconds) {
-    const path = timed(this.path, (keyframe, i) => (i === index ? { ...keyframe, time: Math.round(seconds * 1000) / 1000, here: true } : keyframe));
+    const path = timed(this.path, (keyframe, i) =>
+      i === index ? { ...keyframe, time: Math.round(seconds * 1000) / 1000, here: true } : keyframe,
+    );
     const sorted = arranged(path);
     const chosen = sorted.keyframes.findIndex(({ here }) => here);
     return { path: { ...sorted, keyframes: sorted.keyframes.map(({ here, ...keyframe }) => keyframe) }, chosen };
@@ -143,7 +155,11 @@ class Timeline {
     const all = Math.max(seconds, PATH_GAP * 2 * this.path.keyframes.length);
     if (this.path.keyframes[0].time === undefined) return this.set({ ...this.path, duration: all });
     const by = all / this.curve.seconds;
-    const scaled = timed(this.path, ({ hold, ...keyframe }) => ({ ...keyframe, time: by * keyframe.time, ...(hold ? { hold: by * hold } : {}) }));
+    const scaled = timed(this.path, ({ hold, ...keyframe }) => ({
+      ...keyframe,
+      time: by * keyframe.time,
+      ...(hold ? { hold: by * hold } : {}),
+    }));
     return this.set(arranged({ ...scaled, duration: all }));
   }
 
@@ -199,7 +215,12 @@ class Timeline {
     const apart = timesOf(this.path).map((time) => Math.abs(left + (time / this.span) * width - event.clientX));
     const nearest = apart.indexOf(Math.min(...apart));
     const index = event.clientY - top > RULER && apart[nearest] <= NEAR_MARKER ? nearest : -1;
-    this.press = { index, x: event.clientX, grip: index < 0 ? 0 : timesOf(this.path)[index] - this.secondsAt(event.clientX), moved: null };
+    this.press = {
+      index,
+      x: event.clientX,
+      grip: index < 0 ? 0 : timesOf(this.path)[index] - this.secondsAt(event.clientX),
+      moved: null,
+    };
     (index < 0 ? this.playhead : this.markers[index]).focus();
     if (index < 0) this.goTo(this.secondsAt(event.clientX));
   }
@@ -227,7 +248,14 @@ class Timeline {
     const { key, shiftKey, target } = event;
     const index = this.markers.indexOf(target);
     const step = shiftKey ? COARSE_STEP : FINE_STEP;
-    const by = { ArrowLeft: -step, ArrowDown: -step, ArrowRight: step, ArrowUp: step, PageDown: -COARSE_STEP, PageUp: COARSE_STEP }[key];
+    const by = {
+      ArrowLeft: -step,
+      ArrowDown: -step,
+      ArrowRight: step,
+      ArrowUp: step,
+      PageDown: -COARSE_STEP,
+      PageUp: COARSE_STEP,
+    }[key];
     const ends = { Home: 0, End: this.curve.seconds }[key];
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (index >= 0 && (key === "Enter" || key === " ")) this.choose(index);
@@ -286,7 +314,10 @@ class Timeline {
       if (element(id) !== document.activeElement || this.press) element(id).value = Number(value.toFixed(2));
     };
     const keyframe = path.keyframes[chosen];
-    fill("path-seconds", path === this.path ? this.curve.seconds : path.duration ?? times.at(-1) + restOf(path.keyframes.at(-1)));
+    fill(
+      "path-seconds",
+      path === this.path ? this.curve.seconds : (path.duration ?? times.at(-1) + restOf(path.keyframes.at(-1))),
+    );
     fill("view-time", times[chosen]);
     fill("view-rest", restOf(keyframe));
     element("path-ease").value = path.ease ?? "";

@@ -1,0 +1,69 @@
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { gzipSync } from "node:zlib";
+
+import { arraysIn, inflated } from "../../src/gsplat_edu/viewer/web/scene.js";
+import { SortedSplats } from "../../src/gsplat_edu/viewer/web/sorted_splats.js";
+import { arrayOf, assertClose, vectors } from "./vectors.js";
+
+const NEAR = 0.05;
+
+test("splats are sorted by float32 depth, equal ones from the last to the first", () => {
+  const { means, order } = vectors("order");
+  const splats = new SortedSplats([arrayOf(means), null, null], NEAR);
+  const found = new Uint32Array(arrayOf(means).length / 3);
+  const { count, thinning } = splats.sort([0, 0, 1], [0, 0, -0.5], found, Infinity);
+  assert.deepEqual(found.subarray(0, count), arrayOf(order));
+  assert.equal(thinning, 0);
+});
+
+test("splats that are replaced by NaN are not drawn", () => {
+  const splats = new SortedSplats([Float32Array.of(0, 0, 1, 0, 0, 3, 0, 0, 2), null, null], NEAR);
+  const order = new Uint32Array(3);
+  splats.replace(Float32Array.of(NaN, NaN, NaN), 1);
+  assert.equal(splats.sort([0, 0, 1], [0, 0, 0], order, Infinity).count, 2);
+  assert.deepEqual([...order.subarray(0, 2)], [2, 0]);
+});
+
+test("a sample is the same each time and covers as much", () => {
+  const data = vectors("sample");
+  const [means, scales, logits, area, weight] = [data.means, data.log_scales, data.logits, data.area, data.weight].map(
+    arrayOf,
+  );
+  const splats = new SortedSplats([means, scales, logits], NEAR);
+  const sorted = (most) => {
+    const order = new Uint32Array(area.length);
+    const { count, thinning } = splats.sort([0, 0, 1], [0, 0, -3], order, most);
+    return { chosen: order.slice(0, count), thinning };
+  };
+  const { chosen, thinning } = sorted(2000);
+  assert.equal(sorted(Infinity).chosen.length, area.length);
+  assert.deepEqual(sorted(2000), { chosen, thinning });
+  assert.equal(new Set(chosen).size, 2000);
+  const chance = weight.map((one) => Math.min(1, thinning * one));
+  const sum = (list) => list.reduce((total, value) => total + value, 0);
+  // the number of sampled splats is within 4 sqrt(2000) = 180 of its mean of 2000
+  assertClose(sum(chance), 2000, { absolute: 180 });
+  // the estimate of the total is unbiased, with variance the sum of area² (1 / chance - 1)
+  const spread = Math.sqrt(sum(area.map((one, i) => one ** 2 * (1 / chance[i] - 1))));
+  const estimate = [...chosen].reduce((total, i) => total + area[i] / chance[i], 0);
+  assertClose(estimate, sum(area), { absolute: 4 * spread });
+  assert.ok(spread < 0.1 * sum(area), "a sharp picture follows");
+});
+
+test("packed splats are unpacked as Python packs them", async () => {
+  const { facts, packed, ...expected } = vectors("packed-scene");
+  const data = gzipSync(Buffer.from(packed, "base64"));
+  const halves = [data.subarray(0, 99), data.subarray(99)];
+  const elements = halves.map((part) => ({ textContent: part.toString("base64"), remove() {} }));
+  const bytes = await inflated(elements, Buffer.from(packed, "base64").length);
+  const arrays = arraysIn(bytes.buffer, 0, facts);
+  assert.deepEqual(Object.keys(arrays).sort(), Object.keys(expected).sort());
+  for (const [name, array] of Object.entries(arrays)) assert.deepEqual(array, arrayOf(expected[name]), name);
+});
+
+test("damaged splats are reported", async () => {
+  const data = gzipSync(Buffer.alloc(100)).subarray(0, 15);
+  const elements = [{ textContent: data.toString("base64"), remove() {} }];
+  await assert.rejects(inflated(elements, 100), /damaged; download or export the file again/);
+});

@@ -1,0 +1,79 @@
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+// Modules of the page listen to the window's events, which node does not have.
+const events = new EventTarget();
+globalThis.addEventListener = events.addEventListener.bind(events);
+
+const { leftOf, startJob } = await import("../../src/gsplat_edu/studio/web/jobs.js");
+const { Store } = await import("../../src/gsplat_edu/studio/web/store.js");
+
+const JOB = { id: "1", title: "training of a", subject: "runs/a", command: "", state: "running", waits_for: [] };
+
+// What the card of a job says of the time left after each of some events.
+function said(all) {
+  const work = { command: "train", inputs: ["captures/a"], outputs: ["runs/a"], options: {} };
+  const view = new Store().put({ ...JOB, work });
+  return all.map((event, i) => {
+    view.take({ ...event, number: i + 1 });
+    return view.progress ? leftOf(view.progress, view.stages.length > 1) : "";
+  });
+}
+
+// Events of a stage: its forecasts of the time left, s, at equal steps.
+function stageOf(stage, ...left) {
+  const steps = left.map((seconds, done) => ({
+    event: "progress",
+    stage,
+    done,
+    total: left.length,
+    seconds_left: seconds,
+  }));
+  return [{ event: "stage", name: stage }, ...steps];
+}
+
+function secondsIn(text) {
+  const [, hours, number, unit] = text.match(/(?:(\d+) h )?(\d+) (s|min) left/);
+  return (60 * Number(hours ?? 0) + Number(number)) * (unit === "s" ? 1 : 60);
+}
+
+test("the time left never rises in a stage", () => {
+  // densification makes iterations slower than the pace of the first ones; one forecast is missing
+  const texts = said(stageOf("training", 50, 40, 42, 90, 100, null, 80, 39, 20, 21, 19, 3)).slice(1);
+  assert.deepEqual(texts.map(secondsIn), [50, 40, 40, 40, 40, 40, 40, 39, 20, 20, 19, 3]);
+  // a forecast that is clearly larger makes the figure a least time
+  const least = texts.flatMap((text, i) => (text.includes("at least") ? [i] : []));
+  assert.deepEqual(least, [3, 4, 5, 6]);
+});
+
+test("another stage or attempt has a time of its own", () => {
+  const texts = said([
+    ...stageOf("matching", 10, 5),
+    ...stageOf("training", 600, 500),
+    { event: "started" },
+    ...stageOf("training", 700, 650),
+  ]).filter((text) => text.includes("left"));
+  assert.deepEqual(texts.map(secondsIn), [10, 5, 600, 480, 720, 660]); // minutes are rounded
+});
+
+test("a new job with the id of a removed one is known before the stream tells of it", async () => {
+  const store = new Store();
+  store.heard.set("000007", 3); // of the removed job
+  globalThis.fetch = async () => Response.json({ id: "000007", state: "queued", subject: "runs/a" });
+  assert.equal((await startJob(store, {})).job.state, "queued");
+});
+
+test("an older answer about the library does not replace a newer one", async () => {
+  const answers = [];
+  globalThis.fetch = () => new Promise((resolve) => answers.push(resolve));
+  const store = new Store();
+  const refreshed = [store.refresh(), store.refresh()];
+  for (const [i, folder] of [
+    [1, "newer"],
+    [0, "older"],
+  ]) {
+    answers[i](Response.json({ trouble: [], folder }));
+    await refreshed[i];
+  }
+  assert.equal(store.library.folder, "newer");
+});
