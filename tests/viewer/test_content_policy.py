@@ -49,10 +49,7 @@ def test_our_own_code_works_without_complaints(visit, tmp_path, write, random_ga
 
 def refuses(tab, logged, least):
     """Wait until the browser has logged that the policy refuses something, at least so often."""
-    end = time.monotonic() + PATIENCE
-    while sum("Content Security Policy" in text for text in logged) < least:
-        assert time.monotonic() < end, logged
-        tab.wait_for_timeout(20)
+    awaited(tab, lambda: sum("Content Security Policy" in text for text in logged) >= least)
 
 
 @pytest.mark.parametrize("write", [written_page, written_report])
@@ -68,7 +65,7 @@ def test_injected_code_does_not_run(browser, tmp_path, write, random_gaussians, 
     tab.goto(path.as_uri())
     tab.evaluate("document.getElementById('link').click()")
     refuses(tab, refusals, 4)
-    tab.wait_for_timeout(300)
+    tab.evaluate(FRAMES)
     assert tab.evaluate("window.ran") is None
     assert tab.evaluate("getComputedStyle(document.body).color") != "rgb(1, 2, 3)"
     # without the policy, the injected code runs

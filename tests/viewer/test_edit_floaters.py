@@ -151,14 +151,13 @@ def test_a_press_counts_although_proposals_arrive_meanwhile(opened):
     tab.evaluate("editor.perform({ op: 'select', how: 'replace', by: 'all' })")
     tab.route(f"**{FLOATERS}", last_one_held)
     tab.click("[data-do=propose]")
-    while not held:
-        tab.wait_for_timeout(20)
+    awaited(tab, lambda: held)
     tab.hover("[data-do=undo]")
     tab.mouse.down()
     ((route, answer),) = held
     with tab.expect_response(f"**{FLOATERS}"):
         route.fulfill(response=answer)
-    tab.wait_for_timeout(300)  # in which the page would show them
+    settle(tab)  # the page would show them
     assert tab.locator("#edit-groups button").count() == 0
     tab.mouse.up()
     tab.wait_for_selector("#edit-groups button")

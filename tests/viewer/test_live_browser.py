@@ -115,13 +115,16 @@ def test_a_press_on_pause_pauses_although_another_page_does_meanwhile(capture, t
         tab.page.get_by_role("button", name="pause", exact=True).hover()
         tab.page.mouse.down()
         client = Client(made.view.url)
+        told = []
+        tab.page.on("response", lambda answer: told.append("/state" in answer.url and answer.text()))
         client.control("pause")
         held = client.states(state="paused")["iteration"]
-        tab.page.wait_for_timeout(500)  # in which the page would say so
-        tab.page.mouse.up()
+        awaited(tab.page, lambda: any('"paused"' in (text or "") for text in told))
+        tab.page.evaluate(FRAMES)  # the page would say so
+        with tab.page.expect_response(re.compile("/control")):
+            tab.page.mouse.up()
         tab.says(r"paused, iteration ([\d,]+) of")
-        tab.page.wait_for_timeout(300)
-        assert made.iteration == held
+        assert client.states(state="paused")["iteration"] == made.iteration == held
 
 
 def test_without_webgl2_the_page_shows_our_own_renders(capture, tmp_path, browser):

@@ -104,7 +104,7 @@ def test_keys_move_along_the_cameras_axes_while_they_are_held(tour):
         before = tour.camera()
         tour.tab.keyboard.down(key)
         tour.tab.wait_for_selector("#rate:has-text('frames/s')")
-        tour.tab.wait_for_timeout(100)
+        awaited(tour.tab, lambda before=before: np.linalg.norm(tour.camera().eye - before.eye) > 0.02)
         tour.tab.keyboard.up(key)
         after = tour.camera()
         steps = sign * (before.R @ (after.eye - before.eye))
@@ -118,9 +118,9 @@ def test_keys_move_along_the_cameras_axes_while_they_are_held(tour):
 def test_a_key_released_outside_the_window_does_not_keep_moving(tour):
     tour.tab.keyboard.down("w")
     tour.tab.evaluate("dispatchEvent(new Event('blur'))")
-    tour.tab.wait_for_timeout(60)
+    tour.tab.evaluate(FRAMES)
     before = tour.camera()
-    tour.tab.wait_for_timeout(100)
+    tour.tab.evaluate(FRAMES)
     np.testing.assert_array_equal(tour.camera().eye, before.eye)
 
 
@@ -359,7 +359,7 @@ def wall(show):
 def click_twice(visit, by, x, y, pause):
     """Click or tap twice, `pause` seconds apart by the times of the events, also on a slow computer."""
     session = visit.tab.context.new_cdp_session(visit.tab)
-    start = time.time()
+    start = time.time() - pause - 1  # the times are over, so that later events come after them
     for moment in (start, start + pause):
         for pressed in (True, False):
             at = {"timestamp": moment + (0.0 if pressed else 0.05)}
@@ -375,7 +375,6 @@ def click_twice(visit, by, x, y, pause):
                 kind = {"type": "touchStart" if pressed else "touchEnd", "touchPoints": places}
                 session.send("Input.dispatchTouchEvent", {**kind, **at})
     session.detach()
-    visit.tab.wait_for_timeout(1000 * pause + 500)  # wait until the time of the last event has passed
 
 
 @pytest.mark.parametrize("by", ["mouse", "finger"])

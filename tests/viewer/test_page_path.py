@@ -54,7 +54,7 @@ def test_an_embedded_path_is_played_to_its_end_and_stops_when_somebody_moves(ope
     shown.tab.mouse.wheel(0, 100)
     shown.tab.wait_for_selector('#play[aria-pressed="false"]')
     still = shown.tab.evaluate("viewer.view.camera.eye")
-    shown.tab.wait_for_timeout(100)
+    shown.tab.evaluate(FRAMES)
     assert shown.tab.evaluate("viewer.view.camera.eye") == still
 
 
