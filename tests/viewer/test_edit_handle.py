@@ -185,20 +185,6 @@ def test_numbers_turn_the_box_and_a_button_levels_it(edit_page, random_gaussians
     assert shown.tab.input_value("#edit-angles input >> nth=1") == "-50"
 
 
-TURN = """(count) => {
-  const { gizmo } = editor.tools;
-  for (let i = 0; i < count; ++i) gizmo.take(gizmo.turnedShape(gizmo.shape, gizmo.axes()[i % 3], 0.1 + i));
-  return editor.tools.shape.rotation;
-}"""
-
-
-def test_ten_thousand_turns_leave_a_rotation(edit_page, random_gaussians):
-    shown, _, _ = opened_box(edit_page, random_gaussians)
-    R = np.array(shown.tab.evaluate(TURN, 10_000))
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
-    assert np.linalg.det(R) == pytest.approx(1.0)
-
-
 def test_a_turned_box_selects_and_crops_what_lies_in_it(edit_page, random_gaussians):
     gaussians = random_gaussians(400)
     shown = edit_page(gaussians)
