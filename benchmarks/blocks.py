@@ -36,7 +36,7 @@ from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import finished_blocks, merged
 from gsplat_edu.blocks.plan import BlockPlan
-from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
+from gsplat_edu.blocks.seams import pooled_psnr, strip_masks, strip_width
 from gsplat_edu.blocks.split import SplitOptions, coarse_scene, split_capture
 from gsplat_edu.blocks.task import block_options, pixels_of_block
 from gsplat_edu.cli.arguments import run_command
@@ -84,7 +84,7 @@ def compared(whole: Path, merged: Path, pictures: Path | None) -> dict[str, Any]
     settings = replace(scenes["blocks"].settings, depth=True)
     renderer = functools.partial(render, settings=settings, backend="cpu")
     cameras = [view.camera for view in dataset.test]
-    masks = masks_of(plan.area, plan.cores, scenes["blocks"].scene.gaussians, cameras, renderer)
+    masks = strip_masks(plan.area, plan.cores, scenes["blocks"].scene.gaussians, cameras, renderer)
     found: dict[str, Any] = {
         "strip width": 2 * strip_width(plan.area, plan.cores),
         "share of the strips": float(sum(mask.mean() for mask in masks) / len(masks)),

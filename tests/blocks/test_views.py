@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_edu.blocks.plan import Area, Cell, Ground
-from gsplat_edu.blocks.seams import strip_mask, strip_width
+from gsplat_edu.blocks.seams import strip_masks, strip_width
 from gsplat_edu.blocks.views import ENOUGH, airspace_shares, assigned, in_any_view, seen_shares
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.render.api import render
@@ -144,8 +144,8 @@ def test_places_near_a_cut_are_found_through_a_lens(projection):
         camera = Camera.panorama(pinhole.R, pinhole.eye, 48, 96)
     else:
         camera = Camera(pinhole.R, pinhole.eye, 20.0, 20.0, 31.5, 31.5, 64, 64).through(projection)
-    mask = strip_mask(
-        AREA, HALVES, carpet(), camera, lambda g, c: render(g, c, settings=DEPTH, backend="cpu")
+    (mask,) = strip_masks(
+        AREA, HALVES, carpet(), [camera], lambda g, c: render(g, c, settings=DEPTH, backend="cpu")
     )
     rays = camera.rays()
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -154,6 +154,37 @@ def test_places_near_a_cut_are_found_through_a_lens(projection):
     true = np.abs(there[..., 0]) < strip_width(AREA, HALVES)
     assert ground.sum() > 200 and (mask == true)[ground].mean() > 0.95 and mask[ground].any()
     assert not mask[rays[..., 1] < 0].any()
+
+
+def test_a_sky_behind_the_scene_moves_no_place_near_a_cut():
+    """A camera over the cut sees the ground through thin splats, and a shell of sky 300 away through the gaps."""
+    thin = dataclasses.replace(carpet(), logit_opacities=torch.full((len(carpet()),), -0.5))
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(600, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    shell = Gaussians(
+        means=torch.tensor(300.0 * directions, dtype=torch.float32),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(600, 1),
+        log_scales=torch.full((600, 3), math.log(15.0)),
+        sh0=torch.zeros(600, 1, 3),
+        sh_rest=torch.zeros(600, 0, 3),
+        logit_opacities=torch.full((600,), 3.0),
+    )
+    # the view is tilted: its upper rows look over the end of the carpet into the sky
+    eye = np.array([0.0, -5.0, 0.0])
+    camera = Camera(look_at(eye, [0.0, 0.0, 6.0]), eye, 40.0, 40.0, 31.5, 23.5, 48, 64)
+    whole = Gaussians.concatenated([thin, shell])
+    settings = dataclasses.replace(DEPTH, jacobian_limit=1.3)  # the ground goes on beside the camera
+    (mask,) = strip_masks(
+        AREA, HALVES, whole, [camera], lambda g, c: render(g, c, settings=settings, backend="cpu")
+    )
+    rays = camera.rays()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        there = camera.eye + (5.0 / rays[..., 1:2]) * rays
+    ground = (rays[..., 1] > 0.1) & (np.abs(there[..., ::2]) < 7).all(axis=-1)
+    true = np.abs(there[..., 0]) < strip_width(AREA, HALVES)
+    assert true[ground].sum() > 60 and (mask == true)[ground].mean() > 0.95
+    assert not mask[rays[..., 1] < 0.1].any()
 
 
 def test_the_airspace_of_a_panorama_is_measured_by_its_rays():

@@ -33,6 +33,7 @@ def test_a_scene_without_cameras_is_seen_from_around(scene, tmp_path, capsys):
     out = tmp_path / "ball.glb"
     assert main(["mesh", str(scene), str(out), "--voxel", "0.05", "--backend", "cpu"]) == 0
     said = capsys.readouterr().out
+    assert "no photo is compared (a scene file has no photos; give its run)" in said
     assert "the scene has no cameras: 20 views around it are used" in said
     assert "is seen by 3 views or more" in said and "1 connected part" in said
     assert "no triangle passes through another one" in said

@@ -153,6 +153,9 @@ def test_files_of_a_capture_with_a_vertical_axis_stand_upright(capsys, tmp_path,
     shown = v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
     np.testing.assert_allclose(shown, (0.0, 1.0, 0.0), atol=1e-12)
     assert read_scene(tmp_path / "a.glb").up == pytest.approx(tuple(up))
+    said = called(capsys, "convert", tmp_path / "run", tmp_path / "a.spz", "--verify")
+    assert float(re.search(r"PSNR ([\d.]+) dB", said)[1]) > 35.0
+    assert read_scene(tmp_path / "a.spz").up == pytest.approx(tuple(up))
 
 
 def test_a_damaged_origin_of_a_run_is_one_line(made, capsys, tmp_path):

@@ -1,4 +1,4 @@
-"""How far a mesh can be trusted: on a plane whose depth maps are known."""
+"""How far a mesh can be trusted: by known depth maps of a plane, and by photos of a painted ball."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,11 @@ from gsplat_edu import Camera
 from gsplat_edu.evaluate.surface import Comparison, score_surface
 from gsplat_edu.mesh.depths import DepthCounts, DepthView
 from gsplat_edu.mesh.extract import MeshResult
-from gsplat_edu.mesh.trust import seen_by, seen_truth, trust_of
+from gsplat_edu.mesh.trust import photo_agreement, seen_by, seen_truth, trust_of
 from gsplat_edu.scene.mesh import Mesh
+from gsplat_edu.scene.projection import Projection
+from gsplat_edu.scene.views import View
+from painted_ball import photo_of_ball
 
 CAMERA = Camera(np.eye(3), (0, 0, -2), 32, 32, 20, 20, 41, 41)
 SQUARE = Mesh(
@@ -77,3 +80,71 @@ def test_recall_leaves_out_what_no_camera_sees():
         SQUARE, truth, Comparison(0.1, samples=2_000), seen_truth(truth, [view(2.0)], 0.1)
     ).distances
     assert all_of_it.distances.recall == 0.5 and seen.recall == 1.0 and seen.counted == 0.5
+
+
+VOXEL = 0.03
+
+
+def ball_mesh(radius=1.0, centre=(0.0, 0.0, 0.0), rows=96):
+    """Return a ball of triangles between circles of latitude."""
+    v, u = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, 2 * rows), indexing="ij")
+    vertices = np.stack([np.sin(v) * np.cos(u), np.cos(v), np.sin(v) * np.sin(u)], axis=-1)
+    i = (2 * rows * np.arange(rows)[:, None] + np.arange(2 * rows - 1)).ravel()
+    corners = [i, i + 1, i + 2 * rows], [i + 1, i + 2 * rows + 1, i + 2 * rows]
+    faces = np.concatenate([np.stack(c, axis=1) for c in corners])
+    return Mesh(np.array(centre) + radius * vertices.reshape(-1, 3), faces)
+
+
+def photo_pairs_of_ball(lens=None, **paint):
+    """Return four pairs of photos 0.35 rad apart, around the ball."""
+
+    def taken(angle):
+        eye = 3.2 * np.array([np.cos(angle), -0.2, np.sin(angle)])
+        camera = Camera.looking_at(eye, (0, 0, 0), 260.0, 260.0, 192, 192)
+        camera = camera if lens is None else camera.through(lens)
+        return View(camera, photo_of_ball(camera, **paint), name=f"{angle:.2f}")
+
+    return [(taken(angle), taken(angle + 0.35)) for angle in (0.0, 1.6, 3.1, 4.7)]
+
+
+def test_photos_agree_with_the_true_surface_only():
+    """Away from it by four voxels, in any way, and the point that both photos show is another one.
+
+    The eye moves by 0.35 rad, which moves what is 0.12 too near by 0.35 x 0.12 x 260 / 2.2 = 5 px: paint repeats
+    every 15 px, and a patch is 7 px wide.
+    """
+    pairs = photo_pairs_of_ball()
+    right = photo_agreement(ball_mesh(), pairs, VOXEL)
+    assert right.views == 4 and right.points > 4_000 and right.textured > 0.95 * right.points
+    assert right.share > 0.94
+    for wrong in (
+        ball_mesh(1 + 4 * VOXEL),
+        ball_mesh(1 - 4 * VOXEL),
+        ball_mesh(1, (0.0, 4 * VOXEL, 4 * VOXEL)),
+    ):
+        assert photo_agreement(wrong, pairs, VOXEL).share < right.share - 0.3
+    near = photo_agreement(ball_mesh(1 + 0.2 * VOXEL), pairs, VOXEL)
+    assert near.share > 0.9, "a fifth of a voxel is no fault"
+
+
+def test_photos_of_a_reflection_do_not_agree_with_the_surface():
+    """The paint moves with the eye, as in a mirror, so no surface that the photos show lies on the ball."""
+    found = photo_agreement(ball_mesh(), photo_pairs_of_ball(shiny=0.2), VOXEL)
+    assert found.textured > 2_000 and found.share < 0.6
+
+
+def test_photos_without_texture_judge_nothing():
+    found = photo_agreement(ball_mesh(0.9), photo_pairs_of_ball(texture=0.0), VOXEL)
+    assert found.points > 4_000 and found.textured == 0 and found.share is None
+
+
+def test_photos_through_a_lens_are_compared_as_others():
+    pairs = photo_pairs_of_ball(Projection("fisheye"))[:2]
+    right, wrong = (photo_agreement(ball_mesh(r), pairs, VOXEL) for r in (1.0, 1 + 4 * VOXEL))
+    assert right.textured >= 100 and right.share > 0.94 and wrong.share < right.share - 0.3
+
+
+def test_what_the_other_photo_does_not_see_is_not_compared():
+    """From the opposite side, two photos of a ball share no point of it."""
+    first, second = (photo_pairs_of_ball()[i][0] for i in (0, 2))
+    assert photo_agreement(ball_mesh(), [(first, second)], VOXEL).points == 0

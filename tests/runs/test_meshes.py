@@ -2,6 +2,7 @@
 
 import functools
 import json
+import re
 import shutil
 
 import numpy as np
@@ -20,7 +21,8 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.evaluation import ScoredViews, evaluate_run
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.views import View
-from splat_ball import ball
+from painted_ball import photo_of_ball
+from splat_ball import RADIUS, ball
 from systems import needs_posix
 
 COUNT, SIZE = 16, 96
@@ -28,7 +30,7 @@ RENDER = functools.partial(render, settings=RenderSettings(jacobian_limit=1.3, d
 
 
 def photographs():
-    """Return renders of the ball from all sides."""
+    """Return renders of the ball from all sides, of which no two are within 30 degrees."""
     index = np.arange(COUNT) + 0.5
     y, turn = 0.9 * (1 - 2 * index / COUNT), np.pi * (1 + 5**0.5) * index
     ring = np.sqrt(1 - y * y)
@@ -39,11 +41,9 @@ def photographs():
         yield View(camera, np.rint(255 * image).astype(np.uint8), name=f"{number:02d}.png")
 
 
-@pytest.fixture(scope="module")
-def evaluated(tmp_path_factory):
-    """Return a run of the ball that was evaluated."""
-    home = tmp_path_factory.mktemp("meshes")
-    write_transforms(home / "capture", list(photographs()), ball().means.numpy(), np.full((3_000, 3), 0.5))
+def run_of_ball(home, views):
+    """Write a capture and a run with the ball as its scene; return the run's folder and the dataset."""
+    write_transforms(home / "capture", list(views), ball().means.numpy(), np.full((3_000, 3), 0.5))
     dataset = load_dataset(home / "capture", DataSettings(test_every=8))
     folder = RunFolder(home / "run")
     folder.write_config(
@@ -55,6 +55,13 @@ def evaluated(tmp_path_factory):
     )
     write_scene(folder.scene(7), ball())
     folder.write_cameras(dataset.train, dataset.test, dataset.origin)
+    return folder, dataset
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """Return a run of the ball that was evaluated."""
+    folder, dataset = run_of_ball(tmp_path_factory.mktemp("meshes"), photographs())
     evaluate_run(folder, ScoredViews(dataset.test, dataset.train), ball(), RENDER)
     return folder
 
@@ -89,8 +96,62 @@ def test_the_record_says_what_is_printed(run, capsys):
     assert 0 < record["spread"] < 0.06 and record["intersections"]["found"] == 0
     assert record["left_out"]["pixels"] == 14 * SIZE * SIZE
     page = run.report.read_text("utf-8")
-    for row in ("area seen by 3 views or more", "none: it is closed", "after 7 iterations", "<th>F1</th>"):
+    for row in (
+        "area seen by 3 views or more",
+        "none: it is closed",
+        "after 7 iterations",
+        "<th>F1</th>",
+    ):
         assert page.count(row) == 1, row
+
+
+def test_held_out_photos_are_compared_with_the_mesh(tmp_path, capsys):
+    """Photos 18 degrees apart of a painted ball, by its formula, three of them held out; the scene is a ball of splats.
+
+    Photos that are shifted by 16 px show the ball where it is not.
+    """
+    views = []
+    for number, turn in enumerate(np.linspace(0, 2 * np.pi, 20, endpoint=False)):
+        eye = 3.0 * np.array([np.cos(turn), 0.0, np.sin(turn)])
+        camera = Camera.looking_at(eye, (0, 0, 0), 2.8 * SIZE, 2.8 * SIZE, 2 * SIZE, 2 * SIZE)
+        views.append(View(camera, photo_of_ball(camera, radius=RADIUS), name=f"{number:02d}.png"))
+    run, dataset = run_of_ball(tmp_path, views)
+    evaluate_run(run, ScoredViews(dataset.test, dataset.train), ball(), RENDER)
+    mesh(run)
+    said = capsys.readouterr().out
+    photos = run.read_meshes()["mesh"]["photos"]
+    assert photos["views"] == 3 and photos["textured"] > 200 and photos["share"] > 0.8
+    assert photos["agreeing"] / photos["textured"] == photos["share"]
+    assert f"photos agree with the mesh at {100 * photos['share']:.3g} % of the textured points" in said
+    assert (
+        f"({photos['textured']:,} of the {photos['points']:,} that 3 held-out photos and a neighbour" in said
+    )
+    assert run.report.read_text("utf-8").count("<th>points where held-out photos agree</th>") == 1
+
+    for number, path in enumerate(sorted((tmp_path / "capture" / "images").iterdir())):
+        Image.fromarray(np.roll(np.array(Image.open(path)), 8 * (-1) ** number, axis=0)).save(path)
+    mesh(run)
+    moved = run.read_meshes()["mesh"]["photos"]
+    assert moved["share"] < photos["share"] - 0.2
+
+
+def test_a_mesh_that_no_photo_judges_says_why(run, capsys):
+    mesh(run)
+    assert (
+        "no photo is compared (no held-out photo has another one within 30 degrees" in capsys.readouterr().out
+    )
+    assert run.read_meshes()["mesh"]["photos"] is None
+    config = run.read_config()
+    config["data"]["path"] = str(run.path / "gone")
+    run.write_config(config)
+    mesh(run)
+    assert re.search(
+        r"no photo is compared \(.*gone: the run's dataset no longer exists", capsys.readouterr().out
+    )
+    cameras = json.loads(run.cameras.read_text())
+    run.cameras.write_text(json.dumps([{**camera, "split": "train"} for camera in cameras]))
+    mesh(run)
+    assert "no photo is compared (the run held out no photo)" in capsys.readouterr().out
 
 
 @needs_posix

@@ -16,7 +16,7 @@ from gsplat_edu.base.links import check_links
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
-from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
+from gsplat_edu.blocks.seams import pooled_psnr, strip_masks, strip_width
 from gsplat_edu.blocks.task import block_options
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
@@ -149,7 +149,9 @@ def merge_blocks(
         "seams": None,
     }
     if len(records) > 1 and dataset.test and options.scores_at_end:
-        masks = masks_of(plan.area, plan.cores, gaussians, [view.camera for view in dataset.test], renderer)
+        masks = strip_masks(
+            plan.area, plan.cores, gaussians, [view.camera for view in dataset.test], renderer
+        )
         strips, rest = pooled_psnr(gaussians, dataset.test, masks, renderer, options.config.background)
         width = 2 * strip_width(plan.area, plan.cores)
         facts["seams"] = {"width": width, "psnr": strips, "psnr_elsewhere": rest}

@@ -11,9 +11,11 @@ from jaxtyping import Bool, Float64
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.blocks.plan import Area, Cell
 from gsplat_edu.evaluate.metrics import MSE_FLOOR, Renderer, over_backgrounds
+from gsplat_edu.ops.depth import LEAST_ALPHA
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import Photo, View
 
 STRIP_SHARE = 0.05
@@ -52,30 +54,43 @@ def near_a_cut(
     return near
 
 
-def strip_mask(
-    area: Area, cells: Sequence[Cell], gaussians: Gaussians, camera: Camera, render: Renderer
-) -> Mask:
-    """Return which pixels of a view show places near a cut, by the depth of a scene.
+def strip_masks(
+    area: Area,
+    cells: Sequence[Cell],
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    render: Renderer,
+) -> list[Mask]:
+    """Return which pixels of each view show places near a cut, by the mean depth of the scene without its sky.
+
+    Pixels less than half of which the scene covers show no place: the sky behind it, or nothing.
 
     Args:
         area: The ground.
         cells: The cells.
-        gaussians: The scene.
-        camera: The view's camera.
+        gaussians: The scene; a shell of a sky (`gsplat_edu.scene.shells.far_shell`) does not count.
+        cameras: The cameras of the views.
         render: Renders Gaussians from a camera, with depths.
     """
-    with torch.no_grad():
-        depth = render(gaussians, camera).mean_depth
-    assert depth is not None
-    z = depth.double().numpy(force=True).ravel()
-    if camera.pinhole:
-        columns, rows = np.meshgrid(np.arange(camera.W), np.arange(camera.H))
-        x, y = (columns.ravel() - camera.cx) / camera.fx * z, (rows.ravel() - camera.cy) / camera.fy * z
-        points = np.stack([x, y, z], axis=1) @ camera.R + camera.eye
-    else:  # NaN where a lens has no ray, which is near no cut
-        points = camera.origins().reshape(-1, 3) + z[:, None] * camera.rays().reshape(-1, 3)
-    near = near_a_cut(area.ground.coordinates(points), cells, strip_width(area, cells))
-    return np.asarray((near & (z > 0)).reshape(camera.H, camera.W))
+    sky = torch.from_numpy(far_shell(gaussians.means.numpy(force=True))).to(gaussians.means.device)
+    solid, width = gaussians[~sky] if sky.any() else gaussians, strip_width(area, cells)
+    masks = []
+    for camera in cameras:
+        with torch.no_grad():
+            output = render(solid, camera)
+        z = output.mean_depth.where(output.alpha >= LEAST_ALPHA, 0.0).double().numpy(force=True).ravel()
+        near = near_a_cut(area.ground.coordinates(_places(camera, z)), cells, width)
+        masks.append(np.asarray((near & (z > 0)).reshape(camera.H, camera.W)))
+    return masks
+
+
+def _places(camera: Camera, z: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 3"]:
+    """Return the places at the depths of all pixels; NaN, which is near no cut, where a lens has no ray."""
+    if not camera.pinhole:
+        return np.asarray(camera.origins().reshape(-1, 3) + z[:, None] * camera.rays().reshape(-1, 3))
+    columns, rows = np.meshgrid(np.arange(camera.W), np.arange(camera.H))
+    x, y = (columns.ravel() - camera.cx) / camera.fx * z, (rows.ravel() - camera.cy) / camera.fy * z
+    return np.asarray(np.stack([x, y, z], axis=1) @ camera.R + camera.eye)
 
 
 def pooled_psnr(
@@ -118,10 +133,3 @@ def _squares(output: RenderOutput, behind: ArrayLike, photo: Photo) -> Float64[n
     truth = truth / 255.0 if truth.dtype == np.uint8 else truth.astype(np.float64)
     image = np.clip(output.image.double().numpy(force=True), 0.0, 1.0)
     return np.asarray(np.square(image - truth).mean(axis=2))
-
-
-def masks_of(
-    area: Area, cells: Sequence[Cell], gaussians: Gaussians, cameras: Sequence[Camera], render: Renderer
-) -> list[Mask]:
-    """Return `strip_mask` for several cameras."""
-    return [strip_mask(area, cells, gaussians, camera, render) for camera in cameras]

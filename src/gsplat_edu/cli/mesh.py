@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.headroom import available_memory
 from gsplat_edu.base.locks import locked, locked_file
@@ -31,12 +31,19 @@ from gsplat_edu.mesh.depths import Progress, render_depths
 from gsplat_edu.mesh.extract import MeshResult, MeshSettings, extract_mesh
 from gsplat_edu.mesh.plan import Demand, plan_mesh, survey
 from gsplat_edu.mesh.tidy import SMALLEST_SHARE, TidySettings, require_simplification
-from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust, seen_truth, trust_of
+from gsplat_edu.mesh.trust import (
+    FEW_VIEWS,
+    MeshTrust,
+    PhotoAgreement,
+    photo_agreement,
+    seen_truth,
+    trust_of,
+)
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import open_subject
 from gsplat_edu.runs.dataset import run_dataset
-from gsplat_edu.runs.meshes import KINDS, MadeMesh, write_mesh_record
+from gsplat_edu.runs.meshes import KINDS, MadeMesh, photo_pairs, write_mesh_record
 from gsplat_edu.runs.painting import painted
 from gsplat_edu.runs.source import NamedCamera, Source, open_source, run_of
 from gsplat_edu.scene.frame import ORIGIN
@@ -90,14 +97,34 @@ def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal, pr
         scores = _scored(arguments, mesh, truth, result, source, progress)
     held_out = [(name, camera) for name, camera in source.cameras if name in source.held_out]
     others = render_depths(gaussians, held_out[:MOST_HELD_OUT], source.settings, backend, progress)
-    trust = trust_of(result, others, scores, progress)
-    console.print(*_trust(trust), sep="\n", soft_wrap=True)
+    photos, why = _photo_agreement(result, source, dataset, progress)
+    trust = trust_of(result, others, scores, progress, photos)
+    console.print(*_trust(trust, why), sep="\n", soft_wrap=True)
     if scores is not None:
         console.print(*_compared(scores, source.scene.unit or "world units"), sep="\n", soft_wrap=True)
     kind = "collider" if arguments.collider else "mesh"
     progress("pictures", 0, 1)
     _record(MadeMesh(kind, mesh, result, trust, facts), source, dataset, console)
     progress("pictures", 1, 1)
+
+
+def _photo_agreement(
+    result: MeshResult, source: Source, dataset: Dataset | None, progress: Progress
+) -> tuple[PhotoAgreement | None, str]:
+    """Compare the mesh with held-out photos; without any, return why."""
+    run = run_of(source.path)
+    if run is None:
+        return None, "a scene file has no photos; give its run"
+    if not source.held_out:
+        return None, "the run held out no photo"
+    try:
+        capture = run_dataset(run.read_config()) if dataset is None else dataset
+        pairs = photo_pairs(source.cameras, source.held_out, capture)
+        if not pairs:
+            return None, "no held-out photo has another one within 30 degrees that looks from elsewhere"
+        return photo_agreement(result.mesh, pairs, result.voxel, progress), ""
+    except (CheckpointError, DatasetError) as error:
+        return None, str(error)
 
 
 def _scored(
@@ -256,8 +283,13 @@ def _moved(mesh: Mesh, origin: tuple[float, float, float]) -> Mesh:
     return mesh if origin == ORIGIN else replace(mesh, vertices=mesh.vertices + np.array(origin))
 
 
-def _trust(trust: MeshTrust) -> list[str]:
-    """Say what of the mesh few views saw, how held-out views agree with it, and where it is open."""
+def _trust(trust: MeshTrust, why: str) -> list[str]:
+    """Say what of the mesh few views saw, how held-out views and photos agree with it, and where it is open.
+
+    Args:
+        trust: What is known.
+        why: Why no photo was compared.
+    """
     certain = short_number(100 * trust.certain, 3)
     said = [f"{certain} % of the area is seen by {FEW_VIEWS} views or more"]
     if trust.held_out is not None:
@@ -265,9 +297,29 @@ def _trust(trust: MeshTrust) -> list[str]:
         views = trust.held_out.views
         said.append(
             f"{within} % of the splats' depths from {views} held-out views lie within a voxel of the mesh;"
-            " no photo is compared: where the splats are wrong, as on glossy things, so is the mesh"
+            " this compares it with the splats, not with photos"
         )
+    said.append(_photos(trust.photos, why))
     return [*said, _shape(trust.shape), _intersecting(trust.intersections)]
+
+
+def _photos(found: PhotoAgreement | None, why: str) -> str:
+    """Say at how many points the photos agree with the mesh, or that none says so."""
+    if found is None:
+        return (
+            f"no photo is compared ({why}): where the splats are wrong, as on glossy things, so is the mesh"
+        )
+    seen = f"{found.views} held-out photo{'s' * (found.views != 1)} and a neighbour of each see"
+    if found.share is None:
+        return (
+            f"photos cannot judge the mesh: too little texture, at {found.textured:,} of the {found.points:,} points"
+            f" that {seen}"
+        )
+    return (
+        f"photos agree with the mesh at {short_number(100 * found.share, 3)} % of the textured points"
+        f" ({found.textured:,} of the {found.points:,} that {seen});"
+        " where they disagree, the surface is wrong, shiny or hidden"
+    )
 
 
 def _shape(shape: Topology) -> str:

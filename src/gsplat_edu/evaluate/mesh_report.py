@@ -146,6 +146,7 @@ def _facts(record: Mapping[str, Any]) -> dict[str, str]:
         f"area seen by {few} views or more": _percent(record.get("certain")),
         "distance of its depth maps": _joined("", _number(record.get("spread")), f"{unit} on average"),
         "splats' depths from held-out views within a voxel": _held_out(record.get("held_out")),
+        "points where held-out photos agree": _photos(record.get("photos")),
         "connected parts": _count(record.get("parts")),
         "holes": _holes(record),
         "triangles that pass through others": _intersecting(record.get("intersections")),
@@ -157,9 +158,20 @@ def _facts(record: Mapping[str, Any]) -> dict[str, str]:
 def _held_out(found: object) -> str:
     if not isinstance(found, Mapping):
         return ""
-    return _joined(
-        "", _percent(found.get("within")), f", of {_count(found.get('views'))} views; no photo is compared"
-    )
+    return _joined("", _percent(found.get("within")), f", of {_count(found.get('views'))} views; not photos")
+
+
+def _photos(found: object) -> str:
+    if not isinstance(found, Mapping):
+        return ""
+    points, textured, views = (_count(found.get(name)) for name in ("points", "textured", "views"))
+    if not points or not textured or not views:
+        return ""
+    of = f"{textured} of {points} points in {views} photos have enough texture to judge"
+    agreeing, share = found.get("agreeing"), found.get("share")
+    if share is None or not _is_number(agreeing):
+        return f"too little texture: {of}"
+    return f"{_percent(share)}; {of}. Elsewhere the surface is wrong, shiny or hidden"
 
 
 def _holes(record: Mapping[str, Any]) -> str:

@@ -194,8 +194,7 @@ class _File:
         if not (type(start) is type(size) is int and 0 <= start <= start + size <= len(self._body)):
             self._refuse("has splats that extend beyond the file's end")
         self._take(size)
-        packed = spz.unpacked(self._path, bytes(self._body[start : start + size]))
-        return Scene(half_turned(packed.gaussians), packed.antialiased)
+        return spz.in_own_axes(self._path, bytes(self._body[start : start + size]))
 
     def _plain(self, primitive: Mapping[str, Any]) -> Scene:
         """Return splats that are attributes."""

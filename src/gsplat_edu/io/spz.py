@@ -14,12 +14,13 @@ Scales are clamped to e^-10 to e^5.94, the coefficient of degree 0 to +-3.33, th
 antialiasing flag is always stored, so an unknown value reads back as false. Degree 4 of the harmonics is dropped on
 reading.
 
-An origin, a unit and an up direction other than y are stored in an extension of our own, whose content is the JSON of
-`gsplat_edu.io.scene.extras`; other programs skip extensions that they do not know, and show the scene near zero.
-Without it, up is y by definition.
+Axes are right, up, back; `gsplat_edu.io.axes.half_turned` converts them to ours. A scene whose up direction is another
+one is turned, by the rotation of `root_transform`, so that y is up in the file: splats, in double before they are
+rounded. An extension may name other axes; of these, ours are supported and the rest are rejected.
 
-Axes are right, up, back; `gsplat_edu.io.axes.half_turned` converts them to ours. An extension may name other axes; of
-these, ours are supported and the rest are rejected.
+An origin, a unit and an up direction other than y, all in the scene's own axes, are stored in an extension of our own,
+whose content is the JSON of `gsplat_edu.io.scene.extras`. The up direction says how to turn a file back into the
+scene's axes. Other programs skip extensions that they do not know, and show the scene upright and near zero.
 
 Niantic's library rejects scenes without splats; here they can be written and read.
 
@@ -45,10 +46,12 @@ from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.io import spz_values as values
-from gsplat_edu.io.axes import half_turned
+from gsplat_edu.io.axes import half_turned, root_transform
+from gsplat_edu.io.edit import Similarity
 from gsplat_edu.io.quantize import SMALL, byte_to_logit, check_expansion, logit_to_byte
 from gsplat_edu.io.scene import Scene, extras, read_extras
 from gsplat_edu.scene.camera import WORLD_UP
+from gsplat_edu.scene.frame import ORIGIN, Vector
 from gsplat_edu.scene.gaussians import Gaussians
 
 MAGIC = b"NGSP"
@@ -126,11 +129,17 @@ def read(path: Path) -> Scene:
         SceneFormatError: the file is not an SPZ, is damaged, or is of an unsupported kind; the message says which.
         OSError: the file cannot be read.
     """
-    return unpacked(path, read_bytes(path))
+    stored, extensions = _opened(path, read_bytes(path))
+    try:
+        up, unit, origin = read_extras(parse_json(extensions.get(FRAME, b"{}")))
+    except ValueError:
+        raise _damaged(path, "its extension with the origin cannot be read") from None
+    gaussians = half_turned(_turned(stored.gaussians, up, back=True))
+    return Scene(gaussians, stored.antialiased, up or WORLD_UP, unit, origin)
 
 
-def unpacked(path: Path, data: bytes) -> Scene:
-    """Read an SPZ from bytes; see `read`.
+def in_own_axes(path: Path, data: bytes) -> Scene:
+    """Read an SPZ from bytes without our extension and in its own axes: right, up, back, as glTF has them.
 
     Args:
         path: The file that holds them, for messages.
@@ -139,6 +148,11 @@ def unpacked(path: Path, data: bytes) -> Scene:
     Raises:
         SceneFormatError: as for `read`.
     """
+    return _opened(path, data)[0]
+
+
+def _opened(path: Path, data: bytes) -> tuple[Scene, dict[int, bytes]]:
+    """Return the splats in the format's axes, and the content of the extensions by their kind."""
     if data.startswith(LFS_POINTER):
         raise SceneFormatError(f"{path}: is a Git LFS pointer, not the file; fetch it with: git lfs pull")
     if data.startswith(GZIP):
@@ -151,13 +165,19 @@ def unpacked(path: Path, data: bytes) -> Scene:
         else:
             streams, records = _planes(path, header, memoryview(data)[HEADER.size :])
     gaussians, extensions = _decoded(header, streams), dict(_extensions(records))
-    if _axes(path, extensions) != RIGHT_DOWN_FORWARD:
+    if _axes(path, extensions) == RIGHT_DOWN_FORWARD:
         gaussians = half_turned(gaussians)
-    try:
-        up, unit, origin = read_extras(parse_json(extensions.get(FRAME, b"{}")))
-    except ValueError:
-        raise _damaged(path, "its extension with the origin cannot be read") from None
-    return Scene(gaussians, bool(header.flags & ANTIALIASED), up or WORLD_UP, unit, origin)
+    return Scene(gaussians, bool(header.flags & ANTIALIASED)), extensions
+
+
+def _turned(gaussians: Gaussians, up: Vector | None, back: bool = False) -> Gaussians:
+    """Turn Gaussians in y-up axes so that a scene's up direction is y, or back; in double where they are turned."""
+    if up is None or up == WORLD_UP:
+        return gaussians
+    turn, _ = root_transform(up, ORIGIN)
+    dtype, move = gaussians.means.dtype, Similarity(turn.T if back else turn, 1.0, np.zeros(3))
+    turned = move.gaussians(gaussians.map(torch.Tensor.double))
+    return turned.map(lambda tensor: tensor.to(dtype)) if back else turned
 
 
 def _read_header(path: Path, data: bytes) -> _Header:
@@ -312,7 +332,8 @@ def write(path: Path, scene: Scene) -> None:
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     degree = scene.gaussians.sh_degree
-    bits, streams = _encoded(scene.gaussians, values.write_smallest_three)
+    upright = _turned(half_turned(scene.gaussians), scene.up)
+    bits, streams = _encoded(upright, values.write_smallest_three)
     contents = [stream.tobytes() for stream in streams if stream.size]
     packed = [zstandard.ZstdCompressor(level=LEVEL).compress(content) for content in contents]
     records = _frame_record(scene)
@@ -337,13 +358,15 @@ def _frame_record(scene: Scene) -> bytes:
 def packed_version_2(scene: Scene) -> bytes:
     """Return an SPZ file of version 2, in one gzip, which is the version that glTF embeds.
 
+    Its coordinates are those of the glTF: what turns the scene upright, and its origin, belong to the glTF's nodes.
+
     Args:
         scene: The scene, in this package's axes, with finite parameters.
 
     Raises:
         ArgumentError: as for `write`.
     """
-    bits, streams = _encoded(scene.gaussians, values.write_first_three)
+    bits, streams = _encoded(half_turned(scene.gaussians), values.write_first_three)
     flags = ANTIALIASED if scene.antialiased else 0
     header = HEADER.pack(MAGIC, 2, len(scene.gaussians), scene.gaussians.sh_degree, bits, flags)
     return gzip.compress(b"".join([header, *(stream.tobytes() for stream in streams)]), mtime=0)
@@ -352,9 +375,8 @@ def packed_version_2(scene: Scene) -> bytes:
 def _encoded(
     gaussians: Gaussians, write_quats: Callable[[Float[np.ndarray, "N 4"]], UInt8[np.ndarray, "N B"]]
 ) -> tuple[int, tuple[UInt8[np.ndarray, "..."], ...]]:
-    """Return the fractional bits of positions, and the streams in the format's axes and order."""
-    turned = half_turned(gaussians)
-    arrays = {name: tensor.numpy(force=True) for name, tensor in turned.tensors().items()}
+    """Return the fractional bits of positions, and the streams in the format's order, of splats in its axes."""
+    arrays = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     bits = values.fractional_bits(arrays["means"])
     if bits is None:
         far = float(np.abs(arrays["means"]).max())

@@ -29,6 +29,9 @@ from gsplat_edu.scene.views import Photo
 RADIUS = 3
 """A patch has 7 x 7 pixels, as in Chen et al. 2024 (PGSR)."""
 
+PIXELS = (2 * RADIUS + 1) ** 2
+"""Pixels of a patch."""
+
 MOST = 0.6
 """Largest loss of a patch, 1 - ncc: patches that agree less show another surface, as where one hides the other, and
 learn nothing."""
@@ -42,6 +45,9 @@ it covers five or more of the surface."""
 
 LEAST_SPREAD = 2.0
 """Smallest standard deviation of a patch's values, in levels of 255: below it there is noise and no texture."""
+
+JUDGED_SPREAD = 4.0
+"""The same of a patch that is counted for or against a surface: noise of 1.5 levels then leaves an ncc above 0.8."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +112,20 @@ class PatchLoss(NamedTuple):
 
     value: Float[Tensor, ""]
     learning: int
+
+
+class PatchCounts(NamedTuple):
+    """How many patches of a photo agree with another photo.
+
+    Args:
+        seen: Patches with a surface that lie in both photos.
+        textured: Those of them that vary by `JUDGED_SPREAD` or more in the photo.
+        agreeing: Those of the textured ones whose loss is below `MOST`.
+    """
+
+    seen: int
+    textured: int
+    agreeing: int
 
 
 def patch_error(
@@ -173,6 +193,51 @@ def patch_error_in_torch(
 ) -> PatchLoss:
     """Return `patch_error` from its definition, by torch's operations, on any device."""
     H, W = alpha.shape
+    products, squares, held = _products(normals, depth, alpha, photo, other, grid)
+    held = held & (squares.detach() >= LEAST_SPREAD**2 * PIXELS).all(dim=0)
+    lengths = squares.where(held, 1.0).sqrt()
+    error = 1 - products / (lengths[0] * lengths[1])
+    bounded = error.clamp(max=MOST).where(held, 0.0)
+    value = grid.each(weight, H, W) * bounded.sum()
+    return PatchLoss(value, int((held & (error < MOST)).sum()))
+
+
+@one_thread()
+def patch_counts(
+    normals: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    photo: GreyPhoto,
+    other: GreyPhoto,
+    grid: Grid,
+) -> PatchCounts:
+    """Count the patches of `patch_error` that agree with the other photo, to judge a surface.
+
+    A patch with texture in the photo and none in the other one does not agree.
+
+    Args:
+        normals: As for `patch_error`, like all others.
+        depth: (H, W) sum of w z, world units.
+        alpha: (H, W) accumulated alpha.
+        photo: The photo of this camera, which is not orthographic.
+        other: The other photo.
+        grid: The patches' centres.
+    """
+    with torch.no_grad():
+        products, squares, held = _products(normals, depth, alpha, photo, other, grid)
+    textured = held & (squares[0] >= JUDGED_SPREAD**2 * PIXELS)
+    agreeing = textured & (products > (1 - MOST) * (squares[0] * squares[1]).sqrt())
+    return PatchCounts(int(held.sum()), int(textured.sum()), int(agreeing.sum()))
+
+
+def _products(
+    normals: Tensor, depth: Tensor, alpha: Tensor, photo: GreyPhoto, other: GreyPhoto, grid: Grid
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return of each patch, without its mean, its product with the other photo (P,) and both squares (2, P).
+
+    The last tensor says which patches lie in both photos with all of their pixels (P,).
+    """
+    H, W = alpha.shape
     seats = [torch.arange(first, size, grid.stride) for first, size in ((grid.first_v, H), (grid.first_u, W))]
     v, u = (seat.reshape(-1).to(alpha.device) for seat in torch.meshgrid(*seats, indexing="ij"))
     away = torch.arange(-RADIUS, RADIUS + 1, device=alpha.device)
@@ -205,12 +270,7 @@ def patch_error_in_torch(
     seen = corners[0] + corners[1] + corners[2] + corners[3]
     own, seen = own - own.mean(dim=1, keepdim=True), seen - seen.mean(dim=1, keepdim=True)
     squares = torch.stack([(own * own).sum(dim=1), (seen * seen).sum(dim=1)])
-    held = held & (squares.detach() >= LEAST_SPREAD**2 * own.shape[1]).all(dim=0)
-    lengths = squares.where(held, 1.0).sqrt()
-    error = 1 - (own * seen).sum(dim=1) / (lengths[0] * lengths[1])
-    bounded = error.clamp(max=MOST).where(held, 0.0)
-    value = grid.each(weight, H, W) * bounded.sum()
-    return PatchLoss(value, int((held & (error < MOST)).sum()))
+    return (own * seen).sum(dim=1), squares, held
 
 
 def _values(photo: GreyPhoto, like: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:

@@ -102,6 +102,7 @@ MESH: Mapping[str, Check] = {
     "rendered": _texts,
     "size": _place,
     "held_out": _numbers,
+    "photos": _numbers,
     "intersections": _numbers,
     "truth": _numbers,
     "left_out": _numbers,

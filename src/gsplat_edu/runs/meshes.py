@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,11 +33,21 @@ from gsplat_edu.mesh.faces import drawn_in
 from gsplat_edu.mesh.raster import Raster, lit, picture, rasterized
 from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.source import NamedCamera
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.mesh import Mesh
+from gsplat_edu.scene.rig import scene_extent
+from gsplat_edu.scene.views import View
+from gsplat_edu.train.patches import neighbours_of
 
 KINDS = {"mesh": "Mesh", "collider": "Collider"}
 """The kinds of meshes that a run has a record of, the latest of each, and their titles in the report."""
+
+PHOTOS = 8
+"""Largest number of held-out photos that are compared with the mesh."""
+
+PHOTO_SIDE = 800
+"""Longer side, px, of photos that are compared with the mesh."""
 
 CAMERAS = 2
 """Number of training cameras that a mesh is shown from."""
@@ -78,7 +88,7 @@ def record_of(made: MadeMesh) -> dict[str, Any]:
         made: The mesh. `gsplat_edu.runs.fields.MESH` has the types of the entries.
     """
     mesh, result, trust = made.mesh, made.result, made.trust
-    held_out, scores = trust.held_out, trust.scores
+    held_out, photos, scores = trust.held_out, trust.photos, trust.scores
     truth = None
     if scores is not None:
         truth = {**dataclasses.asdict(scores.distances), "normal_degrees": scores.normal_degrees}
@@ -94,6 +104,7 @@ def record_of(made: MadeMesh) -> dict[str, Any]:
         "certain": trust.certain,
         "spread": trust.spread,
         "held_out": None if held_out is None else dataclasses.asdict(held_out),
+        "photos": None if photos is None else {**dataclasses.asdict(photos), "share": photos.share},
         "parts": trust.shape.components,
         "boundary_edges": trust.shape.boundary_edges,
         "holes": trust.shape.boundary_loops,
@@ -102,6 +113,39 @@ def record_of(made: MadeMesh) -> dict[str, Any]:
         "left_out": dataclasses.asdict(result.counts),
         "notes": list(result.notes),
     }
+
+
+def photo_pairs(
+    cameras: Sequence[NamedCamera], held_out: Set[str], dataset: Dataset
+) -> list[tuple[View, View]]:
+    """Choose held-out photos spread evenly over all, and for each another photo that sees its subject from elsewhere.
+
+    Args:
+        cameras: The run's cameras, by the names of the photos.
+        held_out: Names of the photos that were not used for training.
+        dataset: The capture.
+
+    Returns:
+        At most `PHOTOS` pairs, at most `PHOTO_SIDE` px wide and high; those without another photo are left out.
+    """
+    photos = {view.name: view for view in (*dataset.test, *dataset.train)}
+    views = [_small(photos[name], camera) for name, camera in cameras if name in photos]
+    if not views:
+        return []
+    own = [view.camera for view in views]
+    neighbours = neighbours_of(own, scene_extent(own))
+    usable = [i for i, view in enumerate(views) if view.name in held_out and neighbours[i]]
+    count = min(PHOTOS, len(usable))
+    chosen = [usable[i * len(usable) // count] for i in range(count)]
+    return [(views[i], views[neighbours[i][len(neighbours[i]) // 2]]) for i in chosen]
+
+
+def _small(view: View, camera: Camera) -> View:
+    """Return a photo with the run's camera, so small that many can be compared in seconds."""
+    longest = max(view.camera.W, view.camera.H)
+    if longest > PHOTO_SIDE or (camera.W, camera.H) != (view.camera.W, view.camera.H):
+        camera = resized(camera, min(longest, PHOTO_SIDE))
+    return View.stored(camera, lambda: view.read().scaled(camera.W, camera.H), view.name)
 
 
 def write_mesh_record(

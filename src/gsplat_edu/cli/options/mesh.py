@@ -93,7 +93,8 @@ def _add_kinds(parser: argparse.ArgumentParser) -> None:
         choices=COLLIDERS,
         const="triangles",
         help="make a coarse mesh for collisions: voxels four times as large, and 5,000 triangles unless --faces says"
-        ' otherwise; "convex" cuts it into convex parts, nodes collider_0, collider_1, ... of a .glb (extra mesh)'
+        ' otherwise; "convex" cuts it into convex parts, nodes collider_0, collider_1, ... of a .glb (extra mesh);'
+        " they fill hollows, and how much and what they leave out is printed"
         ' (default without a value: "triangles")',
     )
     parser.add_argument(
