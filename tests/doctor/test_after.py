@@ -364,8 +364,8 @@ def test_an_unexplained_photo_is_not_also_reported_as_fitted(scene):
 
 def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     gaussians, views = scene
-    findings, why = _exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
-    assert findings == [] and "gone" in why
+    findings, why, correction = _exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
+    assert findings == () and "gone" in why and correction == "none"
     said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
     (line,) = [line for line in said if line.startswith("exposure ")]
     assert line.endswith(f"not between photos: {why}")
