@@ -66,9 +66,9 @@ shadow stay below 0.2."""
 VEILED = 0.02
 """Warn if near splats cover more than this fraction of a view's pixels: a spot of a seventh of its width and height."""
 
-SPILLED = 0.05
-"""Warn if on average more than this fraction of a scene's solid pixels lies outside of what the photos cut out; coarse
-edges of a good scene stay below 0.01."""
+SPILLED = 0.02
+"""Warn if on average more than this fraction of a scene's solid pixels lies outside of what the photos cut out. Of 22
+runs (fast, adc; 150 to 500 iterations), the 15 without a phantom have at most 0.0023, the 7 with one 0.06 to 0.39."""
 
 FAINT = 0.02
 """Splats below this opacity are hardly visible: they change a white 8-bit pixel by five levels."""
