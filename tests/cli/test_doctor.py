@@ -260,7 +260,7 @@ def real(name):
 
 @pytest.mark.sliced(1, group="captures that the doctor reads")
 def test_snowmiku97(doctor):
-    """Checked by eye: two photos have motion blur; automatic exposure brightens what is before the window (3944, 3945),
+    """Checked by eye: two photos have motion blur; automatic exposure brightens the far side of the toy (3944, 3945),
     and a bed and a wall of which the photographer's shadow darkens a half (4028).
     """
     code, said = doctor(real("snowmiku97"), "--no-forecast")
