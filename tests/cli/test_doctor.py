@@ -259,14 +259,16 @@ def real(name):
 
 
 def test_snowmiku97(doctor):
-    """Checked by eye: two photos have motion blur, and in two the photographer's shadow falls on the toy."""
+    """Checked by eye: two photos have motion blur; automatic exposure brightens the far side of the toy (3944, 3945),
+    and a bed and a wall of which the photographer's shadow darkens a half (4028).
+    """
     code, said = doctor(real("snowmiku97"), "--no-forecast")
     blurred, exposure = (
         "\n".join(x for x in said.splitlines() if f"warning    {n}" in x) for n in ("blur", "expo")
     )
     assert code == 0
     assert "2 of 97" in blurred and "003946" in blurred and "004020" in blurred
-    assert "004028" in exposure and "004027" in exposure
+    assert all(f"{name}.jpg (+" in exposure for name in ("003945", "003944", "004028"))
     assert said.count("warning") == 2
 
 

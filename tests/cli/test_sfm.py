@@ -3,6 +3,8 @@
 import argparse
 import importlib.util
 import io
+import os
+import shutil
 import signal
 
 import numpy as np
@@ -290,4 +292,19 @@ def test_missing_points_are_reported_before_poses_are_computed(tmp_path, capsys)
     assert main(words) == 2
     said = capsys.readouterr().err
     assert "--points: nowhere.ply does not exist" in said and said.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.usefixtures("never")
+def test_a_time_limit_that_cannot_hold_the_poses_is_refused_first(tmp_path, capsys, monkeypatch):
+    """60 photos of 320 x 240 px: 60 * 4.5 s * sqrt(0.0768 / 2.07) / 2 cores is 26 s."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    save(tmp_path / "photos", box_orbit(1))
+    (photo,) = (tmp_path / "photos").iterdir()
+    for number in range(59):
+        shutil.copy(photo, photo.with_name(f"copy_{number:02d}{photo.suffix}"))
+    words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--time-limit", "10s"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "--time-limit" in said and "poses of its photos takes about 26 s" in said and said.count("\n") == 1
     assert not (tmp_path / "run").exists()

@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.cli.main import main
@@ -247,3 +248,61 @@ def test_transforms_with_a_byte_order_mark(written, ending):
 )
 def test_the_captures_that_fell(real, name, photos):
     assert len(load_dataset(real(f"fell/{name}"), EVERYTHING).train) == photos
+
+
+def cropped(folder, name="view_004.png"):
+    path = folder / "images" / name
+    with Image.open(path) as image:
+        image.crop((0, 0, image.width // 2, image.height)).save(path)
+
+
+UNFIT = {
+    "cropped": (cropped, "another aspect ratio"),
+    "lens": (
+        lambda folder: of_cameras(folder, "SIMPLE_RADIAL 24 18 30 12 9 50"),
+        "focal length would change",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", UNFIT)
+def test_a_photo_that_does_not_fit_its_camera_is_left_out_and_named(written, how):
+    damage, said = UNFIT[how]
+    folder = written("text")
+    whole = load_dataset(folder)
+    damage(folder)
+    dataset = load_dataset(folder)
+    (note,) = (note for note in dataset.notes if isinstance(note, UnusablePhotos))
+    ((name, reason),) = note.problems
+    assert name == "view_004.png" and said in reason and note.total == 9
+    for part in ("train", "test"):  # the split of the others does not change
+        names = [view.name for view in getattr(whole, part)]
+        assert [view.name for view in getattr(dataset, part)] == [each for each in names if each != name]
+
+
+def test_unusable_poses_and_unfit_photos_are_one_note(written):
+    folder = written("text")
+    bad_image_txt(folder, ["nan"])
+    cropped(folder, "view_002.png")
+    (note,) = (note for note in load_dataset(folder).notes if isinstance(note, UnusablePhotos))
+    assert [name for name, _ in note.problems] == ["view_004.png", "view_002.png"] and note.total == 9
+
+
+def test_a_capture_of_unfit_photos_only_is_one_line(written, capsys):
+    folder = written("text")
+    for path in (folder / "images").iterdir():
+        cropped(folder, path.name)
+    assert main(["train", str(folder), "--out", str(folder / "run"), "--iterations", "1"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "another aspect ratio" in line and not (folder / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["view_004.png", "images/view_004.png"])
+def test_leave_out_says_that_an_unusable_photo_is_left_out_already(written, name, capsys):
+    folder = written("text")
+    bad_image_txt(folder, ["nan"])
+    assert main(["leave-out", str(folder), name]) == 2
+    said = capsys.readouterr().err
+    assert f"{name} is left out already" in said and "nan" in said.lower() and "has no photo" not in said
+    assert main(["leave-out", str(folder), "view_999.png"]) == 2
+    assert "has no photo" in capsys.readouterr().err

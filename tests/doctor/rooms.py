@@ -46,12 +46,12 @@ def texture(points, footprint):
     return np.clip(0.5 + 0.18 * light + 0.05 * color, 0.05, 0.95).T
 
 
-def cast(eye, directions, ball):
-    """Return where rays from a point inside the room hit the ball or a wall."""
+def cast(eye, directions, ball, radius=BALL):
+    """Return where rays from a point inside the room hit the ball, if there is one, or a wall."""
     with np.errstate(divide="ignore"):
         reach = np.min((WALL * np.sign(directions) - eye) / directions, axis=1)
     if ball:
-        along, apart = directions @ eye, eye @ eye - BALL**2
+        along, apart = directions @ eye, eye @ eye - radius**2
         root = along**2 - apart
         hit = -along - np.sqrt(np.maximum(root, 0.0))
         reach = np.where((root > 0) & (hit > 0), hit, reach)

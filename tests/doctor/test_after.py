@@ -364,8 +364,8 @@ def test_an_unexplained_photo_is_not_also_reported_as_fitted(scene):
 
 def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     gaussians, views = scene
-    findings, why = _exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
-    assert findings == [] and "gone" in why
+    findings, why, correction = _exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
+    assert findings == () and "gone" in why and correction == "none"
     said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
     (line,) = [line for line in said if line.startswith("exposure ")]
     assert line.endswith(f"not between photos: {why}")
@@ -397,3 +397,19 @@ def test_a_photo_below_the_others_is_suspicious_only_if_the_scene_fits_the_other
     badly = advice(25.0)
     assert "train without it" not in badly and "--max-gaussians" in badly and "median 25" in badly
     assert len(run.test) < 4 or "it was held out" in advice(31.0, "test")
+
+
+@pytest.mark.parametrize(("share", "is_named"), [(0.0023, False), (0.0597, True), (0.2049, True)])
+def test_a_phantom_of_a_short_run_is_named(scene, share, is_named):
+    """Means over the views of trainings: the worst without a phantom, and the two slightest with one."""
+    run = trained(*scene)
+    run = replace(run, train=[replace(view, outside=share) for view in run.train], test=[])
+    found = {finding.name: finding.sentence for finding in examine_run(run).findings}
+    assert ("outside cut-outs" in found) == is_named
+    assert not is_named or found["outside cut-outs"].startswith(f"{100 * share:.0f} %")
+
+
+def test_a_phantom_of_three_hundredths_is_named(scene):
+    run = trained(*scene)
+    run = replace(run, train=[replace(view, outside=0.03) for view in run.train], test=[])
+    assert "outside cut-outs" in {finding.name for finding in examine_run(run).findings}

@@ -1,13 +1,30 @@
 """Faults of the pixels, each at three severities: the slightest passes, the others are reported and nothing else is."""
 
+import functools
 import io
+import math
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
-from doctor.rooms import replaced, room, with_camera, with_photo
+from doctor.rooms import (
+    WALL,
+    camera_at,
+    cast,
+    placed,
+    rays,
+    replaced,
+    room,
+    texture,
+    with_camera,
+    with_photo,
+)
+from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.doctor.appearance import check_exposure, correction_of
+from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.scene.views import View
 
 SPOILED = (4, 13)
@@ -70,7 +87,7 @@ def test_exposure(named, stops, sign, is_named, with_points):
     spoiled, names = changed(views, lambda image: image * 2.0 ** (sign * stops / 2.2))
     found = named(spoiled, points if with_points else None)
     jumps = {text.removeprefix("images/").split(" (")[0]: text for text in found.get("exposure", ())}
-    assert set(jumps) == (names if is_named else set())
+    assert set(jumps) == (names if is_named and with_points else set()), "without points, nothing is claimed"
     assert set(found) <= {"exposure"}
     for text in jumps.values():
         # At most a fifth of a small jump is lost, because pixels that are clipped or have no known depth do not
@@ -153,3 +170,104 @@ def test_blur_is_judged_inside_a_cut_out(named, inside, kind):
         photos.append(View(view.camera, image, name=view.name, **plane))
     found = {name.removeprefix("images/") for name in named(photos, points).get("blurred", ())}
     assert found == ({views[i].name for i in SPOILED} if inside else set())
+
+
+@functools.cache
+def before_a_window():
+    """Photograph a large ball in a room of which one wall is 2.5 stops brighter, as a window, at one exposure.
+
+    Most photos show the ball and a little of the walls, at the silhouette. Their mean brightness differs by 0.9 stops.
+    """
+    views, points = [], []
+    rng = np.random.default_rng(1)
+    for i in range(24):
+        camera = camera_at(*placed("orbit", i, 24), 128)
+        ends = cast(camera.eye, rays(camera), True, radius=2.2)
+        albedo = 0.2 + 0.7 * texture(ends, np.linalg.norm(ends - camera.eye, axis=1) / camera.fx)
+        light = albedo**2.2 * np.where(ends[:, 2] > 0.98 * WALL, 1.0, 2.0**-2.5)[:, None]
+        image = 255.0 * np.clip(light, 0.0, 1.0) ** (1 / 2.2)
+        views.append(
+            View(camera, np.round(image).astype(np.uint8).reshape(camera.H, camera.W, 3), name=f"{i:02d}.png")
+        )
+        points.append(ends[rng.choice(len(ends), 60)])
+    return views, np.concatenate(points)
+
+
+@pytest.mark.parametrize("with_points", [True, False])
+def test_photos_that_show_other_things_at_one_exposure_are_not_named(named, with_points):
+    views, points = before_a_window()
+    means = np.log2([view.image.mean() for view in views])
+    assert 2.2 * np.ptp(means) > 0.8, "the photos as such differ by 0.9 stops"
+    assert not {"exposure", "white balance"} & set(named(views, points if with_points else None))
+
+
+def to_linear(srgb):
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(linear):
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+def test_a_photo_of_twice_or_half_the_light_is_a_stop_off(named, factor):
+    views, points = before_a_window()
+    other = to_srgb(np.minimum(factor * to_linear(views[5].image / 255.0), 1.0))
+    found = named(replaced(views, {5: with_photo(views[5], 255.0 * other)}), points)
+    (label,) = found["exposure"]
+    assert "05.png" in label
+    assert float(label.partition("(")[2].rstrip(")")) == pytest.approx(math.log2(factor), abs=0.2)
+
+
+def exposed(times):
+    """Return a function that writes exposure times, with ISO 100 and f/2, into the photos of a folder."""
+
+    def spoil(folder):
+        for path, time in zip(sorted((folder / "images").iterdir()), times, strict=True):
+            exif = Image.Exif()
+            exif[ExifTags.IFD.Exif] = {33434: time, 33437: 2.0, 34855: 100}
+            with Image.open(path) as image:
+                image.load()
+                image.save(path, exif=exif)
+
+    return spoil
+
+
+@pytest.mark.parametrize("with_points", [True, False])
+@pytest.mark.parametrize(("recorded", "shown", "is_named"), [(1, 1, True), (0, 1, False), (1, 0, False)])
+def test_exif_decides_on_exposure_unless_the_points_contradict(named, recorded, shown, is_named, with_points):
+    """Photo 6 has twice the exposure by its EXIF, by its pixels, or by both."""
+    views, points = room("forward", 96)
+    views = replaced(views, {6: with_photo(views[6], views[6].image * 2.0 ** (shown / 2.2))})
+    times = [1 / 50 if recorded and i == 6 else 1 / 100 for i in range(len(views))]
+    found = named(views, points if with_points else None, exposed(times)).get("exposure", ())
+    names = [label.removeprefix("images/") for label in found]
+    told = is_named or (recorded and not with_points)  # without points nothing contradicts EXIF
+    assert names == (["view_006.png (+1.0)"] if told else [])
+
+
+def test_advice_on_exposure_is_what_a_training_chooses(tmp_path):
+    """Photos of which many differ are corrected, unless they have alpha; a single one is not."""
+    plain, points = room("orbit", 96)
+    alpha = np.full(plain[0].image.shape[:2], 255, np.uint8)
+    alpha[0] = 0
+    rng = np.random.default_rng(2)
+    many = {i: float(stops) for i, stops in enumerate(rng.uniform(-0.9, 0.9, len(plain)))}
+    for name, stops, plane in (("many", many, None), ("one", {4: -1.2}, None), ("clear", many, alpha)):
+        views = [
+            View(
+                view.camera,
+                with_photo(view, view.image * 2.0 ** (stops.get(i, 0.0) / 2.2)).image,
+                alpha=plane,
+                name=view.name,
+            )
+            for i, view in enumerate(plain)
+        ]
+        write_colmap(tmp_path / name, views, points, np.full((len(points), 3), 0.5))
+        survey = prepare(CaptureReader(tmp_path / name), sharpness=False)
+        choice = correction_of(survey).value
+        (found,) = (finding for finding in check_exposure(survey) if finding.name == "exposure")
+        assert choice == ("exposure" if name == "many" else "none")
+        assert found.options == ((("appearance", choice),) if choice != "none" else ())
+        assert ("--appearance" in found.advice) == (choice != "none")
+        assert ("remove it" in found.advice) == (choice == "none")

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -21,7 +21,7 @@ from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
-from gsplat_edu.doctor.appearance import check_exposure
+from gsplat_edu.doctor.appearance import check_exposure, compares_exposure, correction_of
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.cameras import side_for_training
 from gsplat_edu.doctor.depth import own_depth
@@ -163,7 +163,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     extent = scene_extent([view.camera for view in dataset.train])
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
-    beforehand, uncompared = ([], "") if appearance != "none" else _exposure_beforehand(reader, console)
+    before = BeforeTraining() if appearance != "none" else _exposure_beforehand(reader, console)
     trained = Trained(
         folder.path,
         gaussians,
@@ -175,8 +175,9 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         log=folder.log(),
         capture=reader.path,
         options=_options(config),
-        beforehand=beforehand,
-        uncompared=uncompared,
+        beforehand=before.findings,
+        uncompared=before.uncompared,
+        correction=before.correction,
         strategy=_strategy(section),
         corrected=appearance != "none",
         moved=moved,
@@ -222,21 +223,27 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
     return (*words, *(flag for flag, key in flags.items() if train.get(key)))
 
 
-def _exposure_beforehand(reader: CaptureReader, console: Console) -> tuple[list[Finding], str]:
-    """Check the photos' exposure as before training.
+class BeforeTraining(NamedTuple):
+    """What the photos alone tell about their exposure."""
 
-    Returns:
-        The findings, and why there are none to expect: empty if the photos were compared.
-    """
+    findings: Sequence[Finding] = ()
+    uncompared: str = ""  # why there are none; empty if the photos were compared
+    correction: str = "none"  # what `--appearance auto` chooses
+
+
+def _exposure_beforehand(reader: CaptureReader, console: Console) -> BeforeTraining:
+    """Check the photos' exposure as before training."""
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         try:
             survey = prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))
         except DatasetError as error:
-            return [], str(error)
+            return BeforeTraining(uncompared=str(error))
         if len(survey.shots) < 2:
-            return [], "fewer than two photos can be read"
-        return check_exposure(survey), ""
+            return BeforeTraining(uncompared="fewer than two photos can be read")
+        if not compares_exposure(survey):
+            return BeforeTraining(uncompared="the capture has no points, and its photos no EXIF exposure")
+        return BeforeTraining(check_exposure(survey), correction=correction_of(survey).value)
 
 
 def _bar(console: Console) -> Progress:

@@ -14,12 +14,14 @@ from gsplat_edu.data.reader import CaptureReader
 def run(arguments: argparse.Namespace) -> None:
     """Change the list of a capture, and print it."""
     capture: Path = arguments.capture
-    frames = CaptureReader(capture).capture.frames
+    contents = CaptureReader(capture).capture
+    frames = contents.frames
     if not arguments.photos and not arguments.undo:
         listed = read_left_out(capture)
     else:
         try:
-            listed = change_left_out(capture, frames, arguments.photos or None, arguments.undo)
+            photos = arguments.photos or None
+            listed = change_left_out(capture, frames, photos, arguments.undo, contents.notes)
         except OSError as error:
             raise DatasetError(
                 f"{capture}: {error.strerror}; the list of photos to leave out is not changed"

@@ -47,7 +47,7 @@ from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
-from gsplat_edu.sfm.source import needs_poses
+from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
 from gsplat_edu.train.capacity import advised_side
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
@@ -132,7 +132,7 @@ def _run(
 ) -> None:
     seconds = arguments.time_limit
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
-    options = with_poses(options_from(arguments), arguments, console, say)
+    options = with_poses(options_from(arguments), arguments, console, say, seconds)
     reader = CaptureReader(options.data)
     options = with_right_poses(options, reader, arguments.keep_photos, say)
     if arguments.points is None:
@@ -240,7 +240,11 @@ def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:
 
 
 def with_poses(
-    options: RunOptions, arguments: argparse.Namespace, console: Console, say: Callable[[str], None]
+    options: RunOptions,
+    arguments: argparse.Namespace,
+    console: Console,
+    say: Callable[[str], None],
+    time_limit: float | None = None,
 ) -> RunOptions:
     """Find the poses first if the input is plain photos or a video; keep the capture in the run's folder."""
     if not needs_poses(options.data):
@@ -261,6 +265,8 @@ def with_poses(
         if find_model(found) is not None:
             say(f"{found}: using the poses that this run started with; {options.data} is not read again")
             return replace(options, data=found)
+    if time_limit is not None and not found.exists():
+        check_time_for_poses(options.data, time_limit, say)
     say(f"{options.data}: has no poses; finding them first and writing them to {found}")
     with locked("--out", found, "gsplat-edu train", say), stage_bars(console) as progress:
         try:

@@ -221,6 +221,10 @@ def find_photo(path: Path) -> Path | None:
     return next((copy for copy in copies if copy is not None), None)
 
 
+class UnfitPhotoError(DatasetError):
+    """A photo does not fit its camera: another aspect ratio, or a lens that cannot be undistorted."""
+
+
 class Problem(NamedTuple):
     """A photo whose pose or camera cannot be used."""
 
@@ -345,8 +349,8 @@ def photo_file(
         whether the file's size differs from the frame's, in which case the intrinsics were rescaled.
 
     Raises:
-        DatasetError: a file is not an image, the sizes of photo, mask and camera are inconsistent, or the photo cannot
-            be undistorted.
+        UnfitPhotoError: the photo has another aspect ratio than its camera, or cannot be undistorted.
+        DatasetError: a file is not an image, or the sizes of photo and mask differ.
     """
     resolution = settings.resolution
     path, orientation = frame.image, frame.orientation
@@ -379,7 +383,7 @@ def photo_file(
                 W, H = _target(seen.W, seen.H, resolution if smaller is None else None)
             seen = seen.scaled(W, H)
         except DatasetError as error:
-            raise DatasetError(f"{frame.name}: {error}", error.reason) from None
+            raise UnfitPhotoError(f"{frame.name}: {error}", error.reason) from None
     # an opaque file has no alpha to keep, so none is counted as needing memory
     background = settings.background if headers.of(path).alpha else OPAQUE_BEHIND
     source = PhotoFile(path, frame.mask, lens, W, H, background, orientation, native=kept is not None)
@@ -406,7 +410,7 @@ def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
     (W, H), lens = size, frame.lens
     if not fits_camera(lens, size):
         what = f"is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect ratio"
-        raise DatasetError(
+        raise UnfitPhotoError(
             f"{path}: the photo of {frame.name} {what}; was the photo cropped or turned after the poses were found?",
             f"the photo {what}",
         )

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.data.capture import Capture, Cloud, Frame, photo_file, whole_panoramas
+from gsplat_edu.data.capture import Capture, Cloud, Frame, UnfitPhotoError, photo_file, whole_panoramas
 from gsplat_edu.data.images import UPRIGHT, ImageStore, PhotoFile, PhotoHeaders
 from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
 from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
@@ -36,7 +36,7 @@ from gsplat_edu.data.loading_notes import (
     UnevenFocalLengths,
     UnlistedPhotos,
 )
-from gsplat_edu.data.notes import Background, LeftOutPhotos, OnlyInRegion, UnreadColors
+from gsplat_edu.data.notes import Background, LeftOutPhotos, OnlyInRegion, UnreadColors, UnusablePhotos
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.points import random_cloud
@@ -117,8 +117,7 @@ class Dataset:
         listed = _listed(path, placed_frames, settings)
         about: list[LoadingNote] = []  # the choice of photos
         chosen, parts = _used(path, listed, _split(path, listed, settings, about), settings, about)
-        frames = oriented(chosen, headers)
-        made = [photo_file(frame, settings, headers) for frame in frames]
+        frames, parts, made = _fitting(path, oriented(chosen, headers), parts, settings, headers, notes)
         sources = [source for source, *_ in made]
         decoding = max(headers.of(source.path).decoding for source in sources)
         store = ImageStore(settings.image_memory, sources, decoding, reader.watch)
@@ -350,6 +349,37 @@ def _used(
             f"{path}: {LEFT_OUT} leaves out every photo for training; take some off it, or set test_every to 0"
         )
     return [frame for frame, gone in zip(frames, out, strict=True) if not gone], kept
+
+
+def _fitting(
+    path: Path,
+    frames: Sequence[Frame],
+    parts: Sequence[str],
+    settings: DataSettings,
+    headers: PhotoHeaders,
+    notes: list[LoadingNote],
+) -> tuple[list[Frame], list[str], list[tuple[PhotoFile, Camera, bool]]]:
+    """Return the frames whose photos fit their cameras, with their parts and files, and report the others."""
+    fitting, problems, error = list[tuple[Frame, str, tuple[PhotoFile, Camera, bool]]](), [], None
+    for frame, part in zip(frames, parts, strict=True):
+        try:
+            fitting.append((frame, part, photo_file(frame, settings, headers)))
+        except UnfitPhotoError as unfit:
+            problems.append((frame.name, unfit.reason))
+            error = error or unfit
+    if error is not None:
+        if not fitting:
+            raise error
+        if not any(part == "train" for _, part, _ in fitting):
+            raise DatasetError(f"{path}: no photo for training fits its camera, first {error}")
+        earlier = next((note for note in notes if isinstance(note, UnusablePhotos)), None)
+        if earlier is None:
+            notes.append(UnusablePhotos(tuple(problems), len(frames)))
+        else:
+            both = (*earlier.problems, *problems)
+            notes[notes.index(earlier)] = UnusablePhotos(both, earlier.total)
+    kept, parts_kept, made = [list(column) for column in zip(*fitting, strict=True)]
+    return kept, parts_kept, made
 
 
 def _places(centres: Sequence[Float64[np.ndarray, "3"]]) -> list[int]:

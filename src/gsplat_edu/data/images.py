@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import threading
 import warnings
@@ -144,6 +145,38 @@ def image_orientation(path: Path) -> int:
                 return stored_orientation(file)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
+
+
+def recorded_exposure(path: Path) -> float | None:
+    """Read how bright EXIF says a photo is: log2(t ISO / N²) with exposure time t in s and f-number N, stops.
+
+    Returns:
+        A number to compare with that of other photos; None unless the file records all three.
+
+    Raises:
+        DatasetError: as for `image_header`.
+    """
+    tags = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about invalid EXIF, which the user cannot fix
+            with opened_image(path) as file:
+                # Pillow decodes a PNG to look for EXIF behind its pixels, where cameras do not write it
+                late = file.format == "PNG" and "exif" not in file.info
+                details = {} if late else file.getexif().get_ifd(ExifTags.IFD.Exif)
+    except UNDECODABLE as error:
+        raise _undecodable(path, error) from None
+    time, iso, number = (_positive(details.get(tag)) for tag in tags)
+    return math.log2(time * iso / number**2) if time and iso and number else None
+
+
+def _positive(value: object) -> float:
+    """Convert an EXIF value, the first if there are several, to a number; 0 if it is none, or not positive."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return 0.0
+    return number if 1e-9 < number < 1e9 else 0.0
 
 
 class PhotoHeaders:

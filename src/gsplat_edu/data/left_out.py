@@ -15,6 +15,7 @@ from gsplat_edu.base.reading import read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import Frame, is_file, is_folder
 from gsplat_edu.data.changes import changing
+from gsplat_edu.data.notes import UnusablePhotos
 
 LEFT_OUT = "left_out.txt"
 """Name of the list."""
@@ -73,7 +74,11 @@ def is_left_out(frame: Frame, capture: Path, names: Iterable[str]) -> bool:
 
 
 def changed_left_out(
-    capture: Path, frames: Sequence[Frame], photos: Sequence[str], back: bool = False
+    capture: Path,
+    frames: Sequence[Frame],
+    photos: Sequence[str],
+    back: bool = False,
+    notes: Sequence[object] = (),
 ) -> tuple[str, ...]:
     """Return the list of a capture with further photos, or without them.
 
@@ -82,11 +87,14 @@ def changed_left_out(
         frames: Its frames.
         photos: The photos: their paths below the folder, their names, or their file names if only one photo has it.
         back: Take the photos off the list instead.
+        notes: The capture's, which name the photos that are not among its frames because they are unusable.
 
     Raises:
-        DatasetError: a photo is unknown, or several have its name; none is left; or as for `read_left_out`.
+        DatasetError: a photo is unknown or unusable, or several have its name; none is left; or as for `read_left_out`.
     """
     paths = {photo_path(frame, capture): frame.name for frame in frames}
+    for photo in photos:
+        _refuse_unusable(photo, paths, capture, notes)
     chosen = [_found(photo, paths, capture) for photo in photos]
     # lines that name no photo stay: it may come back
     kept = [name for name in read_left_out(capture) if name not in chosen and paths.get(name) not in chosen]
@@ -98,7 +106,11 @@ def changed_left_out(
 
 
 def change_left_out(
-    capture: Path, frames: Sequence[Frame], photos: Sequence[str] | None, back: bool = False
+    capture: Path,
+    frames: Sequence[Frame],
+    photos: Sequence[str] | None,
+    back: bool = False,
+    notes: Sequence[object] = (),
 ) -> tuple[str, ...]:
     """Change the list of a capture and return it; changes by other threads and processes are kept.
 
@@ -107,13 +119,14 @@ def change_left_out(
         frames: Its frames.
         photos: The photos, as for `changed_left_out`; None empties the list.
         back: Take the photos off the list instead.
+        notes: The capture's, as for `changed_left_out`.
 
     Raises:
         DatasetError: as for `changed_left_out` and `gsplat_edu.data.changes.changing`.
         OSError: the folder cannot be written to.
     """
     with changing(capture):
-        listed = () if photos is None else changed_left_out(capture, frames, photos, back)
+        listed = () if photos is None else changed_left_out(capture, frames, photos, back, notes)
         write_left_out(capture, listed)
     return listed
 
@@ -141,6 +154,19 @@ def photo_path(frame: Frame, capture: Path) -> str:
     """
     folder = capture if is_folder(capture) else capture.parent
     return (frame.image.relative_to(folder) if frame.image.is_relative_to(folder) else frame.image).as_posix()
+
+
+def _refuse_unusable(photo: str, paths: dict[str, str], capture: Path, notes: Sequence[object]) -> None:
+    """Say so if a text means no photo in use, but one that is left out because its pose or camera is unusable."""
+    if any(photo in (path, name, path.rsplit("/", 1)[-1]) for path, name in paths.items()):
+        return
+    unusable = [problem for note in notes if isinstance(note, UnusablePhotos) for problem in note.problems]
+    for name, reason in unusable:
+        if photo.rsplit("/", 1)[-1] == name.rsplit("/", 1)[-1]:
+            problem = (
+                f"{legible(photo)} is left out already, because its pose or camera is unusable ({reason})"
+            )
+            raise DatasetError(f"{capture}: {problem}; repair it to use it again, or do not name it")
 
 
 def _found(photo: str, paths: dict[str, str], capture: Path) -> str:

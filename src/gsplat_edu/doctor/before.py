@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.notes import Background, MissingPhotos, Note
-from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure
+from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure, compares_exposure
 from gsplat_edu.doctor.cameras import (
     check_away,
     check_coverage,
@@ -74,7 +74,7 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
     for name, check in checks:
         found = check(survey)
         findings += found
-        if not found:
+        if not found and (check is not check_exposure or compares_exposure(survey)):
             fine.append(name)
     if "--resolution" not in options and any(finding.name == "resolution" for finding in findings):
         options = (*options, "--resolution", "auto")

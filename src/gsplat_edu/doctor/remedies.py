@@ -1,29 +1,20 @@
 """Choose the remedies that a capture needs, for the options of `gsplat-edu train` with the value auto.
 
-The checks of `gsplat_edu.doctor.appearance` name photos that a user should look at. This module decides whether the
-training should correct all photos, and whether it should start with a sky.
+Each choice is one function of a surveyed capture, whose result the doctor's advice quotes too. This module decides
+whether a training should start with a sky; `gsplat_edu.doctor.appearance` decides whether it corrects exposures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from gsplat_edu.base.text import Told
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.appearance import Gains
+from gsplat_edu.doctor.appearance import correction_of
 from gsplat_edu.doctor.cut_out import outside_masks_of
 from gsplat_edu.doctor.finding import Finding, Remedy, Severity
 from gsplat_edu.doctor.survey import Progress, Survey, prepare
 from gsplat_edu.sky.find import Sky, find_sky
-
-DIFFERENT = 0.25
-"""A photo differs if its brightness or a channel's tint is off its neighbours' by more than this, stops."""
-
-SHARE = 0.1
-"""Correct exposures if at least this fraction of the photos differs. snowmiku97, taken by a phone whose exposure
-drifts, has 0.05, and the scene follows with view-dependent colour. Random gains of +-0.7 stops give 0.4."""
 
 ENOUGH = 12
 """`--transients auto` looks for moving objects from this number of training photos on. In smaller captures, fewer than
@@ -49,22 +40,6 @@ def remedies_for(
     """
     survey = prepare(reader, progress, sharpness=False, left_out=left_out)
     return {name: CHOICES[name](survey) for name in names}
-
-
-def appearance_of(survey: Survey) -> Remedy:
-    """Choose `--appearance` for a surveyed capture: "exposure" if many photos differ from their neighbours."""
-    if len(survey.shots) < 2 or any(shot.stats.transparent for shot in survey.shots):
-        return Remedy("none")
-    gains = Gains(survey)
-    differ = (np.abs(gains.light) > DIFFERENT) | (gains.tint > DIFFERENT)
-    if np.mean(differ) < SHARE:
-        return Remedy("none")
-    largest = float(np.abs(gains.light).max())
-    return Remedy(
-        "exposure",
-        f"{int(differ.sum())} of {len(differ)} photos differ in brightness or tint from neighbours that see the same,"
-        f" by up to {largest:.1f} stops",
-    )
 
 
 def transients_for(count: int) -> Remedy:
@@ -94,7 +69,7 @@ def sky_of(survey: Survey) -> Remedy:
     return Remedy("shell", _sky_sentence(sky, survey)) if sky.is_certain else Remedy("none")
 
 
-CHOICES = {"appearance": appearance_of, "sky": sky_of, "outside_masks": outside_masks_of}
+CHOICES = {"appearance": correction_of, "sky": sky_of, "outside_masks": outside_masks_of}
 """Functions that choose a setting for a surveyed capture, by the setting's name."""
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
 from gsplat_edu.data.depths import DepthReport
-from gsplat_edu.data.images import PhotoHeaders
+from gsplat_edu.data.images import PhotoHeaders, recorded_exposure
 from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import LeftOutPhotos, Note, UnreadColors
@@ -48,6 +48,7 @@ class Shot:
         camera: The undistorted pinhole camera at the thumbnail's size.
         stats: Its thumbnail and measurements.
         colors: Why its colours are taken as sRGB although its file declares another space; empty if they are converted.
+        exposure: Brightness by its EXIF (`gsplat_edu.data.images.recorded_exposure`), stops; None if it has none.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Shot:
     camera: Camera
     stats: PhotoStats
     colors: str = ""
+    exposure: float | None = None
 
 
 class Refused(NamedTuple):
@@ -221,7 +223,8 @@ def _shot(headers: PhotoHeaders, sharpness: bool, frame: Frame) -> Shot | Refuse
         return Refused(frame.name, error.reason)
     h, w = stats.thumbnail.shape[:2]
     small = camera.scaled(w, h)
-    return Shot(frame.name, frame.lens, (camera.W, camera.H), small, stats, colors)
+    exposure = recorded_exposure(source.path)
+    return Shot(frame.name, frame.lens, (camera.W, camera.H), small, stats, colors, exposure)
 
 
 def _points(capture: Capture) -> Float64[np.ndarray, "N 3"]:
