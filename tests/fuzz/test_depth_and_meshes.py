@@ -21,6 +21,8 @@ from gsplat_edu.scene.mesh import Mesh, Texture
 from processes import Program
 from systems import needs_posix
 
+pytestmark = pytest.mark.fuzz
+
 FILES = tiers.count("GSPLAT_EDU_FUZZ", 200, 20_000)
 """Damaged files per reader."""
 
@@ -41,8 +43,6 @@ from gsplat_edu.base.errors import DatasetError, NotEnoughMemoryError, SceneForm
 from gsplat_edu.data.depth_files import read_depth
 from gsplat_edu.io.mesh_files import read_mesh
 import numpy as np
-
-pytestmark = pytest.mark.fuzz
 
 folder, first, count, whole, *names = sys.argv[1:]
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -316,8 +316,7 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
         tab.close()
         return left
 
-    left = closed_with_edits()
-    tab = person.tab
+    left, tab = closed_with_edits(), person.tab
     tab.clock.install()
     tab.reload()
     frame = opened(tab, address)

@@ -1,7 +1,6 @@
 """What arrives late on the page of a capture, while something is pressed, or after a later question."""
 
 import re
-import time
 
 import pytest
 
@@ -9,7 +8,7 @@ from gsplat_edu.data.left_out import read_left_out
 from viewer.handles import until
 from viewer.test_capture_matches import DOTS
 from viewer.test_capture_page import folder, opened, served
-from waiting import PATIENCE
+from waiting import awaited, settle
 
 __all__ = ["folder", "opened", "served"]
 

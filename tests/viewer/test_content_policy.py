@@ -1,7 +1,5 @@
 """The content policy of pages and reports in a browser: our code works, injected code does not run."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,7 @@ from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.viewer import page
 from viewer.handles import until
-from waiting import PATIENCE
+from waiting import FRAMES, awaited
 
 INJECTED = (
     "<script>window.ran = 'script'</script>"

@@ -21,6 +21,7 @@ from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, FLOATERS, EditServer
 from viewer.handles import until
+from waiting import awaited, settle
 
 N = 400
 

@@ -16,6 +16,7 @@ from gsplat_edu.viewer import live
 from gsplat_edu.viewer.live_folder import LiveFolder, header_of
 from live_clients import GROWING, PATIENCE, Client, training, until
 from processes import Program
+from waiting import FRAMES, awaited
 
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 NO_WEBGL2 = """

@@ -11,6 +11,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from viewer.handles import touch as put_fingers, until
+from waiting import FRAMES, awaited
 
 SIZE = (640, 400)
 MIDDLE = (400, 250)  # right of the panel

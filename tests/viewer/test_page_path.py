@@ -10,6 +10,7 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.viewer import page
 from js.camera_paths import AROUND, around
 from viewer.handles import until
+from waiting import FRAMES
 
 ORIGIN = (500.0, -64.0, 8.0)
 
