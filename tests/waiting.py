@@ -1,7 +1,9 @@
 """Waiting for a state of a thread, a program or a page. Nothing else in the tests sleeps (repo/test_waiting.py)."""
 
+import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 PATIENCE = 300.0
@@ -31,6 +33,13 @@ def until(
         assert time.monotonic() < end, f"{what} did not occur"
         pause(PAUSE)
     return found
+
+
+def finished(coroutine: Coroutine[Any, Any, Any]) -> Any:
+    """Run a coroutine to its end and return its result; in a thread of its own, because the main thread of a process
+    that drives a browser has a running event loop."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(asyncio.run, asyncio.wait_for(coroutine, PATIENCE)).result()
 
 
 def awaited(tab: Any, condition: Callable[[], Any], what: str = "the awaited state") -> Any:

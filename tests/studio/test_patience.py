@@ -15,6 +15,7 @@ from gsplat_edu.studio.uploads import Limits
 from studio.conftest import Inline
 from studio.pages import TOKEN, served
 from studio.test_stream import ODD
+from waiting import finished
 
 LONG = "x" * 5_000
 
@@ -36,7 +37,7 @@ def read(piece, wait, count, seconds):
             found.extend(message["body"])
             more = message["more_body"]
 
-    asyncio.run(asyncio.wait_for(Patience(app, seconds)({"type": "http"}, receive, None), 180))
+    finished(Patience(app, seconds)({"type": "http"}, receive, None))
     return len(found)
 
 

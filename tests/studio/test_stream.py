@@ -8,6 +8,7 @@ from gsplat_edu.jobs import events, following
 from gsplat_edu.jobs.record import State, Work
 from gsplat_edu.studio import stream as stream_module
 from gsplat_edu.studio.stream import Stream
+from waiting import finished
 
 ODD = ("\u00b2", "\u0663", "+6", "-6", " 6", "6_0", "6.0", "9" * 5_000)
 """Texts that `str.isdigit`, `str.isdecimal` or `int` accept as numbers."""
@@ -29,7 +30,7 @@ def collected(stream, last_id, count):
         assert not stream._woken
         return found
 
-    return asyncio.run(asyncio.wait_for(run(), 10))
+    return finished(run())
 
 
 def test_a_watcher_resumes_after_the_last_event_it_has():
