@@ -360,7 +360,7 @@ def wall(show):
 def click_twice(visit, by, x, y, pause):
     """Click or tap twice, `pause` seconds apart by the times of the events, also on a slow computer."""
     session = visit.tab.context.new_cdp_session(visit.tab)
-    start = time.time() - pause - 1  # the times are over, so that later events come after them
+    start = time.time()
     for moment in (start, start + pause):
         for pressed in (True, False):
             at = {"timestamp": moment + (0.0 if pressed else 0.05)}
@@ -376,6 +376,10 @@ def click_twice(visit, by, x, y, pause):
                 kind = {"type": "touchStart" if pressed else "touchEnd", "touchPoints": places}
                 session.send("Input.dispatchTouchEvent", {**kind, **at})
     session.detach()
+    end = start + pause + 0.5
+    awaited(
+        visit.tab, lambda: time.time() > end, "the time of the last event, which later ones must not precede"
+    )
 
 
 @pytest.mark.parametrize("by", ["mouse", "finger"])
