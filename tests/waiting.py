@@ -1,4 +1,4 @@
-"""Waiting for a state of a thread, a program or a page. Nothing else in the tests sleeps (repo/test_waiting.py)."""
+"""Waiting for a state of a thread, a program or a page. Tests call it instead of sleeping in loops of their own."""
 
 import asyncio
 import time

@@ -448,7 +448,7 @@ class Ratios(NamedTuple):
     stops: Float64[np.ndarray, "n 3"]
     """How much brighter the first photo is at each point, by channel, stops."""
     cells: int
-    """Number of the first photo's cells that the points lie in."""
+    """Number of cells of the first photo that hold at least one of the points."""
 
 
 def _points_seen(survey: Survey) -> tuple[Float64[np.ndarray, "N 3"], list[Int64[np.ndarray, "..."]]]:

@@ -375,7 +375,7 @@ export async function drawMask(store, entry, photo, name, saved) {
     questions += 1;
     [base, version] = [answer.shapes, answer.version];
     if (newer?.version === version) {
-      // it was looked at before this answer came
+      // the library told of this version before the answer to saving came
       newer = null;
       put(line, "");
     }
