@@ -109,9 +109,8 @@ gallery("the first ten photos: no pose, no focal length", {n: photos[n] for n in
 # %%
 def trained(data, out, iterations, strategy="adc", appearance="none", sky="none", **reading):
     config = recipe(iterations, strategy=strategy, appearance=appearance, sky=sky, max_gaussians=20_000)
-    options = RunOptions(
-        WORK / data, WORK / out, config, DataSettings(**reading), eval_every=iterations, save_every=0
-    )
+    settings = DataSettings(**reading)
+    options = RunOptions(WORK / data, WORK / out, config, settings, eval_every=iterations, save_every=0)
     job = CaptureRun(options)
     job.train()
     return job, job.seconds, job.finish()
