@@ -22,6 +22,7 @@ from gsplat_edu.evaluate.metrics import score_views
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.cleaning import report_lines
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
@@ -217,6 +218,21 @@ def test_clean_removes_the_phantom(capture, haunted):
     assert phantom(left, held_out) < 0.1 * phantom(haunted, held_out)
     assert cleaning.after > cleaning.before + 3
     assert len(left) > 100
+    assert cleaning.outside < 0.03
+
+
+def test_clean_says_what_it_left_outside_of_the_cut_outs(capture):
+    """Held-out photos that cut out nothing: whatever is left of the scene lies outside."""
+    shown, held_out = split(capture)
+    empty = []
+    for view in held_out:
+        photo = view.read()
+        empty.append(View(view.camera, photo.image, alpha=np.zeros_like(photo.alpha), name=view.name))
+    run = trainer(shown, 20)
+    run.run()
+    cleaning = clean(run.gaussians, shown[0], empty, RenderSettings(background=WHITE, sh_degree=0))
+    assert cleaning.outside == 1.0
+    assert "100 % of the scene's solid area still lies outside" in report_lines(cleaning)[-1]
 
 
 def test_the_doctor_names_what_lies_outside_of_the_cut_outs(capture, haunted, tmp_path):

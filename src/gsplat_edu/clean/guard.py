@@ -20,7 +20,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import in_range
 from gsplat_edu.clean.evidence import judging_backend
 from gsplat_edu.clean.judge import Progress, Reason, Verdict, judge
-from gsplat_edu.evaluate.metrics import photo_psnr
+from gsplat_edu.evaluate.metrics import outside_cut_out, photo_psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
@@ -48,6 +48,7 @@ class Cleaning:
         held_out: Whether the guard's views were held out; otherwise the scene was trained on them.
         guards: Number of the guard's views.
         views: Number of views that judged.
+        outside: Mean of `outside_cut_out` over the guard's views without the removed splats; None without alpha.
     """
 
     reasons: UInt8[np.ndarray, " N"]
@@ -58,6 +59,7 @@ class Cleaning:
     held_out: bool
     guards: int
     views: int
+    outside: float | None
 
     @property
     def kept(self) -> Bool[np.ndarray, " N"]:
@@ -125,7 +127,11 @@ def clean(
         reasons[stay if len(ranked) else slice(None)] = Reason.KEPT
         ranked = ranked[: len(ranked) - len(stay)]
         after = score(reasons == Reason.KEPT)
-    return Cleaning(reasons, verdict.reasons, before, after, whole, bool(test), len(guards), verdict.views)
+    cut_out = [view for view in guards if view.read().alpha is not None]
+    outside = _outside(_rows(gaussians, reasons == Reason.KEPT), cut_out, settings, backend)
+    return Cleaning(
+        reasons, verdict.reasons, before, after, whole, bool(test), len(guards), verdict.views, outside
+    )
 
 
 def _ranked(verdict: Verdict) -> Int64[np.ndarray, " M"]:
@@ -157,3 +163,17 @@ def _score(
             output = render(some, view.camera, settings=settings, backend=backend)
         scores.append(photo_psnr(photo, output, settings.background))
     return float(np.mean(scores)) if scores else None
+
+
+def _outside(
+    gaussians: Gaussians, views: Sequence[View], settings: RenderSettings, backend: Backend
+) -> float | None:
+    """Return `Cleaning.outside`."""
+    shares = []
+    for view in views:
+        with torch.no_grad():
+            output = render(gaussians, view.camera, settings=settings, backend=backend)
+        share = outside_cut_out(view.read(), output)
+        if share is not None:
+            shares.append(share)
+    return float(np.mean(shares)) if shares else None

@@ -32,6 +32,7 @@ from gsplat_edu.doctor.finding import (
 )
 from gsplat_edu.doctor.moving import check_moved
 from gsplat_edu.doctor.residuals import Residual
+from gsplat_edu.evaluate.metrics import SPILLED
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
@@ -65,10 +66,6 @@ shadow stay below 0.2."""
 
 VEILED = 0.02
 """Warn if near splats cover more than this fraction of a view's pixels: a spot of a seventh of its width and height."""
-
-SPILLED = 0.02
-"""Warn if on average more than this fraction of a scene's solid pixels lies outside of what the photos cut out. Of 22
-runs (fast, adc; 150 to 500 iterations), the 15 without a phantom have at most 0.0023, the 7 with one 0.06 to 0.39."""
 
 FAINT = 0.02
 """Splats below this opacity are hardly visible: they change a white 8-bit pixel by five levels."""

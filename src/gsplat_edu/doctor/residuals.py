@@ -11,12 +11,11 @@ from jaxtyping import Bool, Float64
 
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
-from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, photo_psnr, transparency_of
-from gsplat_edu.photos.resizing import eroded
+from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, outside_cut_out, photo_psnr, transparency_of
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
-from gsplat_edu.scene.views import Photo, View
+from gsplat_edu.scene.views import View
 
 SOLID = 0.5
 """A pixel has a depth if its splats block more than this share of the light."""
@@ -40,7 +39,7 @@ class Residual:
         psnr: dB.
         stops: How much brighter the photo is than the render, median over pixels; negative if it is darker.
         veiled: Share of the pixels covered by splats close to the camera.
-        outside: Share of the scene's solid pixels that lie where the photo's alpha is 0; None if it has no alpha.
+        outside: What `outside_cut_out` returns.
     """
 
     name: str
@@ -93,19 +92,9 @@ def residuals(
                 image = at_exposure_of(truth, image, photo.mask, shown, vignetting=vignetting)
             stops = _stops(pixels, image.double().numpy(force=True), photo.mask)
             score = photo_psnr(photo, replace(output, image=image), background)
-            found.append(Residual(view.name, score, stops, veiled, _outside(photo, output)))
+            found.append(Residual(view.name, score, stops, veiled, outside_cut_out(photo, output)))
         progress()
     return found
-
-
-def _outside(photo: Photo, output: RenderOutput) -> float | None:
-    """Return `Residual.outside`. Pixels beside the cut-out do not count: a splat's edge may reach over it."""
-    if photo.alpha is None:
-        return None
-    solid = (output.transmittance < 1.0 - SOLID).numpy(force=True)
-    solid &= True if photo.mask is None else photo.mask
-    clear = eroded(photo.alpha == 0)
-    return int(np.count_nonzero(solid & clear)) / max(int(np.count_nonzero(solid)), 1)
 
 
 def _veiled(gaussians: Gaussians, view: View, output: RenderOutput, render: Renderer) -> float:

@@ -15,6 +15,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.guard import Cleaning, clean
 from gsplat_edu.clean.judge import Reason
 from gsplat_edu.data.dataset import Dataset, load_dataset
+from gsplat_edu.evaluate.metrics import SPILLED
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
@@ -167,6 +168,11 @@ def report_lines(cleaning: Cleaning) -> list[str]:
         f"PSNR of {cleaning.guards} {which} views: {cleaning.before:.2f} dB before,"
         f" {cleaning.after:.2f} dB after ({change:+.3f} dB)"
     )
+    if cleaning.outside is not None and cleaning.outside > SPILLED:
+        text.append(
+            f"{100 * cleaning.outside:.0f} % of the scene's solid area still lies outside of what the photos cut out,"
+            " where their alpha is 0; train again without --white-background and --background"
+        )
     return text
 
 
@@ -179,6 +185,7 @@ def document(cleaning: Cleaning) -> dict[str, Any]:
         "psnr_before": cleaning.before,
         "psnr_after": cleaning.after,
         "held_out": cleaning.held_out,
+        "outside_cut_outs": cleaning.outside,
     }
 
 
