@@ -17,6 +17,8 @@ from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.scene.projection import Projection
 from lens_captures import FISHEYE, write_room
 
+pytestmark = pytest.mark.slow
+
 KINDS = ["fisheye", "panorama", "shutter"]
 LENSES = {"fisheye": FISHEYE, "panorama": Projection("equirectangular")}
 WORDS = ["--blocks", "2", "--lens", "native", *RECIPE, "--min-views", "6"]

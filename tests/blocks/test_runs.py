@@ -19,6 +19,8 @@ from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.train.length import planned_iterations
 from systems import needs_posix
 
+pytestmark = pytest.mark.slow
+
 
 def scene(folder):
     return (folder / "point_cloud" / "iteration_40" / "point_cloud.ply").read_bytes()
@@ -31,7 +33,6 @@ def run(split, tmp_path):
     return tmp_path / "run"
 
 
-@pytest.mark.slow
 def test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all(city, run, serial, capsys):
     for number in (2, 0, 3, 1):  # in any order
         assert main(["block", str(run), str(number)]) == 0

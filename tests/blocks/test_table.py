@@ -3,11 +3,14 @@
 import io
 import shutil
 
+import pytest
 from rich.console import Console
 
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.cli.block_table import BlockTable
+
+pytestmark = pytest.mark.slow
 
 
 def test_waiting_training_and_finished_blocks(serial, tmp_path):

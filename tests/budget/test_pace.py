@@ -21,6 +21,8 @@ from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import StepEvent
 
+pytestmark = pytest.mark.slow
+
 SPEED = Speed(fixed=0.4, per_pixel=2e-4, per_gaussian=1e-3)
 """Speed of the simulated machine, as the plan expects it."""
 

@@ -13,6 +13,8 @@ from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.views import View
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def uneven(tmp_path_factory):
@@ -83,7 +85,6 @@ def test_transparent_photos_are_corrected_and_unknown_names_are_refused(tmp_path
     assert main([*words, "exposure", "--resume"]) == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("appearance", ["auto", "vignetting"])
 def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, tmp_path, capsys, appearance):
     run = tmp_path / "run"

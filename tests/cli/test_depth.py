@@ -8,6 +8,8 @@ import pytest
 from data.depth_maps import ray_lengths, traced, write_capture, write_maps
 from gsplat_edu.cli.main import main
 
+pytestmark = pytest.mark.slow
+
 
 def lines_of(capsys):
     out, err = capsys.readouterr()

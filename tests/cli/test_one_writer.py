@@ -15,6 +15,8 @@ from gsplat_edu.io.formats import read_scene, write_scene
 from scene_files import make_run, random_scene
 from splat_ball import ball
 
+pytestmark = pytest.mark.slow
+
 WAITS = """
 import sys
 from gsplat_edu.cli.main import main

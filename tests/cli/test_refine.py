@@ -16,6 +16,8 @@ from gsplat_edu.runs.trials import RefineTrials
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.poses import DISTORTIONS, MOTIONS
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
@@ -24,7 +26,6 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 def test_a_run_writes_the_refined_capture_and_an_aligned_score(capture, tmp_path, capsys):
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--iterations", "12", "--refine", "both"]
@@ -61,7 +62,6 @@ def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
     assert judged and all(abs(view.camera.eye - refined[view.name].eye).max() < 1e-9 for view in judged)
 
 
-@pytest.mark.slow
 def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
     run = tmp_path / "run"

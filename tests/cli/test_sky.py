@@ -18,6 +18,8 @@ from gsplat_edu.io.formats import read_scene
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import View
 
+pytestmark = pytest.mark.slow
+
 SHORT = ("--iterations", "20", "--max-gaussians", "1200", "--eval-every", "0")
 
 
@@ -42,7 +44,6 @@ def scene(run):
     return path
 
 
-@pytest.mark.slow
 def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(outdoors, tmp_path, capsys):
     run = tmp_path / "run"
     assert main(["train", str(outdoors), "--out", str(run), *SHORT]) == 0
@@ -68,7 +69,6 @@ def test_adc_and_none_have_no_sky(outdoors, tmp_path, capsys, words):
     assert not far_shell(read_scene(scene(run)).gaussians.means.numpy()).any()
 
 
-@pytest.mark.slow
 def test_a_room_has_no_sky_and_doctor_finds_the_one_outdoors(outdoors, tmp_path, capsys):
     views, points = room("orbit", 96)
     write_colmap(tmp_path / "room", views, points, np.full((len(points), 3), 0.5))
@@ -84,7 +84,6 @@ def test_a_room_has_no_sky_and_doctor_finds_the_one_outdoors(outdoors, tmp_path,
     assert "--sky: no photo shows" in capsys.readouterr().err and not (tmp_path / "asked").exists()
 
 
-@pytest.mark.slow
 def test_a_capture_without_points_has_its_sky_too(made, tmp_path, capsys):
     none = np.zeros((0, 3))
     write_colmap(tmp_path / "capture", made.views, none, none)
@@ -93,7 +92,6 @@ def test_a_capture_without_points_has_its_sky_too(made, tmp_path, capsys):
     assert stored(tmp_path / "run") == "shell"
 
 
-@pytest.mark.slow
 def test_transparent_and_masked_photos_get_no_sky(made, tmp_path, capsys):
     clear, masked = [], []
     for view, sky in zip(made.views, made.sky, strict=True):
@@ -155,7 +153,6 @@ def test_threads_do_not_change_the_bits(outdoors, tmp_path, strategy):
     assert found[0] == found[1] == found[2]
 
 
-@pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_bytes(outdoors, tmp_path):
     words = [*SHORT, "--sky", "shell", "--save-every", "5"]
     whole = trained(outdoors, tmp_path / "whole", torch.get_num_threads(), *words)
@@ -171,7 +168,6 @@ def test_a_killed_run_ends_with_the_same_bytes(outdoors, tmp_path):
     assert trained(outdoors, killed, torch.get_num_threads(), *words, "--resume") == whole
 
 
-@pytest.mark.slow
 def test_a_run_from_a_scene_keeps_its_sky_also_when_it_is_resumed(outdoors, tmp_path):
     threads = torch.get_num_threads()
     trained(outdoors, tmp_path / "first", threads, *SHORT, "--sky", "shell")

@@ -13,6 +13,8 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from passers_by import pasted
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def struck(tmp_path_factory):
@@ -40,7 +42,6 @@ def stored(run):
     return json.loads((run / "config.json").read_text())["train"]["transients"]
 
 
-@pytest.mark.slow
 def test_masks_are_saved_scored_and_shown(struck, run):
     capture, names = struck
     entries = json.loads((run / "metrics.json").read_text())["transients"]
@@ -82,7 +83,6 @@ def test_eval_keeps_the_masks_in_the_report(run, tmp_path):
     assert json.loads((copy / "metrics.json").read_text())["transients"]["photos"]
 
 
-@pytest.mark.slow
 def test_auto_gives_its_reason_and_a_resumed_run_keeps_its_choice(struck, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "run", "--transients", "auto", iterations=40)
     said = " ".join(capsys.readouterr().out.split())
@@ -121,7 +121,6 @@ def test_few_photos_and_unknown_names_are_refused(tmp_path, capsys):
     assert stored(tmp_path / "run") == "none"
 
 
-@pytest.mark.slow
 def test_doctor_names_the_photos_and_the_option(struck, run, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "plain")
     ended = " ".join(capsys.readouterr().out.split())

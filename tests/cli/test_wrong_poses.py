@@ -68,6 +68,7 @@ def test_the_extent_is_that_of_the_other_cameras(captures):
     assert scene_extent([view.camera for view in views]) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_train_leaves_the_photos_out_and_trains_as_if_they_were_not_there(runs):
     default, clean = (runs[name].scene(150).read_bytes() for name in ("default", "clean"))
     assert default == clean

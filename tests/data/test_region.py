@@ -77,6 +77,7 @@ def test_a_bad_file_costs_one_line(capture, tmp_path, capsys, content, told):
     assert train(capture, tmp_path / "run", "--set", "region=none") == 0  # it is not read
 
 
+@pytest.mark.slow
 def test_a_run_stores_its_region_and_resumes_with_it(capture, tmp_path, capsys):
     write_region(capture, BOX)
     whole, out = tmp_path / "whole", tmp_path / "out"
@@ -93,6 +94,7 @@ def test_a_run_stores_its_region_and_resumes_with_it(capture, tmp_path, capsys):
     assert "region" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_a_region_and_with_one_ignored_a_run_is_as_before(capture, tmp_path):
     assert train(capture, tmp_path / "before") == 0
     write_region(capture, BOX)

@@ -22,6 +22,8 @@ from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.initialize import from_points
 
+pytestmark = pytest.mark.slow
+
 STRATEGIES = {
     "fast": {"strategy": "fast", "max_gaussians": 120},
     "adc": {"strategy": "adc", "grad_threshold": 1e-5, "reset_every": 9},

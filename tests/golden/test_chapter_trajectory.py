@@ -24,11 +24,12 @@ from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 
+pytestmark = pytest.mark.slow
+
 CHAPTER = {0: 0.2492, 20: 0.1827, 40: 0.1315, 60: 0.1152, 80: 0.1181, 100: 0.1346}
 TOLERANCE = {"torch": 2e-4, "cpu": 1e-3}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("backend", "iterations"),
     [("torch", 1), ("cpu", 101), pytest.param("torch", 101, marks=pytest.mark.soak)],

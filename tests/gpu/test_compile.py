@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 SPILLED = 64
 """Bytes per thread that may spill to memory. A kernel that spills thousands is tens of times slower."""
 

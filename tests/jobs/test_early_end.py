@@ -13,6 +13,7 @@ from gsplat_edu.jobs.record import Rendered, State, Work
 from waiting import until
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.own_process,
     pytest.mark.skipif(sys.platform == "win32", reason="no jobs run on Windows"),
 ]

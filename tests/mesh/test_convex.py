@@ -20,6 +20,8 @@ from gsplat_edu.mesh.convex import ConvexSettings, convex_parts, farthest_outsid
 from gsplat_edu.scene.mesh import Mesh
 from known_surfaces import torus
 
+pytestmark = pytest.mark.slow
+
 RING = torus(24, 12, r=0.3)
 
 CORNERS = np.array([[(i >> axis) & 1 for axis in range(3)] for i in range(8)], float)

@@ -193,6 +193,7 @@ def imports(source, module):
     return re.search(found, source.read_text()) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", ["data", "clean"])
 def test_packages_that_had_fixtures_have_only_modules_for_users(room):
     """Each module of these packages is imported by the package, or used in the course or the documents."""
@@ -236,12 +237,14 @@ def compiled(folder):
     return {name: (folder / "build" / name).read_bytes() for name in objects}
 
 
+@pytest.mark.slow
 def test_the_compiler_gives_the_same_bytes_in_every_folder(tmp_path):
     """`make wheels REPEAT=1` compares the whole module."""
     first, second = compiled(tmp_path / "one"), compiled(tmp_path / "another" / "folder")
     assert [name for name in first if first[name] != second[name]] == []
 
 
+@pytest.mark.slow
 def test_differences_between_two_wheels_are_named(module, pure, tmp_path):
     tag = "cp311-cp311-linux_x86_64"
     wheel, same = (pack(pure, module, tag, [], tmp_path / name) for name in ("one", "two"))

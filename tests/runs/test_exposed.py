@@ -20,6 +20,8 @@ from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
 from test_exposure import photographed
 
+pytestmark = pytest.mark.slow
+
 
 def shows(image):
     """Return a renderer that shows this image, opaque everywhere."""

@@ -26,6 +26,8 @@ from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.setting import option_with
 
+pytestmark = pytest.mark.slow
+
 BASE = ["--eval-every", "1000", "--save-every", "5", "--set", "densify_start=1", "densify_every=4"]
 ADC = ["--strategy", "adc", "--set", "grad_threshold=5e-5"]
 STRATEGIES = {

@@ -16,6 +16,8 @@ from gsplat_edu.runs.lod_refinement import refine_levels
 from gsplat_edu.runs.source import open_source
 from scene_files import random_scene
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = LodOptions(smallest=30, leaf=40)
 
 
@@ -29,7 +31,6 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
-@pytest.mark.slow
 def test_refined_levels_match_the_photos_better(run):
     source = open_source(run)
     root = build_levels(source.scene.gaussians, OPTIONS)

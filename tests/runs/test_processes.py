@@ -28,6 +28,8 @@ from gsplat_edu.train.team import ALONE
 from ranks import together
 from waiting import PATIENCE
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
@@ -210,7 +212,6 @@ of the next step, so the run cannot end before.
 """
 
 
-@pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.parametrize(("size", "victim"), [(2, 0), (2, 1), (4, None), (4, 3)])
 def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
@@ -237,7 +238,6 @@ def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tm
     assert ("resuming after" in done.stdout) == (victim is not None), done.stdout
 
 
-@pytest.mark.slow
 @pytest.mark.own_process
 def test_points_that_one_process_triangulates_start_all(tmp_path):
     pytest.importorskip("pycolmap")

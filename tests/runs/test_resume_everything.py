@@ -17,6 +17,8 @@ from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.poses import LENSES, TWISTS
 from passers_by import pasted
 
+pytestmark = pytest.mark.slow
+
 EVERYTHING = ("--refine", "both", "--appearance", "exposure", "--transients", "mask", "--sky", "shell")
 EVERYTHING += ("--outside-masks", "empty", "--random-background")
 

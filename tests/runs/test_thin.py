@@ -123,6 +123,7 @@ def test_a_time_limit_does_not_train_longer_than_the_trial(given, monkeypatch, l
     assert plan(options, generous, ["iterations"], reader=reader).iterations == options.config.iterations
 
 
+@pytest.mark.slow
 def test_trials_end_after_a_quarter_of_the_time(given):
     _, options, reader = given
     seconds = itertools.count()  # every look at the clock takes a second, and there is one per iteration

@@ -206,6 +206,7 @@ def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_imag
     assert [i for i in range(24) if found.is_due(i)] == [2, 4, 7, 10]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*CONFIGS])
 @pytest.mark.parametrize("extra", [{}, {"appearance": "exposure", "refine": "both"}], ids=["plain", "models"])
 def test_ranks_train_to_the_same_bits(name, extra):
@@ -218,6 +219,7 @@ def test_ranks_train_to_the_same_bits(name, extra):
             assert found == expected
 
 
+@pytest.mark.slow
 def test_batches_of_any_size_are_shared_among_ranks():
     settings = config("adc", 6)
     _, expected = trained(settings)
@@ -239,6 +241,7 @@ def test_the_number_of_threads_does_not_change_a_batch(threads):
         torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_by_another_number_of_ranks(tmp_path):
     settings = config("adc", appearance="exposure", random_background=False)
     _, expected = trained(settings)

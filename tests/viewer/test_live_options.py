@@ -8,6 +8,8 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):

@@ -18,6 +18,8 @@ from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer.proposing import MODULE, Proposing
 
+pytestmark = pytest.mark.slow
+
 PATIENCE = 120.0
 
 
