@@ -9,7 +9,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch, render_gaussians
 from gsplat_edu.base.errors import ArgumentError
@@ -22,6 +21,7 @@ from gsplat_edu.scene.lens_record import lens_entry, with_lens
 from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
 from lens_scenes import around, lens_camera, lens_truth, moved, smooth_around
 from native_scenes import BACKGROUND
+from proofs import proves_gradients
 
 COUNT = 64
 EXACT = {"extent": "exact", "stop": "none"}
@@ -180,13 +180,12 @@ def test_the_derivative_by_the_motion_is_that_of_the_blur(backend):
     """A global shutter's motion acts through the blur only."""
     scene = smooth_around(3)
     tensors = CameraTensors.of(lens_camera("pinhole, moving", 11, 9))
-    motion = tensors.motion.clone().requires_grad_()
 
     def forward(motion):
         given = dataclasses.replace(tensors, motion=motion, readout=AT_ONCE, exposure=1.5)
         return render(scene.gaussians(), given, backend=backend).image
 
-    assert torch.autograd.gradcheck(forward, (motion,), eps=1e-6, atol=2e-6, rtol=2e-5)
+    assert proves_gradients(forward, [tensors.motion], atol=2e-6, rtol=2e-5)
 
 
 @pytest.mark.parametrize(("readout", "exposure"), [(AT_ONCE, 1.0), ("left", 0.25), ("down", 0.0)])
