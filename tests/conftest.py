@@ -14,7 +14,13 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import jaxtyping
 import numpy as np
 import pytest
+import torch
 from hypothesis import settings
+
+# Both are read when a kernel's module is imported.
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # Triton's kernels run in its interpreter
+os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")  # otherwise triton 3.9 warns at the first compilation
 
 if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: tools/sanitize.sh
     (built,) = Path(os.environ["GSPLAT_TEST_NATIVE"]).glob("_native*.so")
