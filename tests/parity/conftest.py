@@ -1,1 +1,22 @@
+import pytest
+import torch
+
 from engine.conftest import device as device, pool as pool
+
+
+@pytest.fixture(params=["cuda", "webgpu"])
+def backend(request, monkeypatch):
+    """A backend that computes in float32, ready to be used on `where(backend)`."""
+    if request.param == "cuda":
+        pytest.importorskip("triton.language", reason="triton is not installed")
+    else:
+        from gsplat_edu.render import webgpu
+
+        pool = request.getfixturevalue("pool")
+        monkeypatch.setattr(webgpu, "_pool", lambda: pool)
+    return request.param
+
+
+def where(backend: str) -> str:
+    """The device of a backend's tensors; without a GPU, Triton's interpreter takes those of the CPU."""
+    return "cuda" if backend == "cuda" and torch.cuda.is_available() else "cpu"

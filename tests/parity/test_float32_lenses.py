@@ -16,7 +16,6 @@ import torch
 
 from float32_backends import sensitivity
 from gsplat_edu import Camera
-from gsplat_edu.render import webgpu
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.scene.projection import Projection
@@ -36,24 +35,11 @@ from lens_scenes import (
     lens_truth,
     lost,
 )
+from parity.conftest import where
 
 EPS = float(np.finfo(np.float32).eps)
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter computes with NumPy
-
-
-@pytest.fixture(params=["cuda", "webgpu"])
-def backend(request, monkeypatch):
-    if request.param == "cuda":
-        pytest.importorskip("triton.language", reason="triton is not installed")
-    else:
-        pool = request.getfixturevalue("pool")
-        monkeypatch.setattr(webgpu, "_pool", lambda: pool)
-    return request.param
-
-
-def where(backend):
-    return "cuda" if backend == "cuda" and torch.cuda.is_available() else "cpu"
 
 
 @pytest.fixture

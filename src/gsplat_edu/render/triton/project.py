@@ -321,8 +321,10 @@ def _store_shape(grad_quats, grad_log_scales, turn, R, s, t, p, f, g, i, touched
         _store_if(grad_log_scales, 3, k, i, along, touched, mask)
     w, x, y, z, length = turn
     found = _turn_gradient(w, x, y, z, G)
+    # A turn does not change a round Gaussian; Adam would make a whole step of each rounding error.
+    turns = touched & ((s[0] != s[1]) | (s[1] != s[2]))
     for k in tl.static_range(4):
-        _store_if(grad_quats, 4, k, i, found[k] / length, touched, mask)
+        _store_if(grad_quats, 4, k, i, found[k] / length, turns, mask)
 
 
 @triton.jit
