@@ -50,9 +50,9 @@ def test_the_script_of_each_page_is_a_classic_one(name):
 
 def test_a_page_has_only_the_modules_that_it_reaches():
     plain, editor = (modules.script(ENTRIES[name]) for name in ("plain", "editor"))
-    for word in ("class EditTools ", "function released(", "class Levels "):
+    for word in ("class EditTools ", "class EditFloaters ", "class Levels "):
         assert word not in plain
-    assert "class EditTools " in editor and "function released(" in editor
+    assert "class EditTools " in editor and "class EditFloaters " in editor
     assert "class EditTools " not in modules.script(ENTRIES["capture"])
 
 
