@@ -95,9 +95,9 @@ def test_only_the_files_of_the_page_are_served(page, path):
 
 
 def test_the_scripts_of_the_viewer_are_served(page):
-    answer = page.get("/viewer/web/press.js")
+    answer = page.get("/viewer/web/patch.js")
     assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/javascript")
-    again = page.get("/viewer/web/press.js", headers={"If-None-Match": answer.headers["etag"]})
+    again = page.get("/viewer/web/patch.js", headers={"If-None-Match": answer.headers["etag"]})
     assert again.status_code == 304
 
 

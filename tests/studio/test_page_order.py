@@ -334,21 +334,3 @@ def test_a_restored_entry_does_not_come_back_to_the_trash_with_an_older_list(vis
     with tab.expect_response("**/api/library"):  # comes once the older answer has been read
         held[0][0].fulfill(response=held[0][1])
     assert listed.count() == 0
-
-
-KEYED = """async () => {
-  const { button, keyed } = await import("/web/dom.js");
-  const list = document.createElement("div");
-  document.body.append(list);
-  const show = (names) => {
-    keyed(list, [...names], (name) => name, (name) => button(name, () => {}));
-    return document.activeElement.textContent;
-  };
-  show("abcd");
-  list.children[2].focus();
-  return ["bcd", "dcb", "xcdb", "cy"].map(show);
-}"""
-
-
-def test_the_focus_stays_when_a_list_changes(visitor):
-    assert visitor().tab.evaluate(KEYED) == ["c", "c", "c", "c"]

@@ -45,19 +45,19 @@ def waits_for(tab, held):
 
 
 def pressed_while(tab, name, arrive):
-    """Press a button, let something arrive, and release; check that the button has not moved meanwhile."""
+    """Press a button, let something arrive that moves it away from the pointer, and release."""
     button = tab.get_by_role("button", name=name)
     button.hover()
     before = button.bounding_box()
     tab.mouse.down()
     arrive()
-    settle(tab)  # the page would show it
-    assert button.bounding_box() == before
+    settle(tab)
+    assert button.bounding_box() != before
     tab.mouse.up()
 
 
 def test_a_press_counts_although_findings_arrive_meanwhile(opened, served):
-    """They lengthen the legend, which moves the buttons below it, and what has moved is not clicked."""
+    """They lengthen the legend, which moves the buttons below it."""
     tab, done = opened(), []
 
     def heard(route):

@@ -1,8 +1,10 @@
 """The modules of a page's script become one classic script, in the order in which an engine runs modules."""
 
 import json
+import re
 import shutil
 import subprocess
+from importlib.resources import files
 
 import pytest
 
@@ -50,10 +52,19 @@ def test_the_script_of_each_page_is_a_classic_one(name):
 
 def test_a_page_has_only_the_modules_that_it_reaches():
     plain, editor = (modules.script(ENTRIES[name]) for name in ("plain", "editor"))
-    for word in ("class EditTools ", "function released(", "class Levels "):
+    for word in ("class EditTools ", "class EditFloaters ", "class Levels "):
         assert word not in plain
-    assert "class EditTools " in editor and "function released(" in editor
+    assert "class EditTools " in editor and "class EditFloaters " in editor
     assert "class EditTools " not in modules.script(ENTRIES["capture"])
+
+
+@pytest.mark.parametrize("package", ["studio", "viewer"])
+def test_no_script_replaces_nodes(package):
+    """They use the renderer, which keeps presses, focus and what is unfolded."""
+    scripts = {
+        path.name: path.read_text("utf-8") for path in (files("gsplat_edu") / package / "web").iterdir()
+    }
+    assert [name for name, text in scripts.items() if re.search(r"\.replace(Children|With)\(", text)] == []
 
 
 def test_modules_run_after_those_they_import(join):

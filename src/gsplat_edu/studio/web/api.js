@@ -1,7 +1,4 @@
-// The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives. Answers wait while a button is
-// pressed, because they change the page.
-
-import { released } from "../../viewer/web/press.js";
+// The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives.
 
 export class ApiError extends Error {
   constructor(line, status) {
@@ -25,15 +22,7 @@ const lineOf = (status, text) => {
   }
 };
 
-async function ask(...question) {
-  try {
-    return await answerTo(...question);
-  } finally {
-    await released();
-  }
-}
-
-async function answerTo(method, address, body) {
+async function ask(method, address, body) {
   const given =
     body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
   const answer = await fetch(address, { method, ...given }).catch(() => {

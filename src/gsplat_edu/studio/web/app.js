@@ -1,7 +1,7 @@
 // The page: which screen the address names, keys, and what every screen shares.
 
-import { released } from "../../viewer/web/press.js";
-import { announce, keptFocus, put } from "./dom.js";
+import { keepPresses } from "../../viewer/web/patch.js";
+import { announce, keptFocus, patch, put } from "./dom.js";
 import { Store } from "./store.js";
 import { library } from "./library.js";
 import { trash } from "./trash.js";
@@ -35,7 +35,7 @@ function route() {
   const where = place();
   if (shown?.follows?.(where)) return; // the screen shows another part of itself
   shown?.close?.();
-  main.replaceChildren();
+  patch(main);
   shown = (SCREENS[where.kind] ?? library)({ main, store, where });
   update();
   for (const item of document.querySelectorAll("header nav a")) {
@@ -69,12 +69,10 @@ store.addEventListener("change", ({ detail }) => {
   tell(detail.job);
   if (asked) return;
   asked = true;
-  nextFrame()
-    .then(released)
-    .then(() => {
-      asked = false;
-      update();
-    });
+  nextFrame().then(() => {
+    asked = false;
+    update();
+  });
 });
 
 const nextFrame = () =>
@@ -117,6 +115,7 @@ function onKey(event) {
 }
 
 function start() {
+  keepPresses();
   if (location.search) history.replaceState(null, "", `/${location.hash}`); // the token is a secret; a cookie has it now
   const setting = document.getElementById("keys-on");
   setting.checked = usesKeys();

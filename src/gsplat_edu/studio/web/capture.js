@@ -1,7 +1,7 @@
 // The screen of a capture: previews, the doctor's findings, and the start of a training with its forecast.
 
 import { at, get } from "./api.js";
-import { attempt, button, errorLine, forecastText, h, heading, keyed, link, put } from "./dom.js";
+import { attempt, button, errorLine, forecastText, h, heading, link, patch, put, want } from "./dom.js";
 import { choices } from "./choices.js";
 import { doctor } from "./doctor.js";
 import { gallery } from "./gallery.js";
@@ -103,14 +103,13 @@ function training({ main, store }, entry) {
       pictures.read(now).then(shown, (error) => put(line, error.message));
       const own = store.entries("runs").filter((run) => store.captureOf(run)?.entry === entry.entry);
       past.hidden = !own.length;
-      keyed(
+      patch(
         runs,
-        own,
-        ({ name }) => name,
-        (run) => h("li", { class: "row" }, link(run.name, addressOf(run)), h("span", { class: "quiet" })),
-        (item, run) => {
-          item.lastChild.textContent = factsOf(run).filter(Boolean).join(" · ");
-        },
+        own.map((run) => {
+          const facts = factsOf(run).filter(Boolean).join(" · ");
+          const to = want("a", { href: addressOf(run) }, run.name);
+          return want("li", { class: "row", "data-key": run.name }, to, want("span", { class: "quiet" }, facts));
+        }),
       );
     },
   };

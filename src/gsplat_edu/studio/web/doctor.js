@@ -1,7 +1,7 @@
 // The part of a screen that asks the doctor.
 
 import { at, get } from "./api.js";
-import { attempt, button, errorLine, h, heading, link, versioned } from "./dom.js";
+import { attempt, button, errorLine, h, heading, patch, versioned, want } from "./dom.js";
 import { showFindings } from "./gallery.js";
 import { jobPlace, startJob } from "./jobs.js";
 
@@ -14,7 +14,7 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
   const job = jobPlace(store, entry, ["doctor"]);
   const ask = button("Examine", () => attempt(ask, line, () => startJob(store, { command: "doctor", subject: entry })));
   const again = h("p", { class: "row", hidden: true });
-  let request = null;
+  let [request, answer] = [null, null];
 
   // After photos were left out or masked, a run is trained again without them.
   const kinds = new Set();
@@ -23,37 +23,53 @@ export function doctor(store, entry, hint, marked = () => {}, left = () => {}) {
     if (!request || kinds.has(kind)) return;
     kinds.add(kind);
     const label = kinds.size > 1 ? "Train again with these changes" : AGAIN[kind];
-    again.replaceChildren(offer({ label, request }));
+    patch(again, offer({ label, request }));
     again.hidden = false;
+  }
+
+  const show = () => showFindings(found, offer, heard, answer);
+
+  // Notes what has become of a photo, given by its path, in each finding that means it.
+  function note(list, path, is) {
+    for (const finding of answer.findings)
+      finding.photos?.forEach((one, index) => {
+        if (one === path) finding[list][index] = is;
+      });
+    show();
   }
 
   const heard = {
     store,
-    left(photo, out) {
+    line: errorLine(),
+    left(path, photo, out) {
+      note("left_out", path, out);
       left(photo, out);
       noted("left");
     },
-    drawn: () => noted("masked"),
+    drawn(path, is) {
+      note("masked", path, is);
+      noted("masked");
+    },
   };
 
   function offer({ label, request: asked, place }) {
-    if (place) return link(label, place, { class: "button" });
-    const begin = button(label, () =>
-      attempt(begin, line, async () => {
+    if (place) return want("a", { href: place, class: "button" }, label);
+    const onclick = ({ currentTarget }) =>
+      attempt(currentTarget, line, async () => {
         const { job: begun } = await startJob(store, { ...asked, begun: { by: label, at: entry } });
         await store.refresh();
         location.hash = `#/${begun.subject.split("/").map(encodeURIComponent).join("/")}`;
-      }),
-    );
-    return begin;
+      });
+    return want("button", { type: "button", onclick }, label);
   }
 
   const findings = versioned(
     line,
     () => get(at(entry, "findings")),
-    (answer) => {
-      request = answer.again;
-      marked(showFindings(found, offer, heard, answer));
+    (now) => {
+      answer = now;
+      request = now.again;
+      marked(show());
     },
   );
 

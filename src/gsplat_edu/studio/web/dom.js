@@ -1,19 +1,8 @@
 // Elements and the words on them. Text always becomes text nodes, so that a name like <b> is shown as it is.
 
-const SVG = "http://www.w3.org/2000/svg";
-const SVG_NAMES = new Set(["svg", "path", "line", "text", "title", "g", "circle"]);
+import { h, patch, want } from "../../viewer/web/patch.js";
 
-// Makes an element. Attributes that are functions are listeners; null, undefined and false leave an attribute out.
-export function h(name, attributes = {}, ...children) {
-  const made = SVG_NAMES.has(name) ? document.createElementNS(SVG, name) : document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (typeof value === "function") made.addEventListener(key.replace(/^on/, ""), value);
-    else if (value === true) made.setAttribute(key, "");
-    else if (value !== null && value !== undefined && value !== false) made.setAttribute(key, value);
-  }
-  made.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined && child !== false));
-  return made;
-}
+export { h, patch, want };
 
 export const button = (text, onclick, more = {}) => h("button", { type: "button", onclick, ...more }, text);
 
@@ -23,41 +12,8 @@ export const heading = (level, text, more = {}) => h(`h${level}`, more, text);
 
 // Shows a text, or hides the element if there is none. Screen readers hear the same text only once.
 export function put(element, text) {
-  if (element.textContent !== text) element.textContent = text;
+  patch(element, text);
   element.hidden = !text;
-}
-
-// Makes the children of a container those of a list: `make(item)` for new keys, `update(child, item)` for all. The focus
-// stays where it is, although what is moved loses it.
-export function keyed(container, items, keyOf, make, update = () => {}) {
-  const focused = document.activeElement;
-  const old = new Map([...container.children].map((child) => [child.dataset.key, child]));
-  const kept = new Set(items.map((item) => String(keyOf(item))));
-  for (const [key, child] of old) if (!kept.has(key)) child.remove(); // first, so that the others need not be moved
-  items.forEach((item, index) => {
-    const key = String(keyOf(item));
-    let child = old.get(key);
-    old.delete(key);
-    if (!child) {
-      child = make(item);
-      child.dataset.key = key;
-    }
-    update(child, item);
-    if (container.children[index] !== child) container.insertBefore(child, container.children[index] ?? null);
-  });
-  if (document.activeElement !== focused && container.contains(focused)) focused.focus({ preventScroll: true });
-}
-
-// Replaces what is in a place. The control that takes the place of the one with the focus gets it, and what was unfolded
-// stays so.
-export function renew(place, ...children) {
-  const all = (kind) => [...place.querySelectorAll(kind)];
-  const controls = "button, a, summary";
-  const focused = all(controls).indexOf(document.activeElement);
-  const unfolded = all("details").map(({ open }) => open);
-  place.replaceChildren(...children);
-  all("details").forEach((one, index) => (one.open = Boolean(unfolded[index])));
-  all(controls)[focused]?.focus({ preventScroll: true });
 }
 
 export const count = (number, one, many = `${one}s`) => `${whole(number)} ${number === 1 ? one : many}`;
@@ -88,22 +44,26 @@ export function announce(text) {
   document.getElementById("status").textContent = text;
 }
 
-// The words of a command line and a button that copies them.
+// The words of a command line and a button that copies them, for patch() and h().
 export function commandLine(command) {
-  const text = h("code", { tabindex: "0", role: "textbox", "aria-readonly": "true", "aria-label": "command" }, command);
-  const copy = button("Copy", async () => {
+  const attributes = { tabindex: "0", role: "textbox", "aria-readonly": "true", "aria-label": "command" };
+  const onclick = async ({ currentTarget: copy }) => {
     try {
       await navigator.clipboard.writeText(command);
       copy.textContent = "Copied";
       announce("Copied the command");
     } catch {
-      getSelection().selectAllChildren(text); // without permission, the user presses Ctrl-C
+      getSelection().selectAllChildren(copy.previousSibling); // without permission, the user presses Ctrl-C
       copy.textContent = "Selected";
     }
     setTimeout(() => (copy.textContent = "Copy"), 2000);
-  });
-  copy.className = "copy";
-  return h("div", { class: "command" }, text, copy);
+  };
+  return want(
+    "div",
+    { class: "command" },
+    want("code", attributes, command),
+    want("button", { type: "button", class: "copy", onclick }, "Copy"),
+  );
 }
 
 // A line about an error, next to what it is about.

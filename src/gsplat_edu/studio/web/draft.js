@@ -1,7 +1,7 @@
 // Unsaved edits. Those whose editor was left for another screen of this page come back by themselves. All are kept in the
 // browser's storage as well, by the scene's digest, and are offered when the scene is edited again after the tab was closed.
 
-import { button, h } from "./dom.js";
+import { button, h, patch } from "./dom.js";
 
 const drafts = new Map(); // by entry: {text, base, scene}: the edits, the saved ones they began from, and their scene
 const renamed = new Map(); // old names of entries
@@ -54,7 +54,7 @@ function offerStored(editor, place) {
     editor.undecided = false;
     localStorage.removeItem(keyOf(draft.scene));
     after?.();
-    place.replaceChildren();
+    patch(place);
   };
   const time = new Date(draft.time).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
   const since = draft.base === editor.stored ? "" : ", but other edits were saved since";
@@ -62,7 +62,7 @@ function offerStored(editor, place) {
     "Restore",
     end(() => load(editor, draft)),
   );
-  place.replaceChildren(`There are unsaved changes from ${time}${since}. `, restore, " ", button("Forget", end()));
+  patch(place, `There are unsaved changes from ${time}${since}. `, restore, " ", button("Forget", end()));
 }
 
 export const hasDraft = (entry) => drafts.has(entry);
@@ -112,20 +112,22 @@ export function bringBack(entry, editor, place, changed) {
     localStorage.removeItem(keyOf(draft.scene));
     editor.undecided = false;
     after?.();
-    place.replaceChildren();
+    patch(place);
     changed();
   };
   const discard = button("Discard them", end());
   editor.undecided = true;
   if (draft.scene !== editor.scene.sha256) {
-    place.replaceChildren(
+    patch(
+      place,
       "There are unsaved edits of an earlier state of this scene, which do not fit this one. ",
       button("Download them", () => download(draft)),
       " ",
       discard,
     );
   } else if (draft.base !== editor.stored) {
-    place.replaceChildren(
+    patch(
+      place,
       "There are unsaved edits in this tab, but other edits were saved since. ",
       button(
         "Use mine",

@@ -1,7 +1,7 @@
 // Our page of a scene in a frame, and a photo laid over the same view.
 
 import { at, get, head } from "./api.js";
-import { button, h, put } from "./dom.js";
+import { button, h, patch, put, want } from "./dom.js";
 
 const RETRY = 3000; // milliseconds until a page that is not there yet is asked for again
 const LOOK = 250; // milliseconds between two looks at what the frame shows
@@ -154,9 +154,9 @@ export function beside(scene, captureOf) {
     if (viewer && viewer !== known) {
       known = viewer;
       const options = viewer.facts.cameras.map(({ name, held_out: held }, index) => {
-        return h("option", { value: index }, held ? `${name} (held out)` : name);
+        return want("option", { value: index }, held ? `${name} (held out)` : name);
       });
-      select.replaceChildren(h("option", { value: "" }, "free view"), ...options);
+      patch(select, want("option", { value: "" }, "free view"), options);
       free();
     }
     if (chosen && viewer?.exact !== chosen) free(); // the user moved

@@ -1,59 +1,32 @@
 // Previews of photos, and what the doctor says about them.
 
 import { at, get, post } from "./api.js";
-import { announce, attempt, bytes, button, count, errorLine, h, heading, keyed, put, renew } from "./dom.js";
+import { announce, attempt, bytes, count, errorLine, h, heading, patch, want } from "./dom.js";
 import { drawMask } from "./mask.js";
 
 const FIRST = 60; // previews at once; more come by a button
 
 const thumbOf = (entry, name, side = 256) => `${at(entry, "thumbs", name)}?side=${side}`;
 
-// A file whose size can be read, but not its pixels.
-function damaged({ target }) {
-  target.replaceWith(h("span", { class: "thumb error" }, "cannot be read"));
+// A button that leaves a photo of a capture out of trainings, or takes it back. out: whether it is left out. label: what
+// the photo is called here. changed(out) comes after the change.
+function leaving(entry, name, { out, label = name, line, changed }) {
+  const text = out ? "Use again" : "Leave out";
+  const onclick = ({ currentTarget }) =>
+    attempt(currentTarget, line, async () => {
+      await post(at(entry, "left-out"), { photos: [name], back: Boolean(out) });
+      announce(out ? `${name} is used again` : `${name} is left out`);
+      changed(!out);
+    });
+  return want("button", { type: "button", class: "leave", "aria-label": `${text} ${label}`, onclick }, text);
 }
 
-const LEAVE = "Leave out";
-const TAKE = "Use again";
-
-// A button that leaves a photo of a capture out of trainings, or takes it back; changed(out) comes after it.
-function leaving(entry, name, line, changed) {
-  const pressed = button("", () =>
-    attempt(pressed, line, async () => {
-      const back = pressed.textContent === TAKE;
-      await post(at(entry, "left-out"), { photos: [name], back });
-      announce(back ? `${name} is used again` : `${name} is left out`);
-      changed(!back);
-    }),
-  );
-  pressed.className = "leave";
-  return pressed;
-}
-
-// A button that draws on the mask of a photo; changed(isMasked) comes after each mask that was saved.
-function masking(store, entry, name, line, changed) {
-  const pressed = button("Mask this", () =>
-    attempt(pressed, line, () =>
-      drawMask(store, entry, name, name.split("/").at(-1), (is) => {
-        tellMasked(pressed, name, is);
-        changed(is);
-      }),
-    ),
-  );
-  pressed.className = "leave";
-  return pressed;
-}
-
-function tellMasked(pressed, name, is) {
-  put(pressed, is ? "Change the mask" : "Mask this");
-  pressed.setAttribute("aria-label", `${pressed.textContent}: ${name}`);
-}
-
-// What such a button says, and how its photo looks.
-function tellLeft(item, pressed, name, out) {
-  put(pressed, out ? TAKE : LEAVE);
-  pressed.setAttribute("aria-label", `${pressed.textContent} ${name}`);
-  item.classList.toggle("left-out", out);
+// A button that draws on the mask of a photo. is: whether one is drawn. changed(is) comes after each mask that was saved.
+function masking(store, entry, name, { is, label = name, line, changed }) {
+  const text = is ? "Change the mask" : "Mask this";
+  const draw = () => drawMask(store, entry, name, name.split("/").at(-1), changed);
+  const onclick = ({ currentTarget }) => attempt(currentTarget, line, draw);
+  return want("button", { type: "button", class: "leave", "aria-label": `${text}: ${label}`, onclick }, text);
 }
 
 // The previews of an entry's photos. findings: Map from a photo's name to the names of what was found. changed(photo,
@@ -66,33 +39,35 @@ export function gallery(entry, changed = () => {}, masked = () => {}, store = nu
   const isCapture = entry.startsWith("captures/");
   let [photos, videos, marks, shown, version, reading, questions] = [[], 0, new Map(), FIRST, "", null, 0];
 
-  function item({ name, W, H, problem, bytes: size }) {
+  function item(photo) {
+    const { name, W, H, problem, bytes: size, left_out: out, masked: drawn } = photo;
     const detail = problem ?? `${W} × ${H} px, ${bytes(size)}`;
-    return h(
+    const notes = [...(out ? ["left out"] : []), ...(drawn ? ["masked"] : []), ...(marks.get(name) ?? [])];
+    // a file whose size can be read, but not its pixels
+    const onerror = () => {
+      photo.damaged = true;
+      show();
+    };
+    const noted = (is) => {
+      photo.masked = is;
+      show();
+      masked();
+    };
+    const leave = (gone) => {
+      left(name, gone);
+      changed(name, gone);
+    };
+    return want(
       "li",
-      { title: `${name}: ${detail}` },
-      problem
-        ? h("span", { class: "thumb" }, "cannot be read")
-        : h("img", {
-            src: thumbOf(entry, name),
-            alt: name,
-            loading: "lazy",
-            width: 160,
-            height: 120,
-            onerror: damaged,
-          }),
-      h("span", { class: "name" }, name),
-      h("span", { class: problem ? "error" : "quiet" }, detail),
-      h("span", { class: "mark" }),
-      isCapture
-        ? leaving(entry, name, line, (out) => {
-            left(name, out);
-            changed(name, out);
-          })
-        : null,
-      isCapture && !problem
-        ? Object.assign(masking(store, entry, name, line, masked), { className: "leave masking" })
-        : null,
+      { "data-key": name, title: `${name}: ${detail}`, class: isCapture && out ? "left-out" : null },
+      problem || photo.damaged
+        ? want("span", { class: problem ? "thumb" : "thumb error" }, "cannot be read")
+        : want("img", { src: thumbOf(entry, name), alt: name, loading: "lazy", width: 160, height: 120, onerror }),
+      want("span", { class: "name" }, name),
+      want("span", { class: problem ? "error" : "quiet" }, detail),
+      want("span", { class: "mark" }, notes.join(", ")),
+      isCapture && leaving(entry, name, { out, line, changed: leave }),
+      isCapture && !problem && masking(store, entry, name, { is: drawn, line, changed: noted }),
     );
   }
 
@@ -104,23 +79,7 @@ export function gallery(entry, changed = () => {}, masked = () => {}, store = nu
   }
 
   function show() {
-    const some = photos.slice(0, shown);
-    keyed(
-      list,
-      some,
-      ({ name }) => name,
-      item,
-      (element, { name, left_out: out, masked: drawn }) => {
-        element.querySelector(".mark").textContent = [
-          ...(out ? ["left out"] : []),
-          ...(drawn ? ["masked"] : []),
-          ...(marks.get(name) ?? []),
-        ].join(", ");
-        if (isCapture) tellLeft(element, element.querySelector(".leave"), name, out);
-        const mask = element.querySelector(".masking");
-        if (mask) tellMasked(mask, name, drawn);
-      },
-    );
+    patch(list, photos.slice(0, shown).map(item));
     more.hidden = photos.length <= shown;
     more.textContent = `Show all ${photos.length} photos`;
   }
@@ -176,86 +135,75 @@ const SEVERITIES = { note: "note", warning: "warning", fatal: "serious" };
 
 // What the doctor found, with the photos that each finding means. Returns the marks of a gallery.
 // offer(proposal) makes the button or link of something that the page can do about a finding.
-// store: what the studio knows. left(photo, out) is called after a photo of a finding was left out or taken back, drawn() after its mask was changed.
-export function showFindings(place, offer, { store, left, drawn }, { findings, facts, fine, advice, state, stale }) {
+// store: what the studio knows. left(path, photo, out) is called after a photo of a finding was left out or taken back,
+// drawn(path, is) after its mask was changed; both show the findings again. path: kind, entry and photo. line: for errors.
+export function showFindings(
+  place,
+  offer,
+  { store, line, left, drawn },
+  { findings, facts, fine, advice, state, stale },
+) {
   const marks = new Map();
-  const line = errorLine();
   const items = findings.map(
     ({ name, severity, sentence, advice: what, images, values, photos, left_out: gone, masked, proposals }) => {
       const pictures = images.map((image, index) => {
-        const [kind, entry, ...rest] = (photos?.[index] ?? "").split("/");
+        const path = photos?.[index] ?? "";
+        const [kind, entry, ...rest] = path.split("/");
         const photo = rest.join("/");
         if (photo) marks.set(photo, [...(marks.get(photo) ?? []), name]);
-        const caption = h("figcaption", {}, values[index] ? `${image}: ${values[index]}` : image);
-        const src = photo && thumbOf(`${kind}/${entry}`, photo, 128);
-        const figure = h(
+        const caption = want("figcaption", {}, values[index] ? `${image}: ${values[index]}` : image);
+        if (!photo) return want("figure", {}, caption);
+        const src = thumbOf(`${kind}/${entry}`, photo, 128);
+        const [out, is] = [gone[index], masked[index]];
+        return want(
           "figure",
-          {},
-          photo ? h("img", { src, alt: "", loading: "lazy", width: 96, height: 72 }) : null,
+          { class: out ? "left-out" : null },
+          want("img", { src, alt: "", loading: "lazy", width: 96, height: 72 }),
           caption,
+          leaving(`${kind}/${entry}`, photo, { out, label: image, line, changed: (now) => left(path, photo, now) }),
+          masking(store, `${kind}/${entry}`, photo, { is, label: image, line, changed: (now) => drawn(path, now) }),
         );
-        if (photo) {
-          const pressed = leaving(`${kind}/${entry}`, photo, line, (out) => {
-            tellLeft(figure, pressed, image, out);
-            left(photo, out);
-          });
-          tellLeft(figure, pressed, image, gone[index]);
-          const mask = masking(store, `${kind}/${entry}`, photo, line, drawn);
-          tellMasked(mask, image, masked[index]);
-          figure.append(pressed, mask);
-        }
-        return figure;
       });
-      return h(
+      return want(
         "li",
-        { class: `finding ${severity}` },
-        h(
+        { class: `finding ${severity}`, "data-key": name },
+        want(
           "p",
           {},
-          h("span", { class: `badge ${severity}` }, SEVERITIES[severity] ?? severity),
+          want("span", { class: `badge ${severity}` }, SEVERITIES[severity] ?? severity),
           " ",
-          h("strong", {}, name),
+          want("strong", {}, name),
         ),
-        h("p", {}, sentence),
-        what && h("p", { class: "quiet" }, what),
-        pictures.length ? h("div", { class: "figures" }, pictures) : null,
-        proposals.length ? h("p", { class: "row" }, proposals.map(offer)) : null,
+        want("p", {}, sentence),
+        what && want("p", { class: "quiet" }, what),
+        pictures.length ? want("div", { class: "figures" }, pictures) : null,
+        proposals.length ? want("p", { class: "row" }, proposals.map(offer)) : null,
       );
     },
   );
-  const said =
-    state === "done" && !findings.length ? [h("p", { class: "good" }, "The doctor found nothing wrong.")] : [];
-  const old = stale ? [h("p", { class: "error" }, "This has changed since the doctor looked; examine it again.")] : [];
-  const table = facts.length
-    ? [
-        h(
-          "details",
-          {},
-          h("summary", {}, "Facts"),
-          h(
-            "table",
-            {},
-            h(
-              "tbody",
-              {},
-              facts.map(([key, value]) => h("tr", {}, h("th", { scope: "row" }, key), h("td", {}, value))),
-            ),
-          ),
-          fine.length ? h("p", { class: "quiet" }, `Nothing wrong with: ${fine.join(", ")}.`) : null,
-        ),
-      ]
-    : [];
-  const lead =
-    advice.length > 1
-      ? [
-          h("p", {}, "Most useful first:"),
-          h(
-            "ol",
-            {},
-            advice.map((one) => h("li", {}, one)),
-          ),
-        ]
-      : [];
-  renew(place, ...old, ...said, line, h("ul", { class: "findings" }, items), ...lead, ...table);
+  const row = ([key, value]) => want("tr", {}, want("th", { scope: "row" }, key), want("td", {}, value));
+  patch(
+    place,
+    stale && want("p", { class: "error" }, "This has changed since the doctor looked; examine it again."),
+    state === "done" && !findings.length && want("p", { class: "good" }, "The doctor found nothing wrong."),
+    line,
+    want("ul", { class: "findings" }, items),
+    advice.length > 1 && [
+      want("p", {}, "Most useful first:"),
+      want(
+        "ol",
+        {},
+        advice.map((one) => want("li", {}, one)),
+      ),
+    ],
+    facts.length > 0 &&
+      want(
+        "details",
+        {},
+        want("summary", {}, "Facts"),
+        want("table", {}, want("tbody", {}, facts.map(row))),
+        fine.length > 0 && want("p", { class: "quiet" }, `Nothing wrong with: ${fine.join(", ")}.`),
+      ),
+  );
   return marks;
 }

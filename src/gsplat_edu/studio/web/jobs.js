@@ -1,7 +1,7 @@
 // Jobs: how far each one is, its buttons, and the command that repeats it.
 
 import { at, get, post, remove } from "./api.js";
-import { attempt, button, commandLine, duration, errorLine, h, heading, keyed, link, put } from "./dom.js";
+import { attempt, button, commandLine, duration, errorLine, h, heading, link, patch, put, want } from "./dom.js";
 
 const STATES = {
   held: "waits for you",
@@ -15,7 +15,10 @@ const STATES = {
   unfinished: "no poses yet",
 };
 
-export const badge = (state) => h("span", { class: `badge ${state}` }, STATES[state] ?? state);
+const REMOVE = "Remove from the list";
+
+// For patch().
+export const badge = (state) => want("span", { class: `badge ${state}` }, STATES[state] ?? state);
 
 // Starts a job; its answer is in the store when this returns.
 export async function startJob(store, request) {
@@ -40,9 +43,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const pause = button("Pause", change("pause"));
   const resume = button("Resume", change("resume"), { class: "primary" });
   const stop = button("Stop", change("cancel"), { title: "A training writes a checkpoint and can be resumed." });
-  const forget = button("Remove from the list", (event) =>
-    attempt(event.currentTarget, line, () => remove(at("jobs", id))),
-  );
+  const forget = button(REMOVE, (event) => attempt(event.currentTarget, line, () => remove(at("jobs", id))));
   if (main) {
     pause.dataset.keyP = "";
     resume.dataset.keyP = "";
@@ -88,18 +89,16 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     const found = store.jobs.get(id);
     if (!found) return;
     const { job, progress, messages } = found;
-    if (state.dataset.state !== job.state + job.cancelling) {
-      state.dataset.state = job.state + job.cancelling;
-      state.replaceChildren(badge(job.cancelling ? "stopping" : job.state));
-    }
+    patch(state, badge(job.cancelling ? "stopping" : job.state));
     const current = found.stage;
     const ended = job.state === "done";
-    keyed(
+    const step = (name) => (name === current && !ended ? "step" : null);
+    patch(
       stages,
-      found.stages.map((name) => ({ name, now: name === current && !ended })),
-      ({ name }) => name,
-      ({ name }) => h("li", { title: name }, name.replace(/\S*\/(?=\S)/g, "")), // files without their folders
-      (item, { now }) => (now ? item.setAttribute("aria-current", "step") : item.removeAttribute("aria-current")),
+      found.stages.map((name) =>
+        // files without their folders
+        want("li", { "data-key": name, title: name, "aria-current": step(name) }, name.replace(/\S*\/(?=\S)/g, "")),
+      ),
     );
     const known = progress?.total && !ended;
     bar.setAttribute("aria-label", `progress of ${current || job.title}`);
@@ -119,8 +118,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     resume.hidden = !(job.state === "paused" || (job.resumable && !found.active));
     resume.textContent = { failed: "Try again", held: "Start" }[job.state] ?? "Resume";
     ask.hidden = job.state !== "held";
-    if (command.dataset.text !== job.command) command.replaceChildren(commandLine(job.command));
-    command.dataset.text = job.command;
+    patch(command, commandLine(job.command));
     label.textContent = job.state === "held" ? "What it will run" : "The same as a command";
     stop.hidden = !found.active || job.cancelling;
     forget.hidden = found.active && job.state !== "queued";
@@ -163,7 +161,7 @@ export function jobPlace(store, subject, commands, options = {}) {
       const newest = store.jobsOf(subject, ...commands)[0] ?? null;
       if ((newest?.job.id ?? null) !== (card?.id ?? null)) {
         card = newest && jobCard(store, newest.job.id, options);
-        element.replaceChildren(...(card ? [card.element] : []));
+        patch(element, card?.element);
       }
       card?.update();
     },
@@ -172,40 +170,32 @@ export function jobPlace(store, subject, commands, options = {}) {
 
 // The screen with all jobs.
 export function jobs({ main, store }) {
-  const cards = new Map();
+  let cards = new Map();
+  const fault = errorLine();
   const list = h("div", { class: "cards wide" });
   const broken = h("ul", { class: "damaged", "aria-label": "damaged jobs" });
   const empty = h("p", {}, "No jobs yet. Add photos in the ", link("library", "#/"), ", and start one there.");
-  main.append(heading(1, "Jobs"), broken, empty, list);
+  main.append(heading(1, "Jobs"), broken, fault, empty, list);
   return {
     update() {
       const all = [...store.jobs.values()].sort((a, b) => b.job.id.localeCompare(a.job.id));
       empty.hidden = all.length + store.damaged.size > 0;
-      keyed(
+      patch(
         broken,
-        [...store.damaged.values()],
-        ({ id }) => id,
-        ({ id, line }) => {
-          const fault = errorLine();
-          const forget = button("Remove from the list", () => attempt(forget, fault, () => remove(at("jobs", id))));
-          return h("li", {}, line, " ", forget, fault);
-        },
+        [...store.damaged.values()].map(({ id, line }) => {
+          const onclick = ({ currentTarget }) => attempt(currentTarget, fault, () => remove(at("jobs", id)));
+          return want("li", { "data-key": id }, line, " ", want("button", { type: "button", onclick }, REMOVE));
+        }),
       );
-      keyed(
+      cards = new Map(all.map(({ job: { id } }) => [id, cards.get(id) ?? jobCard(store, id, { level: 2 })]));
+      patch(
         list,
-        all,
-        ({ job }) => job.id,
-        ({ job }) => {
-          cards.set(job.id, jobCard(store, job.id, { level: 2 }));
-          return h(
-            "div",
-            {},
-            link(job.subject, `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`),
-            cards.get(job.id).element,
-          );
-        },
-        (_, { job }) => cards.get(job.id).update(),
+        all.map(({ job: { id, subject } }) => {
+          const href = `#/${subject.split("/").map(encodeURIComponent).join("/")}`;
+          return want("div", { "data-key": id }, want("a", { href }, subject), cards.get(id).element);
+        }),
       );
+      for (const card of cards.values()) card.update();
     },
   };
 }

@@ -1,7 +1,7 @@
 // Judges a run by the photos that it was not trained on, and compares two runs.
 
 import { at, get } from "./api.js";
-import { decibels, errorLine, h, heading, keyed, link, put, versioned } from "./dom.js";
+import { decibels, errorLine, h, heading, link, patch, put, versioned, want } from "./dom.js";
 import { doctor } from "./doctor.js";
 
 const PICTURES = ["photo", "render", "difference"];
@@ -82,39 +82,39 @@ export function judge({ place, store, entry, where }) {
     const ordered = [...views];
     if (order.value === "best") ordered.reverse();
     if (order.value === "name") ordered.sort((a, b) => a.name.localeCompare(b.name));
-    keyed(
+    patch(
       list,
-      ordered,
-      ({ index }) => `${index} ${version}`,
-      ({ index, name, psnr, ssim }) => {
+      ordered.map(({ index, name, psnr, ssim }) => {
         const pictures = PICTURES.map((what) => {
-          return h(
+          const src = previewOf(entry.entry, index, what);
+          return want(
             "figure",
             {},
-            h("img", { src: previewOf(entry.entry, index, what), alt: `${what} of ${name}`, loading: "lazy" }),
-            h("figcaption", {}, what),
+            want("img", { src, alt: `${what} of ${name}`, loading: "lazy" }),
+            want("figcaption", {}, what),
           );
         });
         const score = `${decibels(psnr)}${typeof ssim === "number" ? `, SSIM ${ssim.toFixed(3)}` : ""}`;
-        return h(
+        const top = [want("a", { href: `${base}?view=${index}` }, name), want("span", { class: "quiet" }, score)];
+        return want(
           "li",
-          {},
-          h("p", { class: "row" }, link(name, `${base}?view=${index}`), h("span", { class: "quiet" }, score)),
-          h("div", { class: "triple" }, pictures),
+          { "data-key": `${index} ${version}` }, // a new version has new pictures
+          want("p", { class: "row" }, top),
+          want("div", { class: "triple" }, pictures),
         );
-      },
+      }),
     );
     open();
   }
 
   function open() {
     const view = views.find(({ index }) => String(index) === opened);
-    if (large.dataset.view === (view ? opened : "")) return;
+    if (large.dataset.view === (view ? opened : "")) return undefined;
     large.dataset.view = view ? opened : "";
-    large.replaceChildren();
-    if (!view) return;
+    if (!view) return patch(large);
     const pictures = ["photo", "render"].map((what) => pictureOf(entry.entry, view.index, what));
-    large.append(
+    return patch(
+      large,
       heading(3, view.name),
       slider(...pictures, ["photo", "render"], view.name, view),
       link("Close", base, { class: "button" }),
@@ -151,14 +151,11 @@ export function judge({ place, store, entry, where }) {
       now = found;
       checked.update(now);
       const runs = store.entries("runs").filter(({ name }) => name !== entry.name);
-      const names = runs.map(({ name }) => name).join("\n");
-      if (others.dataset.names !== names) {
-        others.dataset.names = names;
-        others.replaceChildren(
-          h("option", { value: "" }, runs.length ? "another run" : "no other run"),
-          ...runs.map(({ name }) => h("option", { value: name }, name)),
-        );
-      }
+      patch(
+        others,
+        want("option", { value: "" }, runs.length ? "another run" : "no other run"),
+        runs.map(({ name }) => want("option", { value: name, "data-key": name }, name)),
+      );
       version = `${now.finished} ${now.psnr} ${now.iterations}`;
       held.read(version);
     },

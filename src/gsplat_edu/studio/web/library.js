@@ -11,9 +11,10 @@ import {
   errorLine,
   h,
   heading,
-  keyed,
   link,
+  patch,
   put,
+  want,
   whole,
 } from "./dom.js";
 import { follow } from "./draft.js";
@@ -115,26 +116,21 @@ function card(store, project) {
     top.href = addressOf(present);
     facts.textContent = factsOf(present).filter(Boolean).join(" · ");
     const all = entries.map((entry) => stateOf(store, entry));
-    showState(states, all.findLast(Boolean) ?? "");
+    patch(states, badges(all.findLast(Boolean)));
     stages.update(now);
     next.update(now, now.next);
     summary.textContent = `Everything in it (${entries.length})`;
-    keyed(
+    patch(
       list,
-      entries,
-      ({ entry }) => entry,
-      (entry) =>
-        h(
+      entries.map((entry) =>
+        want(
           "li",
-          {},
-          link(`${KINDS[entry.kind]} ${entry.name}`, addressOf(entry)),
-          h("span", { class: "quiet" }),
-          h("span", {}),
+          { "data-key": entry.entry },
+          want("a", { href: addressOf(entry) }, `${KINDS[entry.kind]} ${entry.name}`),
+          want("span", { class: "quiet" }, ` ${factsOf(entry).filter(Boolean).join(" · ")} `),
+          want("span", {}, badges(stateOf(store, entry))),
         ),
-      (item, entry) => {
-        item.children[1].textContent = ` ${factsOf(entry).filter(Boolean).join(" · ")} `;
-        showState(item.lastChild, stateOf(store, entry));
-      },
+      ),
     );
     const shown = entries.find(({ entry }) => entry === now.picture);
     if (shown) picture(top, shown);
@@ -143,11 +139,7 @@ function card(store, project) {
   return element;
 }
 
-function showState(place, state) {
-  if (place.dataset.state === state) return;
-  place.dataset.state = state;
-  place.replaceChildren(...(state ? [badge(state)] : []));
-}
+const badges = (state) => state && badge(state);
 
 // The studio draws the pictures of scenes, one after the other, and only those that somebody sees.
 let drawn = Promise.resolve();
@@ -196,6 +188,7 @@ export function library({ main, store }) {
   const foot = h("p", { class: "quiet" });
   const footer = h("footer", {}, foot, trash);
   const add = intake(store);
+  let cards = new Map();
   main.append(heading(1, "Library"), add, first, section, footer);
   for (const part of [section, footer]) part.hidden = true; // until it is known what is in them, so that nothing moves
   return {
@@ -207,13 +200,11 @@ export function library({ main, store }) {
       section.hidden = !projects.length;
       first.hidden = projects.length > 0;
       add.querySelector("[data-key-u]").classList.toggle("primary", !projects.length);
-      keyed(
-        list,
-        projects,
-        ({ entries }) => entries[0],
-        (project) => card(store, project),
-        (element, project) => element.show(project),
+      cards = new Map(
+        projects.map((project) => [project.entries[0], cards.get(project.entries[0]) ?? card(store, project)]),
       );
+      patch(list, [...cards.values()]);
+      for (const project of projects) cards.get(project.entries[0]).show(project);
       foot.textContent = `${all.folder} · ${bytes(all.used_bytes)} used, ${bytes(all.free_bytes)} free`;
       trash.textContent = all.trash_bytes ? `Trash (${bytes(all.trash_bytes)})` : "Trash";
     },
@@ -339,7 +330,7 @@ export function withEntry({ main, store, where }, show) {
     update() {
       const entry = store.entry(where.kind, where.name);
       if (!inner && entry && store.read) {
-        main.replaceChildren(gone);
+        patch(main, gone);
         inner = show(entry);
       } else if (!inner && store.library && store.read && !asked) {
         ask();

@@ -2,7 +2,7 @@
 // used.
 
 import { at, get, post } from "./api.js";
-import { announce, attempt, button, commandLine, count, errorLine, h, heading, put } from "./dom.js";
+import { announce, attempt, button, commandLine, count, errorLine, h, heading, patch, put, want } from "./dom.js";
 
 const STEP = 50; // presses of an arrow key across the longer side; single pixels with Shift
 const SPACE = 400; // points of an outline are at least this fraction of the longer side apart
@@ -20,7 +20,7 @@ const pathOf = (shape) => {
 };
 
 // A stroke {brush: radius, points} as an element, which has the brush's width; a stroke of one point is a dot.
-const strokeOf = ({ brush, points }) => h("path", { d: `${lineOf(points)}h0`, "stroke-width": 2 * brush });
+const strokeOf = ({ brush, points }) => want("path", { d: `${lineOf(points)}h0`, "stroke-width": 2 * brush });
 
 // Leaves out the points of an outline that lie within `slack` of the line between those kept (Douglas and Peucker).
 export function simplified(points, slack) {
@@ -103,13 +103,13 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
           .map(pathOf)
           .join(""),
       );
-      strokes.replaceChildren(...shapes.filter(({ brush }) => brush).map(strokeOf));
+      patch(strokes, shapes.filter(({ brush }) => brush).map(strokeOf));
       shown = shapes;
     }
     const paints = tool === "brush";
     const begun = points && !paints && (tool === "rectangle" ? shapeOf(points, tool, 0) : points.flat());
     trace.setAttribute("d", begun ? pathOf(begun) : "");
-    stroke.replaceChildren(...(points && paints ? [strokeOf({ brush: radius, points: points.flat() })] : []));
+    patch(stroke, points && paints && strokeOf({ brush: radius, points: points.flat() }));
     const middle = paints ? (cross ?? tip) : null;
     circle.style.display = middle ? "" : "none";
     for (const [key, value] of Object.entries(middle ? { cx: middle[0], cy: middle[1], r: radius } : {}))
@@ -382,7 +382,7 @@ export async function drawMask(store, entry, photo, name, saved) {
     stored = answer.shapes.length
       ? "Saved. Trainings that begin from now on use it."
       : "Removed. The mask is as it was before.";
-    printed.replaceChildren(h("p", { class: "quiet" }, "The same as a command"), commandLine(answer.command));
+    patch(printed, want("p", { class: "quiet" }, "The same as a command"), commandLine(answer.command));
     saved(answer.shapes.length > 0);
   }
 

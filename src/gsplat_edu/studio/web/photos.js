@@ -1,6 +1,6 @@
 // The screen of photos without poses: previews, and the first step, which finds the poses.
 
-import { attempt, errorLine, h, heading, link, put } from "./dom.js";
+import { attempt, errorLine, h, heading, patch, put, want } from "./dom.js";
 import { gallery } from "./gallery.js";
 import { intake } from "./intake.js";
 import { jobPlace, startJob } from "./jobs.js";
@@ -87,15 +87,10 @@ export function photos(given) {
         );
         form.hidden = Boolean(job.view?.active);
         const made = store.madeBy(job.view);
-        if (made && next.dataset.shown !== made.entry) {
-          next.dataset.shown = made.entry;
-          next.replaceChildren(
-            link(`Continue with the capture ${made.name}`, addressOf(made), { class: "button" }),
-            " ",
-            h("span", {}),
-          );
+        if (made) {
+          const open = want("a", { href: addressOf(made), class: "button" }, `Continue with the capture ${made.name}`);
+          patch(next, open, " ", want("span", {}, searchOf(made)));
         }
-        if (made) put(next.lastElementChild, searchOf(made)); // the link stays: a press on it would be lost with it
         next.hidden = !made;
         find.textContent = made ? "Find the poses again" : "Find the poses";
       },

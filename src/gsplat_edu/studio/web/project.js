@@ -1,7 +1,7 @@
 // A project: its timeline, and the one next step.
 
 import { at, get } from "./api.js";
-import { announce, attempt, button, errorLine, forecastText, h, link, put } from "./dom.js";
+import { announce, attempt, errorLine, forecastText, h, patch, put, want } from "./dom.js";
 import { startJob } from "./jobs.js";
 
 const STAGES = { photos: "Photos", poses: "Poses", training: "Training", look: "Look and edit", share: "Share" };
@@ -17,18 +17,17 @@ export function timeline() {
     element,
     update(project) {
       element.hidden = !project;
-      const text = JSON.stringify(project && [project.stage, project.steps]);
-      if (!project || element.dataset.text === text) return;
-      element.dataset.text = text;
+      if (!project) return;
       const present = project.steps.findIndex(({ stage }) => stage === project.stage);
-      element.replaceChildren(
-        ...project.steps.map(({ stage, place }, index) => {
+      patch(
+        element,
+        project.steps.map(({ stage, place }, index) => {
           const title = STAGES[stage];
           const more = {
             class: index < present && place ? "done" : null,
             "aria-current": index === present ? "step" : null,
           };
-          return h("li", more, place ? link(title, hashOf(place)) : h("span", {}, title));
+          return want("li", more, place ? want("a", { href: hashOf(place) }, title) : want("span", {}, title));
         }),
       );
     },
@@ -54,7 +53,7 @@ function onward(step) {
 export function nextStep(store, of = "") {
   const line = errorLine();
   const place = h("div", { class: "row" });
-  const note = h("span", { class: "quiet" }, "The next step comes when the job has ended.");
+  const note = want("span", { class: "quiet" }, "The next step comes when the job has ended.");
   const takes = h("p", { class: "forecast quiet", hidden: true });
   const element = h("div", { class: "next-step" }, place, takes, line);
   let shown = "";
@@ -66,47 +65,57 @@ export function nextStep(store, of = "") {
       location.hash = hashOf(request.command === "convert" ? `${job.subject}/share` : job.subject);
     });
 
-  // A training that is started from a card says first what it takes; the same button then starts it.
-  async function tellFirst(request, pressed, more) {
-    pressed.disabled = true;
-    put(takes, "Measuring time and memory ...");
-    put(line, "");
-    try {
-      const { qualities } = await get(at(request.subject, "forecast"));
-      put(takes, `It takes ${forecastText(qualities[request.options.quality])}.`);
-      announce(takes.textContent);
-    } catch (error) {
-      put(takes, "There is no forecast.");
-      put(line, error.message);
-    }
-    const begin = h(
-      "button",
-      { ...more, "aria-label": `Next: Start it, ${of}`, type: "button", onclick: () => ask(request, begin) },
-      "Next: Start it",
-    );
-    const later = button("Not now", () => {
-      put(takes, "");
-      put(line, "");
-      pressed.disabled = false;
-      place.replaceChildren(pressed);
-      pressed.focus();
+  // A training that is started from a card says first what it takes; a button beside that then starts it.
+  function tellFirst(request, pressed, offered) {
+    const step = shown;
+    return attempt(pressed, line, async () => {
+      put(takes, "Measuring time and memory ...");
+      const { qualities, trouble } = await get(at(request.subject, "forecast")).catch((error) => ({ trouble: error }));
+      if (shown !== step) return; // there is another step by now
+      put(takes, trouble ? "There is no forecast." : `It takes ${forecastText(qualities[request.options.quality])}.`);
+      if (trouble) put(line, trouble.message);
+      else announce(takes.textContent);
+      const begin = "Next: Start it";
+      offer(
+        want(
+          "button",
+          {
+            type: "button",
+            class: "button primary",
+            "aria-label": `${begin}, ${of}`,
+            "data-key": "begin",
+            onclick: ({ currentTarget }) => ask(request, currentTarget),
+          },
+          begin,
+        ),
+        want("button", { type: "button", "data-key": "later", onclick: () => later(offered) }, "Not now"),
+      );
     });
-    if (pressed.isConnected) {
-      place.replaceChildren(begin, later);
-      begin.focus();
-    }
+  }
+
+  function later(offered) {
+    put(takes, "");
+    put(line, "");
+    offer(offered);
+  }
+
+  // Shows buttons in place of the one that was pressed.
+  function offer(...buttons) {
+    patch(place, buttons);
+    place.firstElementChild.focus();
   }
 
   function made({ label, place: to, request, entry, file }, form) {
     const text = `Next: ${label}`;
     const more = { class: "button primary", "aria-label": of ? `${text}, ${of}` : null };
-    if (to) return link(text, hashOf(to), more);
-    if (file) return link(text, at(entry, "exports", file), { ...more, download: file });
-    if (form) return h("button", { ...more, type: "submit", form: form.id }, text);
+    if (to) return want("a", { ...more, href: hashOf(to) }, text);
+    if (file) return want("a", { ...more, href: at(entry, "exports", file), download: file }, text);
+    if (form) return want("button", { ...more, type: "submit", form: form.id }, text);
     const isToTell = of && request.command === "train" && request.options?.quality;
-    const act = () => (isToTell ? tellFirst(request, pressed, more) : ask(request, pressed));
-    const pressed = h("button", { ...more, type: "button", onclick: act }, text);
-    return pressed;
+    const onclick = ({ currentTarget: pressed }) =>
+      isToTell ? tellFirst(request, pressed, offered) : ask(request, pressed);
+    const offered = want("button", { ...more, type: "button", onclick }, text);
+    return offered;
   }
 
   return {
@@ -135,7 +144,7 @@ export function nextStep(store, of = "") {
       shown = text;
       put(line, "");
       put(takes, "");
-      place.replaceChildren(...(found ? [made(found, form)] : active && !of ? [note] : []));
+      patch(place, found ? made(found, form) : active && !of && note);
     },
   };
 }

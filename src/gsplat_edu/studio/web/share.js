@@ -1,6 +1,5 @@
 // Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
 
-import { released } from "../../viewer/web/press.js";
 import { at, get, remove } from "./api.js";
 import {
   attempt,
@@ -11,10 +10,11 @@ import {
   errorLine,
   h,
   heading,
-  keyed,
   link,
+  patch,
   put,
   versioned,
+  want,
 } from "./dom.js";
 import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
@@ -120,28 +120,27 @@ export function share({ place, store, entry }) {
     entry.kind === "runs" ? cleaning(store, entry, () => now) : noCleaning(),
   );
 
-  function item(found) {
-    const { file, command } = found;
-    const away = button("Remove", () =>
-      attempt(away, line, async () => {
+  function item({ file, command, modified, job: by, bytes: size, psnr }) {
+    const onclick = ({ currentTarget }) =>
+      attempt(currentTarget, line, async () => {
         await remove(at(entry.entry, "exports", file));
         exported.forget();
         store.refresh();
-      }),
-    );
-    const address = at(entry.entry, "exports", file);
-    return h(
+      });
+    const href = at(entry.entry, "exports", file);
+    const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
+    return want(
       "li",
-      {},
-      h(
+      { "data-key": `${file} ${modified} ${by}` },
+      want(
         "div",
         { class: "row" },
-        h("strong", { class: "name" }, file),
-        h("span", { class: "quiet facts" }),
-        link("Download", address, { class: "button", download: file }),
-        away,
+        want("strong", { class: "name" }, file),
+        want("span", { class: "quiet facts" }, [bytes(size), isVideo(file) ? "" : exact].filter(Boolean).join(" · ")),
+        want("a", { href, class: "button", download: file }, "Download"),
+        want("button", { type: "button", onclick }, "Remove"),
       ),
-      command ? h("details", {}, h("summary", {}, "The same as a command"), commandLine(command)) : null,
+      command ? want("details", {}, want("summary", {}, "The same as a command"), commandLine(command)) : null,
     );
   }
 
@@ -154,18 +153,7 @@ export function share({ place, store, entry }) {
     put(withMesh.lastChild, ` show the ${what} beside the splats (about ${bytes(size)} more)`);
     explain();
     const newest = [...exports].sort((a, b) => b.modified - a.modified);
-    keyed(
-      list,
-      newest,
-      ({ file, modified, job: by }) => `${file} ${modified} ${by}`,
-      item,
-      (element, { file, bytes: size, psnr }) => {
-        const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
-        element.querySelector(".facts").textContent = [bytes(size), isVideo(file) ? "" : exact]
-          .filter(Boolean)
-          .join(" · ");
-      },
-    );
+    patch(list, newest.map(item));
   }
 
   const exported = versioned(
@@ -205,23 +193,21 @@ function cleaning(store, entry, entryNow) {
     }),
   );
   const update = () => {
-    if (!next.isConnected) return store.removeEventListener("change", look);
+    if (!next.isConnected) return store.removeEventListener("change", update);
     job.update();
     const { view } = job;
     const said = view?.job.state === "done" ? view.messages.filter((text) => !/^wrote /.test(text)) : [];
-    if (found.dataset.said !== said.join())
-      found.replaceChildren(...said.map((text) => h("li", {}, text.trim().replace(/\s+/g, " "))));
-    found.dataset.said = said.join();
+    patch(
+      found,
+      said.map((text) => want("li", {}, text.trim().replace(/\s+/g, " "))),
+    );
     found.hidden = !said.length;
     const made = store.madeBy(view);
-    if (made && next.dataset.made !== made.name)
-      next.replaceChildren(link(`Open the scene ${made.name}`, addressOf(made), { class: "button" }));
-    if (made) next.dataset.made = made.name;
+    if (made) patch(next, want("a", { href: addressOf(made), class: "button" }, `Open the scene ${made.name}`));
     next.hidden = !made;
     return undefined;
   };
-  const look = () => released().then(update);
-  store.addEventListener("change", look);
+  store.addEventListener("change", update);
   setTimeout(update);
   return h(
     "section",

@@ -1,6 +1,6 @@
 // The screens of runs and scenes: a row of tabs, each of which shows one part.
 
-import { h, link } from "./dom.js";
+import { h, link, patch } from "./dom.js";
 import { hasDraft } from "./draft.js";
 import { edit } from "./edit.js";
 import { compare, judge } from "./judge.js";
@@ -56,7 +56,7 @@ function tabbed(given, title, tabs) {
         if (current) element.setAttribute("aria-current", "page");
         else element.removeAttribute("aria-current");
       }
-      place.replaceChildren();
+      patch(place);
       part = (tab === "compare" ? compare : tabs[tab][1])({ place, store, entry, where });
       part.tab = tab;
       mark();

@@ -1,7 +1,7 @@
 // What was removed, until the trash is emptied.
 
 import { at, get, post, remove } from "./api.js";
-import { attempt, button, errorLine, h, heading, keyed, link } from "./dom.js";
+import { attempt, button, errorLine, h, heading, link, patch, want } from "./dom.js";
 
 export function trash({ main, store }) {
   const line = errorLine();
@@ -23,27 +23,24 @@ export function trash({ main, store }) {
     if (asked !== questions) return; // the answer is older than that to a later question
     empty.hidden = found.length > 0;
     clear.hidden = !found.length;
-    keyed(
+    patch(
       list,
-      found,
-      ({ id }) => id,
-      ({ id, kind, name, removed }) => {
-        const back = button("Restore", () =>
-          attempt(back, line, async () => {
+      found.map(({ id, kind, name, removed }) => {
+        const onclick = ({ currentTarget }) =>
+          attempt(currentTarget, line, async () => {
             await post(at("trash", id, "restore"));
             await read();
             store.refresh();
-          }),
-        );
+          });
         const when = new Date(1000 * removed).toLocaleString("en");
-        return h(
+        return want(
           "li",
-          { class: "row" },
-          h("span", {}, `${kind}/${name}`),
-          h("span", { class: "quiet" }, `removed ${when}`),
-          back,
+          { class: "row", "data-key": id },
+          want("span", {}, `${kind}/${name}`),
+          want("span", { class: "quiet" }, `removed ${when}`),
+          want("button", { type: "button", onclick }, "Restore"),
         );
-      },
+      }),
     );
   }
 

@@ -1,7 +1,7 @@
 // A training as it runs: the scene, how far it is, and its curves. Also the view of a finished scene.
 
 import { at, get, getQuietly, head } from "./api.js";
-import { decibels, duration, h, heading, link, put, whole } from "./dom.js";
+import { decibels, duration, h, heading, link, patch, put, want, whole } from "./dom.js";
 import { curve } from "./curves.js";
 import { beside, frame } from "./frame.js";
 import { jobPlace } from "./jobs.js";
@@ -165,8 +165,8 @@ function showFigures(list, now, view, { points }) {
     ["splats", splats ? whole(splats) : "–"],
     ["time", now.seconds ? duration(now.seconds) : "–"],
   ];
-  const text = JSON.stringify(rows);
-  if (list.dataset.text === text) return;
-  list.dataset.text = text;
-  list.replaceChildren(...rows.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
+  patch(
+    list,
+    rows.map(([name, value]) => want("div", {}, want("dt", {}, name), want("dd", {}, value))),
+  );
 }

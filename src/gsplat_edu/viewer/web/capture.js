@@ -10,7 +10,6 @@ import { RegionTool } from "./capture_region.js";
 import { element, fail, say, startPage } from "./common.js";
 import { Controls } from "./controls.js";
 import { FACTS } from "./facts.js";
-import { released } from "./press.js";
 import { inflated } from "./scene.js";
 
 const SLOW = 40; // milliseconds per frame above which fewer points are drawn while the view moves
@@ -186,7 +185,6 @@ class CaptureView {
     const out = !camera.left_out;
     try {
       const all = new Set(await this.photos.leaveOut(camera.photo, !out));
-      await released();
       for (const one of this.cameras.list) one.left_out = all.has(one.photo);
       this.panel.trouble("");
       this.panel.say(out ? `${camera.name} is left out` : `${camera.name} is used again`);
@@ -203,14 +201,14 @@ class CaptureView {
     this.cameras.list.forEach((camera, i) => {
       camera.marks = [...new Set([...this.facts.cameras[i].marks, ...found(camera)])];
     });
-    released().then(() => this.paint());
+    this.paint();
   }
 
   // For a page around this one: photos were left out there, or taken back; a Map from photos to whether they are left out.
   left(changes) {
     const other = this.cameras.list.filter(({ photo, left_out: out }) => (changes.get(photo) ?? out) !== out);
     for (const camera of other) camera.left_out = changes.get(camera.photo);
-    if (other.length) released().then(() => this.paint());
+    if (other.length) this.paint();
   }
 
   // Asks the server what the doctor found, until it knows.
@@ -218,10 +216,9 @@ class CaptureView {
     this.panel.doctor("The doctor examines the photos ...");
     for (;;) {
       const answer = await fetch(this.facts.findings).catch(() => null);
-      if (!answer?.ok) return released().then(() => this.panel.doctor(""));
+      if (!answer?.ok) return this.panel.doctor("");
       const { done, marks, trouble } = await answer.json();
       if (done) {
-        await released();
         this.mark(new Map(Object.entries(marks)));
         const count = this.cameras.list.filter((camera) => camera.marks.length).length;
         return this.panel.doctor(

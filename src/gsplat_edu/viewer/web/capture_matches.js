@@ -2,6 +2,7 @@
 
 import { numbered } from "./capture_panel.js";
 import { element, refill } from "./common.js";
+import { want } from "./patch.js";
 import { inflated } from "./scene.js";
 
 const MOST_SHARING = 6; // photos in the list
@@ -83,12 +84,8 @@ export class MatchPanel {
       : "Shares points with no other photo.";
     element("sharing-with").textContent = text;
     const items = found.slice(0, MOST_SHARING).map(({ other, common }) => {
-      const [item, button, count] = ["li", "button", "small"].map((tag) => document.createElement(tag));
-      count.textContent = common.toLocaleString("en");
-      button.append(this.cameras.list[other].name, " ", count);
-      button.addEventListener("click", () => this.actions.choose(other));
-      item.append(button);
-      return item;
+      const words = [this.cameras.list[other].name, " ", want("small", {}, common.toLocaleString("en"))];
+      return want("li", {}, want("button", { onclick: () => this.actions.choose(other) }, words));
     });
     refill(element("sharing"), items, element("next"));
   }

@@ -1,7 +1,7 @@
 // Everything around the picture of a capture: the legend, the list of photos, the chosen photo, and the one under the pointer.
 
 import { element } from "./common.js";
-import { released } from "./press.js";
+import { h, patch, want } from "./patch.js";
 
 export const SMALL = "(max-width: 600px)"; // as in capture.css
 const HOVER_APART = 16; // CSS px between the pointer and the photo beside it
@@ -59,16 +59,13 @@ export class CapturePanel {
 
   fillList() {
     this.buttons = this.cameras.list.map(({ name }, index) => {
-      const [item, button] = ["li", "button"].map((tag) => document.createElement(tag));
-      button.append(name, " ", document.createElement("small"));
-      button.addEventListener("click", () => this.actions.choose(index));
-      item.append(button);
-      return button;
+      return h("button", { onclick: () => this.actions.choose(index) }, name, " ", h("small"));
     });
     element("cameras").querySelector("summary").textContent = `photos (${this.buttons.length})`;
-    element("cameras")
-      .querySelector("ol")
-      .append(...this.buttons.map((button) => button.parentElement));
+    patch(
+      element("cameras").querySelector("ol"),
+      this.buttons.map((button) => want("li", {}, button)),
+    );
   }
 
   // What is known of each photo has changed.
@@ -79,13 +76,12 @@ export class CapturePanel {
         ...camera.marks,
       ].join(", ");
     });
-    const items = this.cameras.kinds().map(({ kind, name, cameras }) => {
-      const item = document.createElement("li");
-      item.className = kind;
-      item.textContent = kind === "camera" ? `${numbered(cameras, "photo")}` : `${name} (${cameras})`;
-      return item;
-    });
-    element("legend").replaceChildren(...items);
+    const items = this.cameras
+      .kinds()
+      .map(({ kind, name, cameras }) =>
+        want("li", { class: kind }, kind === "camera" ? numbered(cameras, "photo") : `${name} (${cameras})`),
+      );
+    patch(element("legend"), items);
     if (this.cameras.chosen >= 0) this.describe(this.cameras.list[this.cameras.chosen]);
   }
 
@@ -112,13 +108,11 @@ export class CapturePanel {
     try {
       const address = await this.photos.load(camera.photo, 512);
       await decodedPhoto(address); // it takes its place at once
-      await released();
       if (asked !== this.asked) return;
       element("photo").src = address;
       element("photo").alt = camera.name;
       element("photo").hidden = false;
     } catch (error) {
-      await released();
       if (asked !== this.asked) return;
       element("photo").hidden = true;
       this.trouble(error.message);

@@ -10,7 +10,6 @@ import { Gizmo } from "./edit_gizmo.js";
 import { numberFields } from "./edit_gizmo_panel.js";
 import { Overlay } from "./edit_overlay.js";
 import { boxHandles, boxLines, sideAt, sideDragged } from "./edit_shapes.js";
-import { released } from "./press.js";
 
 const ELSEWHERE = {
   saved: "Another tab has saved a box. Yours is not saved yet; saving it replaces the other one.",
@@ -51,7 +50,6 @@ export class RegionTool {
     const asked = ++this.questions;
     try {
       const region = await this.viewer.photos.region();
-      await released();
       if (asked !== this.questions) return; // a box was saved here meanwhile, or a later question was answered
       this.saved = region && { ...region, center: plus(region.center, this.viewer.facts.origin, -1) };
       const before = this.stored;

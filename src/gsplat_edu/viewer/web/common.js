@@ -1,5 +1,7 @@
 // What the pages of scenes and of captures share: elements, the message, lists, and shader programs.
 
+import { keepPresses, patch } from "./patch.js";
+
 export const element = (id) => document.getElementById(id);
 
 export function say(text) {
@@ -15,16 +17,17 @@ export function fail(error) {
 export function startPage(start) {
   addEventListener("error", (event) => fail(event.error));
   addEventListener("unhandledrejection", (event) => fail(event.reason));
+  keepPresses();
   addEventListener("DOMContentLoaded", () => start().catch(fail));
 }
 
-// Replaces the items of a list. The keyboard's focus stays at its place in it; in an empty list it goes elsewhere.
+// Changes the items of a list. If the one with the keyboard's focus is gone, the last button gets it; in an empty list it
+// goes elsewhere.
 export function refill(list, items, elsewhere) {
-  const at = [...list.querySelectorAll("button")].indexOf(document.activeElement);
-  list.replaceChildren(...items);
-  if (at < 0) return;
-  const buttons = list.querySelectorAll("button");
-  (buttons[Math.min(at, buttons.length - 1)] ?? elsewhere).focus();
+  const isIn = list.contains(document.activeElement);
+  patch(list, items);
+  if (isIn && !list.contains(document.activeElement))
+    ([...list.querySelectorAll("button")].at(-1) ?? elsewhere).focus();
 }
 
 // A program of the shaders whose texts the page has under NAME.vert and NAME.frag.

@@ -1,7 +1,7 @@
 // Groups of splats that the server proposes to delete, each with its reason; absent in a page without a server.
 
 import { element } from "./common.js";
-import { released } from "./press.js";
+import { patch, want } from "./patch.js";
 
 const ASK_EVERY = 500; // ms between questions to the server
 
@@ -47,7 +47,6 @@ export class EditFloaters {
     } catch (error) {
       said = { state: "failed", error: quiet ? "" : error.message };
     }
-    await released();
     if (question === this.questions) this.show(said); // an answer to an earlier question is older
   }
 
@@ -66,19 +65,16 @@ export class EditFloaters {
     else bar.removeAttribute("value");
     const nothing = state === "done" && !groups.length ? "No splat is proposed. " : "";
     element("edit-proposed").textContent = running ? "judging ..." : error || nothing + basis;
-    element("edit-groups").replaceChildren(...groups.map((group) => this.row(group)));
+    patch(
+      element("edit-groups"),
+      groups.map((group) => this.row(group)),
+    );
     if (running) this.timer = setTimeout(() => this.ask("GET"), ASK_EVERY);
   }
 
   row({ reason, runs }) {
-    const button = document.createElement("button");
     const count = runs.reduce((sum, x, k) => sum + (k % 2 ? x : 0), 0);
-    button.textContent = `${count.toLocaleString("en")} · ${reason}`;
-    button.addEventListener("click", () =>
-      this.editor.perform({ op: "select", how: this.editor.how, by: "list", reason, runs }),
-    );
-    const item = document.createElement("li");
-    item.append(button);
-    return item;
+    const onclick = () => this.editor.perform({ op: "select", how: this.editor.how, by: "list", reason, runs });
+    return want("li", {}, want("button", { onclick }, `${count.toLocaleString("en")} · ${reason}`));
   }
 }

@@ -12,6 +12,7 @@ import { POLYGON_ROW } from "./edit_polygon.js";
 import { length3, shortNumber } from "./edit_shapes.js";
 import { POINTS_OF } from "./edit_tools.js";
 import { TOUR_ROW } from "./edit_tour.js";
+import { want } from "./patch.js";
 
 const EDIT_PANEL = `
 <section id="edit" aria-label="editor">
@@ -383,19 +384,9 @@ export class EditPanel {
   list() {
     const { history, editor } = { history: this.editor.history, editor: this.editor };
     const views = history.views();
-    const button = (text, label, action, current) => {
-      const made = document.createElement("button");
-      made.textContent = text;
-      if (label) made.setAttribute("aria-label", label);
-      if (current !== undefined) made.setAttribute("aria-current", current);
-      made.addEventListener("click", action);
-      return made;
-    };
-    const row = (...parts) => {
-      const item = document.createElement("li");
-      item.append(...parts);
-      return item;
-    };
+    const button = (text, label, onclick, more = {}) =>
+      want("button", { "aria-label": label || null, ...more, onclick }, text);
+    const row = (...parts) => want("li", {}, ...parts);
     const names = [...views.named.keys()];
     const rows = [...views.named.values()].map((view) =>
       row(
@@ -409,11 +400,17 @@ export class EditPanel {
     editor.tour.follow(views);
     element("edit-views").querySelector("summary").textContent = `views (${rows.length})`;
     const operations = [...history.done, ...[...history.undone].reverse()];
-    const items = operations.map((operation, i) =>
-      row(button(describeOperation(operation), "", () => editor.goToStep(i + 1), i + 1 === history.done.length)),
-    );
-    if (operations.length) items.unshift(row(button("as opened", "", () => editor.goToStep(0), !history.done.length)));
-    items.forEach((item, i) => item.classList.toggle("undone", i > history.done.length));
+    const step = (at, text) => {
+      const current = { "aria-current": String(at === history.done.length) };
+      const undone = at > history.done.length ? "undone" : null;
+      return want(
+        "li",
+        { class: undone },
+        button(text, "", () => editor.goToStep(at), current),
+      );
+    };
+    const items = operations.map((operation, i) => step(i + 1, describeOperation(operation)));
+    if (operations.length) items.unshift(step(0, "as opened"));
     this.fill("edit-list", items);
     element("edit-list").querySelector("summary").textContent = `operations (${history.done.length})`;
   }

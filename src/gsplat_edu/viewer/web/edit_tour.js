@@ -48,10 +48,8 @@ export class EditTour {
       ["↑", "earlier", -1],
       ["↓", "later", 1],
     ].map(([sign, when, by]) => {
-      const made = button(sign, `${name} ${when}`, () => this.move(names, at, by, when));
-      made.dataset.order = `${when} ${name}`;
-      made.setAttribute("aria-disabled", names[at + by] === undefined);
-      return made;
+      const more = { "data-order": `${when} ${name}`, "aria-disabled": String(names[at + by] === undefined) };
+      return button(sign, `${name} ${when}`, () => this.move(names, at, by, when), more);
     });
   }
 

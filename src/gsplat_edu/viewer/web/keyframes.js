@@ -2,6 +2,7 @@
 
 import { plus, radians, transposed } from "./camera.js";
 import { element, refill } from "./common.js";
+import { want } from "./patch.js";
 import { PathCurve } from "./path.js";
 import { restOf, Timeline } from "./timeline.js";
 
@@ -127,19 +128,15 @@ export class Keyframes {
     element("path").querySelector("summary").textContent = `camera path (${keyframes.length})`;
     element("loop").checked = loop;
     for (const name of ["play", "download-path"]) element(name).disabled = !this.playable;
-    const button = (text, label, action) => {
-      const made = document.createElement("button");
-      made.textContent = text;
-      made.setAttribute("aria-label", label);
-      made.addEventListener("click", action);
-      return made;
-    };
+    const button = (text, label, onclick) => want("button", { "aria-label": label, onclick }, text);
     const items = keyframes.map((keyframe, i) => {
-      const item = document.createElement("li");
       const goTo = () => this.actions.goToView(this.camera(keyframe));
-      item.append(button(`view ${i + 1}`, `go to view ${i + 1}`, goTo));
-      if (!keyframe.given) item.append(button("×", `remove view ${i + 1}`, () => this.remove(i)));
-      return item;
+      return want(
+        "li",
+        {},
+        button(`view ${i + 1}`, `go to view ${i + 1}`, goTo),
+        !keyframe.given && button("×", `remove view ${i + 1}`, () => this.remove(i)),
+      );
     });
     refill(element("path").querySelector("ol"), items, element("save-view"));
     this.timeline.changed();

@@ -3,8 +3,8 @@
 import { element, fail, say } from "./common.js";
 import { Renderer } from "./draw.js";
 import { FACTS } from "./facts.js";
-import { created, Curve } from "./live_curves.js";
-import { released } from "./press.js";
+import { Curve } from "./live_curves.js";
+import { h, patch, want } from "./patch.js";
 import { arraysIn } from "./scene.js";
 
 // Drawing other splats takes this computer's time, which the training needs as well. So the page waits this many times
@@ -37,38 +37,44 @@ if (INSIDE) document.documentElement.classList.add("inside");
 
 class Live {
   constructor(viewer, { step }) {
-    Object.assign(this, { viewer, state: null, over: false, wake: () => {} });
+    Object.assign(this, { viewer, state: null, over: false, wake: () => {}, steps: step });
     this.draws = viewer.renderer instanceof Renderer;
     viewer.isTraining = this.draws; // until a state tells otherwise
     this.build();
-    this.step.hidden = !step;
     history.replaceState(null, "", location.pathname); // without the token
     this.watch();
     if (this.draws) this.follow().catch(fail);
   }
 
   build() {
-    this.title = created("p", { class: "state", role: "status" }, "waiting for the first iteration");
-    this.bar = created("progress", { max: 1, value: 0, "aria-label": "iterations" });
-    this.left = created("p", { class: "left" }, "\u00a0");
-    this.photos = created("p", { title: "Size that is trained on, and its share of the full width" }, "\u00a0");
+    this.title = h("p", { class: "state", role: "status" }, "waiting for the first iteration");
+    this.bar = h("progress", { max: 1, value: 0, "aria-label": "iterations" });
+    this.left = h("p", { class: "left" }, "\u00a0");
+    this.photos = h("p", { title: "Size that is trained on, and its share of the full width" }, "\u00a0");
     this.curves = {
       loss: new Curve("loss", (value) => value.toPrecision(3), PHOTOS_VARY),
       psnr: new Curve("PSNR", (value) => `${value.toFixed(2)} dB`, PHOTOS_VARY),
       count: new Curve("splats", whole, 1),
     };
-    this.pause = created("button", { title: "Wait after this iteration, or continue" }, "pause");
-    this.step = created("button", { title: "One more iteration, then wait" }, "step");
-    this.pause.addEventListener("click", () => this.control(this.state?.state === "paused" ? "resume" : "pause"));
-    this.step.addEventListener("click", () => this.control("step"));
-    this.note = created("p", { class: "note", role: "alert", hidden: "" });
-    const buttons = created("p", { class: "row" }, this.pause, this.step);
+    this.note = h("p", { class: "note", role: "alert", hidden: "" });
+    this.buttons = h("p", { class: "row" });
+    this.offer("pause");
     const curves = Object.values(this.curves).map((curve) => curve.element);
-    const section = created("section", { id: "live", "aria-label": "training" });
-    section.append(this.title, this.bar, this.left, buttons, this.note);
+    const section = h("section", { id: "live", "aria-label": "training" });
+    section.append(this.title, this.bar, this.left, this.buttons, this.note);
     element("tools").before(section);
-    element("tools").prepend(created("section", { id: "curves", "aria-label": "curves" }, ...curves, this.photos));
+    element("tools").prepend(h("section", { id: "curves", "aria-label": "curves" }, ...curves, this.photos));
     this.noted(this.draws ? "" : "This browser has no WebGL2, so the training's computer draws the pictures.");
+  }
+
+  // Shows the buttons. What the first one does is what it said when it was pressed.
+  offer(what, disabled = false) {
+    const button = (text, more) => want("button", { disabled, onclick: () => this.control(text), ...more }, text);
+    patch(
+      this.buttons,
+      button(what, { title: "Wait after this iteration, or continue" }),
+      button("step", { title: "One more iteration, then wait", hidden: !this.steps }),
+    );
   }
 
   noted(text) {
@@ -94,7 +100,6 @@ class Live {
         const state = await answer.json();
         if (state.error) throw new Error(state.error);
         [version, failures] = [state.version, 0];
-        await released();
         this.show(state);
       } catch {
         ++failures;
@@ -105,7 +110,7 @@ class Live {
     this.spare(false);
     this.wake();
     this.title.textContent = "ended";
-    this.pause.disabled = this.step.disabled = true;
+    this.offer(this.state?.state === "paused" ? "resume" : "pause", true);
     this.noted("The training's program has ended or cannot be reached. This is the last scene that the page received.");
   }
 
@@ -118,8 +123,7 @@ class Live {
     const share = state.photo_factor === 1 ? "" : ` (1/${Number(state.photo_factor.toFixed(2))})`;
     this.photos.textContent = state.width ? `photos of ${state.width} × ${state.height} px${share}` : "\u00a0";
     for (const [name, curve] of Object.entries(this.curves)) curve.show(state[name], history.iteration, history[name]);
-    this.pause.textContent = state.state === "paused" ? "resume" : "pause";
-    this.pause.disabled = this.step.disabled = !["training", "paused"].includes(state.state);
+    this.offer(state.state === "paused" ? "resume" : "pause", !["training", "paused"].includes(state.state));
     const still = ["paused", "finished"].includes(state.state);
     this.spare(!still);
     if (state.failure || this.draws) this.noted(state.failure);

@@ -1,26 +1,20 @@
 // Small curves of a training: loss, PSNR and the number of splats over the iterations.
 
+import { h } from "./patch.js";
+
 const CURVE_WIDTH = 100; // units of the drawing, which is stretched to its place
 const CURVE_HEIGHT = 24;
-
-export function created(name, attributes = {}, ...children) {
-  const svg = ["svg", "polyline"].includes(name);
-  const made = svg ? document.createElementNS("http://www.w3.org/2000/svg", name) : document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
-}
 
 // One curve with its name and newest value.
 export class Curve {
   // shown(value) makes the text of a value. weight: that of the newest value in a moving mean, at most 1.
   constructor(name, shown, weight) {
     Object.assign(this, { name, shown, weight });
-    this.line = created("polyline", { fill: "none" });
+    this.line = h("polyline", { fill: "none" });
     const box = { viewBox: `0 0 ${CURVE_WIDTH} ${CURVE_HEIGHT}`, preserveAspectRatio: "none", role: "img" };
-    this.drawing = created("svg", box, this.line);
-    this.value = created("span", { class: "value" });
-    this.element = created("div", { class: "curve" }, created("span", {}, name), this.value, this.drawing);
+    this.drawing = h("svg", box, this.line);
+    this.value = h("span", { class: "value" });
+    this.element = h("div", { class: "curve" }, h("span", {}, name), this.value, this.drawing);
     this.show(null, [], []);
   }
 

@@ -1,6 +1,7 @@
 // Everything around the picture: metadata, buttons, the capture's cameras, messages.
 
 import { element } from "./common.js";
+import { h } from "./patch.js";
 
 const POINT_SHOWN = 800; // milliseconds
 
@@ -64,16 +65,9 @@ export class Panel {
   fillCameras(actions) {
     const { cameras, shared } = this.facts;
     this.buttons = cameras.map(({ name, held_out }, index) => {
-      const button = document.createElement("button");
-      button.textContent = name;
-      if (held_out) {
-        const mark = document.createElement("small");
-        mark.textContent = "held out";
-        mark.title = "Test view: this photo was not used for training.";
-        button.append(" ", mark);
-      }
-      button.addEventListener("click", () => actions.goTo(index));
-      return button;
+      const title = "Test view: this photo was not used for training.";
+      const mark = held_out && [" ", h("small", { title }, "held out")];
+      return h("button", { onclick: () => actions.goTo(index) }, name, mark);
     });
     this.listed(
       "views",
@@ -91,14 +85,9 @@ export class Panel {
   listed(id, title, buttons) {
     element(id).hidden = buttons.length === 0;
     element(id).querySelector("summary").textContent = `${title} (${buttons.length})`;
-    const items = buttons.map((button) => {
-      const item = document.createElement("li");
-      item.append(button);
-      return item;
-    });
     element(id)
       .querySelector("ol")
-      .append(...items);
+      .append(...buttons.map((button) => h("li", {}, button)));
   }
 
   // Highlights the current camera; none once the view has moved away from it.
