@@ -17,7 +17,7 @@ from gsplat_edu.engine import frame
 from gsplat_edu.engine.frame import PAIRS, VISIBLE
 from gsplat_edu.engine.passes import Program, manifest, sort_bits
 from gsplat_edu.engine.statistics import Asked, statistics_program
-from gsplat_edu.engine.step import GROUPS, HALT, L1, LIVE, Photo, StepNumbers, step_program
+from gsplat_edu.engine.step import GROUPS, HALT, L1, LIVE, PackedPhoto, StepNumbers, step_program
 from gsplat_edu.render.output import STATISTICS
 from lens_scenes import around, lens_camera
 
@@ -153,7 +153,7 @@ def test_a_step_of_training_in_a_browser(page, device):
     """The gradients of the photo's loss arrive in Adam's first moments; loss, visible Gaussians and pairs in `live`."""
     scene, view = packed(SMALLER["random"]), view_of(SMALLER["random"])
     H, W = view.camera.H, view.camera.W
-    photo = Photo.packed((255 * np.random.default_rng(2).random((H, W, 3))).astype(np.uint8), None)
+    photo = PackedPhoto.packed((255 * np.random.default_rng(2).random((H, W, 3))).astype(np.uint8), None)
     rates = dict.fromkeys(GROUPS, (1e-3, 0.9, 0.999, 1e-15, 0.1, 0.001))
     numbers = StepNumbers(rates, opacity_weight=0.01, scale_weight=0.01, collects=True)
     block = view.packed(scene.rest.shape[1]) + numbers.packed(H * W, len(scene.core), photo.floats)

@@ -6,7 +6,7 @@ import torch
 
 from engine.frames import plain_view
 from gsplat_edu.base.constants import SSIM_C2
-from gsplat_edu.engine.step import LIVE, PHOTO_WORDS, Photo, StepNumbers, loss_program, loss_value
+from gsplat_edu.engine.step import LIVE, PHOTO_WORDS, PackedPhoto, StepNumbers, loss_program, loss_value
 from gsplat_edu.ops.losses import l1_ssim_in_torch, photo_loss
 
 EPS = 2.0**-24
@@ -49,7 +49,7 @@ def pictures(H, W, kind):
 def test_the_loss_is_the_reference_s(device, H, W, kind, weight):
     image, target = pictures(H, W, kind)
     mask = np.random.default_rng(0).random((H, W)) > 0.1
-    photo = Photo.packed(target, mask)
+    photo = PackedPhoto.packed(target, mask)
     assert photo.floats == (kind == "floats")
     value, gradient = played(device, image, photo, weight, spare=3)
     x = torch.tensor(image, dtype=torch.float64, requires_grad=True)
@@ -65,14 +65,14 @@ def test_a_photo_of_bytes_in_floats_is_packed_into_bytes():
     """As far as its values are exactly k/255; else floats keep them."""
     image = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
     floats = image.astype(np.float32) / np.float32(255)
-    packed = Photo.packed(floats, None)
-    assert not packed.floats and np.array_equal(packed.words, Photo.packed(image, None).words)
+    packed = PackedPhoto.packed(floats, None)
+    assert not packed.floats and np.array_equal(packed.words, PackedPhoto.packed(image, None).words)
     floats[0, 0, 0] = np.nextafter(np.float32(0), np.float32(1))
-    assert Photo.packed(floats, None).words.shape == (256, PHOTO_WORDS)
+    assert PackedPhoto.packed(floats, None).words.shape == (256, PHOTO_WORDS)
 
 
 def test_the_same_bits_again(device):
     image, target = pictures(50, 51, "bytes")
-    photo = Photo.packed(target, None)
+    photo = PackedPhoto.packed(target, None)
     first, second = (played(device, image, photo, 0.2) for _ in range(2))
     assert first[0] == second[0] and np.array_equal(first[1], second[1])

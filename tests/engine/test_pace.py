@@ -10,7 +10,7 @@ from float32_backends import SMALLER
 from gsplat_edu.engine import dispatch, frame, host
 from gsplat_edu.engine.pace import GROWTH, REACH, Pace, Stretch, Timing
 from gsplat_edu.engine.passes import LIMITS, sort_bits
-from gsplat_edu.engine.step import GROUPS, LIVE, STATE, Noise, Photo, StepNumbers, step_program
+from gsplat_edu.engine.step import GROUPS, LIVE, STATE, Noise, PackedPhoto, StepNumbers, step_program
 from native_scenes import random
 
 SPLITS = {"one submission": math.inf, "as on this device": 0.2, "a workgroup in each": 0.0}
@@ -66,7 +66,7 @@ def steps_of(device):
     counts = {"gaussians": len(scene.core), "rest": scene.rest.size, "pixels": H * W, "live": LIVE}
     counts |= {"edges": view.tiles + 2, "pairs": 1 << 12}
     memory = device.allocate(step_program(sort_bits(view.tiles.bit_length())), counts)
-    photo = Photo.packed((255 * np.random.default_rng(2).random((H, W, 3))).astype(np.uint8), None)
+    photo = PackedPhoto.packed((255 * np.random.default_rng(2).random((H, W, 3))).astype(np.uint8), None)
     memory.write("core", scene.core)
     memory.write("rest", scene.rest)
     rates = dict.fromkeys(GROUPS, (1e-3, 0.9, 0.999, 1e-15, 0.1, 0.001))

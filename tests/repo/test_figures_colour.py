@@ -121,7 +121,7 @@ def test_the_ball_is_painted(opened):
     shown = page.evaluate(
         """([x, y]) => [...document.querySelector("[data-play=harmonics] canvas").getContext("2d")
             .getImageData(x, y, 1, 1).data]""",
-        [box["width"] / 2 - (box["height"] - 20) / 2, box["height"] / 2 + 8],
+        [box["width"] / 2 - (box["height"] - 20) / 2, box["height"] / 2 + 6],
     )
     peak = np.exp(
         4.0 * (np.array([-0.35, -0.45, 0.82]) @ [0, 0, 1] / np.linalg.norm([-0.35, -0.45, 0.82]) - 1)

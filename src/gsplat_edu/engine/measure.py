@@ -12,7 +12,7 @@ from gsplat_edu.engine.frame import PAIRS, Scene, rounded_pairs
 from gsplat_edu.engine.host import Device, Memory
 from gsplat_edu.engine.model import Counters, by_stage, forecast, step_costs
 from gsplat_edu.engine.passes import sort_bits
-from gsplat_edu.engine.step import GROUPS, HALT, LIVE, STATE, Photo, StepNumbers, step_program
+from gsplat_edu.engine.step import GROUPS, HALT, LIVE, STATE, PackedPhoto, StepNumbers, step_program
 from gsplat_edu.engine.transfers import Kept
 from gsplat_edu.engine.view import DeviceView
 
@@ -86,7 +86,7 @@ class _Run:
         self.device, self.scene, self.view = device, scene, view
         self.host: list[tuple[float, float]] = []  # milliseconds to record and submit each step
         pixels = view.camera.H * view.camera.W
-        photo = Photo(
+        photo = PackedPhoto(
             np.random.default_rng(3).integers(0, 2**24, pixels, dtype=np.uint32) | np.uint32(255 << 24)
         )
         self.photo: Kept = device.keep(photo.words)

@@ -29,7 +29,7 @@ from gsplat_edu.engine.step import (
     STATE,
     STATISTICS,
     Noise,
-    Photo,
+    PackedPhoto,
     StepNumbers,
     pairs_room,
     step_program,
@@ -183,7 +183,7 @@ class Resident:
         self,
         view: DeviceView,
         index: int,
-        photo: Callable[[], Photo],
+        photo: Callable[[], PackedPhoto],
         constant: object | None,
         numbers: StepNumbers,
     ) -> Result:
@@ -275,7 +275,7 @@ class Resident:
         self.settle()
         return self._here
 
-    def _photo(self, index: int, photo: Callable[[], Photo], constant: object | None) -> _KeptPhoto:
+    def _photo(self, index: int, photo: Callable[[], PackedPhoto], constant: object | None) -> _KeptPhoto:
         """Return a photo on the device, and keep it there if it is constant and there is room."""
         belongs, known = self._photos.get(index, (None, None))
         if known is not None and constant is not None and belongs is constant:

@@ -209,7 +209,7 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
+class PackedPhoto:
     """A photo as the engine takes it.
 
     Args:
@@ -225,7 +225,7 @@ class Photo:
         return self.words.ndim == 2
 
     @staticmethod
-    def packed(image: np.ndarray, mask: np.ndarray | None) -> Photo:
+    def packed(image: np.ndarray, mask: np.ndarray | None) -> PackedPhoto:
         """Pack a photo, in bytes if that keeps all of its digits.
 
         Args:
@@ -240,11 +240,11 @@ class Photo:
                 words = np.empty((len(pixels), PHOTO_WORDS), dtype=np.uint32)
                 words[:, :3] = np.ascontiguousarray(pixels, dtype=np.float32).view(np.uint32)
                 words[:, 3] = counts
-                return Photo(words)
+                return PackedPhoto(words)
             pixels = rounded
         rgba = np.empty((len(pixels), 4), dtype=np.uint8)
         rgba[:, :3], rgba[:, 3] = pixels, np.where(counts, 255, 0)
-        return Photo(rgba.view("<u4")[:, 0].astype(np.uint32, copy=False))
+        return PackedPhoto(rgba.view("<u4")[:, 0].astype(np.uint32, copy=False))
 
 
 def loss_value(live: np.ndarray, pixels: int, ssim_weight: float) -> float:

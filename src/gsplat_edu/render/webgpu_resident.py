@@ -13,7 +13,7 @@ from torch import Tensor
 from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.resident import Resident, Result
 from gsplat_edu.engine.room import REPEATED_PHOTOS, kept_photos
-from gsplat_edu.engine.step import NO_SHELL, Noise, Photo, StepNumbers
+from gsplat_edu.engine.step import NO_SHELL, Noise, PackedPhoto, StepNumbers
 from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import WORD, NoiseNumbers
 from gsplat_edu.render import webgpu
@@ -104,7 +104,7 @@ class WebgpuRun:
             result = self.resident.step(
                 view,
                 target.index,
-                lambda: Photo.packed(target.image.numpy(), mask),
+                lambda: PackedPhoto.packed(target.image.numpy(), mask),
                 target.constant,
                 numbers,
             )
