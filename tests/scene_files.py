@@ -1,11 +1,16 @@
 """Scenes and files shared by the tests of scene formats."""
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
+from scipy.spatial import cKDTree
 
-from gsplat_edu.io.formats import LOD_META, SOG_META, write_scene
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.io.formats import LOD_META, SOG_META, read_scene, write_scene
 from gsplat_edu.io.lod import codec as lod
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.ply import save_ply
@@ -14,6 +19,8 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+
+DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 RUN_UP = np.array([0.0, -0.6, 0.8])
 
@@ -34,6 +41,30 @@ def random_scene(count: int, rest: int = 15, seed: int = 0) -> Scene:
         logit_opacities=1.5 * normal(count),
     )
     return Scene(gaussians, antialiased=False, up=(0.0, -1.0, 0.0))
+
+
+def kept_file(name: str) -> Path:
+    """Return a file of the machine's data by its name there; skip the test without it."""
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    return path
+
+
+def refused(path: Path, read: Callable[[Path], object] = read_scene) -> str:
+    """Return why a reader refuses a file: one line that names it, or a file beside the meta.json of a SOG folder."""
+    with pytest.raises(SceneFormatError) as caught:
+        read(path)
+    message, named = str(caught.value), path.parent if path.name == SOG_META else path
+    assert str(named) in message and "\n" not in message and len(message) < 400
+    return message
+
+
+def matched(given: Gaussians, back: Gaussians) -> Gaussians:
+    """Return the given Gaussians in the order in which they were read, matched one to one by the nearest mean."""
+    _, nearest = cKDTree(given.means.numpy()).query(back.means.numpy())
+    assert sorted(nearest) == list(range(len(given))), "each splat appears once"
+    return given.map(lambda tensor: tensor[torch.from_numpy(np.asarray(nearest, dtype=np.int64))])
 
 
 def small_file(folder: Path, suffix: str, rest: int = 3) -> Path:

@@ -7,7 +7,7 @@ import torch
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.formats import FORMATS, format_of, read_scene, write_scene
-from scene_files import random_scene, small_file
+from scene_files import random_scene, refused, small_file
 
 SLACK = 8 << 20
 """Bytes that a reader may use for any file, however small: imports, buffers and the minimum allowance."""
@@ -16,14 +16,6 @@ TIMES = 100
 """A reader may allocate this multiple of the file's size: 64 times for compressed contents, and a float32 copy."""
 
 every_format = pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
-
-
-def refused(path):
-    with pytest.raises(SceneFormatError) as caught:
-        read_scene(path)
-    message = str(caught.value)
-    assert str(path) in message and "\n" not in message and len(message) < 400
-    return message
 
 
 @every_format

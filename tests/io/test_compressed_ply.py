@@ -1,6 +1,4 @@
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +11,7 @@ from gsplat_edu.io.compressed_ply import read, write
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
-from scene_files import random_scene
-
-DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
+from scene_files import kept_file, matched, random_scene, refused
 
 XYZ = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
 SCALES = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
@@ -126,14 +122,6 @@ def test_sh_bytes_are_stored_channel_by_channel(tmp_path, rest):
                 assert values[splat, k, channel] == expected
 
 
-def matched(scene, back):
-    """Return the given splats in the order in which they were read, matched one to one by the nearest mean."""
-    _, nearest = cKDTree(scene.gaussians.means.numpy()).query(back.gaussians.means.numpy())
-    if len(nearest):
-        assert len(set(nearest.tolist())) == len(scene.gaussians)
-    return scene.gaussians.map(lambda tensor: tensor[torch.from_numpy(np.asarray(nearest, dtype=np.int64))])
-
-
 def check_values(path, given):
     """Check what a file holds against Gaussians in its order, each number within half a step of its chunk."""
     back = read(path).relative_to((0.0, 0.0, 0.0))
@@ -166,7 +154,7 @@ def check_rotations(before, after):
     assert ((after - before).abs() <= 3 * HALF * np.sqrt(2) / 1023 + 1e-6).all()
 
 
-@pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 1000])
+@pytest.mark.parametrize("count", [0, 1, 256, 257])
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
 def test_a_round_trip_stays_within_half_a_step(tmp_path, rest, count):
     scene, path = random_scene(count, rest), tmp_path / "new" / "a.compressed.ply"
@@ -176,27 +164,7 @@ def test_a_round_trip_stays_within_half_a_step(tmp_path, rest, count):
     back = read(path)
     assert (back.antialiased, back.up) == (False, (0.0, -1.0, 0.0))
     assert back.gaussians.sh_rest.shape == (count, rest, 3)
-    check_values(path, matched(scene, back))
-
-
-def test_bytes_are_the_same_every_time(tmp_path):
-    for name in ("a", "b"):
-        write(tmp_path / f"{name}.compressed.ply", random_scene(700))
-    assert (tmp_path / "a.compressed.ply").read_bytes() == (tmp_path / "b.compressed.ply").read_bytes()
-
-
-@pytest.mark.parametrize("count", [0, 1, 256, 257, 3000])
-def test_a_second_round_trip_changes_nothing(tmp_path, count):
-    first, second = tmp_path / "a.compressed.ply", tmp_path / "b.compressed.ply"
-    write(first, random_scene(count, 8))
-    write(second, read(first))
-    (bounds, words, sh), (bounds2, words2, sh2) = parse(first), parse(second)
-    np.testing.assert_array_equal(words[:, [0, 2, 3]], words2[:, [0, 2, 3]])
-    np.testing.assert_array_equal(sh, sh2)
-    np.testing.assert_allclose(bounds, bounds2, atol=1e-6)  # colours pass through f_dc in float32
-    # If the two largest components are nearly equal, the second write may omit the other one.
-    assert np.count_nonzero(words[:, 1] != words2[:, 1]) <= count // 100
-    check_rotations(read(first).gaussians.quats, read(second).gaussians.quats)
+    check_values(path, matched(scene.gaussians, back.gaussians))
 
 
 def with_means(means):
@@ -257,14 +225,6 @@ def test_all_means_in_one_point(tmp_path, count):
     )
 
 
-def test_all_means_in_one_plane(tmp_path):
-    means = np.random.default_rng(0).normal(size=(600, 3))
-    means[:, 1] = 2.5
-    scene, path = with_means(means), tmp_path / "a.compressed.ply"
-    order = order_of(scene, path)
-    check_values(path, scene.gaussians.map(lambda tensor: tensor[torch.from_numpy(order)]))
-
-
 @pytest.mark.parametrize("size", [1e-45, 1e-30, 1e-7, 3e38])
 def test_extents_at_the_ends_of_float32(tmp_path, size):
     means = np.random.default_rng(0).integers(-1, 2, (600, 3)) * np.float32(size)
@@ -283,22 +243,12 @@ def test_values_out_of_range_are_clamped(tmp_path):
     scene = Scene(replace(g, log_scales=log_scales, sh_rest=sh_rest, logit_opacities=logits, quats=quats))
     path = tmp_path / "a.compressed.ply"
     write(path, scene)
-    back = matched(read(path), scene)
+    back = matched(read(path).gaussians, scene.gaussians)
     assert back.log_scales[0].tolist() == [-20] * 3 and back.log_scales[1].tolist() == [20] * 3
     assert back.sh_rest[:, 0, 0].tolist() == [-4, -4, 4, 4]
     edge = np.log(0.25 / 254.75)  # a quarter of a step from 0 and 1
     np.testing.assert_allclose(back.logit_opacities.numpy(), [edge, -edge, edge, -edge], rtol=1e-6)
     check_rotations(torch.tensor([[1.0, 0, 0, 0], [1, 1, 0, 0], [-1, 0, 0, 0], [0, 1, 0, -1]]), back.quats)
-
-
-def test_trainable_float64_scenes_can_be_written(tmp_path):
-    scene = random_scene(300)
-    write(tmp_path / "a.compressed.ply", scene)
-    write(
-        tmp_path / "b.compressed.ply",
-        replace(scene, gaussians=scene.gaussians.map(torch.Tensor.double).trainable()),
-    )
-    assert (tmp_path / "a.compressed.ply").read_bytes() == (tmp_path / "b.compressed.ply").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -316,26 +266,6 @@ def test_values_that_cannot_be_written_are_named(tmp_path, name, value, message)
     with pytest.raises(ArgumentError, match=message):
         write(path, scene)
     assert list(tmp_path.iterdir()) == []
-
-
-def refused(path):
-    with pytest.raises(SceneFormatError) as caught:
-        read(path)
-    message = str(caught.value)
-    assert str(path) in message and "\n" not in message
-    return message
-
-
-@pytest.mark.parametrize("rest", [0, 3])
-def test_truncated_files_are_refused(tmp_path, rest):
-    path = tmp_path / "a.compressed.ply"
-    write(path, random_scene(300, rest))
-    whole = path.read_bytes()
-    for length in range(0, len(whole), 64):
-        path.write_bytes(whole[:length])
-        refused(path)
-    path.write_bytes(whole[:-1])
-    assert "is truncated: 299 of 300 rows" in refused(path)
 
 
 @pytest.mark.parametrize(
@@ -385,8 +315,9 @@ def test_damage_is_named(tmp_path, changes, message):
     assert message in refused(path)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("place", range(18))
+@pytest.mark.parametrize(
+    ("place", "value"), [(0, np.nan), (4, np.inf), (8, -np.inf), (10, np.nan), (14, np.inf), (17, -np.inf)]
+)
 def test_bounds_that_are_not_finite_are_named(tmp_path, place, value):
     path = tmp_path / "a.compressed.ply"
     write(path, random_scene(300, 0))
@@ -408,34 +339,13 @@ def test_bounds_beyond_float32_are_named(tmp_path):
         read_scene(path)
 
 
-def test_a_mesh_is_not_a_scene(tmp_path):
-    path = tmp_path / "a.ply"
-    path.write_text(
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 0\n"
-    )
-    assert "is not a compressed splat PLY: vertex lacks packed_position" in refused(path)
-
-
-def test_a_missing_file_stays_an_oserror(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read(tmp_path / "gone.compressed.ply")
-
-
-def shared(name):
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{path} is not there")
-    return path
-
-
 def test_a_file_by_supersplat_matches_its_source_and_ours(tmp_path):
     """SuperSplat compressed a PLY, and our compressed file of this PLY has the same numbers."""
-    theirs = shared("plush_dog/point_cloud_29999_clean.compressed.ply")
-    original = Scene(load_ply(shared("plush_dog/point_cloud_29999_clean.ply")))
+    theirs = kept_file("plush_dog/point_cloud_29999_clean.compressed.ply")
+    original = Scene(load_ply(kept_file("plush_dog/point_cloud_29999_clean.ply")))
     scene = read(theirs)
     assert (len(scene.gaussians), scene.gaussians.sh_degree) == (15_105, 3)
-    check_values(theirs, matched(original, scene))
+    check_values(theirs, matched(original.gaussians, scene.gaussians))
     ours = tmp_path / "a.compressed.ply"
     write(ours, original)
     for a, b in zip(parse(ours), parse(theirs), strict=True):
@@ -443,23 +353,9 @@ def test_a_file_by_supersplat_matches_its_source_and_ours(tmp_path):
 
 
 def test_a_scene_without_sh():
-    scene = read(shared("formats/biker.compressed.ply"))
+    scene = read(kept_file("formats/biker.compressed.ply"))
     assert (len(scene.gaussians), scene.gaussians.sh_degree) == (152_746, 0)
     assert bool(scene.gaussians.finite_rows().all())
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "formats/ply_beetle/beetle.ascii.ply",
-        "formats/ply_beetle/beetle.binary.ply",
-        "odd/no_colour_value_weight.ply",
-        "odd/lfs_pointer_point_cloud.ply",
-        "plush_dog/point_cloud_29999_clean.ply",
-    ],
-)
-def test_real_files_that_are_not_compressed_are_refused(name):
-    refused(shared(name))
 
 
 @pytest.mark.parametrize("near", [2_000, 2_048, 2_050])

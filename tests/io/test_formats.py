@@ -5,7 +5,10 @@ import torch
 
 from gsplat_edu.io.edit import Similarity
 from gsplat_edu.io.formats import FORMATS, losses, read_scene, stored_bytes, write_scene
-from scene_files import random_scene
+from scene_files import matched, random_scene
+
+STEPS = {"means": 8 / 2**11, "log_scales": 1 / 16, "sh0": 0.03, "sh_rest": 8 / 256}
+"""11 bits over a chunk's 8 units, bytes over 16 units, over the colours of SPZ, and over 8 units."""
 
 
 @pytest.fixture
@@ -35,10 +38,23 @@ def test_a_second_round_trip_gives_the_same_scene(tmp_path, suffix):
     write_scene(tmp_path / f"2{suffix}", first)
     again = read_scene(tmp_path / f"2{suffix}")
     assert (again.antialiased, again.up) == (first.antialiased, first.up)
-    order = [torch.from_numpy(scene.gaussians.means.numpy()).sum(dim=1).argsort() for scene in (first, again)]
-    a, b = (scene.gaussians.means[rows] for scene, rows in zip((first, again), order, strict=True))
-    # The second rounding moves a value by at most one step; the coarsest is 11 bits over a chunk's 8 units.
-    assert (a - b).abs().max() < 8 / 2**11
+    same = matched(first.gaussians, again.gaussians)
+    # The second rounding moves a value by at most one step of the coarsest format.
+    for name, step in STEPS.items():
+        moved = same.tensors()[name] - again.gaussians.tensors()[name]
+        assert not moved.numel() or moved.abs().max() <= step, name
+    assert (same.opacities - again.gaussians.opacities).abs().max() <= 1 / 255
+
+
+@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+def test_trainable_doubles_are_written_like_floats(tmp_path, suffix):
+    scene = random_scene(300)
+    for name, gaussians in (
+        ("a", scene.gaussians),
+        ("b", scene.gaussians.map(torch.Tensor.double).trainable()),
+    ):
+        write_scene(tmp_path / f"{name}{suffix}", replace(scene, gaussians=gaussians))
+    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
 
 
 def test_losses_of_a_format_are_reported(tmp_path):

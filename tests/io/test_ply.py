@@ -1,6 +1,4 @@
-import os
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +11,7 @@ from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply, read, save_ply, write
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
-
-DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
+from scene_files import kept_file, refused
 
 
 def random_gaussians(count, rest):
@@ -62,16 +59,6 @@ def test_properties_have_inrias_names_and_order(tmp_path, rest):
         for k in range(rest):
             values = table[f"f_rest_{channel * rest + k}"]
             np.testing.assert_array_equal(values, gaussians.sh_rest[:, k, channel].numpy())
-
-
-def test_an_empty_scene_can_be_saved(tmp_path):
-    save_ply(tmp_path / "empty.ply", random_gaussians(0, 15))
-    assert len(parse(tmp_path / "empty.ply")[1]) == 0
-
-
-def test_trainable_float64_scenes_can_be_saved(tmp_path):
-    save_ply(tmp_path / "a.ply", random_gaussians(3, 0).map(torch.Tensor.double).trainable())
-    assert len(parse(tmp_path / "a.ply")[1]) == 3
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -186,29 +173,6 @@ def test_an_element_before_the_vertices_is_skipped(tmp_path):
     assert_equal(gaussians, load_ply(tmp_path / "b.ply"))
 
 
-def refused(path):
-    with pytest.raises(SceneFormatError) as caught:
-        load_ply(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and "\n" not in message
-    return message
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_truncated_files_are_refused(tmp_path, form):
-    path = tmp_path / "a.ply"
-    written(path, shuffled_table(random_gaussians(4, 0)), form)
-    whole = path.read_bytes()
-    end = whole.index(b"end_header\n") + 11
-    row = (len(whole) - end - 13) // 4
-    for length in [*range(0, end, 7), *range(end, end + 3 * row, 11)]:
-        path.write_bytes(whole[:length])
-        refused(path)
-    if form == "binary_little_endian":
-        path.write_bytes(whole[: end + 2 * row + 5])
-        assert "is truncated: 2 of 4 rows of vertex are present; get the file again" in refused(path)
-
-
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_absurd_counts_allocate_nothing(tmp_path, form):
     path = tmp_path / "a.ply"
@@ -284,15 +248,8 @@ def test_malformed_ascii_rows_are_refused(tmp_path, old, new):
     assert "rows of vertex" in refused(path)
 
 
-def shared(name):
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{path} is not there")
-    return path
-
-
 def test_a_trained_scene_from_another_program():
-    gaussians = load_ply(shared("plush_dog/point_cloud_29999_clean.ply"))
+    gaussians = load_ply(kept_file("plush_dog/point_cloud_29999_clean.ply"))
     assert (len(gaussians), gaussians.sh_degree) == (15_105, 3)
     assert float(gaussians.quats.norm(dim=1).min()) >= 0.36 and float(gaussians.logit_opacities.max()) == 400
 
@@ -308,7 +265,7 @@ def test_a_trained_scene_from_another_program():
     ],
 )
 def test_real_files_that_are_not_scenes_are_refused(name, message):
-    assert message in refused(shared(name))
+    assert message in refused(kept_file(name))
 
 
 @pytest.mark.parametrize("antialiased", [None, False, True])

@@ -1,7 +1,6 @@
 import io
 import json
 import math
-import os
 import zipfile
 from pathlib import Path
 
@@ -19,9 +18,7 @@ from gsplat_edu.io.sog.palette import _picked, codebook, nearest_in_codebook, pa
 from gsplat_edu.io.sog.values import positions_to_steps, quats_to_pixels
 from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
 from gsplat_edu.scene.morton import morton_codes
-from scene_files import random_scene
-
-DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
+from scene_files import kept_file, matched, random_scene
 
 IMAGES = ["means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"]
 SH_IMAGES = ["shN_centroids.webp", "shN_labels.webp"]
@@ -34,13 +31,6 @@ def unzipped(path):
 
 def arrays(gaussians):
     return {name: tensor.numpy() for name, tensor in gaussians.tensors().items()}
-
-
-def in_their_order(original, read):
-    """Return the original splats in the order in which they were read, matched by the nearest mean."""
-    nearest = torch.cdist(read.means.double(), original.means.double()).argmin(dim=1)
-    assert sorted(nearest.tolist()) == list(range(len(original))), "each splat appears once"
-    return original.map(lambda tensor: tensor[nearest])
 
 
 def assert_nearest(values, read, entries):
@@ -84,7 +74,7 @@ def test_a_round_trip_stays_within_half_a_step(tmp_path, count, rest):
     meta = json.loads(unzipped(tmp_path / "new" / "a.sog")["meta.json"])
     assert all(t.dtype == torch.float32 and t.is_contiguous() for t in back.gaussians.tensors().values())
     assert back.gaussians.sh_rest.shape == (count, rest, 3)
-    original = in_their_order(scene.gaussians, back.gaussians)
+    original = matched(scene.gaussians, back.gaussians)
     assert_close(original, back.gaussians, meta)
     if count <= 2:  # fewer values than codebook entries
         for name in ("log_scales", "sh0", "sh_rest"):
@@ -276,7 +266,7 @@ def test_many_vectors_get_a_palette_within_sixteen_bits(tmp_path):
     meta = json.loads(unzipped(tmp_path / "a.sog")["meta.json"])
     assert 1024 < meta["shN"]["count"] <= 2048
     back = sog.read(tmp_path / "a.sog").gaussians
-    error = (in_their_order(scene.gaussians, back).sh_rest - back.sh_rest).square().mean()
+    error = (matched(scene.gaussians, back).sh_rest - back.sh_rest).square().mean()
     assert float(error) < 0.25 * float(scene.gaussians.sh_rest.var())  # 9 dimensions, 1.5 splats per entry
 
 
@@ -287,7 +277,7 @@ def test_harmonics_of_visible_splats_are_kept_best(tmp_path):
     scene.gaussians.logit_opacities[::2] = -4.0
     sog.write(tmp_path / "a.sog", scene)
     back = sog.read(tmp_path / "a.sog").gaussians
-    original = in_their_order(scene.gaussians, back)
+    original = matched(scene.gaussians, back)
     errors = (original.sh_rest - back.sh_rest).square().mean(dim=(1, 2))
     hidden = original.logit_opacities == -4.0
     assert float(errors[~hidden].mean()) < 0.1 * float(errors[hidden].mean())
@@ -337,17 +327,10 @@ def test_a_failed_write_leaves_the_old_folder(tmp_path, monkeypatch):
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
-def shared(name):
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{path} is not there")
-    return path
-
-
 @pytest.mark.parametrize(("name", "count"), [("playbot_lod3_0", 31_000), ("playbot_lod6_0", 1_873)])
 def test_a_scene_from_another_program(tmp_path, name, count):
     """A scene read from a SOG has few distinct values, so writing it again changes only the order."""
-    scene = sog.read(shared(f"formats/{name}.sog"))
+    scene = sog.read(kept_file(f"formats/{name}.sog"))
     read = arrays(scene.gaussians)
     assert (len(scene.gaussians), scene.gaussians.sh_degree) == (count, 2)
     assert (scene.antialiased, scene.up) == (None, None)
@@ -366,7 +349,7 @@ def test_a_scene_from_another_program(tmp_path, name, count):
 
 
 def test_axes_match_those_of_a_ply(tmp_path):
-    original = load_ply(shared("plush_dog/point_cloud_29999_clean.ply"))
+    original = load_ply(kept_file("plush_dog/point_cloud_29999_clean.ply"))
     sog.write(tmp_path / "a.sog", Scene(original))
     back = sog.read(tmp_path / "a.sog").gaussians
     # 16 bits over a logarithmic range of about 1 have an error well below 1e-3.

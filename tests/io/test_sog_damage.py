@@ -11,7 +11,7 @@ from PIL import Image
 
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.sog import codec as sog
-from scene_files import random_scene
+from scene_files import random_scene, refused
 
 COUNT = 40
 
@@ -22,14 +22,6 @@ def contents(tmp_path_factory):
     path = tmp_path_factory.mktemp("sog") / "meta.json"
     sog.write(path, random_scene(COUNT, 3))
     return {file.name: file.read_bytes() for file in sorted(path.parent.iterdir())}
-
-
-def refused(path):
-    with pytest.raises(SceneFormatError) as caught:
-        sog.read(path)
-    message = str(caught.value)
-    assert str(path.parent) in message and "\n" not in message and len(message) < 300
-    return message
 
 
 def peak_of(read, path):
@@ -72,15 +64,6 @@ def webp(pixels, **options):
     return file.getvalue()
 
 
-def test_truncated_bundles_are_refused(tmp_path, contents):
-    path = zipped(tmp_path / "a.sog", contents)
-    whole = path.read_bytes()
-    assert len(whole) < 16 * 1024 and len(sog.read(path).gaussians) == COUNT
-    for length in range(0, len(whole), 64):
-        path.write_bytes(whole[:length])
-        refused(path)
-
-
 def test_truncated_files_in_a_folder_are_refused(tmp_path, contents):
     path = in_folder(tmp_path / "a", contents)
     for name, data in contents.items():
@@ -89,29 +72,6 @@ def test_truncated_files_in_a_folder_are_refused(tmp_path, contents):
             refused(path)
         (path.parent / name).write_bytes(data)
     sog.read(path)
-
-
-def test_changed_bytes_are_refused_or_harmless(tmp_path, contents):
-    """A damaged file may still be a valid scene. Any other outcome must be a SceneFormatError."""
-    path = in_folder(tmp_path / "a", contents)
-    bundle = zipped(tmp_path / "a.sog", contents)
-    rng = np.random.default_rng(0)
-    outcomes = {"read": 0, "refused": 0}
-    for place, where in [(path.parent / name, path) for name in contents] + [(bundle, bundle)]:
-        whole = place.read_bytes()
-        for _ in range(60):
-            data = bytearray(whole)
-            for at in rng.integers(0, len(whole), rng.integers(1, 4)):
-                data[at] = rng.integers(256)
-            place.write_bytes(data)
-            try:
-                assert all(bool(t.isfinite().all()) for t in sog.read(where).gaussians.tensors().values())
-                outcomes["read"] += 1
-            except SceneFormatError as error:
-                assert "\n" not in str(error)
-                outcomes["refused"] += 1
-        place.write_bytes(whole)
-    assert min(outcomes.values()) > 20, outcomes
 
 
 def test_deflated_zips_are_read(tmp_path, contents):

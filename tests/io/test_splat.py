@@ -1,19 +1,15 @@
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from gsplat_edu.base.constants import C0
-from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.splat import MIN_SCALE, read, write
-from scene_files import random_scene
-
-DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
+from scene_files import kept_file, random_scene, refused
 
 ROW = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 GOOD = ((1, 2, 3), (0.5, 1, 2), (255, 0, 51, 204), (128, 0, 192, 255))
@@ -58,8 +54,8 @@ def test_the_layout_of_a_written_file(tmp_path):
     assert row["quat"].tolist() == [128, 0, 128, 128]
 
 
-@pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 1000])
-@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+@pytest.mark.parametrize("count", [0, 1, 257, 1000])
+@pytest.mark.parametrize("rest", [0, 15])
 def test_a_round_trip_stays_within_half_a_step(tmp_path, rest, count):
     scene, path = random_scene(count, rest), tmp_path / "a.splat"
     write(path, scene)
@@ -97,30 +93,6 @@ def test_ties_keep_their_order(tmp_path):
     write(tmp_path / "a.splat", Scene(replace(g, log_scales=log_scales, logit_opacities=torch.zeros(1000))))
     back = read(tmp_path / "a.splat").gaussians
     assert torch.equal(back.means, torch.cat([g.means[large], g.means[~large]]))
-
-
-def test_bytes_are_the_same_every_time(tmp_path):
-    for name in ("a", "b"):
-        write(tmp_path / f"{name}.splat", random_scene(700))
-    scene = random_scene(700)
-    write(
-        tmp_path / "c.splat", replace(scene, gaussians=scene.gaussians.map(torch.Tensor.double).trainable())
-    )
-    first = (tmp_path / "a.splat").read_bytes()
-    assert first == (tmp_path / "b.splat").read_bytes() == (tmp_path / "c.splat").read_bytes()
-
-
-@pytest.mark.parametrize("count", [0, 1, 1000])
-def test_a_second_round_trip_changes_almost_nothing(tmp_path, count):
-    first, second = tmp_path / "a.splat", tmp_path / "b.splat"
-    write(first, random_scene(count))
-    write(second, read(first))
-    one, two = (np.frombuffer(path.read_bytes(), dtype=ROW) for path in (first, second))
-    for name in ("position", "rgba"):
-        np.testing.assert_array_equal(one[name], two[name])
-    np.testing.assert_allclose(one["scales"], two["scales"], rtol=1e-6)  # log and exp in float32
-    # The rounded components have a length within 4 * 1/256 of 1 and are normalised again.
-    assert np.abs(one["quat"].astype(int) - two["quat"]).max(initial=0) <= 2
 
 
 def test_values_out_of_range_are_clamped(tmp_path):
@@ -163,24 +135,6 @@ def test_values_that_cannot_be_written_are_named(tmp_path, name, value, message)
     assert list(tmp_path.iterdir()) == []
 
 
-def refused(path):
-    with pytest.raises(SceneFormatError) as caught:
-        read(path)
-    message = str(caught.value)
-    assert str(path) in message and "\n" not in message
-    return message
-
-
-def test_a_file_cut_inside_a_splat_is_refused(tmp_path):
-    path = tmp_path / "a.splat"
-    write(path, random_scene(100))
-    whole = path.read_bytes()
-    for length in range(len(whole)):
-        if length % 32:
-            path.write_bytes(whole[:length])
-            assert f"is {length} bytes, {length % 32} more than whole splats of 32" in refused(path)
-
-
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(
     ("name", "value", "message"),
@@ -217,17 +171,10 @@ def test_a_missing_file_stays_an_oserror(tmp_path):
         read(tmp_path / "gone.splat")
 
 
-def shared(name):
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{path} is not there")
-    return path
-
-
 def test_the_same_splats_as_in_a_ply():
     name = "formats/metalsplatter_3splats/test-splat.3-points-from-train"
-    splats = read(shared(f"{name}.splat")).gaussians
-    ply = load_ply(shared(f"{name}.ply"))
+    splats = read(kept_file(f"{name}.splat")).gaussians
+    ply = load_ply(kept_file(f"{name}.ply"))
     np.testing.assert_array_equal(splats.means.numpy(), ply.means.numpy())
     np.testing.assert_allclose(splats.log_scales.numpy(), ply.log_scales.numpy(), rtol=1e-6)
     # Its writer truncates where ours rounds, so values differ by up to a step.
@@ -239,18 +186,8 @@ def test_the_same_splats_as_in_a_ply():
 
 
 def test_a_file_from_another_program():
-    g = read(shared("formats/splat_fixtures/minimal.splat")).gaussians
+    g = read(kept_file("formats/splat_fixtures/minimal.splat")).gaussians
     np.testing.assert_array_equal(g.means.numpy(), [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]])
     np.testing.assert_allclose(g.scales.numpy(), 0.1, rtol=1e-6)
     np.testing.assert_array_equal(g.quats.numpy(), [[0, 0, 0, 127 / 128]] * 4)
     np.testing.assert_allclose(g.opacities.numpy(), 230 / 255, rtol=1e-6)
-
-
-def test_a_trained_scene_is_written(tmp_path):
-    """The scene has logits up to 400 and quaternions of lengths 0.4 to 2.3."""
-    scene = Scene(load_ply(shared("plush_dog/point_cloud_29999_clean.ply")))
-    write(tmp_path / "a.splat", scene)
-    back = read(tmp_path / "a.splat").gaussians
-    means = {tuple(mean) for mean in scene.gaussians.means.tolist()}
-    assert {tuple(mean) for mean in back.means.tolist()} == means
-    assert bool(back.finite_rows().all())

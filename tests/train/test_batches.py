@@ -76,7 +76,7 @@ def contents_of(path):
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, metadata
 
 
-@pytest.mark.parametrize("count", range(1, 18))
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 8, 12, 16, 17])
 def test_partial_sums_of_any_ranges_have_the_bits_of_the_whole_sum(count):
     """The numbers have very different sizes, so that another order of the sum gives other bits."""
     rng = np.random.default_rng(count)
@@ -173,7 +173,7 @@ def test_milestones_count_images():
     assert milestone(7, 3, 8) == 6
 
 
-@pytest.mark.parametrize("batch", [1, 2, 3, 4])
+@pytest.mark.parametrize("batch", [1, 3, 4])
 def test_the_number_of_densifications_per_image_does_not_depend_on_the_batch(batch):
     changes = []
     watch = [lambda _, event: changes.append(event)]
@@ -206,36 +206,31 @@ def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_imag
     assert [i for i in range(24) if found.is_due(i)] == [2, 4, 7, 10]
 
 
+MODELS = {"appearance": "exposure", "refine": "both", "random_background": False}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*CONFIGS])
-@pytest.mark.parametrize("extra", [{}, {"appearance": "exposure", "refine": "both"}], ids=["plain", "models"])
-def test_ranks_train_to_the_same_bits(name, extra):
+@pytest.mark.parametrize(
+    ("name", "batch", "changes", "sizes"),
+    [("adc", 6, {}, (2, 3)), ("mcmc", 4, MODELS, (4,)), ("fast", 4, {}, (2,)), ("fast", 4, MODELS, (4,))],
+    ids=["sixes", "models", "fast", "fast with models"],
+)
+def test_ranks_train_to_the_same_bits(name, batch, changes, sizes):
     """The number of Gaussians changes, and with it the range of each rank."""
-    settings = config(name, **extra) if not extra else config(name, **extra, random_background=False)
+    settings = config(name, batch, **changes)
     losses, expected = trained(settings)
-    for size in (2, 4):
+    for size in sizes:
         for found_losses, found in together(size, lambda team: trained(settings, team)):
             assert found_losses == losses
             assert found == expected
 
 
-@pytest.mark.slow
-def test_batches_of_any_size_are_shared_among_ranks():
-    settings = config("adc", 6)
-    _, expected = trained(settings)
-    for size in (2, 3):
-        assert [found for _, found in together(size, lambda team: trained(settings, team))] == [
-            expected
-        ] * size
-
-
-@pytest.mark.parametrize("threads", [2, 5])
-def test_the_number_of_threads_does_not_change_a_batch(threads):
+def test_the_number_of_threads_does_not_change_a_batch():
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
         _, expected = trained(config())
-        torch.set_num_threads(threads)
+        torch.set_num_threads(5)
         assert trained(config())[1] == expected
     finally:
         torch.set_num_threads(before)
