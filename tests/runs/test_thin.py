@@ -112,7 +112,7 @@ def test_a_time_limit_does_not_train_longer_than_the_trial(given, monkeypatch, l
     _, options, reader = given
     trial = ThinTrial(longest, {100: 20.0, 200: 19.0}, 2)
     monkeypatch.setattr("gsplat_edu.budget.length.try_lengths", lambda *_: trial)
-    generous = Limits(time=Deadline(600.0, lambda: 1.0))
+    generous = Limits(time=Deadline(36_000.0, lambda: 1.0))  # however slow this machine is now
     found = plan(options, generous, reader=reader)
     said = [sentence for sentence in found.sentences if "before the limit" in sentence]
     if longest is None:
