@@ -5,6 +5,7 @@ import re
 import struct
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag, inside
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.formats import read_scene
 from studio.pages import visitor_of
@@ -48,11 +49,7 @@ def select_and_delete(tab, frame, corners):
     """Drag a rectangle over a part of the picture, in fractions of its size, and delete the selected splats."""
     frame.get_by_role("button", name="rectangle", exact=True).click()
     box = frame.locator("#canvas").bounding_box()
-    (a, b), (c, d) = corners
-    tab.mouse.move(box["x"] + a * box["width"], box["y"] + b * box["height"])
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + c * box["width"], box["y"] + d * box["height"], steps=3)
-    tab.mouse.up()
+    drag(tab, *inside(box, *corners))
     frame.get_by_role("button", name="delete", exact=True).click()
 
 

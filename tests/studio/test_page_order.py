@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag, inside
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.drawn_masks import read_drawings
 from gsplat_edu.data.left_out import read_left_out
@@ -197,10 +198,7 @@ def masking(tab):
     box = dialog.locator("svg").bounding_box()  # what the dialog says later does not move it
 
     def draw(x0, y0, x1, y1):
-        tab.mouse.move(box["x"] + x0 / 48 * box["width"], box["y"] + y0 / 36 * box["height"])
-        tab.mouse.down()
-        tab.mouse.move(box["x"] + x1 / 48 * box["width"], box["y"] + y1 / 36 * box["height"], steps=4)
-        tab.mouse.up()
+        drag(tab, *inside(box, (x0 / 48, y0 / 36), (x1 / 48, y1 / 36)))
 
     return dialog, draw
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from browsers import chromium
+from gestures import drag, inside
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
@@ -77,10 +78,7 @@ def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     assert psnr(sent, truth.double().numpy()) > 35  # the loss of JPEG of quality 85
 
     box = frame.locator("#canvas").bounding_box()
-    tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"])
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 0.6 * box["height"], steps=2)
-    tab.mouse.up()
+    drag(tab, *inside(box, (0.6, 0.5), (0.8, 0.6)))
     drawn(tab, frame, lambda pixels: np.abs(pixels - before).mean() > 2)  # seen from another side
 
 

@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import threading
 import urllib.error
 import urllib.request
 
@@ -12,6 +11,7 @@ import pytest
 from PIL import Image
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag
 from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
@@ -19,8 +19,8 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.viewer import capture_page
 from gsplat_edu.viewer.capture_serve import CaptureServer, Examination
 from viewer.captures import measured, ring
-from viewer.conftest import READING
 from viewer.handles import until
+from viewer.pages import running
 
 REFUSED = "the server responded with a status of 400"
 """What Chromium logs about an answer that the page shows to the user."""
@@ -41,40 +41,21 @@ def folder(tmp_path, request):
 @pytest.fixture
 def served(folder):
     """Serve the capture."""
-    with CaptureServer("127.0.0.1", 0, capture_page.policy(), folder) as server:
+    with CaptureServer("127.0.0.1", 0, capture_page.policy(), folder) as server, running(server):
         server.prepare("egg & spoon")
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
         yield server
-        server.shutdown()
-        thread.join(10)
 
 
 @pytest.fixture
-def opened(browser, served):
-    """Open the page; console messages, errors, and requests to other servers fail the test."""
-    made, complaints = [], []
+def opened(visit, served):
+    """Return a function that opens the page in a tab."""
 
-    def visit(width=900, height=600, **options):
-        context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        tab = context.new_page()
-        made.append(context)
-        tab.on("console", lambda message: complaints.append(f"{message.type}: {message.text}"))
-        tab.on("pageerror", lambda error: complaints.append(str(error)))
-        tab.on("request", lambda request: foreign(request.url))
-        tab.goto(served.url)
-        tab.wait_for_selector("#message", state="hidden")
-        until(tab, "viewer.isWhole")
-        return tab
+    def make(width=900, height=600, **options):
+        shown = visit(width, height, url=served.url, **options).ready()
+        shown.expected = REFUSED
+        return shown.tab
 
-    def foreign(url):
-        if not url.startswith((f"http://127.0.0.1:{served.server_port}/", "blob:", "data:")):
-            complaints.append(url)
-
-    yield visit
-    for context in made:
-        context.close()
-    assert [text for text in complaints if READING not in text and REFUSED not in text] == []
+    return make
 
 
 def view_of(tab):
@@ -250,10 +231,7 @@ def test_a_drag_orbits_and_chooses_nothing(opened):
     tab = opened()
     before = view_of(tab)
     x, y = middle_of(tab, alone(tab))
-    tab.mouse.move(x, y)
-    tab.mouse.down()
-    tab.mouse.move(x + 80, y, steps=4)
-    tab.mouse.up()
+    drag(tab, (x, y), (x + 80, y))
     assert tab.evaluate("viewer.cameras.chosen") == -1
     after = view_of(tab)
     assert np.linalg.norm(after.eye - before.eye) > 0.5

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+import gestures
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
-from viewer.handles import touch as put_fingers, until
+from viewer.handles import until
 from waiting import FRAMES, awaited
 
 SIZE = (640, 400)
@@ -24,15 +25,12 @@ def tour(show, random_gaussians, three_views):
 
 
 def pivot(visit):
-    return np.array(visit.tab.evaluate("viewer.view.centre()"))
+    return np.array(visit.evaluate("viewer.view.centre()"))
 
 
-def drag(visit, dx, dy, button="left", steps=3):
-    mouse = visit.tab.mouse
-    mouse.move(*MIDDLE)
-    mouse.down(button=button)
-    mouse.move(MIDDLE[0] + dx, MIDDLE[1] + dy, steps=steps)
-    mouse.up(button=button)
+def drag(visit, dx, dy, button="left"):
+    """Drag from the middle; return the camera afterwards."""
+    gestures.drag(visit.tab, MIDDLE, (MIDDLE[0] + dx, MIDDLE[1] + dy), button=button)
     return visit.camera()
 
 
@@ -40,7 +38,7 @@ def touch(visit, before, after):
     """Put fingers down, move and lift them; positions are (right, down) from the middle."""
     session = visit.tab.context.new_cdp_session(visit.tab)
     for kind, places in (("touchStart", before), ("touchMove", after), ("touchEnd", ())):
-        put_fingers(session, kind, *((MIDDLE[0] + x, MIDDLE[1] + y) for x, y in places))
+        gestures.touch(session, kind, *((MIDDLE[0] + x, MIDDLE[1] + y) for x, y in places))
     session.detach()
     return visit.camera()
 
@@ -69,8 +67,8 @@ def test_a_drag_orbits_about_the_point_ahead(tour):
 
 def test_no_drag_turns_the_world_upside_down(tour):
     for dy in (90, 90, 90, -90, -90, -90, -90, -90, -90):
-        after = drag(tour, 3, dy, steps=12)
-        assert -after.R[1] @ tour.tab.evaluate("viewer.view.up") > 0
+        after = drag(tour, 3, dy)
+        assert -after.R[1] @ tour.evaluate("viewer.view.up") > 0
 
 
 def test_a_right_drag_pans(tour):
@@ -118,16 +116,16 @@ def test_keys_move_along_the_cameras_axes_while_they_are_held(tour):
 
 def test_a_key_released_outside_the_window_does_not_keep_moving(tour):
     tour.tab.keyboard.down("w")
-    tour.tab.evaluate("dispatchEvent(new Event('blur'))")
-    tour.tab.evaluate(FRAMES)
+    tour.evaluate("dispatchEvent(new Event('blur'))")
+    tour.evaluate(FRAMES)
     before = tour.camera()
-    tour.tab.evaluate(FRAMES)
+    tour.evaluate(FRAMES)
     np.testing.assert_array_equal(tour.camera().eye, before.eye)
 
 
 def test_flying_a_drag_looks_around(tour):
     before = tour.camera()
-    tour.tab.keyboard.press("f")
+    tour.press("f")
     assert tour.tab.get_attribute("#fly", "aria-pressed") == "true"
     after = drag(tour, 40, 10)
     np.testing.assert_array_equal(after.eye, before.eye)
@@ -159,18 +157,18 @@ def test_the_captures_cameras(tour, three_views):
     assert stands_at(tour, second) and marked() == ["photo 2"]
     # Enlarged 2.5 times, the 200 x 160 image fills the window's height; at most a fifth of it may be cropped.
     assert tour.camera().fx == pytest.approx(1.25 * 2.5 * second.fx)
-    tour.tab.keyboard.press("ArrowRight")
+    tour.press("ArrowRight")
     assert stands_at(tour, third)
-    tour.tab.keyboard.press("ArrowRight")
+    tour.press("ArrowRight")
     assert stands_at(tour, first)
-    tour.tab.keyboard.press("ArrowLeft")
+    tour.press("ArrowLeft")
     assert stands_at(tour, third)
     drag(tour, 10, 0)
     assert marked() == []
-    tour.tab.keyboard.press("ArrowRight")
+    tour.press("ArrowRight")
     assert stands_at(tour, first)
     drag(tour, 10, 0)
-    tour.tab.keyboard.press("ArrowLeft")
+    tour.press("ArrowLeft")
     assert stands_at(tour, third)
 
 
@@ -178,10 +176,10 @@ def test_the_captures_cameras(tour, three_views):
 def test_a_window_of_any_shape_keeps_the_middle_of_the_photo(tour, three_views, width, height):
     tour.tab.set_viewport_size({"width": width, "height": height})
     # on a phone, what lies under the panel does not count
-    covered = tour.tab.evaluate("Math.round(viewer.panel.covered())")
+    covered = tour.evaluate("Math.round(viewer.panel.covered())")
     assert (covered > 0) == (width < 600)
     for index, (_, camera) in enumerate(three_views):
-        tour.tab.evaluate(f"delete viewer.facts.cameras[{index}].subject; viewer.goTo({index})")
+        tour.evaluate(f"delete viewer.facts.cameras[{index}].subject; viewer.goTo({index})")
         shown = tour.camera()
         scale = shown.fx / camera.fx
         assert width == shown.W and height == shown.H
@@ -214,7 +212,7 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
     inner = inner[np.linalg.norm(inner, axis=1) < 0.6]
     for index in (None, 3, 8):
         if index is not None:
-            seen.tab.evaluate(f"viewer.goTo({index})")
+            seen.evaluate(f"viewer.goTo({index})")
         shown = seen.camera()
         u, v, _ = shown.project(shown.world_to_cam(inner))
         assert u.min() > 0 and u.max() < 390 and v.min() > 0 and v.max() < 844, "the whole ball is in view"
@@ -225,18 +223,18 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
 def test_zooming_and_panning_are_limited_and_r_returns_to_the_start(tour):
     """The scene stays within reach, so a visitor cannot lose it."""
     start, farthest = tour.camera(), max(np.linalg.norm(eye) for eye in ((2.0, -0.5, 0.3), (-1.0, -0.4, 2.0)))
-    tour.tab.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(1.2); viewer.moved(-1)")
+    tour.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(1.2); viewer.moved(-1)")
     out = np.linalg.norm(tour.camera().eye - pivot(tour))
     assert farthest < out < 4 * farthest
-    tour.tab.evaluate(
+    tour.evaluate(
         "for (let i = 0; i < 200; ++i) viewer.view.pan(300, 100, viewer.camera()); viewer.moved(-1)"
     )
     assert farthest < np.linalg.norm(pivot(tour)) < 5 * farthest
-    tour.tab.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(0.8); viewer.moved(-1)")
+    tour.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(0.8); viewer.moved(-1)")
     near = np.linalg.norm(tour.camera().eye - pivot(tour))
     assert 0.005 * farthest < near < 0.05 * farthest
     drag(tour, 50, 20)
-    tour.tab.keyboard.press("r")
+    tour.press("r")
     np.testing.assert_allclose(tour.camera().eye, start.eye, atol=1e-12)
 
 
@@ -248,11 +246,11 @@ def test_the_page_fits_a_phone_and_follows_its_colours(
     seen = visit(390, 844, color_scheme=scheme, has_touch=True).open(tmp_path / "a.html").ready()
     assert not seen.tab.is_visible("#tools"), "the panel is closed at first"
     seen.tab.click("#fold")
-    ground = seen.tab.evaluate("getComputedStyle(document.body).backgroundColor")
+    ground = seen.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (sum(map(int, ground[4:-1].split(","))) > 384) == (scheme == "light")
     for name in ("cameras", "path"):
         seen.tab.click(f"#{name} summary")
-    boxes = seen.tab.evaluate(
+    boxes = seen.evaluate(
         "[...document.querySelectorAll('button, select, summary')].filter((one) => one.checkVisibility())"
         ".map((one) => one.getBoundingClientRect())"
         ".map(({ left, right, height, width }) => [left, right, height, width])"
@@ -260,7 +258,7 @@ def test_the_page_fits_a_phone_and_follows_its_colours(
     assert len(boxes) > 8
     for left, right, height, width in boxes:
         assert height >= 40 and width >= 40 and left >= 0 and right <= 390
-    assert seen.tab.evaluate("document.documentElement.scrollWidth") == 390
+    assert seen.evaluate("document.documentElement.scrollWidth") == 390
 
 
 def test_held_out_cameras_are_marked_and_none_is_the_start(visit, tmp_path, random_gaussians, three_views):
@@ -271,9 +269,9 @@ def test_held_out_cameras_are_marked_and_none_is_the_start(visit, tmp_path, rand
     assert names == ["photo 1 held out", "photo 2", "photo 3"]
     assert seen.tab.locator("#cameras button[aria-current=true]").all_inner_texts() == ["photo 2"]
     assert stands_at(seen, three_views[1][1])
-    seen.tab.keyboard.press("ArrowLeft")
+    seen.press("ArrowLeft")
     assert stands_at(seen, three_views[0][1])
-    seen.tab.keyboard.press("r")
+    seen.press("r")
     assert stands_at(seen, three_views[1][1])
 
 
@@ -310,20 +308,19 @@ def test_a_drag_across_a_quarter_of_the_window_stays_near_the_cameras(forward):
         "the pivot is on a visible surface, although the axes of the cameras do not cross"
     )
     for dx, dy in ((160, 0), (-160, 0), (0, 100), (0, -100), (160, 100)):
-        for steps in (1, 20):
-            forward.tab.keyboard.press("r")
-            after = drag(forward, dx, dy, steps=steps)
-            # 6 degrees are free; beyond them, dragging moves the view less and less
-            assert 0.5 < off_the_cameras(forward) < 15
-            assert np.linalg.norm(after.eye - pivot(forward)) == pytest.approx(distance)
+        forward.press("r")
+        after = drag(forward, dx, dy)
+        # 6 degrees are free; beyond them, dragging moves the view less and less
+        assert 0.5 < off_the_cameras(forward) < 15
+        assert np.linalg.norm(after.eye - pivot(forward)) == pytest.approx(distance)
     moved = off_the_cameras(forward)
     for _ in range(4):
-        drag(forward, 160, 100, steps=4)
+        drag(forward, 160, 100)
     assert moved < off_the_cameras(forward) < 35, "repeated drags still move the view, slowly"
 
 
 def test_after_flying_outside_one_can_orbit_there(forward):
-    forward.tab.evaluate(
+    forward.evaluate(
         "viewer.view.camera = {...viewer.view.camera, eye: [4, 0, 4]}; viewer.view.look(-1.5, 0)"
     )
     before = off_the_cameras(forward)
@@ -399,7 +396,7 @@ def test_a_double_click_or_tap_sets_the_pivot_on_the_surface_there(wall, by):
     # the point keeps its place in the window, because the view orbits about it
     np.testing.assert_allclose(on_the_screen(wall, found) + 0.5, (column, row), atol=1)
     wall.tab.wait_for_selector("#point", state="hidden")
-    wall.tab.keyboard.press("r")
+    wall.press("r")
     assert np.linalg.norm(pivot(wall) - found) > 0.5, "the start view restores its pivot"
 
 
@@ -436,7 +433,7 @@ def test_the_panel_uses_words_that_a_visitor_knows(tour):
 
 
 def test_back_to_the_start(tour, three_views):
-    for reset in (lambda: tour.tab.keyboard.press("r"), lambda: tour.tab.click("#reset")):
+    for reset in (lambda: tour.press("r"), lambda: tour.tab.click("#reset")):
         drag(tour, 30, 30)
         assert not stands_at(tour, three_views[0][1])
         reset()
@@ -445,7 +442,7 @@ def test_back_to_the_start(tour, three_views):
 
 def test_help_is_shown_on_request(tour):
     assert tour.tab.is_hidden("#help")
-    tour.tab.keyboard.press("h")
+    tour.press("h")
     assert tour.tab.is_visible("#help")
     tour.tab.click("#help-button")
     assert tour.tab.is_hidden("#help")
@@ -481,9 +478,9 @@ def test_a_program_sets_the_camera_until_somebody_moves(tour, camera):
 
 def orbits(seen, *keys):
     """Press keys; return whether the camera moved on a sphere around the pivot."""
-    eye, pivot = seen.camera().eye, np.array(seen.tab.evaluate("viewer.view.focus"))
+    eye, pivot = seen.camera().eye, np.array(seen.evaluate("viewer.view.focus"))
     for key in keys:
-        seen.tab.keyboard.press(key)
+        seen.press(key)
     moved = seen.camera().eye
     same = np.linalg.norm(moved - pivot) == pytest.approx(np.linalg.norm(eye - pivot))
     return same and np.linalg.norm(moved - eye) > 0.01 * np.linalg.norm(eye - pivot)
@@ -494,7 +491,7 @@ def test_arrows_orbit_with_shift_and_without_cameras_to_step_through(show, rando
     assert orbits(alone, "ArrowRight") and orbits(alone, "ArrowDown") and orbits(alone, "Shift+ArrowLeft")
     seen = show(random_gaussians(30), three_views)
     assert orbits(seen, "Shift+ArrowRight") and orbits(seen, "ArrowUp")
-    seen.tab.keyboard.press("ArrowRight")
+    seen.press("ArrowRight")
     assert any(stands_at(seen, camera) for _, camera in three_views), "as before: the next camera"
     seen.tab.focus("#degree")
     assert not orbits(seen, "ArrowDown"), "the panel keeps its keys"
