@@ -1,9 +1,13 @@
 """Gestures of a person's mouse and fingers on any page. Places are CSS px of the window."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from waiting import FRAMES
+
+STEPS = 4
+"""Moves from one place to the next."""
 
 
 def drag(tab: Any, *places: Sequence[float], button: str = "left") -> None:
@@ -11,7 +15,7 @@ def drag(tab: Any, *places: Sequence[float], button: str = "left") -> None:
     tab.mouse.move(*places[0])
     tab.mouse.down(button=button)
     for place in places[1:]:
-        tab.mouse.move(*place, steps=3)
+        tab.mouse.move(*place, steps=STEPS)
     tab.mouse.up(button=button)
 
 
@@ -33,8 +37,11 @@ def swipe(tab: Any, *places: Sequence[float]) -> None:
     """Put a finger down at the first place, move it along the others, and lift it."""
     session = tab.context.new_cdp_session(tab)
     touch(session, "touchStart", places[0])
-    for place in places[1:]:
-        touch(session, "touchMove", place)
+    for start, end in pairwise(places):
+        for k in range(1, STEPS + 1):
+            touch(
+                session, "touchMove", tuple(a + k / STEPS * (b - a) for a, b in zip(start, end, strict=True))
+            )
     touch(session, "touchEnd")
     session.detach()
 

@@ -33,7 +33,10 @@ def tabs(browser):
 
 @pytest.fixture
 def visit(browser, tabs):
-    """Return a function that opens tabs. A tab that logs a complaint or requests another address fails."""
+    """Return a function that opens tabs. A tab that logs a complaint or requests another address fails.
+
+    A fixture that serves a page is named before this one, so that tabs close before their server ends.
+    """
     visits = []
 
     def make(width=320, height=200, *, fresh=False, url="", kind=Visit, **options):
@@ -127,7 +130,7 @@ def three_views(camera):
 def edit_page(visit, tmp_path):
     """Return a function that writes a scene and its page with the editor, and opens the page."""
 
-    def make(gaussians, cameras=(), size=(900, 700), origin=(0.0, 0.0, 0.0), tour=None, **options):
+    def make(gaussians, cameras=(), width=900, height=700, *, origin=(0.0, 0.0, 0.0), tour=None, **options):
         """Other options are those of `visit`."""
         settings = RenderSettings(jacobian_limit=1.3, depth=False)
         source = Source(tmp_path / "scene.ply", Scene(gaussians, origin=origin), cameras, settings)
@@ -135,7 +138,7 @@ def edit_page(visit, tmp_path):
         editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
         html = page.html(source.scene, cameras, source.settings, "scene", (), tour, editing)
         (tmp_path / "edit.html").write_bytes(html)
-        return visit(*size, kind=Editor, **options).open(tmp_path / "edit.html").ready()
+        return visit(width, height, kind=Editor, **options).open(tmp_path / "edit.html").ready()
 
     return make
 

@@ -60,7 +60,7 @@ class Visit:
     """
 
     expected = READING
-    """A part of the console messages that are no complaints."""
+    """A part of further console messages that are no complaints."""
 
     def __init__(self, tab, site="file:"):
         self.tab, self.site = tab, site
@@ -82,8 +82,9 @@ class Visit:
 
     def check(self):
         """Check that nothing was complained of, and no other address asked."""
-        assert [text for text in self.complaints if READING not in text and self.expected not in text] == []
-        assert [url for url in self.requests if not url.startswith((self.site, "blob:", "data:"))] == []
+        complaints = [text for text in self.complaints if READING not in text and self.expected not in text]
+        elsewhere = [url for url in self.requests if not url.startswith((self.site, "blob:", "data:"))]
+        assert (complaints, elsewhere) == ([], [])
 
     def open(self, path):
         self.tab.goto(path.as_uri())

@@ -47,7 +47,7 @@ def served(folder):
 
 
 @pytest.fixture
-def opened(visit, served):
+def opened(served, visit):
     """Return a function that opens the page in a tab."""
 
     def make(width=900, height=600, **options):

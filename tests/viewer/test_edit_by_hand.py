@@ -39,7 +39,7 @@ def served(edit_site):
 
 
 @pytest.fixture
-def opened(visit, served):
+def opened(served, visit):
     """Return a function that opens the served page in a tab."""
 
     def make(width=900, height=420, **options):
@@ -221,7 +221,7 @@ def test_the_view_moves_while_a_tool_is_chosen_and_keys_draw(opened):
 
 def test_one_finger_draws_and_two_move_the_view_on_a_phone(opened):
     shown = opened(390, 844, has_touch=True)
-    session = shown.tab.context.new_cdp_session(shown)
+    session = shown.tab.context.new_cdp_session(shown.tab)
     shown.tab.tap("[data-tool=brush]")
     shown.tab.wait_for_selector("[data-tool=brush][aria-pressed=true]")
     eye = shown.evaluate("viewer.view.camera.eye")

@@ -47,7 +47,7 @@ def served(edit_site):
 
 
 @pytest.fixture
-def opened(visit, served):
+def opened(served, visit):
     """Return a function that opens the page in a tab."""
     return lambda: visit(900, 700, url=served.url, kind=Editor).ready()
 
@@ -72,8 +72,8 @@ def test_floaters_are_proposed_with_reasons_selected_undone_and_deleted(opened, 
     shown.tab.wait_for_selector('#edit-saved:text-is("saved")')
     np.testing.assert_array_equal(flags_after(read_edits(served.file).operations, ball()), shown.flags())
     again = opened()
-    again.wait_for_selector("#edit-groups button")
-    assert again.inner_text("[data-do=propose]") == "propose floaters"
+    again.tab.wait_for_selector("#edit-groups button")
+    assert again.tab.inner_text("[data-do=propose]") == "propose floaters"
 
 
 def test_a_judgement_can_be_stopped_and_a_lost_server_is_said(opened, served):

@@ -45,7 +45,7 @@ def edit(edit_page):
     """Return a function that opens the editor in front of a scene."""
 
     def make(gaussians, width=640, height=400, **options):
-        shown = edit_page(gaussians, size=(width, height), **options)
+        shown = edit_page(gaussians, width=width, height=height, **options)
         shown.evaluate(FACE)
         return shown
 

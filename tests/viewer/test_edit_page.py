@@ -58,7 +58,7 @@ def source_of(gaussians, path="scene.ply", origin=(0.0, 0.0, 0.0)):
 @pytest.fixture
 def edit(edit_page):
     """Return a function that opens the editor in a small window."""
-    return functools.partial(edit_page, size=SIZE)
+    return functools.partial(edit_page, width=SIZE[0], height=SIZE[1])
 
 
 def state(shown):

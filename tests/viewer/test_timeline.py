@@ -196,11 +196,11 @@ def test_a_finger_drags_a_marker_and_scrubs(opened):
     shown = opened(path(), width=390, height=844, has_touch=True)
     strip = Strip(shown)
     x, y = strip.marker(1.0)
-    swipe(shown.tab, (x + 8, y), (strip.marker(1.6)[0] + 8, y + 5), (strip.marker(2.2)[0] + 8, y + 5))
+    swipe(shown.tab, (x + 8, y), (strip.marker(2.2)[0] + 8, y + 5))
     assert times(shown) == pytest.approx([0, 2.2, 3, 6], abs=strip.pixel), (
         "the finger need not hit the middle"
     )
-    swipe(shown.tab, strip.ruler(0.3), strip.ruler(2.0), strip.ruler(5.0))
+    swipe(shown.tab, strip.ruler(0.3), strip.ruler(5.0))
     at = shown.evaluate("viewer.keyframes.timeline.at")
     assert at == pytest.approx(5.0, abs=strip.pixel) and steps(shown) == 2
     seen_at(shown, PathCurve(stored(shown)), at)
