@@ -139,6 +139,9 @@ class Editor(Visit):
     def is_chosen(self, tool):
         return self.tab.get_attribute(f"[data-tool={tool}]", "aria-pressed") == "true"
 
+    def is_on(self, action):
+        return self.tab.get_attribute(f"[data-do={action}]", "aria-pressed") == "true"
+
     def perform(self, *operations):
         """Perform operations as if their buttons had been pressed."""
         self.evaluate("(operations) => operations.forEach((one) => editor.perform(one))", operations)

@@ -1,7 +1,5 @@
 """The editor selects only what is in front, exactly as the command does with its file, and shows what is selected."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ import torch
 from gestures import drag
 from gsplat_edu.cli.main import main
 from gsplat_edu.edits.apply import flags_after
-from gsplat_edu.edits.document import read_edits
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.scene.gaussians import Gaussians
 from viewer.handles import until
@@ -17,35 +14,31 @@ from viewer.handles import until
 NEAR_WALL, FAR_WALL = 0.0, 0.8
 """z of two walls that face the camera; the far one is larger."""
 
-THICKNESS = 0.01
-
-
-def wall(z, halves, step=0.1):
-    """Return the means of a wall at z."""
-    x, y = (torch.arange(-half, half + 1e-6, step) for half in halves)
-    x, y = torch.meshgrid(x, y, indexing="ij")
-    return torch.stack([x.ravel(), y.ravel(), torch.full((x.numel(),), z)], dim=1)
-
-
-def splats(means, angle=0.0):
-    """Return discs at these means, turned about the y axis."""
-    n = len(means)
-    log_scales = torch.log(torch.tensor([0.08, 0.08, THICKNESS])).expand(n, 3).contiguous()
-    quats = torch.tensor([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0]).expand(n, 4).contiguous()
-    colors = torch.full((n, 1, 3), 0.5)
-    return Gaussians(means, quats, log_scales, colors, torch.zeros(n, 0, 3), torch.full((n,), 4.0))
-
 
 def two_walls():
-    return splats(torch.cat([wall(NEAR_WALL, (0.8, 0.6)), wall(FAR_WALL, (1.6, 1.2))]))
+    """Return discs on both walls."""
+    walls = []
+    for z, halves in ((NEAR_WALL, (0.8, 0.6)), (FAR_WALL, (1.6, 1.2))):
+        x, y = torch.meshgrid(*(torch.arange(-half, half + 1e-6, 0.1) for half in halves), indexing="ij")
+        walls.append(torch.stack([x.ravel(), y.ravel(), torch.full((x.numel(),), z)], dim=1))
+    means = torch.cat(walls)
+    n = len(means)
+    return Gaussians(
+        means,
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        torch.log(torch.tensor([0.08, 0.08, 0.01])).repeat(n, 1),
+        torch.full((n, 1, 3), 0.5),
+        torch.zeros(n, 0, 3),
+        torch.full((n,), 4.0),
+    )
 
 
 @pytest.fixture
 def edit(edit_page):
-    """Return a function that opens the editor in front of a scene."""
+    """Return a function that opens the editor in front of the walls."""
 
-    def make(gaussians, width=640, height=400, **options):
-        shown = edit_page(gaussians, width=width, height=height, **options)
+    def make(width=640, height=400, **options):
+        shown = edit_page(two_walls(), width=width, height=height, **options)
         shown.evaluate(FACE)
         return shown
 
@@ -86,104 +79,33 @@ def shape_only(shown):
 SQUARE = ((-0.45, -0.35), (0.45, -0.35), (0.45, 0.35), (-0.45, 0.35))
 
 
-@pytest.mark.parametrize("tool", ["rectangle", "lasso", "polygon", "brush"])
-def test_only_the_near_wall_is_selected_in_the_page_and_by_the_command(edit, tmp_path, tool):
-    gaussians = two_walls()
+def test_only_the_near_wall_is_selected_in_the_page_and_by_the_command(edit, tmp_path):
+    gaussians, shown = two_walls(), edit()
     near = gaussians.means[:, 2].numpy() == NEAR_WALL
-    shown = edit(gaussians)
     shown.press("5")
-    assert shown.tab.get_attribute("[data-do=front]", "aria-pressed") == "true"
-    draw(shown, tool, SQUARE)
-    shape = shape_only(shown)
-    assert (shape & near).sum() > 15 and (shape & ~near).sum() > 5, "the shape covers both walls"
-    np.testing.assert_array_equal(shown.flags() == 1, shape & near)
-    shown.press("Delete")
-    (tmp_path / "edits.json").write_text(shown.text())
-    edits = read_edits(tmp_path / "edits.json")
-    np.testing.assert_array_equal(flags_after(edits.operations, gaussians), shown.flags())
+    assert shown.is_on("front")
+    for tool in ("rectangle", "lasso", "polygon", "brush"):
+        draw(shown, tool, SQUARE)
+        shape = shape_only(shown)
+        assert (shape & near).sum() > 15 and (shape & ~near).sum() > 5, "the shape covers both walls"
+        np.testing.assert_array_equal(shown.flags() == 1, shape & near)
+        shown.press("Delete")
+        edits = shown.edits()
+        np.testing.assert_array_equal(flags_after(edits.operations, gaussians), shown.flags())
+        (tmp_path / "edits.json").write_text(shown.text())
+        draw(shown, tool, SQUARE)
+        behind = shown.flags() == 1
+        assert not (behind & near).any() and (tool == "brush" or behind.sum() > 20), (
+            "the far wall shows in the hole"
+        )
+        shown.press(*["u"] * len(shown.operations()))
     words = ["convert", str(tmp_path / "scene.ply"), "--edits", str(tmp_path / "edits.json")]
     assert main([*words, str(tmp_path / "out.ply")]) == 0
     left = read_scene(tmp_path / "out.ply").gaussians.means
     assert torch.equal(left, gaussians.means[torch.from_numpy(~(shape & near))])
-    draw(shown, tool, SQUARE)
-    behind = shown.flags() == 1
-    assert not (behind & near).any() and (tool == "brush" or behind.sum() > 20), (
-        "the far wall shows in the hole"
-    )
     shown.press("5")
     draw(shown, tool, SQUARE)
-    assert (
-        "front" not in shown.last() and shown.tab.get_attribute("[data-do=front]", "aria-pressed") == "false"
-    )
-
-
-def test_a_large_shape_takes_the_far_wall_where_it_is_visible_and_not_behind_the_near_one(edit):
-    gaussians = two_walls()
-    means = gaussians.means.numpy()
-    near = means[:, 2] == NEAR_WALL
-    shown = edit(gaussians)
-    shown.press("5")
-    shown.evaluate("""() => { const camera = viewer.camera();
-      const shape = { by: "rectangle", camera: pictureOf(camera), corners: [-0.5, -0.5, camera.W, camera.H] };
-      editor.tools.select("replace", shape, camera); }""")
-    found = shown.flags() == 1
-    assert found[near].all()
-    x, y = (np.abs(means[:, i]) * 3 / (3 + FAR_WALL) for i in (0, 1))  # as seen on the near wall's plane
-    behind, beside = (x < 0.8) & (y < 0.6), (x > 1.05) | (y > 0.85)
-    assert behind[~near].sum() > 100 and beside[~near].sum() > 100
-    assert not found[~near & behind].any() and found[~near & beside].all()
-
-
-def test_splats_just_under_a_rough_surface_belong_to_it(edit):
-    """A wall as deep as three deviations of its splats is taken as a whole; a sloped wall, too."""
-    rng = np.random.default_rng(0)
-    means = wall(NEAR_WALL, (0.8, 0.6), 0.05)
-    rough = means.clone()
-    rough[:, 2] += torch.from_numpy(rng.uniform(0, 2 * THICKNESS, len(means)).astype(np.float32))
-    sloped = means.clone()
-    sloped[:, 2] += 1.2 * means[:, 0]
-    for surface, angle in ((rough, 0.0), (sloped, -math.atan(1.2))):
-        parts = [splats(surface, angle).tensors(), splats(wall(2.5, (2.5, 2.0))).tensors()]
-        both = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        shown = edit(Gaussians(**both))
-        shown.press("5")
-        draw(shown, "rectangle", SQUARE)
-        shape = shape_only(shown)
-        expected = shape & (np.arange(len(shape)) < len(surface))
-        np.testing.assert_array_equal(shown.flags() == 1, expected)
-        assert 0 < expected.sum() < shape.sum()
-
-
-def test_the_surface_of_the_grid_is_that_of_a_click(edit, random_gaussians):
-    """Depths of the grid and of single pixels agree; where there is no surface, neither finds one."""
-    shown = edit(random_gaussians(600), 200, 160)
-    found = shown.evaluate("""() => {
-      const camera = viewer.camera(), { values, history } = editor, { settings, facts } = viewer;
-      const lattice = { u0: 3, v0: 5, du: 11, dv: 9, across: 17, down: 9 };
-      const scene = { values, flags: history.flags, settings, near: facts.near };
-      const { depths, ends } = visibleSurface(scene, camera, lattice);
-      const clicks = Array.from(depths, (_, k) =>
-        editor.tools.depthAt(camera, 3 + 11 * (k % 17), 5 + 9 * Math.floor(k / 17)) ?? 0);
-      return [[...depths], clicks, [...ends]];
-    }""")
-    depths, clicks, ends = map(np.array, found)
-    assert (depths > 0).sum() > 20 and (depths == 0).sum() > 5
-    np.testing.assert_allclose(depths, clicks, rtol=1e-12)
-    assert (ends[depths > 0] > depths[depths > 0]).all()
-
-
-def test_a_front_is_small_and_where_there_is_no_surface_it_has_no_limit(edit):
-    shown = edit(splats(torch.cat([wall(NEAR_WALL, (0.3, 0.3)), torch.tensor([[1.2, 0.0, 2.0]])])))
-    shown.evaluate("values => { editor.values.logits[editor.values.count - 1] = -3; }")  # faint
-    shown.press("5")
-    draw(shown, "rectangle", ((-1.2, -0.5), (1.2, -0.5), (1.2, 0.5), (-1.2, 0.5)))
-    front = shown.last()["front"]
-    assert None in front["deepest"] and shown.flags().all()
-    assert (
-        len(front["deepest"]) == front["columns"] * front["rows"]
-        and max(front["columns"], front["rows"]) <= 48
-    )
-    assert all(len(str(depth)) <= 7 for depth in front["deepest"] if depth is not None)
+    assert "front" not in shown.last() and not shown.is_on("front")
 
 
 def corners(shown):
@@ -191,7 +113,7 @@ def corners(shown):
 
 
 def test_a_polygon_closes_at_its_first_corner_by_a_double_click_and_by_enter(edit):
-    shown = edit(two_walls())
+    shown = edit()
     shown.press("Shift+L")
     points = [shown.place(*corner) for corner in SQUARE]
     for point in points:
@@ -216,7 +138,7 @@ def test_a_polygon_closes_at_its_first_corner_by_a_double_click_and_by_enter(edi
 
 
 def test_corners_are_taken_back_dropped_and_lost_with_the_view(edit):
-    shown = edit(two_walls())
+    shown = edit()
     shown.press("0", "Shift+L")
     for corner in SQUARE[:3]:
         shown.tab.mouse.click(*shown.place(*corner))
@@ -236,7 +158,7 @@ def test_corners_are_taken_back_dropped_and_lost_with_the_view(edit):
 
 
 def test_a_polygon_is_drawn_with_the_keys_alone(edit):
-    shown = edit(two_walls())
+    shown = edit()
     shown.press("Shift+L")
     for key, times in (("ArrowLeft", 8), ("ArrowUp", 6), ("ArrowRight", 8), ("ArrowDown", 6)):
         shown.press(*[key] * times, "Enter")
@@ -246,7 +168,7 @@ def test_a_polygon_is_drawn_with_the_keys_alone(edit):
 
 
 def test_a_polygon_is_drawn_by_taps_on_a_phone(edit):
-    shown = edit(two_walls(), 390, 844, has_touch=True, is_mobile=True)
+    shown = edit(390, 844, has_touch=True, is_mobile=True)
     shown.tab.tap("[data-tool=polygon]")
     shown.tab.wait_for_selector("[data-tool=polygon][aria-pressed=true]")
     assert shown.tab.is_disabled("[data-do=close-polygon]")
@@ -282,7 +204,7 @@ def is_highlight(picture):
 
 
 def test_centres_rings_and_an_outline_show_the_selection(edit):
-    shown = edit(two_walls(), 320, 240)
+    shown = edit(320, 240)
     plain = canvas(shown)
     shown.evaluate("""editor.perform({ op: "select", how: "replace", by: "box", center: [0, 0, 0],
       half: [0.31, 0.21, 0.1], rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]] })""")
@@ -320,7 +242,7 @@ def test_centres_rings_and_an_outline_show_the_selection(edit):
 
 
 def test_a_picked_colour_is_the_scene_s_whatever_is_shown(edit):
-    shown = edit(two_walls(), 320, 240)
+    shown = edit(320, 240)
     pick = "() => { const c = viewer.camera(); return editor.pictureColor(c, Math.round(c.cx), Math.round(c.cy)); }"
     expected = shown.evaluate(pick)
     shown.press("0")

@@ -65,12 +65,6 @@ def test_a_drag_orbits_about_the_point_ahead(tour):
     assert max(angles) * 0.9 < between < np.hypot(*angles)
 
 
-def test_no_drag_turns_the_world_upside_down(tour):
-    for dy in (90, 90, 90, -90, -90, -90, -90, -90, -90):
-        after = drag(tour, 3, dy)
-        assert -after.R[1] @ tour.evaluate("viewer.view.up") > 0
-
-
 def test_a_right_drag_pans(tour):
     for button, shift in (("right", False), ("middle", False), ("left", True)):
         before, centre = tour.camera(), pivot(tour)
@@ -172,29 +166,6 @@ def test_the_captures_cameras(tour, three_views):
     assert stands_at(tour, third)
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (900, 200), SIZE])
-def test_a_window_of_any_shape_keeps_the_middle_of_the_photo(tour, three_views, width, height):
-    tour.tab.set_viewport_size({"width": width, "height": height})
-    # on a phone, what lies under the panel does not count
-    covered = tour.evaluate("Math.round(viewer.panel.covered())")
-    assert (covered > 0) == (width < 600)
-    for index, (_, camera) in enumerate(three_views):
-        tour.evaluate(f"delete viewer.facts.cameras[{index}].subject; viewer.goTo({index})")
-        shown = tour.camera()
-        scale = shown.fx / camera.fx
-        assert width == shown.W and height == shown.H
-        assert shown.fy == pytest.approx(scale * camera.fy)
-        # edges of the window, px of the photo
-        left, right = (np.array([-0.5, width - 0.5]) - shown.cx) / scale + camera.cx
-        top, bottom = (np.array([covered - 0.5, height - 0.5]) - shown.cy) / scale + camera.cy
-        assert left + right == pytest.approx(camera.W - 1) and top + bottom == pytest.approx(camera.H - 1)
-        if width / (height - covered) < camera.W / camera.H:  # a narrow window shows exactly the whole height
-            assert top == pytest.approx(-0.5)
-        else:  # a wide window shows at least four fifths of the height, and the whole width
-            assert bottom - top >= 0.8 * camera.H - 1e-9 and bottom - top <= camera.H + 1e-9
-            assert right - left >= camera.W - 1e-9
-
-
 def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, random_gaussians):
     """Twelve cameras surround a ball; each photo shows the ball on the left, and a wall on the right."""
     ball = random_gaussians(300)
@@ -208,6 +179,8 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
         )
     page.write(tmp_path / "ball.html", Scene(ball), views)
     seen = visit(390, 844).open(tmp_path / "ball.html").ready()
+    covered = seen.evaluate("viewer.panel.covered()")
+    assert covered > 0
     inner = ball.means.double().numpy()
     inner = inner[np.linalg.norm(inner, axis=1) < 0.6]
     for index in (None, 3, 8):
@@ -218,24 +191,7 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
         assert u.min() > 0 and u.max() < 390 and v.min() > 0 and v.max() < 844, "the whole ball is in view"
         assert u.max() - u.min() > 0.5 * 390, "the ball fills the window"
         assert abs(u.max() + u.min() - 390) < 0.2 * 390, "the ball is in the middle"
-
-
-def test_zooming_and_panning_are_limited_and_r_returns_to_the_start(tour):
-    """The scene stays within reach, so a visitor cannot lose it."""
-    start, farthest = tour.camera(), max(np.linalg.norm(eye) for eye in ((2.0, -0.5, 0.3), (-1.0, -0.4, 2.0)))
-    tour.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(1.2); viewer.moved(-1)")
-    out = np.linalg.norm(tour.camera().eye - pivot(tour))
-    assert farthest < out < 4 * farthest
-    tour.evaluate(
-        "for (let i = 0; i < 200; ++i) viewer.view.pan(300, 100, viewer.camera()); viewer.moved(-1)"
-    )
-    assert farthest < np.linalg.norm(pivot(tour)) < 5 * farthest
-    tour.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(0.8); viewer.moved(-1)")
-    near = np.linalg.norm(tour.camera().eye - pivot(tour))
-    assert 0.005 * farthest < near < 0.05 * farthest
-    drag(tour, 50, 20)
-    tour.press("r")
-    np.testing.assert_allclose(tour.camera().eye, start.eye, atol=1e-12)
+        assert abs(v.max() + v.min() - 844 - covered) < 0.1 * 844, "below the panel"
 
 
 @pytest.mark.parametrize("scheme", ["dark", "light"])
@@ -273,61 +229,6 @@ def test_held_out_cameras_are_marked_and_none_is_the_start(visit, tmp_path, rand
     assert stands_at(seen, three_views[0][1])
     seen.press("r")
     assert stands_at(seen, three_views[1][1])
-
-
-def forward_cameras():
-    """Return eleven cameras side by side that face one way, towards a subject 4 ahead."""
-    eyes = [(0.2 * i, 0.05 * (i % 3), 0.0) for i in range(-5, 6)]
-    return [
-        (f"{i:02}", Camera(np.eye(3), eye, 250.0, 250.0, 160.0, 100.0, 200, 320))
-        for i, eye in enumerate(eyes)
-    ]
-
-
-@pytest.fixture
-def forward(show, random_gaussians):
-    gaussians = random_gaussians(60)
-    gaussians.means[:, 2] += 4.0
-    return show(gaussians, forward_cameras(), width=SIZE[0], height=SIZE[1], fresh=True)
-
-
-def off_the_cameras(visit):
-    """Return the angle between the view and the nearest camera, seen from the pivot, degrees."""
-    centre, eye = pivot(visit), visit.camera().eye
-
-    def unit(a):
-        return a / np.linalg.norm(a)
-
-    cosines = [unit(eye - centre) @ unit(camera.eye - centre) for _, camera in forward_cameras()]
-    return np.degrees(np.arccos(min(max(cosines), 1.0)))
-
-
-def test_a_drag_across_a_quarter_of_the_window_stays_near_the_cameras(forward):
-    distance = np.linalg.norm(forward.camera().eye - pivot(forward))
-    assert 3 < distance < 5, (
-        "the pivot is on a visible surface, although the axes of the cameras do not cross"
-    )
-    for dx, dy in ((160, 0), (-160, 0), (0, 100), (0, -100), (160, 100)):
-        forward.press("r")
-        after = drag(forward, dx, dy)
-        # 6 degrees are free; beyond them, dragging moves the view less and less
-        assert 0.5 < off_the_cameras(forward) < 15
-        assert np.linalg.norm(after.eye - pivot(forward)) == pytest.approx(distance)
-    moved = off_the_cameras(forward)
-    for _ in range(4):
-        drag(forward, 160, 100)
-    assert moved < off_the_cameras(forward) < 35, "repeated drags still move the view, slowly"
-
-
-def test_after_flying_outside_one_can_orbit_there(forward):
-    forward.evaluate(
-        "viewer.view.camera = {...viewer.view.camera, eye: [4, 0, 4]}; viewer.view.look(-1.5, 0)"
-    )
-    before = off_the_cameras(forward)
-    assert before > 25
-    drag(forward, -60, 0)
-    drag(forward, 60, 0)
-    assert abs(off_the_cameras(forward) - before) < 20
 
 
 def on_the_screen(visit, point):

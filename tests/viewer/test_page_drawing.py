@@ -165,26 +165,6 @@ def test_a_trained_scene(show):
         assert likeness(drawn, visit, gaussians, one, settings) >= ALIKE
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "scale"),
-    [
-        (160, 500, 2.5),  # a narrow window shows the whole height and crops the sides
-        (320, 200, 1.0),
-        (400, 200, 1.25),  # a wide window shows the whole width and crops a fifth of the height
-        (800, 200, 1.25),  # a wider window crops no more, and shows the surroundings of the image
-    ],
-)
-def test_a_window_crops_the_sides_but_little_of_the_height(
-    show, random_gaussians, camera, width, height, scale
-):
-    assert (camera.W, camera.H) == (320, 200)
-    few = random_gaussians(12)  # too few splats for a subject, which a narrow window would show
-    visit = show(few, [("first", camera)], width=width, height=height)
-    covered = round(visit.evaluate("viewer.panel.covered()"))  # of a small window's height, by the panel
-    assert (covered > 0) == (width == 160)
-    assert visit.camera().fy == pytest.approx(camera.fy * (scale - covered / camera.H))
-
-
 @pytest.mark.parametrize("dense", [1, 2])
 def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
     """In a window of another shape, the window shows all of the image whose content reaches its edges."""

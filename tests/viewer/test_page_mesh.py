@@ -264,25 +264,6 @@ def test_wireframe_and_collider(opened):
     assert not tab.evaluate("viewer.meshes.showsCollider")
 
 
-def test_a_ray_meets_the_surface_where_numpy_says(opened):
-    """The page computes in float64 on float32 coordinates, and so does the test."""
-    mesh = Mesh(ball().vertices.astype(np.float32).astype(np.float64), ball().faces)
-    tab = opened(mesh).tab
-    columns, rows = np.random.default_rng(2).uniform((20, 20), (160, 100), (300, 2)).T
-    directions = rays(VIEW, columns, rows)
-    face, depth, _ = cast(mesh, np.broadcast_to(VIEW.eye, directions.shape), directions)
-    found = tab.evaluate(
-        "([camera, places]) => places.map(([u, v]) => viewer.meshes.depthAt(camera, u, v))",
-        [described(VIEW), np.stack([columns, rows], axis=1).tolist()],
-    )
-    found = np.array([np.inf if depth is None else depth for depth in found])
-    assert 100 < (face >= 0).sum() < 300
-    assert (np.isfinite(found) == (face >= 0)).all()
-    hit = face >= 0
-    np.testing.assert_allclose(found[hit], depth[hit], rtol=1e-9)
-    assert (found[hit].astype(np.float32) == depth[hit].astype(np.float32)).mean() > 0.99
-
-
 def test_measuring_snaps_to_the_mesh(visit, tmp_path, random_gaussians):
     """Two clicks on the mesh give the points that the ray caster finds; beside it, the splats decide."""
     mesh = Mesh(ball().vertices.astype(np.float32).astype(np.float64), ball().faces)
