@@ -75,8 +75,8 @@ def drawn(scene, camera):
     return render(scene.gaussians, camera, settings=file_settings(scene)).image.numpy().clip(0, 1)
 
 
-def test_with_room_for_all_the_page_draws_the_finest_level(
-    folder, open_page, camera, record_property, picture
+def test_with_room_for_all_the_page_loads_coarse_files_first_and_draws_the_finest_level(
+    folder, open_page, camera, record_property
 ):
     opened = open_page(COUNT)
     seen = opened.picture(camera)
@@ -86,50 +86,37 @@ def test_with_room_for_all_the_page_draws_the_finest_level(
     record_property("psnr", found)
     assert found >= ALIKE
     assert opened.tab.inner_text("#count") == "3,000 of 3,000 splats"
+    asked = [url.split("/")[-2] for url in opened.requests if url.endswith("/meta.json")]
+    assert asked[0].startswith(f"{codec.read_index(folder).levels - 1}_") and asked[-1].startswith("0_")
 
 
-def test_a_small_budget_draws_the_whole_scene_coarsely(
-    folder, open_page, camera, three_views, record_property, picture
-):
-    """From several sides, no region is missing, and the budget is never exceeded."""
+def test_a_small_budget_draws_the_whole_scene_coarsely(folder, open_page, camera, three_views):
+    """From several sides, no region is missing, nearer ones are finer, and the budget is never exceeded."""
     index = codec.read_index(folder)
     least = index.counts()[-1]
     budget = 2 * least + 50
     opened = open_page(budget)
-    for _, view in [("", camera), *three_views]:
+    nearness = """(eye) => viewer.levels.regions.map(
+      (region) => [viewer.levels.distance(region, eye), region.shown])"""
+    for _, view in 3 * three_views:
         opened.picture(view)
-        count, most, order, shown, _ = opened.evaluate(WATCH)
+        count, most, order, shown, free = opened.evaluate(WATCH)
         assert least <= count <= most <= budget and order <= budget
         assert min(shown) >= 0, "a region is missing"
         assert len(set(shown)) > 1 and max(shown) >= 3, "the budget allows finer levels only in some places"
-    # nearly everywhere, the picture is at least as good as the coarsest level alone
-    exact = drawn(codec.read(folder), camera)
-    coarse = psnr(drawn(codec.read_level(folder, index, index.levels - 1), camera), exact)
-    mixed = psnr(opened.picture(camera), exact)
-    assert mixed > coarse
-
-
-def test_nearer_regions_are_finer(folder, open_page, camera):
-    opened = open_page(1200)
-    opened.picture(camera)
-    nearness = """(eye) => viewer.levels.regions.map(
-      (region) => [viewer.levels.distance(region, eye), region.shown])"""
-    found = sorted(opened.evaluate(nearness, camera.eye.tolist()))
-    half = len(found) // 2
-    assert np.mean([level for _, level in found[:half]]) < np.mean([level for _, level in found[half:]]) - 0.3
-
-
-def test_memory_of_unused_files_is_released(open_page, three_views):
-    opened = open_page(700)
-    for _ in range(3):
-        for _, view in three_views:
-            opened.picture(view)
-    count, _, _, _, free = opened.evaluate(WATCH)
+        found = sorted(opened.evaluate(nearness, view.eye.tolist()))
+        half = len(found) // 2
+        near, far = (np.mean([level for _, level in part]) for part in (found[:half], found[half:]))
+        assert near < far - 0.2
+    # memory that is not used any more is free
     slots, held = opened.evaluate(
         "() => [viewer.levels.capacity / 32, viewer.levels.regions.flatMap(({ slots }) => slots)]"
     )
-    assert len(set(held)) == len(held) and free + len(held) == slots
-    assert len(held) * 32 >= count
+    assert len(set(held)) == len(held) and free + len(held) == slots and len(held) * 32 >= count
+    # nearly everywhere, the picture is at least as good as the coarsest level alone
+    exact = drawn(codec.read(folder), camera)
+    coarse = psnr(drawn(codec.read_level(folder, index, index.levels - 1), camera), exact)
+    assert psnr(opened.picture(camera), exact) > coarse
 
 
 def test_a_budget_below_the_coarsest_level_leaves_out_the_farthest(folder, open_page, camera):
@@ -140,21 +127,12 @@ def test_a_budget_below_the_coarsest_level_leaves_out_the_farthest(folder, open_
     assert 0 < count <= most <= budget
 
 
-def test_coarse_files_are_loaded_first(folder, open_page, camera):
-    opened = open_page(COUNT)
-    opened.picture(camera)
-    index = codec.read_index(folder)
-    asked = [url.split("/")[-2] for url in opened.requests if url.endswith("/meta.json")]
-    assert asked[0].startswith(f"{index.levels - 1}_") and asked[-1].startswith("0_")
-
-
-def test_a_file_that_vanished_is_named(folder, served, browser):
+def test_a_file_that_vanished_is_named(served, visit):
     server = served(COUNT)
     del server.served["/0_0/meta.json"]
-    tab = browser.new_page(viewport={"width": 320, "height": 200})
-    tab.goto(server.url)
-    tab.wait_for_selector('#message:has-text("/0_0/meta.json could not be loaded (404).")')
-    tab.close()
+    shown = visit(url=server.url)
+    shown.message("/0_0/meta.json could not be loaded (404).")
+    shown.expected = "status of 404"
 
 
 @pytest.mark.parametrize(

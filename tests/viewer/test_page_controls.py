@@ -50,7 +50,7 @@ def wheel(visit, amount):
     until(visit.tab, f"viewer.view.camera.eye.some((x, i) => x !== {eye}[i])")
 
 
-def test_a_drag_orbits_about_the_point_ahead(tour):
+def test_a_mouse_orbits_pans_zooms_and_looks_around(tour):
     before, centre = tour.camera(), pivot(tour)
     after = drag(tour, 50, 20)
     np.testing.assert_allclose(pivot(tour), centre, atol=1e-9)
@@ -64,20 +64,19 @@ def test_a_drag_orbits_about_the_point_ahead(tour):
     between = np.arccos(after.R[2] @ before.R[2])
     assert max(angles) * 0.9 < between < np.hypot(*angles)
 
-
-def test_a_right_drag_pans(tour):
+    tour.press("r")
     for button, shift in (("right", False), ("middle", False), ("left", True)):
         before, centre = tour.camera(), pivot(tour)
         if shift:
             tour.tab.keyboard.down("Shift")
         after = drag(tour, 40, -30, button)
+        tour.tab.keyboard.up("Shift")
         np.testing.assert_array_equal(after.R, before.R)
         # the point ahead stays under the pointer
         was, is_now = (np.array(one.project(one.world_to_cam(centre))[:2]) for one in (before, after))
         np.testing.assert_allclose(is_now - was, (40, -30), atol=1e-6)
 
-
-def test_the_wheel_moves_nearer_and_farther(tour):
+    tour.press("r")
     centre = pivot(tour)
     distances = []
     for amount in (0, -300, 800):
@@ -88,36 +87,7 @@ def test_the_wheel_moves_nearer_and_farther(tour):
         np.testing.assert_allclose(pivot(tour), centre, atol=1e-9)
     assert distances[1] < distances[0] < distances[2]
 
-
-KEYS = {"w": (2, 1), "s": (2, -1), "a": (0, -1), "d": (0, 1), "q": (1, 1), "e": (1, -1)}
-
-
-def test_keys_move_along_the_cameras_axes_while_they_are_held(tour):
-    for key, (axis, sign) in KEYS.items():
-        before = tour.camera()
-        tour.tab.keyboard.down(key)
-        tour.tab.wait_for_selector("#rate:has-text('frames/s')")
-        awaited(tour.tab, lambda before=before: np.linalg.norm(tour.camera().eye - before.eye) > 0.02)
-        tour.tab.keyboard.up(key)
-        after = tour.camera()
-        steps = sign * (before.R @ (after.eye - before.eye))
-        assert steps[axis] > 0.01, key
-        np.testing.assert_allclose(np.delete(steps, axis), 0, atol=1e-9)
-        np.testing.assert_array_equal(after.R, before.R)
-        tour.tab.wait_for_selector("#rate:empty", state="attached")
-        np.testing.assert_array_equal(tour.camera().eye, after.eye)
-
-
-def test_a_key_released_outside_the_window_does_not_keep_moving(tour):
-    tour.tab.keyboard.down("w")
-    tour.evaluate("dispatchEvent(new Event('blur'))")
-    tour.evaluate(FRAMES)
-    before = tour.camera()
-    tour.evaluate(FRAMES)
-    np.testing.assert_array_equal(tour.camera().eye, before.eye)
-
-
-def test_flying_a_drag_looks_around(tour):
+    tour.press("r")
     before = tour.camera()
     tour.press("f")
     assert tour.tab.get_attribute("#fly", "aria-pressed") == "true"
@@ -133,12 +103,49 @@ def test_flying_a_drag_looks_around(tour):
     assert not np.array_equal(drag(tour, 40, 10).eye, after.eye)
 
 
+KEYS = {"w": (2, 1), "s": (2, -1), "a": (0, -1), "d": (0, 1), "q": (1, 1), "e": (1, -1)}
+
+
+def test_keys_move_along_the_cameras_axes_while_they_are_held_and_show_help(tour):
+    for key, (axis, sign) in KEYS.items():
+        before = tour.camera()
+        tour.tab.keyboard.down(key)
+        tour.tab.wait_for_selector("#rate:has-text('frames/s')")
+        awaited(tour.tab, lambda before=before: np.linalg.norm(tour.camera().eye - before.eye) > 0.02)
+        tour.tab.keyboard.up(key)
+        after = tour.camera()
+        steps = sign * (before.R @ (after.eye - before.eye))
+        assert steps[axis] > 0.01, key
+        np.testing.assert_allclose(np.delete(steps, axis), 0, atol=1e-9)
+        np.testing.assert_array_equal(after.R, before.R)
+        tour.tab.wait_for_selector("#rate:empty", state="attached")
+        np.testing.assert_array_equal(tour.camera().eye, after.eye)
+
+    tour.tab.keyboard.down("w")
+    tour.evaluate("dispatchEvent(new Event('blur'))")
+    tour.evaluate(FRAMES)
+    before = tour.camera()
+    tour.evaluate(FRAMES)
+    np.testing.assert_array_equal(tour.camera().eye, before.eye)
+
+    assert tour.tab.is_hidden("#help")
+    tour.press("h")
+    assert tour.tab.is_visible("#help")
+    tour.tab.click("#help-button")
+    assert tour.tab.is_hidden("#help")
+
+    tour.tab.wait_for_selector("#rate:empty", state="attached")
+    text = tour.tab.inner_text("#panel")
+    assert "reflections" in text and "harmonics" not in text and "rest" not in text
+    assert tour.tab.locator("#degree option").all_inner_texts() == ["off", "1 of 3", "2 of 3", "full"]
+
+
 def stands_at(visit, camera: Camera):
     here = visit.camera()
     return np.array_equal(here.R, camera.R) and np.array_equal(here.eye, camera.eye)
 
 
-def test_the_captures_cameras(tour, three_views):
+def test_the_captures_cameras_and_the_way_back_to_the_start(tour, three_views, camera):
     def marked():
         return tour.tab.locator("#cameras button[aria-current=true]").all_inner_texts()
 
@@ -164,6 +171,20 @@ def test_the_captures_cameras(tour, three_views):
     drag(tour, 10, 0)
     tour.press("ArrowLeft")
     assert stands_at(tour, third)
+
+    tour.press("r")
+    for reset in (lambda: tour.press("r"), lambda: tour.tab.click("#reset")):
+        drag(tour, 30, 30)
+        assert not stands_at(tour, three_views[0][1])
+        reset()
+        assert stands_at(tour, three_views[0][1])
+
+    tour.press("r")
+    far = Camera(np.eye(3), (0.0, 0.0, -9.0), 50.0, 60.0, 20.0, 30.0, 50, 70)
+    assert tour.picture(far).shape == (50, 70, 3)
+    assert (tour.camera().W, tour.camera().H) == (70, 50)
+    drag(tour, 5, 0)
+    assert (tour.camera().W, tour.camera().H) == SIZE
 
 
 def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, random_gaussians):
@@ -326,55 +347,22 @@ def test_the_help_matches_the_visitors_device(show, random_gaussians, options, s
     assert ("double tap" in text, "W A S D" in text) == (shown == "touch", shown == "mouse")
 
 
-def test_the_panel_uses_words_that_a_visitor_knows(tour):
-    tour.tab.wait_for_selector("#rate:empty", state="attached")
-    text = tour.tab.inner_text("#panel")
-    assert "reflections" in text and "harmonics" not in text and "rest" not in text
-    assert tour.tab.locator("#degree option").all_inner_texts() == ["off", "1 of 3", "2 of 3", "full"]
-
-
-def test_back_to_the_start(tour, three_views):
-    for reset in (lambda: tour.press("r"), lambda: tour.tab.click("#reset")):
-        drag(tour, 30, 30)
-        assert not stands_at(tour, three_views[0][1])
-        reset()
-        assert stands_at(tour, three_views[0][1])
-
-
-def test_help_is_shown_on_request(tour):
-    assert tour.tab.is_hidden("#help")
-    tour.press("h")
-    assert tour.tab.is_visible("#help")
-    tour.tab.click("#help-button")
-    assert tour.tab.is_hidden("#help")
-
-
-def test_one_finger_orbits(tour):
+def test_fingers_orbit_pan_and_pinch(tour):
     before, centre = tour.camera(), pivot(tour)
     after = touch(tour, [(0, 0)], [(60, 0)])
     np.testing.assert_allclose(pivot(tour), centre, atol=1e-9)
     assert (before.R @ (after.eye - before.eye))[0] < -0.2
 
-
-def test_two_fingers_pan_and_pinch(tour):
+    tour.press("r")
     before, centre = tour.camera(), pivot(tour)
     panned = touch(tour, [(-20, 0), (20, 0)], [(-20, 30), (20, 30)])
     np.testing.assert_allclose(panned.R, before.R, atol=1e-12)
     distance = np.linalg.norm(before.eye - centre)
     assert np.linalg.norm(panned.eye - pivot(tour)) == pytest.approx(distance, rel=0.1)
     assert (before.R @ (panned.eye - before.eye))[1] < -0.1
-
     pinched = touch(tour, [(-20, 0), (20, 0)], [(-40, 0), (40, 0)])
     # the fingers are twice as far apart, so the scene between them appears twice as large
     assert np.linalg.norm(pinched.eye - pivot(tour)) == pytest.approx(distance / 2, rel=0.15)
-
-
-def test_a_program_sets_the_camera_until_somebody_moves(tour, camera):
-    far = Camera(np.eye(3), (0.0, 0.0, -9.0), 50.0, 60.0, 20.0, 30.0, 50, 70)
-    assert tour.picture(far).shape == (50, 70, 3)
-    assert (tour.camera().W, tour.camera().H) == (70, 50)
-    drag(tour, 5, 0)
-    assert (tour.camera().W, tour.camera().H) == SIZE
 
 
 def orbits(seen, *keys):
