@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from chapters import ROOT, tool
-from viewer.handles import touch, until
+from waiting import until_in
 
 STATIC = ROOT / "docs" / "site" / "static"
 FIGURES = [(figure.chapter, figure.name) for figure in tool("site_figures").FIGURES]
@@ -59,31 +59,14 @@ def canvas_box(page, name):
     return canvas, canvas.bounding_box()
 
 
-def drag(page, start, end):
-    """Drag with the mouse."""
-    page.mouse.move(*start)
-    page.mouse.down()
-    page.mouse.move(*end, steps=4)
-    page.mouse.up()
-
-
-def swipe(page, start, end):
-    """Drag with a finger; wait until the page has heard of it."""
-    session = page.context.new_cdp_session(page)
-    touch(session, "touchStart", start)
-    for share in (0.25, 0.5, 0.75, 1.0):
-        touch(session, "touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
-    touch(session, "touchEnd")
-
-
 def tap(page, place):
     """Tap an element, or a place of the window; wait until the page has heard of it, which Playwright does not."""
     page.evaluate(
         "() => { window.tapped = false;"
-        " addEventListener('click', () => setTimeout(() => { window.tapped = true; }), { once: true }); }"
+        " addEventListener('click', () => requestAnimationFrame(() => { window.tapped = true; }), { once: true }); }"
     )
     page.touchscreen.tap(*place) if isinstance(place, tuple) else place.tap()
-    until(page, "window.tapped")
+    until_in(page, page, "window.tapped")
 
 
 def chapter_functions(chapter, names, **given):

@@ -41,13 +41,25 @@ def made_run(capture, out, *words):
     return CaptureRun(plan(options_from(build_parser(["train"]).parse_args(words)), Limits()).options)
 
 
+class CountedView(LiveView):
+    """A live view that notes each time when the training asks whether it has to wait."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.asked = []
+
+    def holds(self, iteration):
+        self.asked.append(iteration)
+        return super().holds(iteration)
+
+
 class Training:
     """A training in its own thread, with its live view."""
 
     def __init__(self, capture, out, *words):
         self.run = made_run(capture, out, *words)
         self.stopped = threading.Event()
-        self.view = LiveView(self.run, port=0)
+        self.view = CountedView(self.run, port=0)
         self.broadcast = Broadcast(self.run, self.stopped.is_set, [self.view])
         self.failure = None
         self.thread = threading.Thread(target=self._train)
@@ -125,6 +137,15 @@ class Client:
     def control(self, what):
         """Press a button; return the status."""
         return self.ask("POST", "/control", json.dumps({"do": what}))[0]
+
+
+def is_closed(connection, more):
+    """Send more of a request; return whether the server has closed the connection."""
+    try:
+        connection.sendall(more)
+    except (BrokenPipeError, ConnectionResetError):
+        return True
+    return False
 
 
 def unframed(data):

@@ -1,10 +1,14 @@
-"""Waiting for a state of a thread, a program or a page. Tests call it instead of sleeping in loops of their own."""
+"""Waiting for a state of a thread, a program or a page. Nothing else in the tests may wait for a time, and
+`repo/test_house_limits.py` checks that. Programs that tests start import it too, so it imports little.
+"""
 
-import asyncio
 import time
 from collections.abc import Callable, Coroutine
-from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
+
+HERE = str(Path(__file__).parent)
+"""Folder in which a program that a test starts finds this module."""
 
 PATIENCE = 300.0
 """Seconds until a state that does not come fails a test, long enough for a computer that runs other tests as well."""
@@ -38,6 +42,9 @@ def until(
 def finished(coroutine: Coroutine[Any, Any, Any]) -> Any:
     """Run a coroutine to its end and return its result; in a thread of its own, because the main thread of a process
     that drives a browser has a running event loop."""
+    import asyncio
+    from concurrent.futures import ThreadPoolExecutor
+
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(asyncio.run, asyncio.wait_for(coroutine, PATIENCE)).result()
 

@@ -25,23 +25,19 @@ WORKER = "from distributed.cli.dask_worker import main; main()"
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 WAITING_WORKER = """
-import sys, time
+import sys
 from pathlib import Path
 from distributed.cli.dask_worker import main
 from gsplat_edu.runs.training import CaptureRun
+from waiting import until
 
-train, passed, patience = CaptureRun.train, Path(sys.argv.pop(1)), float(sys.argv.pop(1))
+train, passed = CaptureRun.train, Path(sys.argv.pop(1))
 
 def waiting(run, stop, callbacks=()):
-    end = None
-
     def wait(trainer, event):
-        nonlocal end
         if trainer.iteration > 30:
             (passed / run.folder.path.name).touch()
-            end = end or time.monotonic() + patience
-            while len(list(passed.iterdir())) == 4 and time.monotonic() < end:
-                time.sleep(0.02)
+            until(lambda: len(list(passed.iterdir())) < 4)
 
     return train(run, stop, [*callbacks, wait])
 
@@ -50,8 +46,7 @@ main()
 """
 """A worker in which the last of four blocks to pass its 30th step waits, and any block that is not finished then.
 
-It waits long enough for a test to kill the scheduler. It does not wait forever: the block of another worker that was
-killed may be waiting for this one.
+It waits until the test kills it.
 """
 
 
@@ -108,7 +103,7 @@ class Cluster:
     def worker(self, passed=None):
         """Start a worker; one that waits, if it is given a folder to note the blocks that passed their 30th step."""
         space = self.folder / f"space_{self.started}"
-        code, words = (WORKER, ()) if passed is None else (WAITING_WORKER, (passed, PATIENCE / 2))
+        code, words = (WORKER, ()) if passed is None else (WAITING_WORKER, (passed,))
         options = ("--no-nanny", "--nthreads", 1, "--no-dashboard", "--local-directory", space)
         return self.start(code, *words, self.address, *options)
 

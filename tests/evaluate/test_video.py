@@ -38,7 +38,7 @@ PLAY = """async ([kind, data, expected]) => {
       found = [0.25, 0.75].flatMap((y) => [0.25, 0.75].map((x) =>
         [...context.getImageData(x * canvas.width, y * canvas.height, 1, 1).data].slice(0, 3)));
       if (Math.max(...found.flat().map((v, k) => Math.abs(v - expected[i].flat()[k]))) <= 8) break;
-      await new Promise((done) => setTimeout(done, 50));
+      await new Promise((done) => requestAnimationFrame(done));
     }
     shown.push(found);
   }

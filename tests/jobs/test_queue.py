@@ -17,10 +17,12 @@ from gsplat_edu.jobs import queue as queue_module
 from gsplat_edu.jobs.process import carries, identity, is_running
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import Job, JobFolder, Rendered, State, Work, collision
-from waiting import until
+from waiting import HERE, until
 
-PROGRAM = """
-import json, os, signal, sys, time
+PROGRAM = (
+    f"import sys; sys.path.append({HERE!r})"
+    + """
+import json, os, signal
 file = os.open(os.environ["GSPLAT_EDU_EVENTS"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 def emit(event, **fields):  # a signal may come while it writes, and a file object does not let its handler write then
     os.write(file, (json.dumps({"event": event, "time": 0, **fields}) + "\\n").encode())
@@ -41,11 +43,12 @@ if "fails" in sys.argv:
 if "crashes" in sys.argv:
     print("Traceback and all", file=sys.stderr)
     sys.exit(1)
-while "waits" in sys.argv and not os.path.exists(sys.argv[2]):
-    emit("progress", stage="work", done=1)
-    time.sleep(0.02)
+if "waits" in sys.argv:
+    from waiting import until
+    until(lambda: emit("progress", stage="work", done=1) or os.path.exists(sys.argv[2]))
 emit("finished", outputs=[sys.argv[2]])
 """
+)
 
 
 def asked(*words, reads=(), writes=()):

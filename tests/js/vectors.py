@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from gsplat_edu.base import constants
 from gsplat_edu.edits.apply import apply_operation, moved_together
 from gsplat_edu.edits.cells import EditWork
 from gsplat_edu.edits.membership import Values, members
@@ -15,7 +16,9 @@ from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.scene.camera import look_at
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.viewer.page_data import packed
+from gsplat_edu.viewer.page_parts import SHADER_CONSTANTS
 from js.camera_paths import PATHS
 from js.random_edits import (
     NUMBER,
@@ -28,6 +31,7 @@ from js.random_edits import (
     witness,
 )
 from js.tilted_cameras import TILT, UP, around, rolled
+from viewer.test_page_mesh import VIEW, ball, cast, rays
 
 
 def numbers(array: np.ndarray) -> dict[str, str]:
@@ -246,6 +250,27 @@ def packed_scene() -> dict[str, Any]:
     }
 
 
+def mesh_rays() -> dict[str, Any]:
+    """Return a mesh, rays from a camera's eye, and the depths at which NumPy finds it; None for a miss."""
+    mesh = Mesh(ball().vertices.astype(np.float32).astype(np.float64), ball().faces)
+    columns, rows = np.random.default_rng(2).uniform((20, 20), (160, 100), (300, 2)).T
+    directions = rays(VIEW, columns, rows)
+    face, depths, _ = cast(mesh, np.broadcast_to(VIEW.eye, directions.shape), directions)
+    return {
+        "positions": numbers(mesh.vertices.astype(np.float32).ravel()),
+        "faces": mesh.faces.tolist(),
+        "eye": VIEW.eye.tolist(),
+        "directions": directions.tolist(),
+        "depths": [depth if hit >= 0 else None for hit, depth in zip(face, depths.tolist(), strict=True)],
+    }
+
+
+def shader_constants() -> dict[str, float]:
+    """Return those constants of the shaders that are single numbers."""
+    values = {name: getattr(constants, name) for name in SHADER_CONSTANTS}
+    return {name: value for name, value in values.items() if not isinstance(value, tuple)}
+
+
 VECTORS: dict[str, Callable[[], Any]] = {
     "paths": paths,
     "regions": regions,
@@ -260,5 +285,7 @@ VECTORS: dict[str, Callable[[], Any]] = {
     "order": order,
     "sample": sample,
     "packed-scene": packed_scene,
+    "mesh-rays": mesh_rays,
+    "constants": shader_constants,
 }
 """By name; vectors.js reads them from a folder."""

@@ -1,8 +1,11 @@
 """Pages with the site's moving figures, and a browser that opens them."""
 
+import re
+
 import pytest
 
-from figure_pages import CHAPTERS, NO_ADAPTER, write_pages
+from figure_pages import CHAPTERS, NO_ADAPTER, STATIC, write_pages
+from node import Node
 
 
 @pytest.fixture(scope="module")
@@ -29,3 +32,18 @@ def opened(browser, pages):
     for context in contexts:
         context.close()
     assert [text for text in messages if text != NO_ADAPTER] == []
+
+
+@pytest.fixture
+def formulas(pages):
+    """Run the scripts of a chapter's page in node, for what they compute."""
+    made = []
+
+    def running(chapter):
+        names = re.findall(r'<script src="../_static/([^"]+)"', (pages / f"{chapter}.html").read_text())
+        made.append(Node([STATIC / name for name in names]))
+        return made[-1]
+
+    yield running
+    for node in made:
+        node.close()

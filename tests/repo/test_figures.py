@@ -10,13 +10,14 @@ import pytest
 from PIL import Image
 
 from chapters import ROOT, tool
-from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, drag, read_data, state, swipe, tap, told
+from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, read_data, state, tap, told
+from gestures import drag, swipe
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
 from viewer.handles import until
 
 
-def test_a_splat_is_computed_like_the_chapter(opened):
-    page = opened("02_gaussians_in_2d")
+def test_a_splat_is_computed_like_the_chapter(formulas):
+    page = formulas("02_gaussians_in_2d")
     rng = np.random.default_rng(2)
     for u, v, s1, s2, angle, x, y in rng.uniform([5, 5, 1, 1, -3, 3, 3], [9, 9, 4, 4, 3, 11, 11], (20, 7)):
         values = {"u": u, "v": v, "s1": s1, "s2": s2, "angle": angle}
@@ -37,8 +38,8 @@ def test_a_splat_is_computed_like_the_chapter(opened):
         assert np.allclose(found["grad"], slopes, rtol=0, atol=1e-9)
 
 
-def test_the_sphere_is_composited_like_the_reference(opened):
-    page, shell = opened("05_sort_and_composite"), read_data("sphere")
+def test_the_sphere_is_composited_like_the_reference(formulas):
+    page, shell = formulas("05_sort_and_composite"), read_data("sphere")
     count, size = len(shell["means"]), 48
     means, _, _, opacities = sphere_shell(count)
     assert np.allclose(shell["means"], means, rtol=0, atol=1e-5)
@@ -61,8 +62,8 @@ def test_the_sphere_is_composited_like_the_reference(opened):
         assert np.mean(gaps > 1e-10) < 1e-3 and gaps.max() < ALPHA_MIN
 
 
-def test_fates_are_those_of_the_training(opened):
-    page, recorded = opened("09_train_in_3d"), read_data("density")
+def test_fates_are_those_of_the_training(formulas):
+    page, recorded = formulas("09_train_in_3d"), read_data("density")
     fates = page.evaluate("gsplatPlay.fates(gsplatData.density, gsplatData.density.threshold)")
     assert fates["counts"]["cloned"] == recorded["cloned"]
     assert 2 * fates["counts"]["split"] == recorded["children"]

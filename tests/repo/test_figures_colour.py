@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from chapters import ROOT, tool
-from figure_pages import chapter_functions, drag, read_data, state, swipe, tap, told
+from figure_pages import chapter_functions, read_data, state, tap, told
+from gestures import drag, swipe
 from gsplat_edu import C0, build_cov3d_batch, eval_sh, orbit_camera, render_gaussians, sh_basis
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.evaluate.metrics import psnr
@@ -28,8 +29,8 @@ def sphere_nodes(n, m):
     return nodes.reshape(-1, 3), np.repeat(w * 2 * np.pi / m, m)
 
 
-def test_harmonics_and_colours_are_those_of_the_package(opened):
-    page, rng = opened("06_spherical_harmonics"), np.random.default_rng(6)
+def test_harmonics_and_colours_are_those_of_the_package(formulas):
+    page, rng = formulas("06_spherical_harmonics"), np.random.default_rng(6)
     dirs = unit_vectors(rng, 300)
     found = page.evaluate("dirs => dirs.map(gsplatPlay.harmonics)", dirs.tolist())
     assert np.allclose(found, sh_basis(dirs), rtol=0, atol=1e-14)
@@ -48,8 +49,8 @@ def test_harmonics_and_colours_are_those_of_the_package(opened):
     assert floored > 100
 
 
-def test_the_coefficients_of_a_lobe_are_its_integrals(opened):
-    page, rng = opened("06_spherical_harmonics"), np.random.default_rng(66)
+def test_the_coefficients_of_a_lobe_are_its_integrals(formulas):
+    page, rng = formulas("06_spherical_harmonics"), np.random.default_rng(66)
     nodes, weights = sphere_nodes(80, 160)
     basis = sh_basis(nodes)
     for axis, kappa in zip(unit_vectors(rng, 30), rng.uniform(0.5, 80, 30), strict=True):
@@ -164,8 +165,8 @@ FORGOTTEN = [
 
 
 @pytest.mark.parametrize("forgotten", FORGOTTEN)
-def test_a_scene_is_drawn_as_the_chapter_does(opened, forgotten):
-    page, size = opened("07_a_trained_scene"), 32
+def test_a_scene_is_drawn_as_the_chapter_does(formulas, forgotten):
+    page, size = formulas("07_a_trained_scene"), 32
     kept = {name: name not in forgotten for name in ("scales", "opacities", "colours", "quats")}
     raw = unpacked(page, read_data("scene"))
     for azimuth, elevation in ((0.26, -0.2), (2.5, 0.7)):
@@ -183,8 +184,8 @@ def test_a_scene_is_drawn_as_the_chapter_does(opened, forgotten):
         assert np.mean(gaps > 1e-8) < 2e-3 and gaps.max() < 1 / 255
 
 
-def test_the_scene_is_the_one_of_the_chapter(opened):
-    page, stored = opened("07_a_trained_scene"), read_data("scene")
+def test_the_scene_is_the_one_of_the_chapter(formulas):
+    page, stored = formulas("07_a_trained_scene"), read_data("scene")
     capture = sphere_capture(128)
     kept = dict.fromkeys(("scales", "opacities", "colours", "quats"), True)
     image = read_by_hand(unpacked(page, stored), capture.held_out.camera, kept)
@@ -196,7 +197,7 @@ def test_the_scene_is_the_one_of_the_chapter(opened):
     assert abs(psnr(image, capture.held_out.image) - float(reached)) < 1.0
 
 
-def test_packed_numbers_are_right_to_half_a_step(opened):
+def test_packed_numbers_are_right_to_half_a_step(formulas):
     rng = np.random.default_rng(7)
     raw = {name: rng.normal(size=(50, width)) for name, width in WIDTHS.items()}
     tensors = {name: torch.tensor(values) for name, values in raw.items()}
@@ -204,7 +205,7 @@ def test_packed_numbers_are_right_to_half_a_step(opened):
     stored = tool("figure_data").scene_data(
         Gaussians(**tensors, sh_rest=torch.zeros(50, 0, 3, dtype=torch.float64))
     )
-    for name, found in unpacked(opened("07_a_trained_scene"), stored).items():
+    for name, found in unpacked(formulas("07_a_trained_scene"), stored).items():
         steps = np.ptp(raw[name], axis=0) / (65535 if name == "means" else 255)
         assert np.all(np.abs(found - raw[name]) < 0.500001 * steps), name
 

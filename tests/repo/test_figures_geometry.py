@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from figure_pages import canvas_box, chapter_functions, drag, state, swipe, tap, told
+from figure_pages import canvas_box, chapter_functions, state, tap, told
+from gestures import drag, swipe
 from gsplat_edu import Z_NEAR, Camera, build_cov3d, orbit_camera, quat_to_R
 from gsplat_edu.scene.gaussian_math import project_cov3d
 
@@ -15,8 +16,8 @@ def keys_change(page, name, steps):
         assert np.isclose(state(page, name)[entry] - earlier, change), key
 
 
-def test_normal_numbers_are_normal_and_independent(opened):
-    drawn = np.array(opened("01_points").evaluate("gsplatPlay.normals(20000, 1)"))
+def test_normal_numbers_are_normal_and_independent(formulas):
+    drawn = np.array(formulas("01_points").evaluate("gsplatPlay.normals(20000, 1)"))
     # means, covariances and third powers of 20,000 draws, each within five of its standard deviations
     assert np.abs(drawn.mean(axis=0)).max() < 5 / np.sqrt(20_000)
     assert np.abs(np.cov(drawn.T) - np.eye(3)).max() < 5 * np.sqrt(2 / 20_000)
@@ -25,8 +26,8 @@ def test_normal_numbers_are_normal_and_independent(opened):
     assert np.abs(neighbours).max() < 5 / np.sqrt(20_000)
 
 
-def test_an_ellipsoid_is_computed_like_the_chapter(opened):
-    page = opened("03_gaussians_in_3d")
+def test_an_ellipsoid_is_computed_like_the_chapter(formulas):
+    page = formulas("03_gaussians_in_3d")
     rng = np.random.default_rng(3)
     to_pixels = np.diag([200.0, 200.0, 1.0])
     for _ in range(60):
@@ -80,8 +81,8 @@ def test_the_ellipsoid_follows_mouse_finger_keys_and_sliders(opened):
     assert slider.get_attribute("aria-valuetext") == "0.49 world units"
 
 
-def test_an_ellipse_of_the_tangent_is_that_of_the_package(opened):
-    page, rng = opened("04_splatting"), np.random.default_rng(4)
+def test_an_ellipse_of_the_tangent_is_that_of_the_package(formulas):
+    page, rng = formulas("04_splatting"), np.random.default_rng(4)
     camera = Camera.looking_at(eye=[0, 0, 0], target=[0, 0, 1], fx=150, fy=150, H=128, W=128)
     clamped = 0
     for limit in [None, 1.3] * 30:
@@ -98,8 +99,8 @@ def test_an_ellipse_of_the_tangent_is_that_of_the_package(opened):
     assert clamped > 5
 
 
-def test_the_error_of_the_ellipse_is_that_of_the_chapter(opened):
-    page, draws = opened("04_splatting"), np.random.default_rng(44).normal(size=(2, 4000))
+def test_the_error_of_the_ellipse_is_that_of_the_chapter(formulas):
+    page, draws = formulas("04_splatting"), np.random.default_rng(44).normal(size=(2, 4000))
     relative_error, predicted_factor = chapter_functions(
         "04_splatting", ["relative_error", "predicted_factor"], np=np, draws=draws, PAIRS_DRAWN=4000
     )
@@ -149,8 +150,8 @@ def test_the_gaussian_follows_mouse_finger_keys_and_sliders(opened):
     assert np.isclose(state(page, "tangent")["across"], 0.07)
 
 
-def test_points_reach_the_pixels_of_the_chapter(opened):
-    page, rng = opened("01_points"), np.random.default_rng(1)
+def test_points_reach_the_pixels_of_the_chapter(formulas):
+    page, rng = formulas("01_points"), np.random.default_rng(1)
     (draw_points,) = chapter_functions("01_points", ["draw_points"], np=np, Z_NEAR=Z_NEAR)
     size, points = 48, rng.normal(size=(3000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -179,8 +180,8 @@ def test_points_reach_the_pixels_of_the_chapter(opened):
             assert np.array_equal(np.reshape(owners, (size, size)), expected), (radius, depth_test)
 
 
-def test_expected_points_are_those_of_the_chapter(opened):
-    page, rng = opened("01_points"), np.random.default_rng(11)
+def test_expected_points_are_those_of_the_chapter(formulas):
+    page, rng = formulas("01_points"), np.random.default_rng(11)
     given = {"np": np, "SIZE": 48, "COUNT": 3000}
     names = ["pixel_rays", "ball_depths", "expected_points"]
     *_, expected_points = chapter_functions("01_points", names, **given)
@@ -188,12 +189,18 @@ def test_expected_points_are_those_of_the_chapter(opened):
         found = page.evaluate(
             """([azimuth, elevation, distance]) => {
                 const camera = gsplatPlay.orbit(azimuth, elevation, 48, 60, distance);
-                return Array.from(gsplatPlay.expected(3000, camera), (value) => Number.isNaN(value) ? -1 : value);
+                return Array.from(gsplatPlay.expected(3000, camera));
             }""",
             [azimuth, elevation, distance],
         )
         (front, _), cosine = expected_points(orbit_camera(azimuth, elevation, 48, 60, distance))
-        assert np.allclose(np.reshape(found, (48, 48)), np.where(cosine > 0.4, front, -1), rtol=1e-9, atol=0)
+        assert np.allclose(
+            np.reshape(found, (48, 48)),
+            np.where(cosine > 0.4, front, np.nan),
+            rtol=1e-9,
+            atol=0,
+            equal_nan=True,
+        )
 
 
 def test_the_points_follow_mouse_finger_keys_and_sliders(opened):

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 
 from chapters import tool
-from figure_pages import canvas_box, drag, read_data, state, swipe, tap, told
+from figure_pages import canvas_box, read_data, state, tap, told
+from gestures import drag, swipe
 from gsplat_edu import Camera
 from gsplat_edu.fit2d.fit import Fit2DSettings, fit_2d
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
@@ -46,8 +47,8 @@ def test_the_fits_data_are_those_of_their_recipe():
     assert stored == made
 
 
-def test_slopes_of_a_fit_are_those_of_the_package(opened):
-    page, rng = opened("08_fit_an_image"), np.random.default_rng(8)
+def test_slopes_of_a_fit_are_those_of_the_package(formulas):
+    page, rng = formulas("08_fit_an_image"), np.random.default_rng(8)
     tall, wide = 19, 23
     for _ in range(12):
         count = int(rng.integers(1, 12))
@@ -103,8 +104,8 @@ def test_the_fit_follows_buttons_keys_and_touch(opened):
     assert state(page, "fit")["losses"][-1] < state(page, "fit")["losses"][0]
 
 
-def test_the_chain_is_that_of_autograd(opened):
-    page, rng = opened("13_back_to_the_parameters"), np.random.default_rng(13)
+def test_the_chain_is_that_of_autograd(formulas):
+    page, rng = formulas("13_back_to_the_parameters"), np.random.default_rng(13)
     floored = 0
     for _ in range(25):
         x = rng.choice([-0.5, 0.5])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from figure_pages import canvas_box, chapter_functions, drag, state, swipe, told
+from figure_pages import canvas_box, chapter_functions, state, told
+from gestures import drag, swipe
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
@@ -28,8 +29,8 @@ def direction(rng, kind):
 
 
 @pytest.mark.parametrize("kind", WIDEST)
-def test_the_ellipse_of_a_ball_is_that_of_the_package(opened, kind):
-    page, rng = opened("04_splatting"), np.random.default_rng(45)
+def test_the_ellipse_of_a_ball_is_that_of_the_package(formulas, kind):
+    page, rng = formulas("04_splatting"), np.random.default_rng(45)
     compared = 0
     for turn in [0.0, 0.3, -0.5] * 12:
         k1 = 0.0 if kind == "equirectangular" else rng.uniform(-0.02, 0.02)
@@ -65,8 +66,8 @@ def test_the_ellipse_of_a_ball_is_that_of_the_package(opened, kind):
     assert compared > 25
 
 
-def test_the_outline_leaves_the_ellipse_as_in_the_chapter(opened):
-    page = opened("04_splatting")
+def test_the_outline_leaves_the_ellipse_as_in_the_chapter(formulas):
+    page = formulas("04_splatting")
     by_fisheye, by_pinhole = chapter_functions("04_splatting", ["by_fisheye", "by_pinhole"], np=np)
     for kind, lens, degrees in (
         ("perspective", by_pinhole, (20, 40, 60)),

@@ -9,7 +9,8 @@ import torch
 
 from browsers import GRAPHICS, chromium
 from chapters import ROOT, tool
-from figure_pages import NO_ADAPTER, canvas_box, drag, read_data, state, swipe, tap, told, write_pages
+from figure_pages import NO_ADAPTER, canvas_box, read_data, state, tap, told, write_pages
+from gestures import drag, swipe
 
 sys.path.append(str(ROOT / "benchmarks"))
 from ladder.oracle import oracle, tolerance

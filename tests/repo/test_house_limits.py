@@ -1,6 +1,7 @@
 """The repository is within the house limits, and the tool that checks them finds violations."""
 
 import importlib.util
+import re
 from pathlib import Path
 
 import pytest
@@ -54,3 +55,21 @@ def test_exceptions_name_functions_that_exist(limits):
     for key in limits.EXCEPTIONS:
         file, function = key.split(":")
         assert f"def {function}(" in (ROOT / file).read_text()
+
+
+def test_no_test_waits_for_a_time():
+    """A state is awaited by `tests/waiting.py`; so does a program or a page's script in a test."""
+    waits = re.compile("|".join((r"\bsleep\(", r"import sleep", "wait_for_timeout", "setTimeout")))
+    files = [path for kind in ("*.py", "*.js") for path in sorted((ROOT / "tests").rglob(kind))]
+    ours = [
+        path
+        for path in files
+        if "npm" not in path.parts and path.name not in ("waiting.py", Path(__file__).name)
+    ]
+    found = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in ours
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if waits.search(line)
+    ]
+    assert len(ours) > 400 and found == []

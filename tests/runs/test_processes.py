@@ -26,7 +26,7 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.team import ALONE
 from ranks import together
-from waiting import PATIENCE
+from waiting import HERE, PATIENCE
 
 pytestmark = pytest.mark.slow
 
@@ -188,18 +188,18 @@ WORDS = (
 
 
 KILLED = """
-import os, signal, sys, time
+import os, signal, sys
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.runs.training import CaptureRun
+from waiting import until
 
 save = CaptureRun.save
 
 
 def save_and_die(run):
     save(run)
-    while not any(run.folder.checkpoints.glob("*.safetensors")):  # the first rank writes it
-        time.sleep(0.01)
+    until(lambda: any(run.folder.checkpoints.glob("*.safetensors")))  # the first rank writes it
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -222,7 +222,7 @@ def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tm
     command = [*launcher, "--max-restarts=1", str(program), "train", str(capture), "--out", str(out)]
     done = subprocess.run(
         [*command, *WORDS, "--resume"],
-        env={**os.environ, "OMP_NUM_THREADS": "1", "VICTIM": str(victim)},
+        env={**os.environ, "OMP_NUM_THREADS": "1", "VICTIM": str(victim), "PYTHONPATH": HERE},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

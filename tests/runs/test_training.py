@@ -39,15 +39,15 @@ STRATEGIES = {
 TRAIN = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 WAITS = """
-import sys, time
+import sys
 from gsplat_edu.cli.main import main
 from gsplat_edu.runs.training import CaptureRun
+from waiting import until
 train, last = CaptureRun.train, int(sys.argv.pop(1))
 
 def waiting(run, stop, callbacks=()):
     def wait(trainer, event):
-        while trainer.iteration >= last and not stop():
-            time.sleep(0.01)
+        until(lambda: trainer.iteration < last or stop())
     return train(run, stop, [*callbacks, wait])
 
 CaptureRun.train = waiting

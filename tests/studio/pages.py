@@ -16,7 +16,7 @@ from gsplat_edu.studio.app import application
 from gsplat_edu.studio.server import _config, _Server
 from gsplat_edu.studio.state import Studio
 from processes import Program
-from waiting import PATIENCE, awaited
+from waiting import PATIENCE, awaited, until_in
 
 TOKEN = "a-token"
 
@@ -108,6 +108,50 @@ class Visitor:
     def command(self, job):
         """Return the printed command of a job's card, by the job's title."""
         return self.tab.get_by_role("article", name=job).get_by_role("textbox", name="command").inner_text()
+
+
+def go(tab, place):
+    """Open a screen of the page in a tab; return the tab."""
+    tab.goto(f"{tab.url.split('#')[0]}#/{place}")
+    return tab
+
+
+def frame_of(tab):
+    """Return the frame with the scene of a screen, once it has started."""
+    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
+    until_in(tab, frame, "Boolean(window.viewer) && document.getElementById('message').hidden")
+    return frame
+
+
+def capture_frame(tab, capture):
+    """Scroll to the cameras of a capture's screen; return the frame with them, once it has started."""
+    section = tab.get_by_role("region", name="cameras")
+    section.scroll_into_view_if_needed()
+    frame = section.locator("iframe:not([hidden])").element_handle().content_frame()
+    frame.wait_for_url(re.compile(f"/captures/{capture}/page"), wait_until="commit")
+    until_in(tab, frame, "Boolean(window.viewer?.isWhole) && document.getElementById('message').hidden")
+    return frame
+
+
+def examined(tab):
+    """Ask the doctor on a screen; return the section with its findings."""
+    part = tab.get_by_role("region", name="doctor")
+    # "Examine again" would show older findings meanwhile
+    part.get_by_role("button", name="Examine", exact=True).click()
+    part.get_by_role("button", name="Examine again").wait_for()
+    part.locator(".findings li").first.wait_for()
+    return part
+
+
+def mask_dialog(tab, photo):
+    """Press *Mask this* of a photo in the gallery; return the dialog and the box of the photo in it."""
+    gallery = tab.get_by_role("region", name="photos")
+    gallery.get_by_role("button", name=re.compile(f"[Mm]ask.*: .*{photo}")).click()
+    dialog = tab.locator("dialog.mask[open]")
+    dialog.wait_for()
+    until_in(tab, tab, "document.activeElement === document.querySelector('dialog.mask svg')")
+    until_in(tab, tab, "document.querySelector('.sheet img').complete")
+    return dialog, dialog.locator("svg").bounding_box()
 
 
 def held_back(tab, address, of=lambda request: True):

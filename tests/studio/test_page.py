@@ -10,7 +10,7 @@ from PIL import Image
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap
-from studio.pages import DROP, encoded, png, repeated, train_and_download, visitor_of
+from studio.pages import DROP, encoded, go, png, repeated, train_and_download, visitor_of
 from waiting import until_in
 
 HOSTILE = "<img src=x onerror=hacked=1>"
@@ -113,7 +113,7 @@ def test_a_waiting_job_says_what_it_waits_for(visitor, library):
     )
     try:
         jobs = [studio.start(request).id for request in requests]
-        tab.goto(f"{tab.url.split('#')[0]}#/jobs")
+        go(tab, "jobs")
         card = tab.get_by_role("article", name="export of waiting.spz")
         line = card.locator(".waits")
         line.get_by_text("Waits until “training of waiting” has ended: it uses runs/waiting too.").wait_for()

@@ -7,8 +7,8 @@ import pytest
 from accessibility import grave_faults, grave_faults_in_all_styles
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from studio.test_page_doctor import examined
-from studio.test_page_watch import at, frame_of, runs
+from studio.pages import examined, frame_of, go
+from studio.test_page_watch import runs
 from waiting import until_in
 
 __all__ = ["runs"]
@@ -28,14 +28,14 @@ SCREENS = {
 
 @pytest.mark.parametrize("screen", SCREENS)
 def test_a_screen(visitor, runs, screen):
-    tab = at(visitor(), SCREENS[screen])
+    tab = go(visitor().tab, SCREENS[screen])
     tab.locator("main h1").first.wait_for()
     tab.wait_for_load_state("networkidle")
     assert grave_faults_in_all_styles(tab) == []
 
 
 def test_the_editor(visitor, runs):
-    tab = at(visitor(), "runs/egg/edit")
+    tab = go(visitor().tab, "runs/egg/edit")
     frame_of(tab)
     assert grave_faults_in_all_styles(tab) == []
 
@@ -43,7 +43,7 @@ def test_the_editor(visitor, runs):
 def test_a_capture_with_its_choices_its_places_and_its_findings(visitor, library):
     views, points, colors = procedural_capture(48, 12, splats=120)
     write_colmap(library[0].library.root / "captures" / "seen", views, points, colors)
-    tab = at(visitor(), "captures/seen")
+    tab = go(visitor().tab, "captures/seen")
     tab.locator("summary", has_text="More").click()
     examined(tab)
     tab.get_by_role("region", name="cameras").scroll_into_view_if_needed()
@@ -54,7 +54,7 @@ def test_a_capture_with_its_choices_its_places_and_its_findings(visitor, library
 def test_the_dialog_that_draws_a_mask(visitor, library):
     views, points, colors = procedural_capture(48, 6, splats=120)
     write_colmap(library[0].library.root / "captures" / "drawn", views, points, colors)
-    tab = at(visitor(), "captures/drawn")
+    tab = go(visitor().tab, "captures/drawn")
     tab.get_by_role("button", name="Mask this: images/view_001.png").click()
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
@@ -68,21 +68,21 @@ def test_the_dialog_that_draws_a_mask(visitor, library):
 
 
 def test_the_offer_to_rename_what_came_from_a_capture(visitor, runs):
-    tab = at(visitor(), "captures/egg")
+    tab = go(visitor().tab, "captures/egg")
     tab.locator("summary", has_text="Rename or remove").click()
     tab.get_by_role("checkbox", name=re.compile("rename what came from it")).wait_for()
     assert grave_faults_in_all_styles(tab) == []
 
 
 def test_the_list_of_keys(visitor, runs):
-    tab = at(visitor(), "")
+    tab = go(visitor().tab, "")
     tab.get_by_role("button", name=re.compile("keys", re.IGNORECASE)).click()
     tab.locator("dialog[open]").wait_for()
     assert grave_faults_in_all_styles(tab) == []
 
 
 def test_a_fault_is_found(visitor, runs):
-    tab = at(visitor(), "")
+    tab = go(visitor().tab, "")
     tab.locator("main h1").first.wait_for()
     tab.evaluate("""() => {
       const faint = document.createElement("p");

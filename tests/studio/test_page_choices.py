@@ -8,8 +8,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.region import read_region, write_region
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.studio.command_options import TRAIN_OPTIONS
-from studio.pages import waiting
-from studio.test_page_watch import at
+from studio.pages import go, waiting
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,7 @@ def started(tab, library):
 
 def test_choices_in_words_become_options_of_the_command(visitor, library, plain):
     person = visitor()
-    tab = at(person, "captures/choices")
+    tab = go(person.tab, "captures/choices")
     job = chosen(
         tab,
         library,
@@ -68,19 +67,19 @@ def test_choices_in_words_become_options_of_the_command(visitor, library, plain)
 
 def test_another_recipe_takes_the_place_of_a_quality(visitor, library, plain):
     person = visitor()
-    tab = at(person, "captures/choices")
+    tab = go(person.tab, "captures/choices")
     job = chosen(tab, library, {"Recipe": "mcmc", "Splats at most": "500"})
     assert job.work.options == {"strategy": "mcmc", "max_gaussians": 500}
 
 
 def test_without_choices_only_the_quality_is_given(visitor, library, plain):
     person = visitor()
-    tab = at(person, "captures/choices")
+    tab = go(person.tab, "captures/choices")
     assert chosen(tab, library, {}).work.options == {"quality": "standard"}
 
 
 def test_every_choice_of_the_page_is_one_of_the_command(visitor, plain):
-    tab = at(visitor(), "captures/choices")
+    tab = go(visitor().tab, "captures/choices")
     tab.locator("summary", has_text="More").click()
     offered = tab.evaluate(
         """[...document.querySelectorAll("[aria-label=training] select")].map(
@@ -95,7 +94,7 @@ def test_every_choice_of_the_page_is_one_of_the_command(visitor, plain):
 
 def test_the_box_is_chosen_while_there_is_one(visitor, library, plain):
     folder = library[0].library.root / "captures" / "choices"
-    tab = at(visitor(), "captures/choices")
+    tab = go(visitor().tab, "captures/choices")
     tab.set_viewport_size({"width": 1200, "height": 900})
     tab.locator("summary", has_text="More").click()
     box = tab.get_by_label("Learn only what is in the box")

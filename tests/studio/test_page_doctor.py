@@ -15,8 +15,8 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import ACTIVE, JobFolder
 from gsplat_edu.scene.views import View
 from processes import Program
-from studio.pages import COMMAND, waiting
-from studio.test_page_watch import at, runs
+from studio.pages import COMMAND, examined, go, waiting
+from studio.test_page_watch import runs
 from waiting import awaited, until_in
 
 __all__ = ["runs"]
@@ -49,18 +49,9 @@ def swapped(library, tmp_path_factory):
     assert Program(COMMAND, words, tmp_path_factory.mktemp("swapped")).ended()[0] == 0
 
 
-def examined(tab):
-    part = tab.get_by_role("region", name="doctor")
-    # "Examine again" would show older findings meanwhile
-    part.get_by_role("button", name="Examine", exact=True).click()
-    part.get_by_role("button", name="Examine again").wait_for()
-    part.locator(".findings li").first.wait_for()
-    return part
-
-
 def test_exposure_jumps_are_corrected_by_a_button(visitor, library, jumping):
     person = visitor()
-    tab = at(person, f"captures/{jumping}")
+    tab = go(person.tab, f"captures/{jumping}")
     part = examined(tab)
     said = part.locator(".found").inner_text()
     assert "exposure correction" in said and not COMMANDS.search(said), said
@@ -72,7 +63,7 @@ def test_exposure_jumps_are_corrected_by_a_button(visitor, library, jumping):
 
 
 def test_a_training_that_a_finding_began_is_undone(visitor, library, jumping):
-    tab = at(visitor(), f"captures/{jumping}")
+    tab = go(visitor().tab, f"captures/{jumping}")
     examined(tab).get_by_role("button", name="Train with exposure correction").first.click()
     tab.wait_for_url(re.compile(f"#/runs/{jumping}"))
     job = library[0].queue.jobs()[-1]
@@ -89,7 +80,7 @@ def test_a_training_that_a_finding_began_is_undone(visitor, library, jumping):
 @pytest.mark.parametrize("by", ["mouse", "keyboard"])
 def test_a_press_counts_although_the_page_changes_meanwhile(visitor, library, jumping, by):
     """The findings are shown anew while the button is pressed."""
-    tab, other = (at(visitor(), f"captures/{jumping}") for _ in range(2))
+    tab, other = (go(visitor().tab, f"captures/{jumping}") for _ in range(2))
     begin = examined(tab).get_by_role("button", name="Train with exposure correction").first
     begin.hover()
     begin.focus()
@@ -125,7 +116,7 @@ def test_every_tab_offers_the_undo_until_the_result_is_kept_or_undone(visitor, l
     person, other = visitor(), visitor()
     tabs = [person.tab, other.tab]
     for undone in (False, True):
-        tab = at(person, f"captures/{jumping}")
+        tab = go(person.tab, f"captures/{jumping}")
         tab.get_by_role("button", name="Start training").wait_for()
         if undone:
             tab.get_by_role("button", name="Train with exposure correction").first.wait_for()
@@ -135,7 +126,7 @@ def test_every_tab_offers_the_undo_until_the_result_is_kept_or_undone(visitor, l
         tab.wait_for_url(re.compile(f"#/runs/{jumping}"))
         job = library[0].queue.jobs()[-1]
         # a tab that knows nothing of the button
-        at(other, job.work.outputs[0])
+        go(other.tab, job.work.outputs[0])
         for one in tabs:
             one.locator(".begun", has_text="“Train with exposure correction” began this training").wait_for()
         assert grave_faults(other.tab) == []
@@ -214,7 +205,7 @@ def test_a_training_is_undone_once_and_only_if_a_proposal_began_it(page, studio)
 
 def test_a_photo_of_a_finding_is_left_out_and_taken_back(visitor, library, jumping):
     person = visitor()
-    tab = at(person, f"captures/{jumping}")
+    tab = go(person.tab, f"captures/{jumping}")
     capture = library[0].library.root / "captures" / jumping
     part = examined(tab)
     figure = part.locator(
@@ -237,7 +228,7 @@ def test_a_photo_of_a_finding_is_left_out_and_taken_back(visitor, library, jumpi
 
 
 def test_findings_that_are_shown_anew_keep_the_focus_and_what_was_unfolded(visitor, library, jumping):
-    tab = at(visitor(), f"captures/{jumping}")
+    tab = go(visitor().tab, f"captures/{jumping}")
     part = examined(tab)
     part.locator("summary", has_text="Facts").click()
     leave = part.get_by_role("button", name=re.compile("^Leave out")).nth(1)
@@ -252,7 +243,7 @@ def test_findings_that_are_shown_anew_keep_the_focus_and_what_was_unfolded(visit
 def test_a_run_is_trained_again_without_a_photo_of_a_wrong_pose(visitor, library, swapped):
     person = visitor()
     capture = library[0].library.root / "captures" / "swapped"
-    tab = at(person, "runs/swapped/judge")
+    tab = go(person.tab, "runs/swapped/judge")
     part = examined(tab)
     part.locator("summary", has_text="Facts").click()
     facts = part.locator("details table").inner_text()
@@ -289,7 +280,7 @@ def test_a_list_that_leaves_nothing_or_names_no_photo_is_refused(page, studio):
 
 def test_a_short_run_is_trained_longer_by_a_button(visitor, library, runs):
     person = visitor()
-    part = examined(at(person, "runs/egg/judge"))
+    part = examined(go(person.tab, "runs/egg/judge"))
     said = part.locator(".found").inner_text()
     assert "short training" in said and not COMMANDS.search(said), said
     with waiting(library[0]):
@@ -301,7 +292,7 @@ def test_a_short_run_is_trained_longer_by_a_button(visitor, library, runs):
 
 def test_pause_and_stop_name_no_files_and_no_options(visitor, runs):
     person = visitor()
-    tab = at(person, "captures/egg")
+    tab = go(person.tab, "captures/egg")
     tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill("100000")
     tab.get_by_role("button", name="Start training").click()

@@ -5,15 +5,16 @@ import re
 import struct
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag, inside
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.formats import read_scene
-from studio.pages import visitor_of
+from studio.pages import go, visitor_of
 from waiting import awaited, pass_time, until_in
 
 
 def opened(tab, address):
     """Go to the editor's screen and return the frame with the editor."""
-    tab.goto(f"{address}#/scenes/wall/edit")
+    go(tab, "scenes/wall/edit")
     # by its title, because the screen before this one may have had a scene as well
     frame = tab.wait_for_selector("iframe[title='editor of wall']:not([hidden])").content_frame()
     frame.wait_for_selector("#edit")
@@ -48,11 +49,7 @@ def select_and_delete(tab, frame, corners):
     """Drag a rectangle over a part of the picture, in fractions of its size, and delete the selected splats."""
     frame.get_by_role("button", name="rectangle", exact=True).click()
     box = frame.locator("#canvas").bounding_box()
-    (a, b), (c, d) = corners
-    tab.mouse.move(box["x"] + a * box["width"], box["y"] + b * box["height"])
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + c * box["width"], box["y"] + d * box["height"], steps=3)
-    tab.mouse.up()
+    drag(tab, *inside(box, *corners))
     frame.get_by_role("button", name="delete", exact=True).click()
 
 
@@ -184,11 +181,11 @@ def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
         key for key in keys if key != "backspace" and key.replace("Shift+", "") not in " ".join(shown)
     ] == []
 
-    tab.goto(f"{address}#/")
+    go(tab, "")
     for name in ("one", "two"):
         (library[0].library.root / "captures" / name).mkdir()
         library[0].library.remove("captures", name)
-    tab.goto(f"{address}#/trash")
+    go(tab, "trash")
     tab.get_by_role("button", name="Restore").nth(1).wait_for()
     tab.get_by_role("button", name="Restore").first.focus()
     tab.keyboard.press("Enter")
@@ -250,7 +247,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     tab.set_viewport_size({"width": 1000, "height": 620})
     address = tab.url.split("#")[0]
     stored.unlink(missing_ok=True)
-    tab.goto(f"{address}#/")
+    go(tab, "")
     card = tab.locator("a.card", has_text="wall").locator("img")
     tab.locator("a.card", has_text="wall").scroll_into_view_if_needed()
     until_in(tab, tab, "document.querySelector('a.card[href*=wall] img').naturalWidth > 0")
@@ -286,7 +283,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     document = json.loads(stored.read_text())
     document["scene"]["sha256"] = "0" * 64
     stored.write_text(json.dumps(document))
-    tab.goto(f"{address}#/scenes/wall")
+    go(tab, "scenes/wall")
     tab.reload()
     tab.get_by_text("The saved edits are not shown.").wait_for()
     shows(176)
@@ -333,7 +330,7 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
     until_in(tab, tab, "localStorage.length === 0")
 
     stored.unlink()
-    tab.goto(f"{address}#/")
+    go(tab, "")
     closed_with_edits()
     other = wall_entry.parent / "other"
     other.mkdir()
@@ -341,7 +338,7 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
     opacity = struct.pack("<f", 3.0)  # of the last splat, before three scales and a quaternion
     assert scene[-32:-28] == struct.pack("<f", 4.0)
     (other / "other.ply").write_bytes(scene[:-32] + opacity + scene[-28:])
-    tab.goto(f"{address}#/scenes/other/edit")
+    go(tab, "scenes/other/edit")
     frame = tab.wait_for_selector("iframe[title='editor of other']:not([hidden])").content_frame()
     until_in(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
     pass_time(tab, 1500)

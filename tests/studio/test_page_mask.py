@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag, inside, swipe
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.drawn_masks import DRAWN, read_drawings
@@ -18,9 +19,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import Work
 from gsplat_edu.scene.views import View
 from processes import Program
-from studio.pages import COMMAND, waiting
-from studio.test_page_doctor import examined
-from studio.test_page_watch import at
+from studio.pages import COMMAND, examined, go, mask_dialog, waiting
 from waiting import until_in
 
 W, H = 96, 72
@@ -46,27 +45,9 @@ def hidden(capture, name):
     return np.zeros((H, W), bool) if mask is None else ~mask
 
 
-def opened(tab, photo):
-    """Press the button of a photo in the gallery; return the dialog and the box of the photo in it."""
-    tab.get_by_role("region", name="photos").get_by_role(
-        "button", name=re.compile(f"[Mm]ask.*: .*{photo}")
-    ).click()
-    dialog = tab.locator("dialog.mask[open]")
-    dialog.wait_for()
-    sheet = dialog.locator("svg")
-    until_in(tab, tab, "document.activeElement === document.querySelector('dialog.mask svg')")
-    until_in(tab, tab, "document.querySelector('.sheet img').complete")
-    return dialog, sheet.bounding_box()
-
-
-def drag(tab, box, *points):
-    """Press at the first of some points of the photo, px, move along the others, release."""
-    places = [(box["x"] + x / W * box["width"], box["y"] + y / H * box["height"]) for x, y in points]
-    tab.mouse.move(*places[0])
-    tab.mouse.down()
-    for place in places[1:]:
-        tab.mouse.move(*place, steps=4)
-    tab.mouse.up()
+def draw(tab, box, *points):
+    """Drag along some points of the photo, px."""
+    drag(tab, *inside(box, *((x / W, y / H) for x, y in points)))
 
 
 def saved(dialog, said="Saved. "):
@@ -82,16 +63,16 @@ def test_a_rectangle_and_an_outline_are_drawn_undone_saved_and_removed(visitor, 
     before = {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
     person = visitor()
     person.tab.set_viewport_size({"width": size[0], "height": size[1]})
-    tab = at(person, f"captures/{capture.name}")
-    dialog, box = opened(tab, "view_001")
+    tab = go(person.tab, f"captures/{capture.name}")
+    dialog, box = mask_dialog(tab, "view_001")
     assert "has a mask of its own" in dialog.inner_text()
     assert dialog.get_by_role("button", name="Save").is_disabled()
-    drag(tab, box, (10, 8), (40, 26))
+    draw(tab, box, (10, 8), (40, 26))
     dialog.get_by_text("1 shape, not saved").wait_for()
     dialog.get_by_role("radio", name="outline").check()
-    drag(tab, box, (60, 5), (90, 5), (90, 35), (60, 35))
+    draw(tab, box, (60, 5), (90, 5), (90, 35), (60, 35))
     dialog.get_by_text("2 shapes, not saved").wait_for()
-    drag(tab, box, (1, 1), (20, 1), (20, 40))
+    draw(tab, box, (1, 1), (20, 1), (20, 40))
     tab.keyboard.press("Control+z")
     dialog.get_by_text("2 shapes, not saved").wait_for()
     command = saved(dialog)
@@ -110,7 +91,7 @@ def test_a_rectangle_and_an_outline_are_drawn_undone_saved_and_removed(visitor, 
     assert (capture / "masks" / "view_001.png").read_bytes() == drawn
     dialog.get_by_role("button", name="Close").click()
     tab.reload()
-    dialog, box = opened(tab, "view_001")
+    dialog, box = mask_dialog(tab, "view_001")
     dialog.get_by_text("2 shapes.").wait_for()
     dialog.get_by_role("button", name="Remove all").click()
     assert saved(dialog, "Removed. ").endswith("--undo")
@@ -119,8 +100,8 @@ def test_a_rectangle_and_an_outline_are_drawn_undone_saved_and_removed(visitor, 
 
 
 def test_the_keyboard_draws_and_escape_gives_up_the_begun_shape_first(visitor, capture):
-    tab = at(visitor(), f"captures/{capture.name}")
-    dialog, _ = opened(tab, "view_002")
+    tab = go(visitor().tab, f"captures/{capture.name}")
+    dialog, _ = mask_dialog(tab, "view_002")
     press = tab.keyboard.press
     for key in ("Shift+ArrowLeft", "Enter", "ArrowRight", "Escape"):
         press(key)
@@ -143,24 +124,24 @@ def test_a_brush_paints_beside_the_photo_too_and_a_command_repeats_it(visitor, c
     before = {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
     person = visitor()
     person.tab.set_viewport_size({"width": size[0], "height": size[1]})
-    tab = at(person, f"captures/{capture.name}")
-    dialog, box = opened(tab, "view_002")
+    tab = go(person.tab, f"captures/{capture.name}")
+    dialog, box = mask_dialog(tab, "view_002")
     tip, slider = dialog.locator(".tip"), dialog.get_by_role("slider", name="radius of the brush")
     assert slider.is_hidden() and tip.is_hidden()
     dialog.get_by_role("radio", name="brush").check()
     assert slider.input_value() == "2"  # of 96 px
-    drag(tab, box, (20, 30))  # a tap
+    draw(tab, box, (20, 30))  # a tap
     assert (tip.get_attribute("r"), tip.get_attribute("cx"), tip.get_attribute("cy")) == ("2", "20", "30")
     dialog.get_by_text("1 shape, not saved").wait_for()
     for key in "]]]":
         tab.keyboard.press(key)
     assert slider.input_value() == tip.get_attribute("r") == "5"
     tab.keyboard.press("[")
-    drag(tab, box, (80, 60), (94, 60), (102, 60))  # out of the photo
+    draw(tab, box, (80, 60), (94, 60), (102, 60))  # out of the photo
     dialog.get_by_text("2 shapes, not saved").wait_for()
     slider.fill("9")
     assert dialog.locator(".brush").inner_text() == "9 px"
-    drag(tab, box, (40, 40), (60, 40))
+    draw(tab, box, (40, 40), (60, 40))
     tab.keyboard.press("Control+z")
     dialog.get_by_text("2 shapes, not saved").wait_for()
     assert dialog.locator(".strokes:not(.trace) path").count() == 2
@@ -178,14 +159,14 @@ def test_a_brush_paints_beside_the_photo_too_and_a_command_repeats_it(visitor, c
     assert main(words[1:]) == 0
     assert (capture / "masks" / "view_002.png.png").read_bytes() == drawn
     dialog.get_by_role("button", name="Close").click()
-    dialog, _ = opened(tab, "view_002")
+    dialog, _ = mask_dialog(tab, "view_002")
     assert dialog.locator(".strokes:not(.trace) path").count() == 2
     assert grave_faults_in_all_styles(tab) == []
 
 
 def test_keys_and_a_long_way_paint_as_well(visitor, capture):
-    tab = at(visitor(), f"captures/{capture.name}")
-    dialog, _ = opened(tab, "view_002")
+    tab = go(visitor().tab, f"captures/{capture.name}")
+    dialog, _ = mask_dialog(tab, "view_002")
     dialog.get_by_role("radio", name="brush").check()
     dialog.locator("svg").focus()
     for key in ("Shift+ArrowLeft", "Enter", "Enter"):
@@ -216,18 +197,8 @@ def test_a_finger_draws(browser, library, capture):
     context = browser.new_context(has_touch=True, is_mobile=True, viewport={"width": 390, "height": 844})
     tab = context.new_page()
     tab.goto(f"{library[1]}#/captures/{capture.name}")
-    dialog, box = opened(tab, "view_002")
-    session = context.new_cdp_session(tab)
-    for kind, x, y in (
-        ("touchStart", 0.1, 0.1),
-        ("touchMove", 0.3, 0.2),
-        ("touchMove", 0.5, 0.4),
-        ("touchEnd", 0, 0),
-    ):
-        spots = [{"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"]}]
-        session.send(
-            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [] if kind == "touchEnd" else spots}
-        )
+    dialog, box = mask_dialog(tab, "view_002")
+    swipe(tab, *inside(box, (0.1, 0.1), (0.3, 0.2), (0.5, 0.4)))
     dialog.get_by_text("1 shape, not saved").wait_for()
     saved(dialog)
     assert hidden(capture, "view_002.png")[9:26, 12:46].all()
@@ -247,13 +218,13 @@ def swapped(library, tmp_path_factory):
 
 
 def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swapped):
-    tab = at(visitor(), "runs/wrong/judge")
+    tab = go(visitor().tab, "runs/wrong/judge")
     part = examined(tab)
     part.get_by_role("button", name="Mask this: view_005.png").first.click()
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
     until_in(tab, tab, "document.querySelector('.sheet img').complete")
-    drag(tab, dialog.locator("svg").bounding_box(), (10, 10), (80, 60))
+    draw(tab, dialog.locator("svg").bounding_box(), (10, 10), (80, 60))
     saved(dialog)
     dialog.get_by_role("button", name="Close").click()
     with waiting(library[0]):

@@ -8,6 +8,7 @@ import pytest
 
 from gsplat_edu.io.mesh_files import read_mesh, write_mesh
 from gsplat_edu.scene.mesh import Mesh
+from studio.pages import go
 from waiting import until_in
 
 
@@ -21,7 +22,7 @@ def viewer_frame(tab):
 def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library, wall_entry):
     person = visitor()
     tab = person.tab
-    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall/share")
+    go(tab, "scenes/wall/share")
     section = tab.get_by_role("region", name="mesh")
     assert not section.get_by_role("button", name="Show beside the splats").is_visible()
     assert not section.get_by_text("texture of the photos").is_visible()  # a scene has no photos
@@ -64,7 +65,7 @@ def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_ent
     exports.mkdir()
     person = visitor()
     tab = person.tab
-    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall/share")
+    go(tab, "scenes/wall/share")
     tab.get_by_label("Title and name of the file").fill("plain")
     box = tab.get_by_label("show the mesh")
     tab.get_by_role("button", name="Export").click()

@@ -4,7 +4,7 @@ import json
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from studio.pages import DROP, encoded, png, visitor_of
+from studio.pages import DROP, encoded, go, png, visitor_of
 from waiting import until_in
 
 
@@ -50,7 +50,7 @@ def test_a_tab_learns_of_the_library_by_the_stream(visitor):
     person.tab.get_by_label("Name", exact=True).fill("told by the stream")
     person.tab.get_by_role("button", name="Rename").click()
     other.locator("a.card", has_text="told by the stream").wait_for()
-    other.goto(f"{other.url.split('#')[0]}#/photos/told by the stream")
+    go(other, "photos/told by the stream")
     other.locator(".thumbs img").first.wait_for()
     person.tab.locator("h1", has_text="told by the stream").wait_for()
     person.tab.locator("summary", has_text="Rename or remove").click()
@@ -67,7 +67,7 @@ def test_what_came_from_a_capture_is_renamed_with_it(visitor, library):
         (root / "runs" / name / "config.json").write_text(json.dumps(config))
     person = visitor()
     tab = person.tab
-    tab.goto(f"{tab.url.split('#')[0]}#/captures/toad")
+    go(tab, "captures/toad")
     tab.locator("summary", has_text="Rename or remove").click()
     too = tab.get_by_role("checkbox", name="rename what came from it, too: run toad, run toad-run-2")
     too.wait_for()
@@ -78,5 +78,5 @@ def test_what_came_from_a_capture_is_renamed_with_it(visitor, library):
     listed = tab.get_by_role("region", name="runs")
     listed.get_by_role("link").nth(2).wait_for()
     assert sorted(listed.get_by_role("link").all_inner_texts()) == ["frog", "frog-run-2", "other"]
-    tab.goto(f"{tab.url.split('#')[0]}#/runs/other")
+    go(tab, "runs/other")
     tab.get_by_role("link", name="frog", exact=True).wait_for()

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
-from studio.pages import DROP, encoded
+from studio.pages import DROP, encoded, go
 from waiting import until_in
 
 NEXT = re.compile("^Next: ")
@@ -96,7 +96,7 @@ def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tm
     person.reach("#/photos/photos")
 
     press_next(tab, "Find the poses")
-    tab.goto(f"{tab.url.split('#')[0]}#/")
+    go(tab, "")
     press_next(tab, "Start training", 240)
     press_next(tab, "Start it")
     person.reach("#/runs/photos")
@@ -109,7 +109,7 @@ def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tm
         press_next(tab, "Save photos.html")
     assert download.value.suggested_filename == "photos.html"
 
-    tab.goto(f"{tab.url.split('#')[0]}#/")
+    go(tab, "")
     tab.locator(".project").first.wait_for()
     assert tab.locator(".project").count() == 1
     check_access(tab, "Library")

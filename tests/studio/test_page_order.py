@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag, inside
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.drawn_masks import read_drawings
 from gsplat_edu.data.left_out import read_left_out
@@ -14,8 +15,7 @@ from gsplat_edu.data.region import read_region, write_region
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.region import Region
 from gsplat_edu.studio.commands import title_of
-from studio.pages import held_back, visitor_of, waiting
-from studio.test_page_watch import at
+from studio.pages import capture_frame, go, held_back, mask_dialog, visitor_of, waiting
 from waiting import awaited, settle, until_in
 
 REVERSED = """async ([first, second]) => {
@@ -53,22 +53,12 @@ def capture(library, request):
     return folder
 
 
-def framed(tab, folder):
-    """Return the frame with the capture's cameras, once it has started."""
-    section = tab.get_by_role("region", name="cameras")
-    section.scroll_into_view_if_needed()
-    frame = section.locator("iframe:not([hidden])").element_handle().content_frame()
-    frame.wait_for_url(re.compile(f"/captures/{folder.name}/page"), wait_until="commit")
-    until_in(tab, frame, "Boolean(window.viewer?.isWhole)")
-    return frame
-
-
 def test_an_older_answer_does_not_replace_a_newer_one(visitor):
     assert visitor().tab.evaluate(REVERSED, ["older", "newer"]) == ["newer", "newer"]
 
 
 def test_a_photo_left_out_while_the_cameras_load_is_left_out_there(visitor, capture):
-    tab = at(visitor(), f"captures/{capture.name}")
+    tab = go(visitor().tab, f"captures/{capture.name}")
     held = held_back(tab, f"**/captures/{capture.name}/page", lambda request: request.method != "HEAD")
     gallery = tab.get_by_role("region", name="photos")
     gallery.locator(".thumbs li").first.wait_for()
@@ -80,17 +70,17 @@ def test_a_photo_left_out_while_the_cameras_load_is_left_out_there(visitor, capt
     ((route, answer),) = held
     assert "view_002" in answer.text() and '"left_out":true' not in answer.text()
     route.fulfill(response=answer)
-    frame = framed(tab, capture)
+    frame = capture_frame(tab, capture.name)
     assert [one["left_out"] for one in frame.evaluate("viewer.cameras.list")] == [i == 2 for i in range(8)]
 
 
 def test_the_saved_box_is_changed_although_its_page_was_not_there(visitor, capture):
     """Pressed before anybody has scrolled to the cameras, the button shows the box that is saved."""
     write_region(capture, Region(np.array([0.1, 0.0, -0.1]), np.eye(3), np.array([0.3, 0.2, 0.1])))
-    tab = at(visitor(), f"captures/{capture.name}")
+    tab = go(visitor().tab, f"captures/{capture.name}")
     tab.locator("summary", has_text="More").click()
     tab.get_by_role("button", name="Change the box").click()
-    frame = framed(tab, capture)
+    frame = capture_frame(tab, capture.name)
     until_in(tab, frame, "viewer.region.drawing")
     assert frame.evaluate("viewer.region.shape.half") == pytest.approx([0.3, 0.2, 0.1])
 
@@ -102,13 +92,13 @@ def test_a_late_answer_does_not_take_back_the_box(visitor, capture):
         f"**/captures/{capture.name}/region",
         lambda request: request.method == "GET" and request.frame == person.tab.main_frame,
     )
-    tab = at(person, f"captures/{capture.name}")
+    tab = go(person.tab, f"captures/{capture.name}")
     tab.set_viewport_size({"width": 1200, "height": 900})
     tab.locator("summary", has_text="More").click()
     box = tab.get_by_label("Learn only what is in the box")
     awaited(tab, lambda: held)
     tab.get_by_role("button", name="Draw the box").click()
-    framed(tab, capture).get_by_role("button", name="save the box").click()
+    capture_frame(tab, capture.name).get_by_role("button", name="save the box").click()
     tab.get_by_role("button", name="Change the box").wait_for()
     assert read_region(capture) is not None and '"region":null' in held[0][1].text()
     with tab.expect_response(re.compile("/region$")):
@@ -130,7 +120,7 @@ def beside(visitor, library, capture):
         tab.set_viewport_size({"width": 1200, "height": 900})  # smaller pages fold their panels
         tab.goto(f"{library[1]}#/captures/{capture.name}")
         tab.locator(".thumbs li").first.wait_for()
-    return [(tab, framed(tab, capture)) for tab in tabs]
+    return [(tab, capture_frame(tab, capture.name)) for tab in tabs]
 
 
 def test_another_tab_shows_what_is_left_out(visitor, library, capture):
@@ -188,21 +178,8 @@ def test_other_tabs_hear_of_a_removed_export(page, studio):
 
 def masking(tab):
     """Press *Mask this* of the first photo; return the dialog and a function that draws a rectangle, px."""
-    tab.get_by_role("region", name="photos").get_by_role(
-        "button", name=re.compile(r"mask.*: .*view_000", re.IGNORECASE)
-    ).click()
-    dialog = tab.locator("dialog.mask[open]")
-    dialog.wait_for()
-    until_in(tab, tab, "document.querySelector('.sheet img').complete")
-    box = dialog.locator("svg").bounding_box()  # what the dialog says later does not move it
-
-    def draw(x0, y0, x1, y1):
-        tab.mouse.move(box["x"] + x0 / 48 * box["width"], box["y"] + y0 / 36 * box["height"])
-        tab.mouse.down()
-        tab.mouse.move(box["x"] + x1 / 48 * box["width"], box["y"] + y1 / 36 * box["height"], steps=4)
-        tab.mouse.up()
-
-    return dialog, draw
+    dialog, box = mask_dialog(tab, "view_000")
+    return dialog, lambda *corners: drag(tab, *inside(box, *((x / 48, y / 36) for x, y in corners)))
 
 
 def drawn_on(capture):
@@ -215,14 +192,14 @@ def test_a_mask_saved_in_another_tab_is_loaded_beneath_what_is_drawn_here(visito
     (here, _), (there, _) = beside(visitor, library, capture)
     (mine, draw), (other, draw_there) = masking(here), masking(there)
     load = other.get_by_role("button", name="Load the other shapes")
-    draw(2, 2, 10, 10)
+    draw((2, 2), (10, 10))
     mine.get_by_text("1 shape, not saved").wait_for()
     assert load.is_hidden()
     mine.get_by_role("button", name="Save").click()
     # without changes, the other dialog shows what was saved
     other.get_by_text("1 shape, saved in another tab.").wait_for()
-    draw_there(20, 20, 30, 30)
-    draw(12, 2, 18, 10)
+    draw_there((20, 20), (30, 30))
+    draw((12, 2), (18, 10))
     mine.get_by_text("2 shapes, not saved").wait_for()
     mine.get_by_role("button", name="Save").click()
     other.get_by_text("another tab has saved this mask").wait_for()
@@ -233,7 +210,7 @@ def test_a_mask_saved_in_another_tab_is_loaded_beneath_what_is_drawn_here(visito
     assert load.is_hidden() and other.get_by_role("alert").is_hidden()
     there.keyboard.press("Control+z")  # takes back what was drawn here, and nothing else
     other.get_by_text("2 shapes, saved in another tab.").wait_for()
-    draw_there(20, 20, 32, 30)
+    draw_there((20, 20), (32, 30))
     other.get_by_text("3 shapes, not saved").wait_for()
     other.get_by_role("button", name="Save").click()
     mine.get_by_text("3 shapes, saved in another tab.").wait_for()
@@ -241,7 +218,7 @@ def test_a_mask_saved_in_another_tab_is_loaded_beneath_what_is_drawn_here(visito
     # what was removed here stays removed, what was added elsewhere comes
     mine.get_by_role("button", name="Remove all").click()
     mine.get_by_text("Nothing is drawn, not saved").wait_for()
-    draw_there(40, 2, 46, 10)
+    draw_there((40, 2), (46, 10))
     other.get_by_role("button", name="Save").click()
     mine.get_by_role("button", name="Load the other shapes").click()
     mine.get_by_text("1 shape, not saved").wait_for()
@@ -251,10 +228,10 @@ def test_a_mask_saved_in_another_tab_is_loaded_beneath_what_is_drawn_here(visito
 
 def test_a_mask_that_was_changed_unheard_is_not_replaced(visitor, capture):
     """The page does not hear of the command line; saving is refused, and the shapes can be loaded."""
-    tab = at(visitor(), f"captures/{capture.name}")
+    tab = go(visitor().tab, f"captures/{capture.name}")
     tab.set_viewport_size({"width": 1200, "height": 900})
     dialog, draw = masking(tab)
-    draw(2, 2, 10, 10)
+    draw((2, 2), (10, 10))
     tab.route("**/api/library", lambda route: None)  # whatever makes the page ask for the library
     assert main(["mask", str(capture), "images/view_000.png", "brush:3,30,30,40,30"]) == 0
     before = drawn_on(capture)
@@ -276,10 +253,10 @@ def test_a_mask_that_was_changed_unheard_is_not_replaced(visitor, capture):
 def test_a_mask_is_saved_by_this_tab_although_the_library_tells_of_it_first(visitor, capture):
     person = visitor()
     held = held_back(person.tab, "**/mask")  # questions about a mask name a photo; saving does not
-    tab = at(person, f"captures/{capture.name}")
+    tab = go(person.tab, f"captures/{capture.name}")
     tab.set_viewport_size({"width": 1200, "height": 900})
     dialog, draw = masking(tab)
-    draw(2, 2, 10, 10)
+    draw((2, 2), (10, 10))
     with tab.expect_response(re.compile(r"/mask\?photo=")):  # the page looks at what was saved
         dialog.get_by_role("button", name="Save").click()
     dialog.get_by_role("alert").wait_for()
@@ -288,7 +265,7 @@ def test_a_mask_is_saved_by_this_tab_although_the_library_tells_of_it_first(visi
     dialog.get_by_text(re.compile(r"^Saved\. ")).wait_for()  # not "not saved."
     assert dialog.get_by_role("alert").is_hidden()
     assert dialog.get_by_role("button", name="Load the other shapes").is_hidden()
-    draw(12, 2, 18, 10)
+    draw((12, 2), (18, 10))
     dialog.get_by_role("button", name="Save").click()
     awaited(tab, lambda: len(held) == 2)
     assert len(drawn_on(capture)) == 2
@@ -323,7 +300,7 @@ def test_a_restored_entry_does_not_come_back_to_the_trash_with_an_older_list(vis
     for name in ("three", "four"):
         (library[0].library.root / "captures" / name).mkdir()
         library[0].library.remove("captures", name)
-    tab.goto(f"{tab.url.split('#')[0]}#/trash")
+    go(tab, "trash")
     listed = tab.locator("main li")
     listed.nth(1).wait_for()
     held = held_back(tab, "**/api/trash", lambda request: not held)

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from browsers import chromium
+from gestures import drag, inside
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
@@ -20,6 +21,7 @@ from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import picture_camera
 from gsplat_edu.viewer.live_folder import LiveFolder, framed
 from studio.conftest import Inline
+from studio.pages import go
 from waiting import awaited, until_in
 
 CAMERA = """() => {
@@ -58,7 +60,7 @@ def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     tab = person.tab
     tab.set_viewport_size({"width": 800, "height": 700})
     assert tab.evaluate("document.createElement('canvas').getContext('webgl2')") is None
-    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall")
+    go(tab, "scenes/wall")
     frame = framed_viewer(tab)
     frame.locator("#count", has_text="176 splats, drawn by the program that serves this page").wait_for()
     assert "no WebGL2" in frame.inner_text("#count")
@@ -77,16 +79,13 @@ def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     assert psnr(sent, truth.double().numpy()) > 35  # the loss of JPEG of quality 85
 
     box = frame.locator("#canvas").bounding_box()
-    tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"])
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 0.6 * box["height"], steps=2)
-    tab.mouse.up()
+    drag(tab, *inside(box, (0.6, 0.5), (0.8, 0.6)))
     drawn(tab, frame, lambda pixels: np.abs(pixels - before).mean() > 2)  # seen from another side
 
 
 def test_the_editor_reports_missing_webgl_in_one_line(visitor, wall_entry):
     tab = visitor().tab
-    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall/edit")
+    go(tab, "scenes/wall/edit")
     frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
     frame.locator("#message", has_text=re.compile("WebGL2.* gsplat-edu render")).wait_for()
     assert "\n" not in frame.inner_text("#message")
@@ -96,7 +95,7 @@ def test_a_training_is_drawn_while_it_runs(visitor, library, tmp_path):
     write_colmap(library[0].library.root / "captures" / "egg", *procedural_capture(24, 6, splats=60))
     person = visitor()
     tab = person.tab
-    tab.goto(f"{tab.url.split('#')[0]}#/captures/egg")
+    go(tab, "captures/egg")
     tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill("100000")
     tab.get_by_role("button", name="Start training").click()

@@ -9,7 +9,7 @@ from gsplat_edu.data.left_out import LEFT_OUT, read_left_out, write_left_out
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.views import View
-from studio.test_page_watch import at
+from studio.pages import capture_frame, go
 from waiting import until_in
 
 STYLES = "viewer.cameras.list.map((_, i) => [...viewer.cameras.styles.slice(8 * viewer.cameras.firsts[i]).slice(0, 3)])"
@@ -29,19 +29,9 @@ def dimmed(library):
     return folder
 
 
-def cameras(tab):
-    """Scroll to the section and return it with the frame inside, once it has started."""
-    section = tab.get_by_role("region", name="cameras")
-    section.scroll_into_view_if_needed()
-    frame = section.locator("iframe:not([hidden])").element_handle().content_frame()
-    frame.wait_for_url(re.compile("/captures/dimmed/page"), wait_until="commit")
-    until_in(tab, frame, "Boolean(window.viewer?.isWhole) && document.getElementById('message').hidden")
-    return section, frame
-
-
 def test_cameras_are_shown_with_their_photos(visitor, dimmed):
-    tab = at(visitor(), "captures/dimmed")
-    section, frame = cameras(tab)
+    tab = go(visitor().tab, "captures/dimmed")
+    section, frame = tab.get_by_role("region", name="cameras"), capture_frame(tab, "dimmed")
     assert section.get_by_role("heading", name="Where the photos were taken").is_visible()
     assert frame.evaluate("viewer.cameras.list.length") == 16
     frame.evaluate("viewer.choose(4)")
@@ -51,9 +41,9 @@ def test_cameras_are_shown_with_their_photos(visitor, dimmed):
 
 
 def test_findings_color_the_cameras(visitor, library, dimmed):
-    tab = at(visitor(), "captures/dimmed")
+    tab = go(visitor().tab, "captures/dimmed")
     part = tab.get_by_role("region", name="doctor")
-    _, frame = cameras(tab)
+    frame = capture_frame(tab, "dimmed")
     before = frame.evaluate(STYLES)
     assert len({tuple(color) for color in before}) == 1
     part.get_by_role("button", name=re.compile("^Examine")).click()
@@ -69,16 +59,16 @@ def test_findings_color_the_cameras(visitor, library, dimmed):
     assert [color != before[0] for color in after] == marked
     # a page that opens later has the colours as well
     tab.reload()
-    _, frame = cameras(tab)
+    frame = capture_frame(tab, "dimmed")
     until_in(tab, frame, "viewer.cameras.list.some(({ marks }) => marks.includes('exposure'))")
     assert frame.evaluate(STYLES) == after
 
 
 def test_a_photo_is_left_out_in_the_frame_and_taken_back_in_the_gallery(visitor, dimmed):
-    tab = at(visitor(), "captures/dimmed")
+    tab = go(visitor().tab, "captures/dimmed")
     gallery = tab.get_by_role("region", name="photos")
     gallery.locator(".thumbs li").first.wait_for()
-    _, frame = cameras(tab)
+    frame = capture_frame(tab, "dimmed")
     frame.evaluate("viewer.choose(2)")
     frame.locator("#leave").click()
     item = gallery.locator(".thumbs li.left-out")

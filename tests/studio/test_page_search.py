@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from studio.pages import DROP, encoded, png
+from studio.pages import DROP, encoded, go, png
 from waiting import until_in
 
 PRIMARY = "[...document.querySelectorAll('main .primary')].filter((one) => one.checkVisibility())"
@@ -27,14 +27,14 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     )
     assert tab.evaluate(f"{PRIMARY}.map((one) => one.textContent)") == ["Try again"]
 
-    tab.goto(f"{tab.url.split('#')[0]}#/")
+    go(tab, "")
     until_in(tab, tab, "document.querySelectorAll('.project li .badge').length === 2")
     assert tab.locator("a.card").count() == 1, "photos and what was made from them are one project"
     inside = tab.get_by_role("article", name="photos")
     inside.locator("summary", has_text="Everything in it (2)").click()
     assert inside.locator("li", has_text="Capture photos").locator(".badge").inner_text() == "no poses yet"
     inside.get_by_role("link", name=re.compile("^Next: Try again")).wait_for()
-    tab.goto(f"{tab.url.split('#')[0]}#/captures/photos")
+    go(tab, "captures/photos")
     tab.get_by_text("has no poses yet").wait_for()
     assert not tab.get_by_role("button", name="Start training").is_visible()
     assert not tab.get_by_role("button", name="Examine").is_visible()

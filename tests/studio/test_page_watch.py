@@ -11,7 +11,7 @@ from gsplat_edu.edits.document import empty_document
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.runs.source import open_source
 from processes import Program
-from studio.pages import COMMAND, DROP, encoded, png
+from studio.pages import COMMAND, DROP, encoded, frame_of, go, png
 from waiting import awaited, until_in
 
 
@@ -33,17 +33,6 @@ def runs(library, tmp_path_factory):
     return root / "runs"
 
 
-def at(person, place):
-    person.tab.goto(f"{person.tab.url.split('#')[0]}#/{place}")
-    return person.tab
-
-
-def frame_of(tab):
-    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
-    until_in(tab, frame, "Boolean(window.viewer) && document.getElementById('message').hidden")
-    return frame
-
-
 def test_a_scene_that_goes_while_its_frame_opens_is_shown_once_it_is_back(visitor, runs):
     person, refused = visitor(), []
     away = runs.parent / "away"
@@ -59,7 +48,7 @@ def test_a_scene_that_goes_while_its_frame_opens_is_shown_once_it_is_back(visito
             route.continue_()
 
     person.tab.route("**/api/runs/egg/page*", opened)
-    frame_of(at(person, "runs/egg"))
+    frame_of(go(person.tab, "runs/egg"))
     assert refused == [404]
 
 
@@ -67,7 +56,9 @@ def test_a_scene_that_goes_while_its_frame_opens_is_shown_once_it_is_back(visito
 def test_what_the_studio_did_not_answer_is_asked_for_again(visitor, library, runs, tab_name, address):
     person = visitor()
     person.tab.route(f"**/api/runs/egg/{address}", lambda route: route.abort(), times=1)
-    line = at(person, f"runs/egg/{tab_name}").locator("main .error", has_text="The studio does not answer")
+    line = go(person.tab, f"runs/egg/{tab_name}").locator(
+        "main .error", has_text="The studio does not answer"
+    )
     line.wait_for()
     library[0].stream.library_changed()
     line.wait_for(state="hidden")
@@ -76,7 +67,7 @@ def test_what_the_studio_did_not_answer_is_asked_for_again(visitor, library, run
 @pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
 def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     person = visitor()
-    tab = at(person, "runs/egg")
+    tab = go(person.tab, "runs/egg")
     tab.set_viewport_size({"width": size[0], "height": size[1]})
     frame = frame_of(tab)
     until_in(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
@@ -96,7 +87,7 @@ PHOTOS_SHOWN = """() => {
 
 def test_a_photo_that_comes_late_is_not_laid_over_another_view(visitor, runs):
     """The list of photos is on its way when the free view is chosen again."""
-    tab, held = at(visitor(), "runs/egg"), []
+    tab, held = go(visitor().tab, "runs/egg"), []
     frame_of(tab)
     until_in(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
     tab.evaluate(PHOTOS_SHOWN)
@@ -121,7 +112,7 @@ def test_clean_says_what_it_removed_and_carries_the_edits_over(visitor, runs):
     }
     (runs / "egg-2" / "edits.json").write_text(json.dumps(mine))
     person = visitor()
-    tab = at(person, "runs/egg-2/share")
+    tab = go(person.tab, "runs/egg-2/share")
     section = tab.get_by_role("region", name="cleaning")
     tab.get_by_label("apply the edits").wait_for()
     section.get_by_role("button", name="Clean", exact=True).click()
@@ -137,7 +128,7 @@ def test_clean_says_what_it_removed_and_carries_the_edits_over(visitor, runs):
 
 def test_visitors_of_an_exported_run_can_check_it(visitor, runs):
     person = visitor()
-    tab = at(person, "runs/egg/share")
+    tab = go(person.tab, "runs/egg/share")
     box = tab.get_by_label("let visitors check the scene")
     box.check()
     tab.get_by_label("SPZ").first.check()
@@ -156,7 +147,7 @@ def test_visitors_of_an_exported_run_can_check_it(visitor, runs):
 
 
 def test_one_held_out_score_is_a_point(visitor, runs):
-    tab = at(visitor(), "runs/egg")
+    tab = go(visitor().tab, "runs/egg")
     plot = tab.locator(".curve", has_text="PSNR of held-out views").locator("path")
     plot.wait_for(state="attached")
     box = plot.evaluate("(path) => { const { x, width } = path.getBBox(); return [x, width]; }")
@@ -165,7 +156,7 @@ def test_one_held_out_score_is_a_point(visitor, runs):
 
 @pytest.mark.parametrize(("opened", "other"), [("egg", "egg-2"), ("egg-2", "egg")])
 def test_the_better_run_is_named_whichever_was_opened(visitor, runs, opened, other):
-    tab = at(visitor(), f"runs/{opened}/compare/{other}")
+    tab = go(visitor().tab, f"runs/{opened}/compare/{other}")
     facts = tab.get_by_role("region", name="comparison").locator(".facts:not(:empty)")
     facts.wait_for()
     said = facts.inner_text()
@@ -183,7 +174,7 @@ CLOCKS = re.compile(r"\bleft\b")
 def test_a_training_has_one_counter_and_one_clock(visitor, runs):
     """All texts of the screen and of the page inside, of one moment."""
     person = visitor()
-    tab = at(person, "captures/egg")
+    tab = go(person.tab, "captures/egg")
     tab.set_viewport_size({"width": 1440, "height": 900})
     tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill("100000")
@@ -216,7 +207,7 @@ def test_normal_use_leaves_no_errors_in_the_console(visitor, runs):
     person.tab.on(
         "console", lambda message: said.append((message.type, message.text, message.location.get("url")))
     )
-    tab = at(person, "captures/egg")
+    tab = go(person.tab, "captures/egg")
     tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill("150")
     tab.get_by_role("button", name="Start training").click()
@@ -232,7 +223,7 @@ def test_normal_use_leaves_no_errors_in_the_console(visitor, runs):
 
 
 def test_the_report_is_linked(visitor, runs):
-    tab = at(visitor(), "runs/egg/judge")
+    tab = go(visitor().tab, "runs/egg/judge")
     with tab.context.expect_page() as opened:
         tab.get_by_role("link", name="Open the report").click()
     opened.value.locator("body", has_text="held-out photos").wait_for()
@@ -240,7 +231,7 @@ def test_the_report_is_linked(visitor, runs):
 
 @pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
 def test_nothing_pushes_the_pictures_down(visitor, runs, size):
-    tab = at(visitor(), "runs/egg")
+    tab = go(visitor().tab, "runs/egg")
     tab.set_viewport_size({"width": size[0], "height": size[1]})
     frame_of(tab)
     if size[0] > 960:  # two columns

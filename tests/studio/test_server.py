@@ -21,21 +21,22 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.viewer.serve import REQUEST_SECONDS
 from processes import Program
-from waiting import PATIENCE, until
+from waiting import HERE, PATIENCE, until
 
 HELD = """
-import sys, time
+import sys
 from pathlib import Path
 from gsplat_edu.cli.main import main
 
 if sys.argv[1] == "train":
+    sys.path.append({tests!r})
     from gsplat_edu.runs.training import CaptureRun
+    from waiting import until
     train = CaptureRun.train
 
     def held(run, stop, callbacks=()):
         def wait(trainer, event):
-            while trainer.iteration >= 390 and not Path({goes_on!r}).exists() and not stop():
-                time.sleep(0.01)
+            until(lambda: trainer.iteration < 390 or Path({goes_on!r}).exists() or stop())
         return train(run, stop, [*callbacks, wait])
 
     CaptureRun.train = held
@@ -154,7 +155,7 @@ def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, captu
     """
     folder, zipped = capture
     library, run, goes_on = tmp_path / "library", tmp_path / "library" / "runs" / "box", tmp_path / "goes on"
-    program = ("-c", HOLDS.format(held=HELD.format(goes_on=str(goes_on))))
+    program = ("-c", HOLDS.format(held=HELD.format(goes_on=str(goes_on), tests=HERE)))
     server = served("--jobs", "2", program=program)
     assert server.client.put("/api/captures/box/zip", content=zipped).json()["files"] > 14
     options = {"iterations": 400, "save_every": 50, "seed": 3}

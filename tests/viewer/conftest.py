@@ -1,96 +1,22 @@
 """Fixtures: scenes, and a browser without a network."""
 
-import base64
 from collections import defaultdict
+from contextlib import ExitStack
 
-import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.source import Source
+from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.viewer import page
+from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
-from viewer.handles import until
-
-PIXELS = """async (camera) => {
-  const { pixels } = await viewer.setCamera(camera);
-  const bytes = new Uint8Array(pixels.buffer);
-  let text = "";
-  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
-  return btoa(text);
-}"""
-
-
-def described(camera):
-    """Return the camera in the form that the page expects."""
-    numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
-    return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
-
-
-def picture_of(tab, camera):
-    """Return the picture that the page in a tab draws from this camera, (H, W, 3) float32."""
-    encoded = tab.evaluate(PIXELS, described(camera))
-    return np.frombuffer(base64.b64decode(encoded), "<f4").reshape(camera.H, camera.W, 3)
-
-
-READING = "GPU stall due to ReadPixels"
-"""Message that Chromium's driver sometimes logs if a test reads the page's pixels. A page that watches a training
-must not cause it, so `test_live_browser.py` does not ignore it."""
-
-
-RESTS = "Boolean(window.viewer?.isWhole && !viewer.frameAsked && !viewer.catching && !viewer.timing)"
-"""Whether a page draws nothing more by itself."""
-
-
-class Visit:
-    """An open page. It records the console messages, errors and requests."""
-
-    def __init__(self, tab):
-        self.tab = tab
-        self.complaints = []
-        self.requests = []
-        self._heard = {
-            "console": lambda message: self.complaints.append(f"{message.type}: {message.text}"),
-            "pageerror": lambda error: self.complaints.append(str(error)),
-            "request": lambda request: self.requests.append(request.url),
-        }
-        for event, note in self._heard.items():
-            tab.on(event, note)
-
-    def leave(self):
-        """Empty the tab for the next visit."""
-        for event, note in self._heard.items():
-            self.tab.remove_listener(event, note)
-        self.tab.goto("about:blank")
-
-    def open(self, path):
-        self.tab.goto(path.as_uri())
-        return self
-
-    def ready(self):
-        """Wait until the page shows its whole picture, which a slow computer draws in parts, and rests."""
-        self.tab.wait_for_selector("#message", state="hidden")
-        until(self.tab, RESTS)
-        return self
-
-    def message(self, text):
-        """Wait until the page shows this message."""
-        self.tab.wait_for_selector(f'#message:has-text("{text}")')
-
-    def camera(self):
-        """Return the camera of the current view."""
-        found = self.tab.evaluate("viewer.camera()")
-        for other in ("name", "held_out", "saved", "text"):
-            found.pop(other, None)
-        return Camera(**found)
-
-    def picture(self, camera):
-        """Return the page's picture from this camera, (H, W, 3) float32."""
-        return picture_of(self.tab, camera)
+from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
+from viewer.pages import Editor, Visit, picture_of, running
 
 
 @pytest.fixture
@@ -107,21 +33,34 @@ def tabs(browser):
 
 @pytest.fixture
 def visit(browser, tabs):
-    """Return a function that opens tabs without a network. A tab that logs a complaint or requests another address
-    fails."""
+    """Return a function that opens tabs. A tab that logs a complaint or requests another address fails.
+
+    A fixture that serves a page is named before this one, so that tabs close before their server ends.
+    """
     visits = []
 
-    def make(width=320, height=200, *, fresh=False, **options):
-        """Open a tab of this size; a `fresh` one if the test leaves init scripts, keys or clicks in it."""
-        free = None if fresh else tabs[repr(sorted(options.items()))]
+    def make(width=320, height=200, *, fresh=False, url="", kind=Visit, **options):
+        """Open a tab of this size.
+
+        Args:
+            width: Of the window, CSS px.
+            height: Of the window, CSS px.
+            fresh: Whether the test leaves init scripts, keys or clicks in the tab.
+            url: The page of a server. Without it, the tab has no network.
+            kind: The class of the page.
+            options: Those of Playwright for a window.
+        """
+        free = None if fresh or url else tabs[repr(sorted(options.items()))]
         if free:
             tab = free.pop()
         else:
             context = browser.new_context(**options)
-            context.set_offline(True)
+            context.set_offline(not url)
             tab = context.new_page()
         tab.set_viewport_size({"width": width, "height": height})
-        visits.append((Visit(tab), free))
+        visits.append((kind(tab, url.partition("?")[0] or "file:"), free))
+        if url:
+            tab.goto(url)
         return visits[-1][0]
 
     yield make
@@ -132,8 +71,7 @@ def visit(browser, tabs):
             one.leave()
             free.append(one.tab)
     for one, _ in visits:
-        assert [text for text in one.complaints if READING not in text] == []
-        assert [url for url in one.requests if not url.startswith(("file:", "blob:", "data:"))] == []
+        one.check()
 
 
 @pytest.fixture
@@ -190,15 +128,35 @@ def three_views(camera):
 
 @pytest.fixture
 def edit_page(visit, tmp_path):
-    """Return a function that opens a scene's page with the editor."""
+    """Return a function that writes a scene and its page with the editor, and opens the page."""
 
-    def make(gaussians, cameras=(), width=900, height=700, **options):
-        source = Source(tmp_path / "s.ply", Scene(gaussians), cameras, RenderSettings(jacobian_limit=1.3))
-        editing = editing_of(source, tmp_path / "s.ply", tmp_path / "edits.json")
-        html = page.html(source.scene, cameras, source.settings, "scene", (), editing=editing)
+    def make(gaussians, cameras=(), width=900, height=700, *, origin=(0.0, 0.0, 0.0), tour=None, **options):
+        """Other options are those of `visit`."""
+        settings = RenderSettings(jacobian_limit=1.3, depth=False)
+        source = Source(tmp_path / "scene.ply", Scene(gaussians, origin=origin), cameras, settings)
+        write_scene(tmp_path / "scene.ply", source.scene)
+        editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
+        html = page.html(source.scene, cameras, source.settings, "scene", (), tour, editing)
         (tmp_path / "edit.html").write_bytes(html)
-        shown = visit(width=width, height=height, fresh=True, **options).open(tmp_path / "edit.html").ready()
-        shown.tab.wait_for_selector("#edit")
-        return shown
+        return visit(width, height, kind=Editor, **options).open(tmp_path / "edit.html").ready()
 
     return make
+
+
+@pytest.fixture
+def edit_site(tmp_path):
+    """Return a function that serves a scene with the editor, which saves edits.json."""
+    with ExitStack() as stack:
+
+        def make(gaussians):
+            scene, file = tmp_path / "scene.ply", tmp_path / "edits.json"
+            write_scene(scene, Scene(gaussians))
+            source = open_source(scene)
+            policy = page_parts.policy(page_parts.EDITOR)
+            server = stack.enter_context(EditServer("127.0.0.1", 0, policy, file))
+            server.prepare(identity_of(source.scene), scene)
+            editing = editing_of(source, scene, file, ADDRESS)
+            server.page = page.html(source.scene, (), source.settings, "scene", editing=editing)
+            return stack.enter_context(running(server))
+
+        yield make

@@ -34,29 +34,8 @@ def shape(shown):
     return {name: np.array(value) for name, value in found.items()}
 
 
-def drag(shown, start, end):
-    mouse = shown.tab.mouse
-    mouse.move(*start)
-    mouse.down()
-    mouse.move(*((np.asarray(start) + end) / 2))
-    mouse.move(*end)
-    mouse.up()
-
-
 def about(axis, angle):
     return Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix()
-
-
-FRAME = "new Promise((done) => requestAnimationFrame(() => setTimeout(done)))"
-"""Resolves after the next frame, before which a page gets the moves of fingers."""
-
-
-def touch(session, kind, *points):
-    """Put fingers down at some points, move them there, or lift those that have no point; wait until the page has heard
-    of it."""
-    points = [{"x": float(x), "y": float(y), "id": i} for i, (x, y) in enumerate(points)]
-    session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-    session.send("Runtime.evaluate", {"expression": FRAME, "awaitPromise": True})
 
 
 def until(tab, expression):

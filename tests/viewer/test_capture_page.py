@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import threading
 import urllib.error
 import urllib.request
 
@@ -12,6 +11,7 @@ import pytest
 from PIL import Image
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag
 from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
@@ -19,8 +19,8 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.viewer import capture_page
 from gsplat_edu.viewer.capture_serve import CaptureServer, Examination
 from viewer.captures import measured, ring
-from viewer.conftest import READING
 from viewer.handles import until
+from viewer.pages import running
 
 REFUSED = "the server responded with a status of 400"
 """What Chromium logs about an answer that the page shows to the user."""
@@ -41,40 +41,21 @@ def folder(tmp_path, request):
 @pytest.fixture
 def served(folder):
     """Serve the capture."""
-    with CaptureServer("127.0.0.1", 0, capture_page.policy(), folder) as server:
+    with CaptureServer("127.0.0.1", 0, capture_page.policy(), folder) as server, running(server):
         server.prepare("egg & spoon")
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
         yield server
-        server.shutdown()
-        thread.join(10)
 
 
 @pytest.fixture
-def opened(browser, served):
-    """Open the page; console messages, errors, and requests to other servers fail the test."""
-    made, complaints = [], []
+def opened(served, visit):
+    """Return a function that opens the page in a tab."""
 
-    def visit(width=900, height=600, **options):
-        context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        tab = context.new_page()
-        made.append(context)
-        tab.on("console", lambda message: complaints.append(f"{message.type}: {message.text}"))
-        tab.on("pageerror", lambda error: complaints.append(str(error)))
-        tab.on("request", lambda request: foreign(request.url))
-        tab.goto(served.url)
-        tab.wait_for_selector("#message", state="hidden")
-        until(tab, "viewer.isWhole")
-        return tab
+    def make(width=900, height=600, **options):
+        shown = visit(width, height, url=served.url, **options).ready()
+        shown.expected = REFUSED
+        return shown.tab
 
-    def foreign(url):
-        if not url.startswith((f"http://127.0.0.1:{served.server_port}/", "blob:", "data:")):
-            complaints.append(url)
-
-    yield visit
-    for context in made:
-        context.close()
-    assert [text for text in complaints if READING not in text and REFUSED not in text] == []
+    return make
 
 
 def view_of(tab):
@@ -140,57 +121,7 @@ def test_a_capture_without_points_shows_its_cameras(opened):
     assert np.ptp(before.reshape(-1, 3), axis=0).max() > 100  # outlines on the backdrop
 
 
-def test_outlines_are_drawn_where_the_cameras_project_them(opened):
-    """Without points, path and arc, the drawn pixels are exactly those near the lines between projected corners."""
-    tab = opened()
-    tab.evaluate("""() => {
-      for (const id of ["show-points", "show-path"]) document.getElementById(id).click();
-      viewer.cameras.arc = viewer.cameras.count;
-      viewer.paint();
-    }""")
-    picture = pixels(tab)
-    ground = picture[-1, -1]
-    drawn = np.abs(picture - ground).sum(axis=2) > 120
-    H, W = drawn.shape
-    rows, columns = np.indices((H, W))
-    near, close = np.zeros((H, W), bool), np.zeros((H, W), bool)
-    for index in range(tab.evaluate("viewer.cameras.list.length")):
-        eye, *rim = corners_of(tab, index)
-        pairs = [(rim[k], rim[(k + 1) % 4]) for k in range(4)] + [(eye, corner) for corner in rim]
-        top = (
-            np.minimum.reduce([*rim, eye]) - 30,
-            np.maximum.reduce([*rim, eye]) + 30,
-        )  # with the mark above the image
-        near |= ((columns > top[0][0]) & (columns < top[1][0]) & (rows > top[0][1]) & (rows < top[1][1]))  # fmt: skip
-        for a, b in pairs:
-            along = b - a
-            share = ((columns - a[0]) * along[0] + (rows - a[1]) * along[1]) / max(along @ along, 1e-9)
-            share = share.clip(0, 1)
-            close |= np.hypot(a[0] + share * along[0] - columns, a[1] + share * along[1] - rows) < 0.3
-    assert close.sum() > 500
-    assert drawn[close].mean() > 0.99
-    assert not (drawn & ~near).any()
-
-
-def test_points_are_drawn_where_the_view_projects_them(opened, served):
-    tab = opened()
-    tab.evaluate("document.getElementById('show-path').click()")
-    positions = np.array(tab.evaluate("[...viewer.positions]")).reshape(-1, 3)
-    view = view_of(tab)
-    with_points = pixels(tab)
-    tab.evaluate("document.getElementById('show-points').click()")
-    changed = (with_points != pixels(tab)).any(axis=2)
-    u, v, _ = view.project(view.world_to_cam(positions))
-    inside = (u > 2) & (u < view.W - 3) & (v > 2) & (v < view.H - 3)
-    expected = np.zeros(changed.shape, bool)
-    reach = np.arange(-2, 3)
-    for x, y in zip(np.rint(u[inside]).astype(int), np.rint(v[inside]).astype(int), strict=True):
-        expected[np.ix_(y + reach, x + reach)] = True
-    assert changed.sum() > 200
-    assert not (changed & ~expected).any()
-
-
-def test_hovering_shows_the_photo_and_its_name(opened, served):
+def test_a_person_hovers_chooses_steps_orbits_and_looks_through_a_camera(opened, served):
     tab = opened()
     index = alone(tab)
     x, y = middle_of(tab, index)
@@ -218,9 +149,6 @@ def test_hovering_shows_the_photo_and_its_name(opened, served):
     tab.mouse.move(5, 595)
     tab.locator("#hover").wait_for(state="hidden")
 
-
-def test_a_click_chooses_a_photo_and_keys_step(opened):
-    tab = opened()
     index = alone(tab)
     tab.mouse.click(*middle_of(tab, index))
     chosen = tab.get_by_role("region", name="photo")
@@ -245,15 +173,9 @@ def test_a_click_chooses_a_photo_and_keys_step(opened):
     tab.mouse.click(5, 595)  # where there is none
     assert tab.evaluate("viewer.cameras.chosen") == -1
 
-
-def test_a_drag_orbits_and_chooses_nothing(opened):
-    tab = opened()
     before = view_of(tab)
     x, y = middle_of(tab, alone(tab))
-    tab.mouse.move(x, y)
-    tab.mouse.down()
-    tab.mouse.move(x + 80, y, steps=4)
-    tab.mouse.up()
+    drag(tab, (x, y), (x + 80, y))
     assert tab.evaluate("viewer.cameras.chosen") == -1
     after = view_of(tab)
     assert np.linalg.norm(after.eye - before.eye) > 0.5
@@ -263,9 +185,6 @@ def test_a_drag_orbits_and_chooses_nothing(opened):
     tab.keyboard.press("r")
     np.testing.assert_allclose(view_of(tab).eye, before.eye)
 
-
-def test_looking_through_a_camera_takes_its_pose_and_lays_the_photo_over_it(opened):
-    tab = opened()
     tab.evaluate("viewer.choose(2)")
     tab.keyboard.press("t")
     tab.locator("#through").wait_for()
@@ -290,7 +209,7 @@ def test_looking_through_a_camera_takes_its_pose_and_lays_the_photo_over_it(open
     tab.locator("#through").wait_for(state="hidden")
 
 
-def test_a_photo_is_left_out_and_used_again(opened, folder):
+def test_photos_are_left_out_and_used_again_but_for_the_last_one(opened, folder):
     tab = opened()
     tab.evaluate("viewer.choose(1)")
     name = tab.evaluate("viewer.facts.cameras[1].photo")
@@ -308,9 +227,6 @@ def test_a_photo_is_left_out_and_used_again(opened, folder):
     tab.get_by_role("button", name="leave out").wait_for()
     assert read_left_out(folder) == ()
 
-
-def test_the_last_photo_cannot_be_left_out(opened, folder):
-    tab = opened()
     names = tab.evaluate("viewer.facts.cameras.map(({ photo }) => photo)")
     for i in range(len(names) - 1):
         tab.evaluate("async (i) => { viewer.choose(i); await viewer.leave(); }", i)
@@ -320,7 +236,7 @@ def test_the_last_photo_cannot_be_left_out(opened, folder):
     assert len(read_left_out(folder)) == len(names) - 1
 
 
-def test_the_gap_is_marked_where_the_arc_is(opened):
+def test_gap_points_and_outlines_are_drawn_where_the_view_projects_them(opened, served):
     tab = opened()
     gap = np.array(tab.evaluate("viewer.facts.gap"))
     view = view_of(tab)
@@ -333,6 +249,45 @@ def test_the_gap_is_marked_where_the_arc_is(opened):
     inside = (red[..., 0] > 200) & (red[..., 1] < 110) & (red[..., 2] < 110)
     column, row = round(float(u)), round(float(v))
     assert inside[row - 3 : row + 4, column - 3 : column + 4].any()
+
+    tab.evaluate("document.getElementById('show-path').click()")
+    positions = np.array(tab.evaluate("[...viewer.positions]")).reshape(-1, 3)
+    view = view_of(tab)
+    with_points = pixels(tab)
+    tab.evaluate("document.getElementById('show-points').click()")
+    changed = (with_points != pixels(tab)).any(axis=2)
+    u, v, _ = view.project(view.world_to_cam(positions))
+    inside = (u > 2) & (u < view.W - 3) & (v > 2) & (v < view.H - 3)
+    expected = np.zeros(changed.shape, bool)
+    reach = np.arange(-2, 3)
+    for x, y in zip(np.rint(u[inside]).astype(int), np.rint(v[inside]).astype(int), strict=True):
+        expected[np.ix_(y + reach, x + reach)] = True
+    assert changed.sum() > 200
+    assert not (changed & ~expected).any()
+
+    tab.evaluate("() => { viewer.cameras.arc = viewer.cameras.count; viewer.paint(); }")
+    picture = pixels(tab)
+    ground = picture[-1, -1]
+    drawn = np.abs(picture - ground).sum(axis=2) > 120
+    H, W = drawn.shape
+    rows, columns = np.indices((H, W))
+    near, close = np.zeros((H, W), bool), np.zeros((H, W), bool)
+    for index in range(tab.evaluate("viewer.cameras.list.length")):
+        eye, *rim = corners_of(tab, index)
+        pairs = [(rim[k], rim[(k + 1) % 4]) for k in range(4)] + [(eye, corner) for corner in rim]
+        top = (
+            np.minimum.reduce([*rim, eye]) - 30,
+            np.maximum.reduce([*rim, eye]) + 30,
+        )  # with the mark above the image
+        near |= ((columns > top[0][0]) & (columns < top[1][0]) & (rows > top[0][1]) & (rows < top[1][1]))  # fmt: skip
+        for a, b in pairs:
+            along = b - a
+            share = ((columns - a[0]) * along[0] + (rows - a[1]) * along[1]) / max(along @ along, 1e-9)
+            share = share.clip(0, 1)
+            close |= np.hypot(a[0] + share * along[0] - columns, a[1] + share * along[1] - rows) < 0.3
+    assert close.sum() > 500
+    assert drawn[close].mean() > 0.99
+    assert not (drawn & ~near).any()
 
 
 def test_findings_color_cameras_when_the_doctor_is_done(opened, served):

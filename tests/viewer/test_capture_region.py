@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag
 from gsplat_edu.data.region import REGION, read_region, write_region
 from gsplat_edu.scene.region import Region
 from viewer.handles import until
@@ -27,20 +28,13 @@ def seen(tab, point):
     return float(u) + 0.5, float(v) + 0.5
 
 
-def dragged(tab, start, end):
-    tab.mouse.move(*start)
-    tab.mouse.down()
-    tab.mouse.move(*end, steps=4)
-    tab.mouse.up()
-
-
 def test_a_box_is_drawn_around_the_subject_moved_saved_and_removed(opened, folder):  # noqa: F811
     tab = opened(1200, 800)
     camera = view_of(tab)
     box = drawing(tab)
     assert tab.get_by_role("region", name="box").is_visible()
     x, y = seen(tab, box["center"])
-    dragged(tab, (x, y), (x + 30, y - 20))  # the handle's middle
+    drag(tab, (x, y), (x + 30, y - 20))  # the handle's middle
     moved = tab.evaluate(SHAPE)
     assert np.allclose(seen(tab, moved["center"]), (x + 30, y - 20), atol=0.5)
     assert moved["half"] == box["half"] and moved["rotation"] == box["rotation"]
@@ -70,14 +64,14 @@ def test_a_side_is_dragged_and_a_drag_elsewhere_orbits(opened):  # noqa: F811
     side = next(i for i, point in enumerate(places) if tab.evaluate(free, list(seen(tab, point))))
     at, middle = np.array(seen(tab, places[side])), np.array(seen(tab, box["center"]))
     away = (at - middle) / np.linalg.norm(at - middle)
-    dragged(tab, at, at + 40 * away)
+    drag(tab, at, at + 40 * away)
     now = tab.evaluate(SHAPE)
     grown = np.array(now["half"]) - box["half"]
     assert grown[side // 2] > 0 and np.count_nonzero(np.abs(grown) > 1e-9) == 1
     other = tab.evaluate(f"boxHandles({SHAPE}).map(({{ point }}) => point)")[side ^ 1]
     assert np.allclose(other, places[side ^ 1])
     before = view_of(tab)
-    dragged(tab, (1000, 700), (940, 680))
+    drag(tab, (1000, 700), (940, 680))
     assert not np.allclose(view_of(tab).R, before.R) and tab.evaluate(SHAPE) == now
 
 

@@ -4,29 +4,23 @@ import http.client
 import json
 import os
 import signal
-import threading
 
 import numpy as np
 import pytest
 import torch
 
+from gestures import drag, inside
 from gsplat_edu.edits.apply import flags_after
 from gsplat_edu.edits.document import read_edits
-from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.io.formats import write_scene
-from gsplat_edu.io.scene import Scene
-from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.viewer import page, page_parts
-from gsplat_edu.viewer.edit_page import editing_of
-from gsplat_edu.viewer.edit_serve import ADDRESS, FLOATERS, EditServer
+from gsplat_edu.viewer.edit_serve import ADDRESS, FLOATERS
 from viewer.handles import until
+from viewer.pages import Editor
 from waiting import awaited
 
 N = 400
 
 
-READY = "async () => { while (!window.editor) await new Promise((done) => setTimeout(done, 20)); }"
 SET = """([id, value]) => {
   element(id).value = value;
   element(id).dispatchEvent(new Event("input", { bubbles: true }));
@@ -48,77 +42,42 @@ def ball():
 
 
 @pytest.fixture
-def served(tmp_path):
-    """Serve the ball with the editor."""
-    scene, file = tmp_path / "ball.ply", tmp_path / "edits.json"
-    write_scene(scene, Scene(ball()))
-    source = open_source(scene)
-    with EditServer("127.0.0.1", 0, page_parts.policy(page_parts.EDITOR), file) as server:
-        server.prepare(identity_of(source.scene), scene)
-        editing = editing_of(source, scene, file, ADDRESS)
-        server.page = page.html(source.scene, (), source.settings, "ball", editing=editing)
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        yield server
-        server.shutdown()
-        thread.join(10)
+def served(edit_site):
+    return edit_site(ball())
 
 
 @pytest.fixture
-def opened(browser, served):
-    """Return a function that opens the page in a tab; nothing may be written to its console."""
-    tabs, complaints = [], []
-
-    def make(width=900, height=700, **options):
-        context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        tab = context.new_page()
-        tab.on("pageerror", lambda error: complaints.append(str(error)))
-        tab.on(
-            "console", lambda message: complaints.append(message.text) if message.type == "error" else None
-        )
-        tab.goto(served.url)
-        tab.wait_for_selector("#edit")
-        tab.evaluate(READY)
-        tabs.append(context)
-        return tab
-
-    yield make
-    for context in tabs:
-        context.close()
-    assert complaints == []
-
-
-def flags(tab):
-    return np.array(tab.evaluate("[...editor.history.flags]"), dtype=np.uint8)
+def opened(served, visit):
+    """Return a function that opens the page in a tab."""
+    return lambda: visit(900, 700, url=served.url, kind=Editor).ready()
 
 
 def test_floaters_are_proposed_with_reasons_selected_undone_and_deleted(opened, served):
-    tab = opened()
-    tab.click("[data-do=propose]")
-    tab.wait_for_selector("#edit-groups button")
-    assert tab.inner_text("#edit-proposed").startswith("Judged by shape alone, without photos: ")
-    texts = [button.inner_text() for button in tab.query_selector_all("#edit-groups button")]
+    shown = opened()
+    shown.do("propose")
+    shown.tab.wait_for_selector("#edit-groups button")
+    assert shown.tab.inner_text("#edit-proposed").startswith("Judged by shape alone, without photos: ")
+    texts = [button.inner_text() for button in shown.tab.query_selector_all("#edit-groups button")]
     assert texts == ["1 · too large: wider than half of the scene", "1 · floating: far from all other splats"]
-    tab.click("#edit-groups button >> nth=1")
-    assert flags(tab).nonzero()[0].tolist() == [N]
-    last = tab.evaluate("editor.history.done.at(-1)")
+    shown.tab.click("#edit-groups button >> nth=1")
+    assert shown.flags().nonzero()[0].tolist() == [N]
+    last = shown.last()
     reason = "floating: far from all other splats"
     assert last == {"op": "select", "how": "replace", "by": "list", "reason": reason, "runs": [N, 1]}
-    assert tab.text_content("#edit-list li:last-child button") == f"select: {reason}"
-    tab.click("[data-do=undo]")
-    assert not flags(tab).any()
-    tab.click("#edit-groups button >> nth=0")
-    tab.keyboard.press("Delete")
-    tab.keyboard.press("Control+s")
-    tab.wait_for_selector('#edit-saved:text-is("saved")')
-    np.testing.assert_array_equal(flags_after(read_edits(served.file).operations, ball()), flags(tab))
+    assert shown.tab.text_content("#edit-list li:last-child button") == f"select: {reason}"
+    shown.do("undo")
+    assert not shown.flags().any()
+    shown.tab.click("#edit-groups button >> nth=0")
+    shown.press("Delete", "Control+s")
+    shown.tab.wait_for_selector('#edit-saved:text-is("saved")')
+    np.testing.assert_array_equal(flags_after(read_edits(served.file).operations, ball()), shown.flags())
     again = opened()
-    again.wait_for_selector("#edit-groups button")
-    assert again.inner_text("[data-do=propose]") == "propose floaters"
+    again.tab.wait_for_selector("#edit-groups button")
+    assert again.tab.inner_text("[data-do=propose]") == "propose floaters"
 
 
 def test_a_judgement_can_be_stopped_and_a_lost_server_is_said(opened, served):
-    tab = opened()
+    shown = opened()
     start = served.proposing.start
 
     def start_and_stand_still():
@@ -128,19 +87,19 @@ def test_a_judgement_can_be_stopped_and_a_lost_server_is_said(opened, served):
         )  # so that it has not ended before it is stopped
 
     served.proposing.start = start_and_stand_still
-    tab.click("[data-do=propose]")
-    tab.wait_for_selector("[data-do=stop-proposing]:visible")
-    assert tab.evaluate("document.activeElement.dataset.do") == "stop-proposing"
-    assert tab.is_visible("#edit-judged") and tab.is_disabled("[data-do=propose]")
-    tab.keyboard.press("Enter")
-    tab.wait_for_selector("[data-do=propose]:not([disabled])")
-    assert tab.is_hidden("[data-do=stop-proposing]") and tab.inner_text("#edit-groups") == ""
+    shown.do("propose")
+    shown.tab.wait_for_selector("[data-do=stop-proposing]:visible")
+    assert shown.evaluate("document.activeElement.dataset.do") == "stop-proposing"
+    assert shown.tab.is_visible("#edit-judged") and shown.tab.is_disabled("[data-do=propose]")
+    shown.press("Enter")
+    shown.tab.wait_for_selector("[data-do=propose]:not([disabled])")
+    assert shown.tab.is_hidden("[data-do=stop-proposing]") and shown.tab.inner_text("#edit-groups") == ""
     assert served.proposing.state() == {"state": "idle"}
 
 
 def test_a_press_counts_although_proposals_arrive_meanwhile(opened):
     """Their list moves the buttons below it."""
-    tab, held = opened(), []
+    shown, held = opened(), []
 
     def last_one_held(route):
         answer = route.fetch()
@@ -149,17 +108,17 @@ def test_a_press_counts_although_proposals_arrive_meanwhile(opened):
         else:
             route.fulfill(response=answer)
 
-    tab.evaluate("editor.perform({ op: 'select', how: 'replace', by: 'all' })")
-    tab.route(f"**{FLOATERS}", last_one_held)
-    tab.click("[data-do=propose]")
-    awaited(tab, lambda: held)
-    tab.hover("[data-do=undo]")
-    tab.mouse.down()
+    shown.select_all()
+    shown.tab.route(f"**{FLOATERS}", last_one_held)
+    shown.do("propose")
+    awaited(shown.tab, lambda: held)
+    shown.tab.hover("[data-do=undo]")
+    shown.tab.mouse.down()
     ((route, answer),) = held
     route.fulfill(response=answer)
-    tab.wait_for_selector("#edit-groups button")
-    tab.mouse.up()
-    assert tab.evaluate("editor.history.done.length") == 0, "the press has undone the selection"
+    shown.tab.wait_for_selector("#edit-groups button")
+    shown.tab.mouse.up()
+    assert len(shown.operations()) == 0, "the press has undone the selection"
 
 
 LATE = """async () => {
@@ -207,75 +166,74 @@ def test_only_the_page_may_start_a_judgement(served):
     assert ask("POST", **own)[0] == 404
 
 
-def set_range(tab, low, high):
+def set_range(shown, low, high):
     for name, value in (("low", low), ("high", high)):
-        tab.evaluate(SET, [f"edit-{name}", value])
+        shown.evaluate(SET, [f"edit-{name}", value])
 
 
-def chart(tab):
-    until(tab, "Boolean(editor.panel.histogram.ends && !editor.panel.histogram.asked)")
-    return tab.evaluate("[[...editor.panel.histogram.all], [...editor.panel.histogram.selected]]")
+def chart(shown):
+    until(shown.tab, "Boolean(editor.panel.histogram.ends && !editor.panel.histogram.asked)")
+    return shown.evaluate("[[...editor.panel.histogram.all], [...editor.panel.histogram.selected]]")
 
 
 def test_a_range_of_the_bar_chart_is_selected_by_keys_and_by_dragging(opened):
-    tab = opened()
-    tab.click("#edit-histogram summary")
-    everything, chosen = chart(tab)
+    shown = opened()
+    shown.tab.click("#edit-histogram summary")
+    everything, chosen = chart(shown)
     assert sum(everything) == N + 2 and sum(chosen) == 0 and len(everything) == 50
     opacities = torch.sigmoid(ball().logit_opacities.double()).numpy()
     assert everything == np.histogram(opacities, 50, (0, 1))[0].tolist()
-    tab.focus("#edit-low")
-    for _ in range(60):
-        tab.keyboard.press("ArrowRight")
-    assert tab.inner_text("#edit-low-text") == "0.3" and "no limit" in tab.inner_text("#edit-high-text")
-    tab.keyboard.press("Enter")
-    assert tab.evaluate("editor.history.done.at(-1).by") == "opacity"
-    np.testing.assert_array_equal(flags(tab), opacities >= 0.3)
-    everything, chosen = chart(tab)
-    assert sum(chosen) == (opacities >= 0.3).sum() and "are selected" in tab.get_attribute(
+    shown.tab.focus("#edit-low")
+    shown.press(*["ArrowRight"] * 60)
+    assert shown.tab.inner_text("#edit-low-text") == "0.3" and "no limit" in shown.tab.inner_text(
+        "#edit-high-text"
+    )
+    shown.press("Enter")
+    assert shown.evaluate("editor.history.done.at(-1).by") == "opacity"
+    np.testing.assert_array_equal(shown.flags(), opacities >= 0.3)
+    everything, chosen = chart(shown)
+    assert sum(chosen) == (opacities >= 0.3).sum() and "are selected" in shown.tab.get_attribute(
         "#edit-chart", "aria-label"
     )
-    box = tab.query_selector("#edit-chart").bounding_box()
-    at = [(box["x"] + share * box["width"], box["y"] + 40) for share in (0.95, 0.5)]
-    tab.mouse.move(*at[0])
-    tab.mouse.down()
-    tab.mouse.move(*at[1], steps=4)
-    tab.mouse.up()
-    assert tab.input_value("#edit-high") == "100" and tab.input_value("#edit-low") == "60"
-    tab.click("[data-do=select-range]")
-    np.testing.assert_array_equal(flags(tab), (opacities >= 0.3) & (opacities <= 0.5))
-    tab.select_option("#edit-quantity", "distance")
-    chart(tab)
-    assert tab.input_value("#edit-low") == "0"
-    set_range(tab, 0, 150)
-    tab.click("[data-do=select-range]")
-    last = tab.evaluate("editor.history.done.at(-1)")
+    box = shown.tab.query_selector("#edit-chart").bounding_box()
+    drag(shown.tab, *inside(box, (0.95, 0.5), (0.5, 0.5)))
+    assert shown.tab.input_value("#edit-high") == "100" and shown.tab.input_value("#edit-low") == "60"
+    shown.do("select-range")
+    np.testing.assert_array_equal(shown.flags(), (opacities >= 0.3) & (opacities <= 0.5))
+    shown.tab.select_option("#edit-quantity", "distance")
+    chart(shown)
+    assert shown.tab.input_value("#edit-low") == "0"
+    set_range(shown, 0, 150)
+    shown.do("select-range")
+    last = shown.last()
     assert (
-        last["by"] == "distance" and "low" not in last and last["center"] == tab.evaluate("viewer.view.focus")
+        last["by"] == "distance"
+        and "low" not in last
+        and last["center"] == shown.evaluate("viewer.view.focus")
     )
     far = np.linalg.norm(ball().means.double().numpy() - np.array(last["center"]), axis=1)
-    np.testing.assert_array_equal(flags(tab), far <= last["high"])
-    tab.select_option("#edit-quantity", "size")
-    chart(tab)
-    set_range(tab, 100, 200)
-    tab.click("[data-do=select-range]")
-    assert tab.evaluate("editor.history.done.at(-1).by") == "size" and flags(tab).nonzero()[0].tolist() == [
-        N + 1
-    ]
+    np.testing.assert_array_equal(shown.flags(), far <= last["high"])
+    shown.tab.select_option("#edit-quantity", "size")
+    chart(shown)
+    set_range(shown, 100, 200)
+    shown.do("select-range")
+    assert shown.evaluate("editor.history.done.at(-1).by") == "size" and shown.flags().nonzero()[
+        0
+    ].tolist() == [N + 1]
 
 
 def test_the_selection_grows_and_shrinks_by_keys(opened):
-    tab = opened()
-    assert float(tab.input_value("#edit-near")) == pytest.approx(0.3)
-    assert tab.is_disabled("[data-do=grow]") and tab.is_disabled("[data-do=shrink]")
-    tab.evaluate("editor.perform({ op: 'select', how: 'replace', by: 'list', reason: '', runs: [0, 5] })")
-    tab.keyboard.press(".")
-    grown = flags(tab).sum()
-    assert grown > 5 and tab.evaluate("editor.history.done.at(-1)") == {"op": "grow", "radius": 0.3}
-    tab.keyboard.press(",")
-    assert flags(tab).sum() < grown
-    assert tab.text_content("#edit-list li:last-child button") == "shrink by 0.3"
-    tab.fill("#edit-near", "0")
-    tab.evaluate("editor.perform({ op: 'select', how: 'replace', by: 'all' })")
-    tab.click("[data-do=grow]")
-    assert tab.inner_text("#edit-message") == "Give a radius above 0."
+    shown = opened()
+    assert float(shown.tab.input_value("#edit-near")) == pytest.approx(0.3)
+    assert shown.tab.is_disabled("[data-do=grow]") and shown.tab.is_disabled("[data-do=shrink]")
+    shown.evaluate("editor.perform({ op: 'select', how: 'replace', by: 'list', reason: '', runs: [0, 5] })")
+    shown.press(".")
+    grown = shown.flags().sum()
+    assert grown > 5 and shown.last() == {"op": "grow", "radius": 0.3}
+    shown.press(",")
+    assert shown.flags().sum() < grown
+    assert shown.tab.text_content("#edit-list li:last-child button") == "shrink by 0.3"
+    shown.tab.fill("#edit-near", "0")
+    shown.select_all()
+    shown.do("grow")
+    assert shown.tab.inner_text("#edit-message") == "Give a radius above 0."

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gestures import drag, swipe, touch
 from gsplat_edu.edits.apply import SELECTED, edited, flags_after
-from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.io.scene import Scene
-from viewer.handles import ARROW, RING, Scale, about, drag, shape, touch
+from viewer.handles import ARROW, RING, Scale, about, shape
 
 KEY = 8
 """CSS pixels that an arrow key moves; 1 with Shift."""
@@ -23,8 +23,8 @@ BOX = """([center, half, angles]) => {
 
 def opened_box(edit_page, random_gaussians, angles=(0.3, -0.5, 0.2), **options):
     shown = edit_page(random_gaussians(60), **options)
-    focus = shown.tab.evaluate("viewer.view.focus")
-    rotation = shown.tab.evaluate(BOX, [focus, [0.8, 0.7, 0.9], list(angles)])
+    focus = shown.evaluate("viewer.view.focus")
+    rotation = shown.evaluate(BOX, [focus, [0.8, 0.7, 0.9], list(angles)])
     return shown, np.array(focus), np.array(rotation)
 
 
@@ -34,7 +34,7 @@ def test_an_arrow_moves_along_its_axis_only(edit_page, random_gaussians, axis):
     scale, direction = Scale(shown), rotation[:, axis]
     begin = center + 0.6 * ARROW * scale.pixel(center) * direction
     end = begin + 0.37 * direction
-    drag(shown, scale.place(begin), scale.place(end))
+    drag(shown.tab, scale.place(begin), scale.place(end))
     now = shape(shown)
     # places are rounded to 0.01 px; along the line of sight a pixel is longer
     np.testing.assert_allclose(now["center"] - center, 0.37 * direction, atol=0.1 * scale.pixel(center))
@@ -55,7 +55,7 @@ def test_a_ring_turns_about_its_axis_by_the_angle_between_two_places_on_it(edit_
     first = int(np.argmin([sight @ (place - center) for place in places]))
     a, b = angles[first] + 0.13, angles[first] + 0.93
     begin, end = (center + radius * (p * np.cos(x) + q * np.sin(x)) for x in (a, b))
-    drag(shown, scale.place(begin), scale.place(end))
+    drag(shown.tab, scale.place(begin), scale.place(end))
     now = shape(shown)
     np.testing.assert_allclose(now["rotation"], about(normal, 0.8) @ rotation, atol=2e-3)
     np.testing.assert_allclose(now["rotation"] @ now["rotation"].T, np.eye(3), atol=1e-15)
@@ -65,13 +65,13 @@ def test_a_ring_turns_about_its_axis_by_the_angle_between_two_places_on_it(edit_
 def test_a_ring_seen_as_a_line_turns_by_the_way_along_it(edit_page, random_gaussians):
     shown, center, _ = opened_box(edit_page, random_gaussians)
     R = shown.camera().R
-    shown.tab.evaluate(
+    shown.evaluate(
         "(rows) => { editor.tools.shape = { ...editor.tools.shape, rotation: rows }; }", R.T.tolist()
     )
     scale = Scale(shown)
     # above the middle, where no arrow lies over the ring about the image's x axis
     start = scale.place(center) - np.array((0.0, 25.0))
-    drag(shown, start, start + np.array((0.0, 30.0)))
+    drag(shown.tab, start, start + np.array((0.0, 30.0)))
     turned = shape(shown)["rotation"] @ R
     # pixels per radian where the ring is grabbed, 25 px above its nearest place, which is enlarged by its nearness
     depth, radius = float(R[2] @ (center - scale.camera.eye)), RING * scale.pixel(center)
@@ -87,7 +87,7 @@ def test_the_middle_moves_in_the_plane_of_the_image(edit_page, random_gaussians)
     shown, center, rotation = opened_box(edit_page, random_gaussians)
     scale = Scale(shown)
     start = scale.place(center)
-    drag(shown, start, start + np.array((70.0, -40.0)))
+    drag(shown.tab, start, start + np.array((70.0, -40.0)))
     now = shape(shown)
     expected = center + scale.pixel(center) * (
         70.0 * scale.camera.R[0] - 40.0 * scale.camera.R[1] * scale.camera.fx / scale.camera.fy
@@ -98,15 +98,15 @@ def test_the_middle_moves_in_the_plane_of_the_image(edit_page, random_gaussians)
 
 def test_a_sphere_has_arrows_and_a_middle_but_no_rings(edit_page, random_gaussians):
     shown = edit_page(random_gaussians(60))
-    shown.tab.evaluate("""() => { editor.tools.choose("sphere");
+    shown.evaluate("""() => { editor.tools.choose("sphere");
       editor.tools.shape = { center: viewer.view.focus, radius: 0.5 }; editor.changed(); }""")
     scale, center = Scale(shown), shape(shown)["center"]
-    axes = np.array(shown.tab.evaluate("transposed(uprightAxes(viewer.view.up))"))
+    axes = np.array(shown.evaluate("transposed(uprightAxes(viewer.view.up))"))
     begin = center + 0.6 * ARROW * scale.pixel(center) * axes[0]
-    drag(shown, scale.place(begin), scale.place(begin + 0.2 * axes[0]))
+    drag(shown.tab, scale.place(begin), scale.place(begin + 0.2 * axes[0]))
     np.testing.assert_allclose(shape(shown)["center"] - center, 0.2 * axes[0], atol=0.1 * scale.pixel(center))
     assert shape(shown)["radius"] == 0.5
-    seen = shown.tab.evaluate(
+    seen = shown.evaluate(
         "[...document.querySelectorAll('[data-handle]')].filter((b) => b.offsetParent).map((b) => b.textContent)"
     )
     assert seen == ["move x", "move y", "move z", "move freely"]
@@ -137,7 +137,7 @@ def test_keys_choose_a_part_and_move_it(edit_page, random_gaussians):
     )
     shown.tab.click("[data-handle='turn y']")  # no part is chosen now: the arrows move the cross again
     shown.tab.click("[data-handle='move z']")
-    shown.tab.keyboard.press("ArrowUp")  # while the button has the focus
+    shown.press("ArrowUp")  # while the button has the focus
     moved = KEY * scale.pixel(before) * shape(shown)["rotation"][:, 2]
     np.testing.assert_allclose(shape(shown)["center"], before + moved, rtol=1e-9)
     shown.tab.click("[data-handle='move z']")
@@ -145,17 +145,14 @@ def test_keys_choose_a_part_and_move_it(edit_page, random_gaussians):
     shown.tab.focus("#canvas")
     keyboard.press("ArrowLeft")
     np.testing.assert_array_equal(shape(shown)["rotation"], there["rotation"])
-    assert shown.tab.evaluate("editor.tools.cursor") is not None
+    assert shown.evaluate("editor.tools.cursor") is not None
 
 
 def test_a_finger_drags_the_handle_and_a_second_one_takes_it_back(edit_page, random_gaussians):
     shown, center, rotation = opened_box(edit_page, random_gaussians, width=390, height=844, has_touch=True)
     scale, session = Scale(shown), shown.tab.context.new_cdp_session(shown.tab)
     start = scale.place(center)
-    touch(session, "touchStart", start)
-    touch(session, "touchMove", start + np.array((30, 20)))
-    touch(session, "touchMove", start + np.array((60, 40)))
-    touch(session, "touchEnd")
+    swipe(shown.tab, start, start + np.array((60, 40)))
     moved = shape(shown)["center"]
     expected = scale.pixel(center) * (
         60 * scale.camera.R[0] + 40 * scale.camera.R[1] * scale.camera.fx / scale.camera.fy
@@ -174,7 +171,7 @@ def test_a_finger_drags_the_handle_and_a_second_one_takes_it_back(edit_page, ran
 
 def test_numbers_turn_the_box_and_a_button_levels_it(edit_page, random_gaussians):
     shown, _, _ = opened_box(edit_page, random_gaussians, (0.0, 0.0, 0.0))
-    upright = np.array(shown.tab.evaluate("uprightAxes(viewer.view.up)"))
+    upright = np.array(shown.evaluate("uprightAxes(viewer.view.up)"))
     for index, value in enumerate((20, -50, 130)):
         shown.tab.fill(f"#edit-angles input >> nth={index}", str(value))
     expected = Rotation.from_euler("YXZ", [-50, 20, 130], degrees=True).as_matrix()
@@ -188,17 +185,15 @@ def test_numbers_turn_the_box_and_a_button_levels_it(edit_page, random_gaussians
 def test_a_turned_box_selects_and_crops_what_lies_in_it(edit_page, random_gaussians):
     gaussians = random_gaussians(400)
     shown = edit_page(gaussians)
-    shown.tab.evaluate(BOX, [[0.1, -0.1, 0.05], [0.3, 0.8, 0.5], [0.4, 0.9, -0.6]])
-    shown.tab.click("[data-do=select-shape]")
+    shown.evaluate(BOX, [[0.1, -0.1, 0.05], [0.3, 0.8, 0.5], [0.4, 0.9, -0.6]])
+    shown.do("select-shape")
     box = shape(shown)
     inside = (
         np.abs((gaussians.means.double().numpy() - box["center"]) @ box["rotation"]) <= box["half"]
     ).all(axis=1)
     assert 20 < inside.sum() < 200
-    np.testing.assert_array_equal(
-        np.array(shown.tab.evaluate("[...editor.history.flags]")) == SELECTED, inside
-    )
-    shown.tab.click("[data-do=crop]")
-    edits = parse_edits(shown.tab.evaluate("editor.text()").encode(), "e.json")
+    np.testing.assert_array_equal(shown.flags() == SELECTED, inside)
+    shown.do("crop")
+    edits = shown.edits()
     np.testing.assert_array_equal(flags_after(edits.operations, gaussians) == SELECTED, inside)
     assert len(edited(Scene(gaussians), edits.operations).gaussians) == inside.sum()

@@ -1,5 +1,6 @@
 """The editor in a browser selects, deletes and stores exactly the splats that Python does."""
 
+import functools
 import json
 
 import numpy as np
@@ -10,12 +11,10 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.edits.apply import SELECTED, edited, flags_after, placed, views_after
 from gsplat_edu.edits.document import read_edits
 from gsplat_edu.edits.runs import runs_of
-from gsplat_edu.io.formats import read_scene, write_scene
+from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.source import Source
-from gsplat_edu.viewer import page
-from gsplat_edu.viewer.edit_page import editing_of
 
 SEEDS, SIZE = 20, (360, 240)
 """Number of sequences. Size of the picture, px: small, to take little time; the panel covers the lower part."""
@@ -57,30 +56,19 @@ def source_of(gaussians, path="scene.ply", origin=(0.0, 0.0, 0.0)):
 
 
 @pytest.fixture
-def edit(visit, tmp_path):
-    """Return a function that writes a scene and its page with the editor, and opens the page."""
-
-    def make(gaussians, origin=(0.0, 0.0, 0.0), width=SIZE[0], height=SIZE[1], **options):
-        source = source_of(gaussians, tmp_path / "scene.ply", origin)
-        editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
-        html = page.html(source.scene, (), source.settings, "scene", (), None, editing)
-        (tmp_path / "edit.html").write_bytes(html)
-        write_scene(tmp_path / "scene.ply", source.scene)
-        shown = visit(width=width, height=height, **options).open(tmp_path / "edit.html").ready()
-        shown.tab.wait_for_selector("#edit")
-        return shown
-
-    return make
+def edit(edit_page):
+    """Return a function that opens the editor in a small window."""
+    return functools.partial(edit_page, width=SIZE[0], height=SIZE[1])
 
 
 def state(shown):
-    found = shown.tab.evaluate(STATE)
+    found = shown.evaluate(STATE)
     return found["text"], np.array(found["flags"], dtype=np.uint8)
 
 
 def means_of(shown):
     """Return the centres of all splats in the page."""
-    return np.array(shown.tab.evaluate(STATE)["means"], dtype=np.float64).reshape(-1, 3)
+    return np.array(shown.evaluate(STATE)["means"], dtype=np.float64).reshape(-1, 3)
 
 
 def tool(name):
@@ -254,8 +242,8 @@ def test_random_sequences_select_and_delete_the_same_splats_as_the_command(
     kinds = set()
     start, moves = means_of(shown), 0
     for seed in range(degree, SEEDS, 4):
-        shown.tab.evaluate("viewer.reset()")
-        shown.tab.evaluate(PLAY, gestures_of(seed))
+        shown.evaluate("viewer.reset()")
+        shown.evaluate(PLAY, gestures_of(seed))
         text, flags = state(shown)
         (tmp_path / "edits.json").write_text(text)
         edits = read_edits(tmp_path / "edits.json")
@@ -266,23 +254,23 @@ def test_random_sequences_select_and_delete_the_same_splats_as_the_command(
         np.testing.assert_array_equal(left, there[flags <= SELECTED])
         moves += not np.array_equal(there, start)
         if seed % 8 > 3:  # without stored states, undo repeats the operations before
-            shown.tab.evaluate("editor.history.changes.forEach((_, i) => editor.history.forget(i))")
+            shown.evaluate("editor.history.changes.forEach((_, i) => editor.history.forget(i))")
         count = len(edits.operations)
         assert count > 5
         done = json.loads(text)["operations"]
         kinds |= {entry.get("by", entry["op"]) for entry in done} | {
             "front" for entry in done if "front" in entry
         }
-        shown.tab.evaluate(CLICK, ["undo", count])
+        shown.evaluate(CLICK, ["undo", count])
         undone = state(shown)
         assert undone[0] == opened[0] and not undone[1].any()
         np.testing.assert_array_equal(means_of(shown), start)
-        shown.tab.evaluate(CLICK, ["redo", count])
+        shown.evaluate(CLICK, ["redo", count])
         redone = state(shown)
         assert redone[0] == text
         np.testing.assert_array_equal(redone[1], flags)
         np.testing.assert_array_equal(means_of(shown), there)
-        shown.tab.evaluate(CLICK, ["undo", count])
+        shown.evaluate(CLICK, ["undo", count])
     assert kinds >= EVERY_KIND
     assert moves > 0, "some of the sequences move splats"
 
@@ -300,7 +288,7 @@ def test_the_random_sequences_hold_every_gesture():
 def test_a_scene_without_splats_can_be_opened(edit, random_gaussians):
     shown = edit(random_gaussians(0))
     gestures = [{"click": f"[data-do={name}]"} for name in ("all", "invert", "undo", "redo")]
-    shown.tab.evaluate(PLAY, [*gestures, {"click": "[data-tool=sphere]"}, {"drag": [[50, 50], [60, 60]]}])
+    shown.evaluate(PLAY, [*gestures, {"click": "[data-tool=sphere]"}, {"drag": [[50, 50], [60, 60]]}])
     assert shown.tab.inner_text("#edit-count") == "0 selected · 0 of 0 left"
     assert "nothing at that point" in shown.tab.inner_text("#edit-message")
     assert shown.tab.is_hidden("#edit-floaters"), "a page that no server sent can propose nothing"
@@ -322,7 +310,7 @@ def test_a_click_finds_the_surface_that_all_splats_show(edit, random_gaussians):
     """
     shown = edit(random_gaussians(900), width=120, height=120)
     places = [[u, v] for u in range(2, 118, 24) for v in range(3, 68, 13)]
-    found, drawn = shown.tab.evaluate(DEPTHS, places)
+    found, drawn = shown.evaluate(DEPTHS, places)
     assert [depth is None for depth in found] == [depth is None for depth in drawn]
     pairs = [(a, b) for a, b in zip(found, drawn, strict=True) if a is not None]
     assert all(a <= b * (1 + 1e-6) and b <= a * 1.0008 for a, b in pairs)

@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import threading
 from contextlib import contextmanager
 
 import pytest
@@ -12,6 +11,7 @@ from gsplat_edu.edits.document import empty_document
 from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.stored import MOST_BYTES, NO_FILE
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
+from viewer.pages import running
 
 SCENE = Identity(7, "ab" * 32, (0.0, 0.0, 0.0))
 PAGE = b"<!doctype html><title>page</title>"
@@ -23,13 +23,8 @@ def serving(file):
     with EditServer("127.0.0.1", 0, "default-src 'none'", file) as made:
         made.page = PAGE
         made.prepare(SCENE)
-        thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
+        with running(made):
             yield made
-        finally:
-            made.shutdown()
-            thread.join(10)
 
 
 @pytest.fixture

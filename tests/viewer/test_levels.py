@@ -1,7 +1,7 @@
 """The page of a folder with levels of detail in a browser: drawing, loading, and served files."""
 
 import http.client
-import threading
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -17,13 +17,12 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page_parts
 from gsplat_edu.viewer.serve import PageServer
 from gsplat_edu.viewer.stream import folder_page
+from viewer.pages import running
 
 ALIKE = 55.0
 """Required PSNR relative to our renderer, dB. For the plain page it is 60; here positions are decoded in float32."""
 
 COUNT = 3000
-
-PATIENCE = 120e3
 
 WATCH = """() => {
   const { levels, renderer } = viewer;
@@ -56,132 +55,84 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def served(folder):
     """Return a function that serves the folder with a budget."""
-    servers = []
+    with ExitStack() as stack:
 
-    def make(budget):
-        server = PageServer(b"", policy=page_parts.policy(page_parts.LEVELS))
-        server.page, server.served = folder_page(folder, "scene", budget)
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        servers.append((server, thread))
-        return server
+        def make(budget):
+            server = stack.enter_context(PageServer(b"", policy=page_parts.policy(page_parts.LEVELS)))
+            server.page, server.served = folder_page(folder, "scene", budget)
+            return stack.enter_context(running(server))
 
-    yield make
-    for server, thread in servers:
-        server.shutdown()
-        thread.join(10)
-        server.server_close()
+        yield make
 
 
 @pytest.fixture
-def open_page(served, browser):
-    """Return a function that opens the folder's page with a budget; complaints and requests to other addresses fail."""
-    complaints, urls, tabs = [], [], []
-
-    def make(budget):
-        server = served(budget)
-        tab = browser.new_page(viewport={"width": 320, "height": 200})
-        tabs.append((tab, server.url))
-        tab.on("console", lambda message: complaints.append(message.text))
-        tab.on("pageerror", lambda error: complaints.append(str(error)))
-        tab.on("request", lambda request: urls.append(request.url))
-        tab.goto(server.url, timeout=PATIENCE)
-        tab.wait_for_selector("#message", state="hidden", timeout=PATIENCE)
-        tab.set_default_timeout(PATIENCE)
-        return tab
-
-    make.urls = urls
-    yield make
-    for tab, url in tabs:
-        tab.close()
-        assert [one for one in urls if not one.startswith((url, "blob:", "data:"))] == []
-    assert complaints == []
+def open_page(served, visit):
+    """Return a function that opens the folder's page with a budget."""
+    return lambda budget: visit(url=served(budget).url).ready()
 
 
 def drawn(scene, camera):
     return render(scene.gaussians, camera, settings=file_settings(scene)).image.numpy().clip(0, 1)
 
 
-def test_with_room_for_all_the_page_draws_the_finest_level(
-    folder, open_page, camera, record_property, picture
+def test_with_room_for_all_the_page_loads_coarse_files_first_and_draws_the_finest_level(
+    folder, open_page, camera, record_property
 ):
-    tab = open_page(COUNT)
-    seen = picture(tab, camera)
-    count, most, _, shown, _ = tab.evaluate(WATCH)
+    opened = open_page(COUNT)
+    seen = opened.picture(camera)
+    count, most, _, shown, _ = opened.evaluate(WATCH)
     assert count == most == COUNT and set(shown) == {0}
     found = psnr(seen, drawn(codec.read(folder), camera))
     record_property("psnr", found)
     assert found >= ALIKE
-    assert tab.inner_text("#count") == "3,000 of 3,000 splats"
+    assert opened.tab.inner_text("#count") == "3,000 of 3,000 splats"
+    asked = [url.split("/")[-2] for url in opened.requests if url.endswith("/meta.json")]
+    assert asked[0].startswith(f"{codec.read_index(folder).levels - 1}_") and asked[-1].startswith("0_")
 
 
-def test_a_small_budget_draws_the_whole_scene_coarsely(
-    folder, open_page, camera, three_views, record_property, picture
-):
-    """From several sides, no region is missing, and the budget is never exceeded."""
+def test_a_small_budget_draws_the_whole_scene_coarsely(folder, open_page, camera, three_views):
+    """From several sides, no region is missing, nearer ones are finer, and the budget is never exceeded."""
     index = codec.read_index(folder)
     least = index.counts()[-1]
     budget = 2 * least + 50
-    tab = open_page(budget)
-    for _, view in [("", camera), *three_views]:
-        picture(tab, view)
-        count, most, order, shown, _ = tab.evaluate(WATCH)
+    opened = open_page(budget)
+    nearness = """(eye) => viewer.levels.regions.map(
+      (region) => [viewer.levels.distance(region, eye), region.shown])"""
+    for _, view in 3 * three_views:
+        opened.picture(view)
+        count, most, order, shown, free = opened.evaluate(WATCH)
         assert least <= count <= most <= budget and order <= budget
         assert min(shown) >= 0, "a region is missing"
         assert len(set(shown)) > 1 and max(shown) >= 3, "the budget allows finer levels only in some places"
+        found = sorted(opened.evaluate(nearness, view.eye.tolist()))
+        half = len(found) // 2
+        near, far = (np.mean([level for _, level in part]) for part in (found[:half], found[half:]))
+        assert near < far - 0.2
+    # memory that is not used any more is free
+    slots, held = opened.evaluate(
+        "() => [viewer.levels.capacity / 32, viewer.levels.regions.flatMap(({ slots }) => slots)]"
+    )
+    assert len(set(held)) == len(held) and free + len(held) == slots and len(held) * 32 >= count
     # nearly everywhere, the picture is at least as good as the coarsest level alone
     exact = drawn(codec.read(folder), camera)
     coarse = psnr(drawn(codec.read_level(folder, index, index.levels - 1), camera), exact)
-    mixed = psnr(picture(tab, camera), exact)
-    assert mixed > coarse
+    assert psnr(opened.picture(camera), exact) > coarse
 
 
-def test_nearer_regions_are_finer(folder, open_page, camera, picture):
-    tab = open_page(1200)
-    picture(tab, camera)
-    nearness = """(eye) => viewer.levels.regions.map(
-      (region) => [viewer.levels.distance(region, eye), region.shown])"""
-    found = sorted(tab.evaluate(nearness, camera.eye.tolist()))
-    half = len(found) // 2
-    assert np.mean([level for _, level in found[:half]]) < np.mean([level for _, level in found[half:]]) - 0.3
-
-
-def test_memory_of_unused_files_is_released(open_page, three_views, picture):
-    tab = open_page(700)
-    for _ in range(3):
-        for _, view in three_views:
-            picture(tab, view)
-    count, _, _, _, free = tab.evaluate(WATCH)
-    slots, held = tab.evaluate(
-        "() => [viewer.levels.capacity / 32, viewer.levels.regions.flatMap(({ slots }) => slots)]"
-    )
-    assert len(set(held)) == len(held) and free + len(held) == slots
-    assert len(held) * 32 >= count
-
-
-def test_a_budget_below_the_coarsest_level_leaves_out_the_farthest(folder, open_page, camera, picture):
+def test_a_budget_below_the_coarsest_level_leaves_out_the_farthest(folder, open_page, camera):
     budget = codec.read_index(folder).counts()[-1] // 2
-    tab = open_page(budget)
-    picture(tab, camera)
-    count, most, *_ = tab.evaluate(WATCH)
+    opened = open_page(budget)
+    opened.picture(camera)
+    count, most, *_ = opened.evaluate(WATCH)
     assert 0 < count <= most <= budget
 
 
-def test_coarse_files_are_loaded_first(folder, open_page, camera, picture):
-    tab = open_page(COUNT)
-    picture(tab, camera)
-    index = codec.read_index(folder)
-    asked = [url.split("/")[-2] for url in open_page.urls if url.endswith("/meta.json")]
-    assert asked[0].startswith(f"{index.levels - 1}_") and asked[-1].startswith("0_")
-
-
-def test_a_file_that_vanished_is_named(folder, served, browser):
+def test_a_file_that_vanished_is_named(served, visit):
     server = served(COUNT)
     del server.served["/0_0/meta.json"]
-    tab = browser.new_page(viewport={"width": 320, "height": 200})
-    tab.goto(server.url, timeout=PATIENCE)
-    tab.wait_for_selector('#message:has-text("/0_0/meta.json could not be loaded (404).")', timeout=PATIENCE)
-    tab.close()
+    shown = visit(url=server.url)
+    shown.message("/0_0/meta.json could not be loaded (404).")
+    shown.expected = "status of 404"
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,8 @@ def test_pause_step_and_resume(capture, tmp_path):
         for k in range(1, 4):
             client.control("step")
             client.states(state="paused", iteration=held + k)
-            time.sleep(3 * snapshots.POLL)
+            made.view.asked.clear()
+            until(lambda: len(made.view.asked) > 2, "questions of the waiting training")
             assert made.iteration == held + k, "a step is exactly one iteration"
         client.control("resume")
         until(lambda: made.iteration > held + 50, "many more iterations")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gestures import drag
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
@@ -134,10 +135,7 @@ def test_without_webgl2_the_page_shows_our_own_renders(capture, tmp_path, browse
         assert "no WebGL2, so the training's computer draws" in tab.page.inner_text("#live")
         until(lambda: tab.picture().std() > 5, "a picture")
         before = tab.picture()
-        tab.page.mouse.move(400, 250)
-        tab.page.mouse.down()
-        tab.page.mouse.move(520, 230, steps=2)
-        tab.page.mouse.up()
+        drag(tab.page, (400, 250), (520, 230))
         until(lambda: np.abs(tab.picture() - before).mean() > 2, "the scene from another side")
         assert tab.complaints == [] and made.view._shown == -1, "no snapshot was packed"
 

@@ -165,32 +165,12 @@ def test_a_trained_scene(show):
         assert likeness(drawn, visit, gaussians, one, settings) >= ALIKE
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "scale"),
-    [
-        (160, 500, 2.5),  # a narrow window shows the whole height and crops the sides
-        (320, 200, 1.0),
-        (400, 200, 1.25),  # a wide window shows the whole width and crops a fifth of the height
-        (800, 200, 1.25),  # a wider window crops no more, and shows the surroundings of the image
-    ],
-)
-def test_a_window_crops_the_sides_but_little_of_the_height(
-    show, random_gaussians, camera, width, height, scale
-):
-    assert (camera.W, camera.H) == (320, 200)
-    few = random_gaussians(12)  # too few splats for a subject, which a narrow window would show
-    visit = show(few, [("first", camera)], width=width, height=height)
-    covered = round(visit.tab.evaluate("viewer.panel.covered()"))  # of a small window's height, by the panel
-    assert (covered > 0) == (width == 160)
-    assert visit.camera().fy == pytest.approx(camera.fy * (scale - covered / camera.H))
-
-
 @pytest.mark.parametrize("dense", [1, 2])
 def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
     """In a window of another shape, the window shows all of the image whose content reaches its edges."""
     gaussians = random_gaussians(2000)
     visit = show(gaussians, [("first", camera)], PLAIN, width=360, height=180, device_scale_factor=dense)
-    visit.tab.evaluate("document.getElementById('panel').hidden = true")
+    visit.evaluate("document.getElementById('panel').hidden = true")
     window = visit.camera()
     width, height = window.W, window.H
     assert (width, height) == (360 * dense, 180 * dense)
@@ -198,7 +178,7 @@ def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
     assert np.allclose([window.fx, window.fy], [camera.fx * scale, camera.fy * scale])
     assert window.cy - 0.5 * (height - 1) == pytest.approx((camera.cy - 0.5 * (camera.H - 1)) * scale)
     assert window.cx - 0.5 * (width - 1) == pytest.approx((camera.cx - 0.5 * (camera.W - 1)) * scale)
-    visit.tab.evaluate("viewer.settled()")
+    visit.evaluate("viewer.settled()")
     screen = np.asarray(Image.open(BytesIO(visit.tab.screenshot())).convert("RGB"))
     truth = np.round(255 * drawn(gaussians, window, PLAIN).clip(0, 1))
     # The canvas rounds half floats to bytes, which may differ by one step.
@@ -224,7 +204,7 @@ def test_names_are_shown_unchanged(show, random_gaussians, camera, tmp_path, vis
 
 def test_the_page_cannot_reach_the_network(show, random_gaussians):
     visit = show(random_gaussians(3))
-    refused = visit.tab.evaluate(
+    refused = visit.evaluate(
         """() => new Promise((resolve) => {
           document.addEventListener("securitypolicyviolation", (event) => resolve(event.effectiveDirective));
           fetch("https://example.com/").catch(() => {});
@@ -283,7 +263,7 @@ def test_damaged_splats_are_reported(visit, tmp_path, random_gaussians, damage):
 
 def test_a_lost_context_is_reported(show, random_gaussians):
     visit = show(random_gaussians(3), fresh=True)
-    visit.tab.evaluate("viewer.renderer.gl.getExtension('WEBGL_lose_context').loseContext()")
+    visit.evaluate("viewer.renderer.gl.getExtension('WEBGL_lose_context').loseContext()")
     visit.message("The graphics processor stopped drawing this page")
     visit.complaints[:] = [one for one in visit.complaints if not re.search("WebGL: CONTEXT_LOST", one)]
 

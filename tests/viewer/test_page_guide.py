@@ -1,19 +1,19 @@
 """Visitors take the guided tour of a page and compare photos with its picture, by pointer, keys and touch."""
 
 import io
-import time
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from accessibility import grave_faults_in_all_styles
+from gestures import drag, inside, swipe
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.page_proof import Proof, ShownPhoto
-from viewer.handles import touch, until
-from waiting import PATIENCE
+from viewer.handles import until
+from waiting import awaited
 
 SIZE = (640, 480)
 
@@ -74,9 +74,7 @@ def is_color(found, color):
 
 def becomes(seen, x, y, color):
     """Wait until the window shows a colour at a place; a photo is decoded after its address is set."""
-    end = time.monotonic() + PATIENCE
-    while not is_color(found := color_at(seen, x, y), color):
-        assert time.monotonic() < end, found
+    awaited(seen.tab, lambda: is_color(color_at(seen, x, y), color), f"the colour {color}")
 
 
 def test_the_tour_goes_by_keys(shown):
@@ -112,19 +110,13 @@ def test_the_tour_goes_by_swipes(shown):
     seen.tab.click("#tour")
     arrives(seen, first)
     box = seen.tab.locator("#guide-text").bounding_box()
-    session = seen.tab.context.new_cdp_session(seen.tab)
-
-    def swipe(dx, dy=0):
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        for kind, places in (("touchStart", [(x, y)]), ("touchMove", [(x + dx, y + dy)]), ("touchEnd", [])):
-            touch(session, kind, *places)
-
-    swipe(-90)
+    ((x, y),) = inside(box, (0.5, 0.5))
+    swipe(seen.tab, (x, y), (x - 90, y))
     arrives(seen, last)
     assert seen.tab.inner_text("#guide-step") == "2 of 2"
-    swipe(10)
+    swipe(seen.tab, (x, y), (x + 10, y))
     assert seen.tab.inner_text("#guide-step") == "2 of 2", "too short for a swipe"
-    swipe(90)
+    swipe(seen.tab, (x, y), (x + 90, y))
     arrives(seen, first)
 
 
@@ -132,7 +124,7 @@ def test_the_view_flies_unless_less_motion_is_preferred(shown):
     begins = "() => { document.getElementById('tour').click(); return viewer.flight !== null; }"
     flying, jumping = shown(), shown(reduced_motion="reduce")
     for seen, flies in ((flying, True), (jumping, False)):
-        assert seen.tab.evaluate(begins) == flies
+        assert seen.evaluate(begins) == flies
         arrives(seen, cameras()[0])
 
 
@@ -150,14 +142,11 @@ ENDLESS = """() => {
 
 def test_a_drag_interrupts_a_flight(shown):
     seen = shown()
-    seen.tab.keyboard.press("t")
+    seen.press("t")
     until(seen.tab, "viewer.flight === null")
-    seen.tab.evaluate(ENDLESS)
-    seen.tab.mouse.move(500, 200)
-    seen.tab.mouse.down()
-    seen.tab.mouse.move(520, 210, steps=2)
-    seen.tab.mouse.up()
-    assert seen.tab.evaluate("viewer.flight === null && viewer.cameraIndex === -1")
+    seen.evaluate(ENDLESS)
+    drag(seen.tab, (500, 200), (520, 210))
+    assert seen.evaluate("viewer.flight === null && viewer.cameraIndex === -1")
 
 
 def test_a_photo_is_slid_over_the_picture_by_pointer(shown):
@@ -168,10 +157,7 @@ def test_a_photo_is_slid_over_the_picture_by_pointer(shown):
     assert tab.inner_text("#compare-card strong") == "photo 1: used for training (1 of 2)"
     becomes(seen, 250, 240, RED)
     assert not is_color(color_at(seen, 400, 240), RED)
-    tab.mouse.move(320, 300)
-    tab.mouse.down()
-    tab.mouse.move(450, 300, steps=4)
-    tab.mouse.up()
+    drag(tab, (320, 300), (450, 300))
     assert tab.locator("#photo-share").input_value() == "70"
     becomes(seen, 430, 240, RED)
     assert not is_color(color_at(seen, 480, 240), RED)
@@ -198,10 +184,7 @@ def test_a_photo_is_slid_by_keys_and_touch(shown):
     assert tab.locator("#photo-share").input_value() == "56"
     assert tab.get_attribute("#photo-share", "aria-valuetext") == "photo 56 %, picture 44 %"
     arrives(seen, cameras()[0])  # the arrow moved the line only
-    session = tab.context.new_cdp_session(tab)
-    at = SIZE[0] * 0.56
-    for kind, places in (("touchStart", [at]), ("touchMove", [160]), ("touchEnd", [])):
-        touch(session, kind, *((x, 200) for x in places))
+    swipe(tab, (SIZE[0] * 0.56, 200), (160, 200))
     until(tab, "document.getElementById('photo-share').value === '25'")
     tab.focus("#canvas")
     tab.keyboard.press("ArrowRight")
@@ -224,10 +207,7 @@ def test_a_photo_lies_exactly_over_the_picture_of_its_camera(shown):
         ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
         found = here.project(here.world_to_cam(camera.eye + ray @ camera.R))
         np.testing.assert_allclose(np.array(found[:2]) + 0.5, (x, y), atol=0.02)
-    seen.tab.mouse.move(500, 150)
-    seen.tab.mouse.down()
-    seen.tab.mouse.move(530, 150, steps=2)
-    seen.tab.mouse.up()
+    drag(seen.tab, (500, 150), (530, 150))
     assert not seen.tab.is_visible("#photo"), "the photo shows its own view only"
     assert seen.tab.is_visible("#compare-card")
 
@@ -246,7 +226,7 @@ NAMELESS = ("button", "slider", "checkbox", "combobox", "region", "image", "head
 @pytest.mark.parametrize("key", ["t", "c"])
 def test_a_screen_reader_gets_a_name_for_everything(shown, key):
     seen = shown()
-    seen.tab.keyboard.press(key)
+    seen.press(key)
     until(seen.tab, "viewer.flight === null")
     nodes = seen.tab.context.new_cdp_session(seen.tab).send("Accessibility.getFullAXTree")["nodes"]
     found = [
@@ -256,7 +236,7 @@ def test_a_screen_reader_gets_a_name_for_everything(shown, key):
     ]
     assert len([name for role, name in found if role == "button"]) > 8
     assert [role for role, name in found if role in NAMELESS and not name.strip()] == []
-    ids = seen.tab.evaluate("[...document.querySelectorAll('[id]')].map(({ id }) => id)")
+    ids = seen.evaluate("[...document.querySelectorAll('[id]')].map(({ id }) => id)")
     assert len(ids) == len(set(ids))
 
 

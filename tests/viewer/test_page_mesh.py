@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gestures import drag
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.main import main
 from gsplat_edu.edits.document import parse_edits
@@ -23,7 +24,7 @@ from gsplat_edu.viewer import page, page_mesh
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edited import edited_meshes
 from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
-from viewer.conftest import described
+from viewer.pages import described
 
 BACKGROUND = (0.2, 0.5, 0.8)
 
@@ -136,7 +137,7 @@ def opened(visit, tmp_path, random_gaussians):
 
 
 def drawn(seen, camera=VIEW):
-    data = base64.b64decode(seen.tab.evaluate(PIXELS, described(camera)))
+    data = base64.b64decode(seen.evaluate(PIXELS, described(camera)))
     return np.frombuffer(data, np.uint8).reshape(camera.H, camera.W, 3)
 
 
@@ -222,10 +223,7 @@ def test_the_line_has_splats_on_its_left_and_the_mesh_on_its_right(opened):
     tab.keyboard.press("ArrowRight")
     assert slider.get_attribute("aria-valuetext") == "splats 1 %, mesh 99 %"
     box = tab.evaluate(f"() => ({{ x: {shown}.x, y: {shown}.y, width: {shown}.width }})")
-    tab.mouse.move(box["x"] + box["width"] / 2, 200)
-    tab.mouse.down()
-    tab.mouse.move(240, 200, steps=3)
-    tab.mouse.up()
+    drag(tab, (box["x"] + box["width"] / 2, 200), (240, 200))
     assert tab.evaluate("viewer.meshes.share") == pytest.approx(0.75)
     assert tab.evaluate(f"{shown}.x + 22") == pytest.approx(240)
 
@@ -264,25 +262,6 @@ def test_wireframe_and_collider(opened):
     assert tab.locator("#mesh-collider").is_checked()
     tab.evaluate("document.getElementById('mesh-collider').click()")
     assert not tab.evaluate("viewer.meshes.showsCollider")
-
-
-def test_a_ray_meets_the_surface_where_numpy_says(opened):
-    """The page computes in float64 on float32 coordinates, and so does the test."""
-    mesh = Mesh(ball().vertices.astype(np.float32).astype(np.float64), ball().faces)
-    tab = opened(mesh).tab
-    columns, rows = np.random.default_rng(2).uniform((20, 20), (160, 100), (300, 2)).T
-    directions = rays(VIEW, columns, rows)
-    face, depth, _ = cast(mesh, np.broadcast_to(VIEW.eye, directions.shape), directions)
-    found = tab.evaluate(
-        "([camera, places]) => places.map(([u, v]) => viewer.meshes.depthAt(camera, u, v))",
-        [described(VIEW), np.stack([columns, rows], axis=1).tolist()],
-    )
-    found = np.array([np.inf if depth is None else depth for depth in found])
-    assert 100 < (face >= 0).sum() < 300
-    assert (np.isfinite(found) == (face >= 0)).all()
-    hit = face >= 0
-    np.testing.assert_allclose(found[hit], depth[hit], rtol=1e-9)
-    assert (found[hit].astype(np.float32) == depth[hit].astype(np.float32)).mean() > 0.99
 
 
 def test_measuring_snaps_to_the_mesh(visit, tmp_path, random_gaussians):

@@ -67,7 +67,7 @@ def slow(show, random_gaussians, camera):
 )
 def test_the_whole_picture_in_parts_is_the_same_to_the_bit(slow, interrupt):
     visit, _ = slow
-    found = visit.tab.evaluate(PARTS.replace("INTERRUPT", interrupt))
+    found = visit.evaluate(PARTS.replace("INTERRUPT", interrupt))
     assert found["isWhole"] and found["equal"] and found["shown"] and found["words"] == ""
     coarse = [size for size in found["sizes"] if size[2]]
     whole = [size for size in found["sizes"] if not size[2]]
@@ -83,7 +83,7 @@ def test_the_whole_picture_in_parts_is_the_same_to_the_bit(slow, interrupt):
 
 def test_a_slow_page_draws_rarely_while_a_training_runs(slow):
     visit, _ = slow
-    found = visit.tab.evaluate(
+    found = visit.evaluate(
         """async () => {
           viewer.pace.level = DETAILS.length - 1;
           viewer.pace.expect = () => {};

@@ -31,7 +31,7 @@ def opened(visit, tmp_path, random_gaussians, three_views):
 
 def stands_at(shown, expected):
     """Return whether the view is that of a keyframe."""
-    here = shown.tab.evaluate("viewer.view.camera")
+    here = shown.evaluate("viewer.view.camera")
     np.testing.assert_allclose(here["eye"], expected.eye, atol=1e-6)
     np.testing.assert_allclose(here["R"], expected.R, atol=1e-6)
     assert 2 * np.degrees(np.arctan(here["H"] / 2 / here["fy"])) == pytest.approx(expected.fov)
@@ -40,23 +40,23 @@ def stands_at(shown, expected):
 def test_an_embedded_path_is_played_to_its_end_and_stops_when_somebody_moves(opened):
     path = KeyframePath(AROUND[:3], False, 0.5)
     shown = opened(path, fresh=True)
-    before = shown.tab.evaluate("viewer.view.camera.eye")
+    before = shown.evaluate("viewer.view.camera.eye")
     shown.tab.click("#path summary")
     assert shown.tab.inner_text("#path summary") == "camera path (3)"
     shown.tab.click("#play")
     shown.tab.wait_for_selector('#play[aria-pressed="false"]')
     stands_at(shown, AROUND[2])
-    assert shown.tab.evaluate("viewer.view.camera.eye") != before
+    assert shown.evaluate("viewer.view.camera.eye") != before
     shown.tab.check("#loop")
-    shown.tab.keyboard.press("p")
+    shown.press("p")
     shown.tab.wait_for_selector('#play[aria-pressed="true"]')
     until(shown.tab, "viewer.journey.began !== null")
     shown.tab.mouse.move(450, 300)
     shown.tab.mouse.wheel(0, 100)
     shown.tab.wait_for_selector('#play[aria-pressed="false"]')
-    still = shown.tab.evaluate("viewer.view.camera.eye")
-    shown.tab.evaluate(FRAMES)
-    assert shown.tab.evaluate("viewer.view.camera.eye") == still
+    still = shown.evaluate("viewer.view.camera.eye")
+    shown.evaluate(FRAMES)
+    assert shown.evaluate("viewer.view.camera.eye") == still
 
 
 def downloaded(shown, tmp_path):
@@ -72,11 +72,11 @@ def test_saved_views_become_the_file_that_render_reads(opened, tmp_path):
     assert shown.tab.inner_text("#path summary") == "camera path (0)"
     shown.tab.click("#path summary")
     assert [shown.tab.is_disabled(name) for name in BUTTONS] == [False, True, True]
-    shown.tab.keyboard.press("p")  # an empty path cannot be played, without a complaint
+    shown.press("p")  # an empty path cannot be played, without a complaint
     views = []
     for press in ("k", "ArrowRight", "k", "ArrowRight"):
-        shown.tab.keyboard.press(press)
-        views.append(shown.tab.evaluate("viewer.view.camera"))
+        shown.press(press)
+        views.append(shown.evaluate("viewer.view.camera"))
     shown.tab.click("#save-view")
     assert shown.tab.inner_text("#path summary") == "camera path (3)"
     assert [shown.tab.is_disabled(name) for name in BUTTONS] == [False, False, False]
@@ -128,7 +128,7 @@ def test_an_embedded_path_is_written_unchanged_and_keeps_its_times_when_it_grows
     assert read_path(downloaded(shown, tmp_path), ORIGIN).duration is None
     shown.tab.focus('button[aria-label="remove view 1"]')
     for left in (4, 3, 2, 1):
-        shown.tab.keyboard.press("Enter")  # the next button has the focus
+        shown.press("Enter")  # the next button has the focus
         assert shown.tab.inner_text("#path summary") == f"camera path ({left})"
     shown.tab.click("#save-view")
     assert not read_path(downloaded(shown, tmp_path), ORIGIN).timed, "a single time determines no speed"

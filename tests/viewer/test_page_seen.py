@@ -79,7 +79,7 @@ def test_the_tint_is_that_of_the_native_kernels_counts(visit, tmp_path, source):
         assert psnr(shown.picture(camera), flipped) < LEAST_PSNR - 10, "the measure tells the splats apart"
     assert shown.tab.get_attribute("#seen", "aria-pressed") == "true"
     assert f"{round(100 * few)} %" in shown.tab.inner_text("#legend")
-    shown.tab.keyboard.press("v")
+    shown.press("v")
     assert shown.tab.get_attribute("#seen", "aria-pressed") == "false" and not shown.tab.is_visible("#legend")
     for camera in views:
         assert psnr(shown.picture(camera), native(source.scene.gaussians, camera)) > LEAST_PSNR
@@ -108,7 +108,7 @@ def test_counts_are_capped_and_one_byte_a_splat(tmp_path, source):
 def test_a_page_without_counts_has_no_switch(visit, tmp_path, source):
     shown = visit().open(written(tmp_path / "a.html", source, None)).ready()
     assert not shown.tab.is_visible("#seen")
-    assert "photos_seen" not in shown.tab.evaluate("document.getElementById('splat.vert').textContent")
+    assert "photos_seen" not in shown.evaluate("document.getElementById('splat.vert').textContent")
 
 
 def test_counts_are_rounded_down_to_powers_of_two():

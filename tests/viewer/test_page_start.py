@@ -61,7 +61,7 @@ def test_the_panel_of_a_phone_lies_above_the_subject(visit, tmp_path, random_gau
     body, head = figure(random_gaussians)
     page.write(tmp_path / "figure.html", Scene(body), around(480, 640, 940.0))
     seen = visit(*PHONE).open(tmp_path / "figure.html").ready()
-    below = seen.tab.evaluate("element('panel').getBoundingClientRect().bottom")
+    below = seen.evaluate("element('panel').getBoundingClientRect().bottom")
     columns, rows = on_the_screen(seen, head)
     assert rows.min() > below, f"the head begins at {rows.min():.0f} px, the panel ends at {below:.0f} px"
     before = rows.min()
@@ -84,7 +84,7 @@ def test_a_saved_view_keeps_its_content_in_a_window_of_any_shape(visit, tmp_path
     page.write(tmp_path / "heaps.html", Scene(gaussians), around(640, 480, 2000.0), tour=tour)
     seen = visit(*size).open(tmp_path / "heaps.html").ready()
     for go in ("0", "viewer.goTo(3)", "viewer.goTo(0)", "viewer.reset()"):
-        seen.tab.evaluate(go)
+        seen.evaluate(go)
         if go == "viewer.goTo(3)":
             continue
         columns, rows = on_the_screen(seen, heaps)
@@ -110,8 +110,8 @@ def test_buttons_are_seen_over_a_scene_of_any_brightness(
 ):
     page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views)
     seen = visit(640, 480, color_scheme=scheme).open(tmp_path / "a.html").ready()
-    seen.tab.keyboard.press("h")
-    found = seen.tab.evaluate(EDGES)
+    seen.press("h")
+    found = seen.evaluate(EDGES)
     assert len(found) >= 5
     for name, edge, sheet in found:
         line, (*color, opacity) = (

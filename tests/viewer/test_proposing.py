@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -17,10 +16,9 @@ from gsplat_edu.runs.floaters import UNSEEN, propose
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer.proposing import MODULE, Proposing
+from waiting import PATIENCE, until
 
 pytestmark = pytest.mark.slow
-
-PATIENCE = 120.0
 
 
 def cloud(n=400, infinite=torch.inf):
@@ -69,11 +67,13 @@ def test_a_scene_file_is_judged_by_shape_and_says_so(tmp_path):
 
 def ended(proposing):
     """Wait until a judgement has ended; return all states on the way."""
-    states, until = [proposing.state()], time.monotonic() + PATIENCE
-    while states[-1]["state"] == "running" and time.monotonic() < until:
-        time.sleep(0.02)
-        if (state := proposing.state()) != states[-1]:
-            states.append(state)
+    states = []
+
+    def is_over():
+        states.append(proposing.state())
+        return states[-1]["state"] != "running"
+
+    until(is_over, "the end of the judgement")
     return states
 
 
@@ -101,7 +101,7 @@ def test_a_scene_that_cannot_be_read_is_one_line(tmp_path):
 def test_a_judgement_is_stopped_at_once(tmp_path, monkeypatch):
     """The first one would never end by itself."""
     written(tmp_path)
-    (tmp_path / "endless.py").write_text("import time\nwhile True:\n    time.sleep(1)\n")
+    (tmp_path / "endless.py").write_text("import threading\nthreading.Event().wait()\n")
     proposing = Proposing(tmp_path / "cloud.ply")
     with monkeypatch.context() as patch:
         patch.setattr("gsplat_edu.viewer.proposing.MODULE", "endless")

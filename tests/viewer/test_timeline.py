@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gestures import drag, swipe
 from gsplat_edu.edits.apply import views_after
-from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import look_at
 from gsplat_edu.viewer import page
-from viewer.handles import touch, until
+from viewer.handles import until
 
 EYES = [(0, 0, -4), (0.5, -0.2, -3.6), (2.5, -0.5, -2), (3, 0, 1)]
 TIMES = (0.0, 1.0, 3.0, 6.0)
@@ -36,12 +36,12 @@ def opened(edit_page, random_gaussians):
 
     def make(of, width=900, height=700, **options):
         shown = edit_page(random_gaussians(40), width=width, height=height, **options)
-        shown.tab.evaluate("(path) => editor.perform({ op: 'path', path })", of.document())
+        shown.evaluate("(path) => editor.perform({ op: 'path', path })", of.document())
         if not shown.tab.is_visible("#tools"):
             shown.tab.click("#fold")
         shown.tab.click("#path summary")
         shown.tab.wait_for_selector("#strip")
-        shown.tab.evaluate("document.getElementById('strip').scrollIntoView({ block: 'center' })")
+        shown.evaluate("document.getElementById('strip').scrollIntoView({ block: 'center' })")
         return shown
 
     return make
@@ -49,18 +49,18 @@ def opened(edit_page, random_gaussians):
 
 def stored(shown):
     """Return the path that the edits file of the page stores, as Python reads it."""
-    edits = parse_edits(shown.tab.evaluate("editor.text()").encode(), "edits.json")
+    edits = shown.edits()
     return views_after(edits.operations).path
 
 
 def steps(shown):
-    return shown.tab.evaluate("editor.history.done.length")
+    return len(shown.operations())
 
 
 def seen_at(shown, curve, seconds):
     """Check that the picture shows the path at a time."""
     eyes, rotations, _ = curve.poses([seconds])
-    here = shown.tab.evaluate("viewer.view.camera")
+    here = shown.evaluate("viewer.view.camera")
     np.testing.assert_allclose(here["eye"], eyes[0], atol=1e-6)
     np.testing.assert_allclose(here["R"], rotations[0], atol=1e-6)
 
@@ -103,89 +103,70 @@ class Strip:
         return self.span / self.box["width"]
 
 
-def drag(shown, start, end):
-    mouse = shown.tab.mouse
-    mouse.move(*start)
-    mouse.down()
-    mouse.move((start[0] + end[0]) / 2, end[1])
-    mouse.move(*end)
-    mouse.up()
-
-
 def focused(shown):
-    return shown.tab.evaluate("document.activeElement.getAttribute('aria-label')")
+    return shown.evaluate("document.activeElement.getAttribute('aria-label')")
 
 
-def test_a_marker_is_dragged_to_another_time_and_back_by_undo(opened):
-    shown = opened(path())
-    strip, before = Strip(shown), shown.tab.evaluate("editor.text()")
-    drag(shown, strip.marker(3.0), strip.marker(4.2))
-    assert steps(shown) == 2 and order(shown) == [1, 2, 3, 4]
-    assert times(shown) == pytest.approx([0, 1, 4.2, 6], abs=strip.pixel)
-    assert focused(shown) == "time of view 3"
-    assert float(shown.tab.input_value("#view-time")) == pytest.approx(times(shown)[2], abs=0.006)
-    shown.tab.keyboard.press("Control+z")
-    assert shown.tab.evaluate("editor.text()") == before
-    assert shown.tab.get_attribute(".marker >> nth=2", "aria-valuenow") == "3"
-
-
-def test_a_drag_past_a_neighbour_changes_the_order(opened):
-    shown = opened(path())
-    strip = Strip(shown)
-    drag(shown, strip.marker(3.0), strip.marker(0.5))
-    assert order(shown) == [1, 3, 2, 4]
-    assert times(shown) == pytest.approx([0, 0.5, 1, 6], abs=strip.pixel)
-    assert shown.tab.inner_text("#chosen-view") == "view 2" and focused(shown) == "time of view 2"
-
-
-def test_the_first_view_may_go_later_and_the_last_one_beyond_the_end(opened):
-    shown = opened(path())
-    strip = Strip(shown)
-    drag(shown, strip.marker(0.0), strip.marker(2.0))
-    assert order(shown) == [2, 1, 3, 4]
-    assert times(shown) == pytest.approx([0, 1, 2, 5], abs=strip.pixel)
-    strip = Strip(shown, stored(shown).seconds)
-    drag(shown, strip.marker(times(shown)[3]), strip.marker(times(shown)[3] + 0.4))
-    assert stored(shown).seconds == pytest.approx(5.4, abs=2 * strip.pixel)
-
-
-def test_a_press_chooses_a_view_and_shows_it(opened):
+def test_markers_are_pressed_and_dragged_and_undo_takes_it_back(opened):
     shown = opened(path())
     shown.tab.mouse.click(*Strip(shown).marker(3.0))
     assert steps(shown) == 1 and shown.tab.inner_text("#chosen-view") == "view 3"
     seen_at(shown, PathCurve(path()), 3.0)
 
+    strip, before = Strip(shown), shown.text()
+    drag(shown.tab, strip.marker(3.0), strip.marker(4.2))
+    assert steps(shown) == 2 and order(shown) == [1, 2, 3, 4]
+    assert times(shown) == pytest.approx([0, 1, 4.2, 6], abs=strip.pixel)
+    assert focused(shown) == "time of view 3"
+    assert float(shown.tab.input_value("#view-time")) == pytest.approx(times(shown)[2], abs=0.006)
+    shown.press("Control+z")
+    assert shown.text() == before
+    assert shown.tab.get_attribute(".marker >> nth=2", "aria-valuenow") == "3"
+
+    strip = Strip(shown)
+    drag(shown.tab, strip.marker(3.0), strip.marker(0.5))
+    assert order(shown) == [1, 3, 2, 4]
+    assert times(shown) == pytest.approx([0, 0.5, 1, 6], abs=strip.pixel)
+    assert shown.tab.inner_text("#chosen-view") == "view 2" and focused(shown) == "time of view 2"
+
+    shown.press("Control+z")
+    strip = Strip(shown)
+    drag(shown.tab, strip.marker(0.0), strip.marker(2.0))
+    assert order(shown) == [2, 1, 3, 4]
+    assert times(shown) == pytest.approx([0, 1, 2, 5], abs=strip.pixel)
+    strip = Strip(shown, stored(shown).seconds)
+    drag(shown.tab, strip.marker(times(shown)[3]), strip.marker(times(shown)[3] + 0.4))
+    assert stored(shown).seconds == pytest.approx(5.4, abs=2 * strip.pixel)
+
 
 def test_the_playhead_scrubs_and_play_begins_there(opened):
     shown = opened(path(ease="views"))
     strip, curve = Strip(shown), PathCurve(path(ease="views"))
-    drag(shown, strip.ruler(1.0), strip.ruler(4.5))
-    at = shown.tab.evaluate("viewer.keyframes.timeline.at")
+    drag(shown.tab, strip.ruler(1.0), strip.ruler(4.5))
+    at = shown.evaluate("viewer.keyframes.timeline.at")
     assert at == pytest.approx(4.5, abs=strip.pixel) and steps(shown) == 1
     seen_at(shown, curve, at)
     shown.tab.click("#play")
     shown.tab.wait_for_selector('#play[aria-pressed="false"]')
-    assert shown.tab.evaluate("viewer.keyframes.timeline.at") == pytest.approx(6.0)
+    assert shown.evaluate("viewer.keyframes.timeline.at") == pytest.approx(6.0)
     seen_at(shown, curve, 6.0)
-    shown.tab.evaluate(BEGINS)
+    shown.evaluate(BEGINS)
     shown.tab.click("#play")
     until(shown.tab, "began.length > 0")
-    assert shown.tab.evaluate("began[0]") < 5.5, "after the end it begins again"
+    assert shown.evaluate("began[0]") < 5.5, "after the end it begins again"
     if shown.tab.get_attribute("#play", "aria-pressed") == "true":
         shown.tab.click("#play")
 
 
 def test_keys_move_views_and_the_playhead_while_a_tool_is_chosen(opened):
     shown = opened(path())
-    shown.tab.click("[data-tool=rectangle]")
+    shown.choose("rectangle")
     shown.tab.focus(".marker >> nth=1")
-    for _ in range(3):
-        shown.tab.keyboard.press("ArrowRight")
+    shown.press(*["ArrowRight"] * 3)
     assert times(shown) == pytest.approx([0, 1.3, 3, 6]) and steps(shown) == 4
-    shown.tab.keyboard.press("Shift+ArrowRight")
-    shown.tab.keyboard.press("Shift+ArrowRight")
+    shown.press("Shift+ArrowRight", "Shift+ArrowRight")
     assert order(shown) == [1, 3, 2, 4] and times(shown) == pytest.approx([0, 3, 3.3, 6])
-    assert focused(shown) == "time of view 3" and shown.tab.evaluate("editor.tools.cursor") is None
+    assert focused(shown) == "time of view 3" and shown.evaluate("editor.tools.cursor") is None
     now = path((0.0, 3.0, 3.3, 6.0))
     now = replace(
         now,
@@ -193,42 +174,33 @@ def test_keys_move_views_and_the_playhead_while_a_tool_is_chosen(opened):
             replace(keyframes()[i], time=k.time) for i, k in zip((0, 2, 1, 3), now.keyframes, strict=True)
         ),
     )
-    shown.tab.keyboard.press("Enter")
+    shown.press("Enter")
     seen_at(shown, PathCurve(now), 3.3)
     shown.tab.focus("#playhead")
-    shown.tab.keyboard.press("Home")
-    shown.tab.keyboard.press("Shift+ArrowRight")
-    shown.tab.keyboard.press("ArrowRight")
+    shown.press("Home", "Shift+ArrowRight", "ArrowRight")
     seen_at(shown, PathCurve(now), 1.1)
     assert shown.tab.get_attribute("#playhead", "aria-valuetext") == "1.1 s"
-    shown.tab.keyboard.press("End")
+    shown.press("End")
     seen_at(shown, PathCurve(now), 6.0)
 
 
 def test_a_finger_drags_a_marker_and_scrubs(opened):
     shown = opened(path(), width=390, height=844, has_touch=True)
-    session, strip = shown.tab.context.new_cdp_session(shown.tab), Strip(shown)
-
-    def swipe(start, end):
-        touch(session, "touchStart", start)
-        touch(session, "touchMove", ((start[0] + end[0]) / 2, end[1]))
-        touch(session, "touchMove", end)
-        touch(session, "touchEnd")
-
+    strip = Strip(shown)
     x, y = strip.marker(1.0)
-    swipe((x + 8, y), (strip.marker(2.2)[0] + 8, y + 5))
+    swipe(shown.tab, (x + 8, y), (strip.marker(2.2)[0] + 8, y + 5))
     assert times(shown) == pytest.approx([0, 2.2, 3, 6], abs=strip.pixel), (
         "the finger need not hit the middle"
     )
-    swipe(strip.ruler(0.3), strip.ruler(5.0))
-    at = shown.tab.evaluate("viewer.keyframes.timeline.at")
+    swipe(shown.tab, strip.ruler(0.3), strip.ruler(5.0))
+    at = shown.evaluate("viewer.keyframes.timeline.at")
     assert at == pytest.approx(5.0, abs=strip.pixel) and steps(shown) == 2
     seen_at(shown, PathCurve(stored(shown)), at)
 
 
 def fill(shown, name, value):
     shown.tab.fill(f"#{name}", str(value))
-    shown.tab.keyboard.press("Enter")
+    shown.press("Enter")
 
 
 def test_numbers_set_time_rest_and_duration(opened):
@@ -245,10 +217,10 @@ def test_numbers_set_time_rest_and_duration(opened):
         1
     ].hold == pytest.approx(5)
     fill(shown, "view-rest", 0)
-    assert "hold" not in shown.tab.evaluate("editor.text()").splitlines()[-3]
+    assert "hold" not in shown.text().splitlines()[-3]
     shown.tab.select_option("#path-ease", "ends")
     assert stored(shown).ease == "ends"
-    shown.tab.click("[data-do=undo]")
+    shown.do("undo")
     assert stored(shown).ease is None and shown.tab.input_value("#path-ease") == ""
 
 
@@ -260,19 +232,19 @@ def test_views_change_places_are_replaced_and_inserted(opened):
     assert order(shown) == [1, 3, 2, 4] and times(shown) == list(TIMES)
     shown.tab.click("#view-earlier")
     assert order(shown) == [1, 2, 3, 4]
-    shown.tab.evaluate("viewer.view.orbit(0.4, 0.1); viewer.moved(-1)")
-    here = shown.tab.evaluate("viewer.view.camera.eye")
+    shown.evaluate("viewer.view.orbit(0.4, 0.1); viewer.moved(-1)")
+    here = shown.evaluate("viewer.view.camera.eye")
     shown.tab.click("#replace-view")
     assert times(shown) == list(TIMES)
     np.testing.assert_allclose(stored(shown).keyframes[1].eye, here)
     shown.tab.mouse.click(*strip.ruler(2.0))
-    shown.tab.evaluate("viewer.view.orbit(0.2, 0); viewer.moved(-1)")
-    here = shown.tab.evaluate("viewer.view.camera.eye")
+    shown.evaluate("viewer.view.orbit(0.2, 0); viewer.moved(-1)")
+    here = shown.evaluate("viewer.view.camera.eye")
     shown.tab.click("#insert-view")
     assert times(shown) == pytest.approx([0, 1, 2, 3, 6], abs=strip.pixel)
     np.testing.assert_allclose(stored(shown).keyframes[2].eye, here)
     assert shown.tab.inner_text("#chosen-view") == "view 3"
-    shown.tab.evaluate("viewer.keyframes.timeline.goTo(3)")
+    shown.evaluate("viewer.keyframes.timeline.goTo(3)")
     shown.tab.click("#insert-view")
     assert times(shown)[4] == pytest.approx(4.5), "at a view, halfway to the next one"
 
@@ -285,21 +257,20 @@ def test_a_path_without_times_keeps_its_speed_until_a_time_is_set(opened):
     assert found == pytest.approx(met, abs=0.006)
     fill(shown, "path-seconds", 9)
     assert not stored(shown).timed and stored(shown).duration == 9
-    shown.tab.evaluate("viewer.keyframes.timeline.goTo(1)")
+    shown.evaluate("viewer.keyframes.timeline.goTo(1)")
     shown.tab.click("#insert-view")
     assert not stored(shown).timed and len(stored(shown).keyframes) == 5
     assert stored(shown).seconds == pytest.approx(12), "as long per segment as before"
-    shown.tab.click("[data-do=undo]")
+    shown.do("undo")
     shown.tab.focus(".marker >> nth=3")
-    shown.tab.keyboard.press("ArrowRight")
+    shown.press("ArrowRight")
     assert times(shown) == pytest.approx([*(1.5 * met[:3]), 9.1])
 
 
 def test_a_loop_keeps_its_duration_and_time_for_the_way_back(opened):
     shown = opened(path(loop=True, duration=8.0))
     shown.tab.focus(".marker >> nth=3")
-    for _ in range(3):
-        shown.tab.keyboard.press("Shift+ArrowRight")
+    shown.press(*["Shift+ArrowRight"] * 3)
     now = stored(shown)
     assert now.loop and times(shown)[3] == pytest.approx(9) and now.duration == pytest.approx(9.01)
     fill(shown, "path-seconds", 18.02)
@@ -309,10 +280,10 @@ def test_a_loop_keeps_its_duration_and_time_for_the_way_back(opened):
 def test_hundred_random_changes_leave_a_path_that_python_reads(opened):
     """Each is one operation, and undoing all gives the first file."""
     shown = opened(path(holds=(0.0, 0.5, 0.0, 1.0)))
-    rng, first, done = np.random.default_rng(5), shown.tab.evaluate("editor.text()"), 0
+    rng, first, done = np.random.default_rng(5), shown.text(), 0
     for _ in range(100):
         kind = rng.integers(7)
-        count = shown.tab.evaluate("viewer.keyframes.path.keyframes.length")
+        count = shown.evaluate("viewer.keyframes.path.keyframes.length")
         line = "viewer.keyframes.timeline"
         index = int(rng.integers(count))
         call = [
@@ -324,25 +295,23 @@ def test_hundred_random_changes_leave_a_path_that_python_reads(opened):
             f"{line}.set({{ ...{line}.path, ease: {rng.choice(['null', '`ends`', '`views`'])} }})",
             f"({line}.chosen = {index}, {line}.swap({1 if index < count - 1 else -1}))",
         ][kind]
-        shown.tab.evaluate(f"() => {{ {call}; }}")
+        shown.evaluate(f"() => {{ {call}; }}")
         done += 1
         if done % 10 == 0:
             now = stored(shown)
             at = np.linspace(0, now.seconds, 7)
-            found = shown.tab.evaluate(
+            found = shown.evaluate(
                 "(times) => times.map((t) => viewer.keyframes.curve().pose(t).eye)", at.tolist()
             )
             np.testing.assert_allclose(found, PathCurve(now).poses(at)[0], atol=1e-6)
     assert steps(shown) == 1 + done
     assert {
         k["hold"] > 0
-        for k in map(
-            dict, json.loads(shown.tab.evaluate("editor.text()"))["operations"][-1]["path"]["keyframes"]
-        )
+        for k in map(dict, json.loads(shown.text())["operations"][-1]["path"]["keyframes"])
         if "hold" in k
     } <= {True}
-    shown.tab.evaluate("editor.goToStep(1)")
-    assert shown.tab.evaluate("editor.text()") == first
+    shown.evaluate("editor.goToStep(1)")
+    assert shown.text() == first
 
 
 def test_a_visitor_arranges_the_path_but_replaces_no_view_of_the_author(visit, tmp_path, random_gaussians):
@@ -352,10 +321,10 @@ def test_a_visitor_arranges_the_path_but_replaces_no_view_of_the_author(visit, t
     shown.tab.click("#path summary")
     assert shown.tab.input_value("#path-ease") == "ends" and not shown.tab.is_visible("#replace-view")
     shown.tab.fill("#view-rest", "1.5")
-    shown.tab.keyboard.press("Enter")
-    assert shown.tab.evaluate("viewer.keyframes.document().keyframes[0].hold") == 1.5
-    shown.tab.keyboard.press("Escape")
-    shown.tab.evaluate("viewer.keyframes.timeline.goTo(4)")
+    shown.press("Enter")
+    assert shown.evaluate("viewer.keyframes.document().keyframes[0].hold") == 1.5
+    shown.press("Escape")
+    shown.evaluate("viewer.keyframes.timeline.goTo(4)")
     shown.tab.click("#insert-view")
     assert shown.tab.is_visible("#replace-view")
     labels = shown.tab.locator("#path li button[aria-label^=remove]").evaluate_all(

@@ -98,7 +98,7 @@ function deepestOf(places, { depths, ends }, steepness) {
 // The surface at the points of a lattice: depths, where half of the opacity is reached, as depthAtPixel finds it (0 if
 // there is none), and ends, which lie deeper by the thickness of the splats up to there: three times the mean of their
 // standard deviations in depth, weighted by what each adds to the opacity.
-function visibleSurface({ values, flags, settings, near }, camera, lattice) {
+export function visibleSurface({ values, flags, settings, near }, camera, lattice) {
   const { u0, v0, du, dv, across, down } = lattice;
   const size = across * down;
   const clear = new Float64Array(size).fill(1); // transmittance
