@@ -121,7 +121,7 @@ def test_a_capture_without_points_shows_its_cameras(opened):
     assert np.ptp(before.reshape(-1, 3), axis=0).max() > 100  # outlines on the backdrop
 
 
-def test_a_person_hovers_chooses_steps_orbits_and_looks_through_a_camera(opened, served):
+def test_the_photo_of_a_camera_is_shown_under_the_pointer(opened, served):
     tab = opened()
     index = alone(tab)
     x, y = middle_of(tab, index)
@@ -149,6 +149,9 @@ def test_a_person_hovers_chooses_steps_orbits_and_looks_through_a_camera(opened,
     tab.mouse.move(5, 595)
     tab.locator("#hover").wait_for(state="hidden")
 
+
+def test_a_person_chooses_steps_and_orbits(opened):
+    tab = opened()
     index = alone(tab)
     tab.mouse.click(*middle_of(tab, index))
     chosen = tab.get_by_role("region", name="photo")
@@ -185,6 +188,9 @@ def test_a_person_hovers_chooses_steps_orbits_and_looks_through_a_camera(opened,
     tab.keyboard.press("r")
     np.testing.assert_allclose(view_of(tab).eye, before.eye)
 
+
+def test_a_person_looks_through_a_camera(opened):
+    tab = opened()
     tab.evaluate("viewer.choose(2)")
     tab.keyboard.press("t")
     tab.locator("#through").wait_for()
