@@ -12,7 +12,7 @@ from studio.pages import go, visitor_of
 from waiting import awaited, pass_time, until_in
 
 
-def opened(tab, address):
+def opened(tab):
     """Go to the editor's screen and return the frame with the editor."""
     go(tab, "scenes/wall/edit")
     # by its title, because the screen before this one may have had a scene as well
@@ -57,11 +57,10 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     person, scene = visitor(), wall_entry
     tab = person.tab
     tab.set_viewport_size({"width": 1000, "height": 620})
-    address = tab.url.split("#")[0]
-    frame = opened(tab, address)
-    late = tab.context.new_page()
+    frame = opened(tab)
+    late = visitor_of(person, person.tab.url)
     late.set_viewport_size({"width": 1000, "height": 620})
-    older = opened(late, address)  # opened before the first tab saves
+    older = opened(late)  # opened before the first tab saves
 
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
     left = frame.inner_text("#edit-count")
@@ -81,7 +80,7 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     late.close()
 
     tab.reload()
-    frame = opened(tab, address)
+    frame = opened(tab)
     assert frame.inner_text("#edit-count") == left
     assert frame.inner_text("#edit-list summary") == "operations (2)"
 
@@ -104,11 +103,10 @@ def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     person, stored = visitor(), wall_entry / "edits.json"
     tab = person.tab
     tab.set_viewport_size({"width": 1000, "height": 620})
-    address = tab.url.split("#")[0]
     stored.unlink(missing_ok=True)
     tab.add_init_script(HELD)
     tab.reload()
-    frame = opened(tab, address)
+    frame = opened(tab)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
     tab.evaluate("hold()")
     until_in(tab, tab, "unanswered === 0")  # an answer on its way would tell of the edits
@@ -131,7 +129,7 @@ def test_two_saves_at_once_are_no_conflict(visitor, wall_entry):
     tab = person.tab
     tab.set_viewport_size({"width": 1000, "height": 620})
     stored.unlink(missing_ok=True)
-    frame = opened(tab, tab.url.split("#")[0])
+    frame = opened(tab)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
     held = []
     tab.route(
@@ -160,9 +158,8 @@ def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
     person = visitor()
     tab = person.tab
     tab.set_viewport_size({"width": 1000, "height": 620})
-    address = tab.url.split("#")[0]
     (wall_entry / "edits.json").unlink(missing_ok=True)
-    frame = opened(tab, address)
+    frame = opened(tab)
     for name, then in (
         ("all", "all"),
         ("delete", "undo"),
@@ -203,9 +200,8 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     person, stored = visitor(), wall_entry / "edits.json"
     tab = person.tab
     tab.set_viewport_size({"width": 1000, "height": 620})
-    address = tab.url.split("#")[0]
     stored.unlink(missing_ok=True)
-    frame = opened(tab, address)
+    frame = opened(tab)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
     left = frame.inner_text("#edit-count")
     tabs = tab.locator("nav.tabs")
@@ -214,7 +210,7 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     tabs.get_by_role("link", name="Edit (unsaved)").wait_for()
     tab.get_by_role("link", name="Library", exact=True).click()
     person.reach("#/")
-    frame = opened(tab, address)
+    frame = opened(tab)
     frame.locator("#edit-count", has_text=left).wait_for()
     assert frame.inner_text("#edit-saved") == "not saved" and not stored.exists()
 
@@ -224,7 +220,7 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     frame.get_by_role("button", name="undo", exact=True).click()
     shares(tab)
     stored.write_text(json.dumps(mine | {"operations": []}))  # as another tab does
-    frame = opened(tab, address)
+    frame = opened(tab)
     tab.get_by_text("other edits were saved since").wait_for()
     assert (
         "176 of 176 left" in frame.inner_text("#edit-count")
@@ -234,7 +230,7 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     assert frame.inner_text("#edit-list summary") == "operations (1)"
     shares(tab)
     stored.write_text(json.dumps(mine))
-    frame = opened(tab, address)
+    frame = opened(tab)
     tab.get_by_role("button", name="Discard them").click()
     assert frame.inner_text("#edit-list summary") == "operations (2)"
     tabs.get_by_role("link", name="Edit", exact=True).wait_for()
@@ -245,14 +241,13 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     person, stored = visitor(), wall_entry / "edits.json"
     tab = person.tab
     tab.set_viewport_size({"width": 1000, "height": 620})
-    address = tab.url.split("#")[0]
     stored.unlink(missing_ok=True)
     go(tab, "")
     card = tab.locator("a.card", has_text="wall").locator("img")
     tab.locator("a.card", has_text="wall").scroll_into_view_if_needed()
     until_in(tab, tab, "document.querySelector('a.card[href*=wall] img').naturalWidth > 0")
     before = card.get_attribute("src")
-    frame = opened(tab, address)
+    frame = opened(tab)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
     left = int(re.search(r"([\d,]+) of 176 left", frame.inner_text("#edit-count"))[1])
     frame.get_by_role("button", name="save", exact=True).click()
@@ -293,14 +288,13 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
 def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wall_entry):
     """The browser's storage has them; the editor of this scene offers them, that of another does not."""
     person, stored = visitor(), wall_entry / "edits.json"
-    address = person.tab.url.split("#")[0]
     stored.unlink(missing_ok=True)
     person.tab.set_viewport_size({"width": 1000, "height": 620})
 
     def closed_with_edits():
-        tab = visitor_of(person, address)
+        tab = visitor_of(person, person.tab.url)
         tab.set_viewport_size({"width": 1000, "height": 620})
-        frame = opened(tab, address)
+        frame = opened(tab)
         select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
         until_in(tab, tab, "localStorage.length === 1")
         tab.evaluate("for (let i = 0; i < 10000; ++i) clearInterval(i)")
@@ -316,7 +310,7 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
     left, tab = closed_with_edits(), person.tab
     tab.clock.install()
     tab.reload()
-    frame = opened(tab, address)
+    frame = opened(tab)
     notice = tab.get_by_text(re.compile(r"There are unsaved changes from .*\d:\d\d"))
     notice.wait_for()
     assert "176 of 176 left" in frame.inner_text("#edit-count")
@@ -343,10 +337,10 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
     until_in(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
     pass_time(tab, 1500)
     assert not notice.is_visible()
-    opened(tab, address)
+    opened(tab)
     tab.get_by_role("button", name="Forget").click()
     until_in(tab, tab, "localStorage.length === 0")
     tab.reload()
-    opened(tab, address)
+    opened(tab)
     pass_time(tab, 1500)
     assert not notice.is_visible()
