@@ -59,6 +59,17 @@ def test_renders_and_gradients_have_the_same_bits_however_they_are_split(device,
         monkeypatch.undo()
 
 
+@pytest.mark.parametrize("count", [3_000, 100_000, 3_000_000])
+def test_a_device_too_fast_to_tell_its_pace_is_timed_once(count):
+    """The levels of a scan dispatch one entry point in sizes that differ a hundred times."""
+    counts = {"gaussians": count, "rest": 45 * count, "pixels": 1_000_000, "edges": 4_000, "live": LIVE}
+    passes = [(one.name, one.groups(counts | {"pairs": 2 * count})) for one in step_program(12).parts["step"]]
+    pace = Pace(0.2)
+    for name, groups in passes:
+        pace.note(name, [(groups, 1e-4)])
+    assert [name for name, groups in passes if not pace.is_known(name, groups)] == []
+
+
 def steps_of(device):
     """Return the state after three steps, a random one included, by `play` and `submit`."""
     scene, view = packed(SMALLER["random"]), view_of(SMALLER["random"])

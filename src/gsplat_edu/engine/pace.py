@@ -117,7 +117,8 @@ class Pace:
     def note(self, name: str, times: Iterable[tuple[int, float]]) -> None:
         """Remember the workgroups and seconds of an entry point's stretches: the slowest one counts.
 
-        The first one may include the driver's compiler, so it counts only if it is the only one.
+        The first one may include the driver's compiler, so it counts only if it is the only one. A pass says nothing
+        new if a longer one of the same entry point was too short to tell: every other level of a scan, for instance.
         """
         self.version += 1
         stretches = [(groups, max(seconds, 0.0)) for groups, seconds in times]
@@ -125,7 +126,7 @@ class Pace:
         total = sum(groups for groups, _ in stretches)
         if telling:
             self.known[name] = Timing(max(telling), float("inf"))
-        else:
+        elif not self.is_known(name, REACH * total):
             self.known[name] = Timing(sum(seconds for _, seconds in stretches) / total, REACH * total)
 
     def watch(self, names: Iterable[str], seconds: float, submissions: int) -> None:

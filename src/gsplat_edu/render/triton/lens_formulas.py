@@ -88,7 +88,7 @@ def angle_of(y, x):
     across = tl.abs(x)
     low, high = tl.minimum(y, across), tl.maximum(y, across)
     t = low / tl.where(high > 0, high, 1.0)
-    for _ in tl.static_range(2):
+    for _step in tl.static_range(2):
         t = t / (1 + tl.sqrt(1 + t * t))
     value, _, _ = arc_series(t * t)
     angle = 4 * t * value

@@ -86,23 +86,12 @@ def _through_lens(seen, i, mask):
     """Load direction, image position, depth, and the rows of J W."""
     row = seen + i * SEEN
     u, v = tl.load(row, mask=mask, other=0.0), tl.load(row + 1, mask=mask, other=0.0)
-    t = (
-        tl.load(row + 2, mask=mask, other=0.0),
-        tl.load(row + 3, mask=mask, other=0.0),
-        tl.load(row + 4, mask=mask, other=0.0),
-    )
-    p = (
-        tl.load(row + 5, mask=mask, other=0.0),
-        tl.load(row + 6, mask=mask, other=0.0),
-        tl.load(row + 7, mask=mask, other=0.0),
-    )
+    t0, t1, t2 = load3(row + 2, 0, mask)
+    p0, p1, p2 = load3(row + 5, 0, mask)
     depth = tl.load(row + 8, mask=mask, other=1.0)
-    direction = (
-        tl.load(row + 9, mask=mask, other=0.0),
-        tl.load(row + 10, mask=mask, other=0.0),
-        tl.load(row + 11, mask=mask, other=1.0),
-    )
-    return direction, u, v, depth, t, p
+    o0, o1 = tl.load(row + 9, mask=mask, other=0.0), tl.load(row + 10, mask=mask, other=0.0)
+    o2 = tl.load(row + 11, mask=mask, other=1.0)
+    return o0, o1, o2, u, v, depth, t0, t1, t2, p0, p1, p2
 
 
 @triton.jit
@@ -116,7 +105,7 @@ def project_kernel(
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
     if LENS:
-        (o0, o1, o2), x, y, z, (t0, t1, t2), (p0, p1, p2) = _through_lens(seen_by_lens, i, mask)
+        o0, o1, o2, x, y, z, t0, t1, t2, p0, p1, p2 = _through_lens(seen_by_lens, i, mask)
         front = tl.load(seen_by_lens + i * SEEN + 12, mask=mask, other=0.0) > 0
         u, v = x, y
     else:
@@ -375,7 +364,7 @@ def project_backward_kernel(
     sums = _sums(slots, slot_begin, pairs_of, i, mask, BLOCK)
     touched = mask & sums[10]
     if LENS:
-        (o0, o1, o2), x, y, z, (t0, t1, t2), (p0, p1, p2) = _through_lens(seen_by_lens, i, mask)
+        o0, o1, o2, x, y, z, t0, t1, t2, p0, p1, p2 = _through_lens(seen_by_lens, i, mask)
     else:
         o0, o1, o2, x, y, z = into_camera(means, camera, i, mask)
         t0, t1, t2, ratio_x = jacobian_row(camera, 0, x, z)

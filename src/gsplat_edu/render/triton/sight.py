@@ -157,7 +157,7 @@ def _time_of(lens, at_rest, OPTICS: tl.constexpr):
     pace, middle = tl.load(lens + PACE), tl.load(lens + READ_MIDDLE)
     first, _, _, _ = image_of(lens, at_rest, OPTICS)
     q = first[0] if BY_COLUMNS & OPTICS else first[1]
-    for _ in range(STEPS):
+    for _step in range(STEPS):
         _, _, _, _, _, _, at, _, _, _, speed = _moment(lens, at_rest, pace * (q - middle), OPTICS)
         if BY_COLUMNS & OPTICS:
             q += (at[0] - q) / (1 - pace * speed[0])
