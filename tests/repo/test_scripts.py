@@ -76,6 +76,7 @@ def script(path, *words, folder):
     return Program(SCRIPT, [path, *words], folder).ended(patience=600)
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.parametrize(
     "path",
@@ -96,6 +97,7 @@ def test_a_benchmark_runs(path, tmp_path):
     assert json.loads(out.read_text())["hardware"]["cores"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.parametrize("path", sorted((ROOT / "train").glob("*.py")), ids=lambda p: p.name)
 def test_a_training_runs(path, tmp_path):

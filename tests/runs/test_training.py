@@ -332,6 +332,7 @@ def test_nonfinite_gaussians_are_left_out(capture, tmp_path):
     assert len(load_ply(run.folder.latest_scene()[0])) == len(trainer.gaussians) - 2
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interruption_saves_and_exits_with_130(capture, whole, tmp_path, number):
