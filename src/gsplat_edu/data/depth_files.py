@@ -9,7 +9,6 @@ import os
 import re
 import sys
 import threading
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +24,7 @@ from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE, open_file, read_bytes
 from gsplat_edu.base.text import install_command
 from gsplat_edu.base.zip_directory import check_directory
-from gsplat_edu.photos.image_files import UNDECODABLE, opened_image, require_room
+from gsplat_edu.photos.image_files import UNDECODABLE, opened_image, quiet_decoders, require_room
 
 Map = Float32[np.ndarray, "h w"]
 
@@ -90,8 +89,7 @@ def read_depth(path: Path) -> Map:
     try:
         if reader is None:
             raise ValueError(f"has none of the suffixes {', '.join(ENDINGS)}")
-        with warnings.catch_warnings():  # of decoders, about what the user cannot fix
-            warnings.simplefilter("ignore")
+        with quiet_decoders():
             values = reader(path)
     except (*UNDECODABLE, zipfile.BadZipFile, zlib.error) as error:
         said = "it is no image" if isinstance(error, UnidentifiedImageError) else str(error)

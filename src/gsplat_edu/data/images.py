@@ -6,7 +6,6 @@ import functools
 import math
 import os
 import threading
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ from gsplat_edu.photos.image_files import (
     UNDECODABLE,
     bytes_per_pixel,
     opened_image,
+    quiet_decoders,
     require_room,
 )
 from gsplat_edu.photos.resizing import area_mean, premultiplied, smaller_mask, unweighted
@@ -139,10 +139,8 @@ def image_orientation(path: Path) -> int:
         DatasetError: as for `image_header`.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about invalid EXIF, which the user cannot fix
-            with opened_image(path) as file:
-                return stored_orientation(file)
+        with quiet_decoders(), opened_image(path) as file:
+            return stored_orientation(file)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
 
@@ -158,12 +156,10 @@ def recorded_exposure(path: Path) -> float | None:
     """
     tags = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about invalid EXIF, which the user cannot fix
-            with opened_image(path) as file:
-                # Pillow decodes a PNG to look for EXIF behind its pixels, where cameras do not write it
-                late = file.format == "PNG" and "exif" not in file.info
-                details = {} if late else file.getexif().get_ifd(ExifTags.IFD.Exif)
+        with quiet_decoders(), opened_image(path) as file:
+            # Pillow decodes a PNG to look for EXIF behind its pixels, where cameras do not write it
+            late = file.format == "PNG" and "exif" not in file.info
+            details = {} if late else file.getexif().get_ifd(ExifTags.IFD.Exif)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
     time, iso, number = (_positive(details.get(tag)) for tag in tags)

@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 from PIL import Image
 
-from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.errors import BackendWarning, DatasetError
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import install_command
@@ -95,6 +95,19 @@ class _PillowsLimit:
 
 
 _no_limit = _PillowsLimit()
+
+
+@contextmanager
+def quiet_decoders() -> Iterator[None]:
+    """Ignore what decoders warn of, as invalid EXIF, which the user cannot fix.
+
+    All threads share the filters, and threads that end this in another order than they began it leave theirs behind.
+    So our own warnings stay on.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", BackendWarning)
+        yield
 
 
 @contextmanager
@@ -175,10 +188,8 @@ def bytes_per_pixel(image: Image.Image) -> int:
 def is_image(path: Path) -> bool:
     """Return whether a file is an image in one of `FORMATS`, according to its header. HEIC needs no decoder here."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with opened_image(path):
-                return True
+        with quiet_decoders(), opened_image(path):
+            return True
     except UNDECODABLE:
         return False
     except DatasetError:
