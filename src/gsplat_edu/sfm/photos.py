@@ -6,7 +6,6 @@ import hashlib
 import math
 import os
 import re
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -30,7 +29,7 @@ from gsplat_edu.data.images import (
     stored_orientation,
     stored_size,
 )
-from gsplat_edu.photos.image_files import HEIF, SPELLED, UNDECODABLE, is_image, opened_image
+from gsplat_edu.photos.image_files import HEIF, SPELLED, UNDECODABLE, is_image, opened_image, quiet_decoders
 from gsplat_edu.scene.views import Photo
 from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, upright_masks, write_mask
 
@@ -352,15 +351,13 @@ def _facts(path: Path, name: str, copy: str) -> tuple[PhotoFacts, tuple[int, int
         DatasetError: it is HEIC, and pillow-heif is not installed.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about sizes and invalid EXIF, which the user cannot fix
-            with opened_image(path) as file:
-                (W, H), exif = stored_size(file), file.getexif()
-                orientation, heif = stored_orientation(file), file.format == HEIF
-                taken = file.info.get("original_orientation") if heif else orientation
-                problem = conversion_of(file.info).problem
-                details = exif.get_ifd(ExifTags.IFD.Exif)
-                place = _place(exif.get_ifd(ExifTags.IFD.GPSInfo))
+        with quiet_decoders(), opened_image(path) as file:
+            (W, H), exif = stored_size(file), file.getexif()
+            orientation, heif = stored_orientation(file), file.format == HEIF
+            taken = file.info.get("original_orientation") if heif else orientation
+            problem = conversion_of(file.info).problem
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            place = _place(exif.get_ifd(ExifTags.IFD.GPSInfo))
     except UNDECODABLE as error:
         reason = f"not a {SPELLED} image" if "cannot identify" in str(error) else str(error).split("\n")[0]
         raise ValueError(reason) from None
@@ -435,10 +432,8 @@ def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:
 def taken_at(path: Path) -> tuple[float, float, float] | None:
     """Read latitude and longitude in degrees and height in m from a photo's EXIF; None if it has none."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about invalid EXIF, which the user cannot fix
-            with opened_image(path) as file:
-                return _place(file.getexif().get_ifd(ExifTags.IFD.GPSInfo))
+        with quiet_decoders(), opened_image(path) as file:
+            return _place(file.getexif().get_ifd(ExifTags.IFD.GPSInfo))
     except UNDECODABLE:
         return None
 
