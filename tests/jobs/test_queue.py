@@ -23,6 +23,7 @@ PROGRAM = (
     f"import sys; sys.path.append({HERE!r})"
     + """
 import json, os, signal
+from waiting import until  # not later: Python drops what a signal's handler raises at some moments of an import
 file = os.open(os.environ["GSPLAT_EDU_EVENTS"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 def emit(event, **fields):  # a signal may come while it writes, and a file object does not let its handler write then
     os.write(file, (json.dumps({"event": event, "time": 0, **fields}) + "\\n").encode())
@@ -44,7 +45,6 @@ if "crashes" in sys.argv:
     print("Traceback and all", file=sys.stderr)
     sys.exit(1)
 if "waits" in sys.argv:
-    from waiting import until
     until(lambda: emit("progress", stage="work", done=1) or os.path.exists(sys.argv[2]))
 emit("finished", outputs=[sys.argv[2]])
 """
