@@ -27,12 +27,11 @@ def run(*arguments, **options):
     return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_default_budget_trains_end_to_end(tmp_path):
     """The dense backend's reduced budget cuts the held-out error at least threefold.
 
-    This takes minutes, so only `make soak` runs it. tests/golden checks the first iteration on every run, and the first
-    hundred with the kernels.
+    This takes minutes; tests/golden checks the first iteration on every run, and the first hundred with the kernels.
     """
     out = tmp_path / "new" / "folder" / "sphere.png"
     # Use one thread: torch's threads wait for each other, which takes minutes on a busy machine.

@@ -100,7 +100,10 @@ def test_the_same_bits_again_and_after_a_resume(views, tmp_path, strategy):
 
 @pytest.mark.slow
 def test_the_sphere_reaches_the_course_s_quality(tmp_path, capsys):
-    """The demo's 800 iterations at half its size, which is a minute in software; 0.0088 was measured."""
-    assert main(["demo", "--backend", "webgpu", "--size", "64", "--out", str(tmp_path / "sphere.png")]) == 0
+    """Half of the demo's 800 iterations at a quarter of its size, half a minute in software; 0.0202 was measured on both
+    backends, and before the training 0.2648.
+    """
+    words = ["--backend", "webgpu", "--size", "32", "--iters", "400", "--out", str(tmp_path / "sphere.png")]
+    assert main(["demo", *words]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("held-out L1")]
-    assert float(line.rsplit(" ", 1)[1]) <= 0.0100
+    assert float(line.rsplit(" ", 1)[1]) <= 0.0230

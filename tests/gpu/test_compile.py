@@ -17,8 +17,15 @@ SPILLED = 64
 
 @pytest.mark.own_process
 @pytest.mark.parametrize(("kernels", "count"), [("gaussians", 9), ("lenses", 8), ("pixels", 4), ("loss", 6)])
-@pytest.mark.parametrize("variant", ["least", "most"])
-@pytest.mark.parametrize("capability", [80, 90])
+@pytest.mark.parametrize(
+    ("capability", "variant"),
+    [
+        (80, "least"),
+        (90, "most"),
+        pytest.param(80, "most", marks=pytest.mark.soak),
+        pytest.param(90, "least", marks=pytest.mark.soak),
+    ],
+)
 def test_every_kernel_compiles_with_few_spills(capability, variant, kernels, count, tmp_path):
     environment = os.environ | {"TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, str(Path(__file__).with_name("compile_kernels.py"))]

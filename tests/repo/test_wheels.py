@@ -36,7 +36,8 @@ repeat = importlib.import_module("wheels.repeat")
 
 FAST_TESTS = (
     *("tests/test_camera.py", "tests/io/test_ply.py"),
-    *("tests/native/test_parity.py", "tests/viewer/test_content_policy.py"),
+    "tests/native/test_parity.py::test_every_sh_degree_matches_the_reference",
+    "tests/viewer/test_content_policy.py",
 )
 """Tests of the references, the kernels, the formats, and the files of the package that are not Python."""
 

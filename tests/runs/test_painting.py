@@ -9,6 +9,7 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.mesh.depths import DepthView
 from gsplat_edu.mesh.faces import faces_of
+from gsplat_edu.mesh.texture import TextureSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.painting import painted
 from gsplat_edu.runs.transients import mask_path
@@ -17,6 +18,7 @@ from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.views import View
 
 SIZE, GREY, RED = 64, (120, 120, 120), (255, 0, 0)
+SMALL = TextureSettings(size=256)
 WALL = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]]), np.array([[0, 2, 1], [1, 2, 3]]))
 
 
@@ -44,24 +46,22 @@ def reddest(mesh):
     return int((image[..., 0] - image[..., 1]).max())
 
 
-@pytest.mark.slow
 def test_masks_of_a_run_say_what_does_not_paint(taken, tmp_path):
     pytest.importorskip("xatlas")
     dataset, maps = taken
     run = RunFolder(tmp_path / "run")
     assert len(dataset.train) == 3
-    assert reddest(painted(WALL, dataset, maps)) > 30
-    assert reddest(painted(WALL, dataset, maps, run)) > 30  # the training looked for nothing that moves
+    assert reddest(painted(WALL, dataset, maps, settings=SMALL)) > 30
+    assert reddest(painted(WALL, dataset, maps, run, SMALL)) > 30  # the training looked for nothing that moves
     counts = np.full((SIZE, SIZE), 255, np.uint8)
     counts[22:42, 22:42] = 0
     path = mask_path(run, next(view.name for view in dataset.train if view.name.endswith("1.png")))
     path.parent.mkdir(parents=True)
     Image.fromarray(counts).save(path)
-    assert reddest(painted(WALL, dataset, maps, run)) == 0
-    assert reddest(painted(WALL, dataset, maps)) > 30
+    assert reddest(painted(WALL, dataset, maps, run, SMALL)) == 0
+    assert reddest(painted(WALL, dataset, maps, settings=SMALL)) > 30
 
 
-@pytest.mark.slow
 def test_photos_of_a_fisheye_paint_the_places_that_they_show(tmp_path):
     pytest.importorskip("xatlas")
     views, lens = [], Projection("fisheye", Distortion.of(k1=-0.02))
@@ -92,7 +92,7 @@ def test_photos_of_a_fisheye_paint_the_places_that_they_show(tmp_path):
                 )
             )
     assert len(maps) > 9  # the wall, at 0.8 from a fisheye, is on its side faces too
-    mesh = painted(WALL, dataset, maps)
+    mesh = painted(WALL, dataset, maps, settings=SMALL)
     texture, corners = mesh.texture.image.astype(float), mesh.texture.uvs * mesh.texture.image.shape[1::-1]
     off = []
     for face, uv in zip(WALL.corners, corners, strict=True):
