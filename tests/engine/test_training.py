@@ -100,8 +100,8 @@ def test_the_same_bits_again_and_after_a_resume(views, tmp_path, strategy):
 
 @pytest.mark.slow
 def test_the_sphere_reaches_the_course_s_quality(tmp_path, capsys):
-    """Half of the demo's 800 iterations at a quarter of its size, half a minute in software; 0.0202 was measured on both
-    backends, and before the training 0.2648.
+    """Half of the demo's 800 iterations at a quarter of its size, half a minute in software. Both backends measured
+    0.0202, and 0.2648 before the training.
     """
     words = ["--backend", "webgpu", "--size", "32", "--iters", "400", "--out", str(tmp_path / "sphere.png")]
     assert main(["demo", *words]) == 0

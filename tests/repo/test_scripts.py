@@ -30,6 +30,9 @@ TRAININGS = {
     "train_3d.py": ("--iters", "3", "--size", "16", "--k0", "10"),
 }
 
+SMALLEST = {"surfaces.py": ("--captures", "box")}
+"""What makes a benchmark's trial run shorter than `--smoke` alone."""
+
 ELSEWHERE = {
     "build_cli_reference.py": "tests/repo/test_cli_reference.py",
     "build_recipe_table.py": "tests/repo/test_recipe_document.py",
@@ -85,7 +88,9 @@ def script(path, *words, folder):
 )
 def test_a_benchmark_runs(path, tmp_path):
     out = tmp_path / "deep" / "figures.json"
-    code, said, complained = script(path, "--smoke", "--out", out, folder=tmp_path)
+    code, said, complained = script(
+        path, "--smoke", *SMALLEST.get(path.name, ()), "--out", out, folder=tmp_path
+    )
     needs = {"gpu.py": not torch.cuda.is_available(), "gpu_model.py": True}.get(path.name, False)
     if needs and unavailable("webgpu"):
         assert (code, complained.count("\n")) == (2, 1) and "no GPU" in complained

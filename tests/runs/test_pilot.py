@@ -73,7 +73,13 @@ def chosen_for(folder, tmp_path, lens):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("k1", "kept"), [(-0.1, {"lens", "poses+lens"}), (0.0, {"none", "poses"})])
+@pytest.mark.parametrize(
+    ("k1", "kept"),
+    [
+        (-0.1, {"lens", "poses+lens"}),
+        pytest.param(0.0, {"none", "poses"}, marks=pytest.mark.soak),
+    ],
+)
 def test_a_lens_is_learned_if_it_is_wrong(tmp_path, k1, kept):
     """One that does not gain is trained on from what it found, before it is left out.
 
