@@ -52,9 +52,7 @@ def test_masks_of_a_run_say_what_does_not_paint(taken, tmp_path):
     run = RunFolder(tmp_path / "run")
     assert len(dataset.train) == 3
     assert reddest(painted(WALL, dataset, maps, settings=SMALL)) > 30
-    assert (
-        reddest(painted(WALL, dataset, maps, run, SMALL)) > 30
-    )  # the training looked for nothing that moves
+    assert reddest(painted(WALL, dataset, maps, run, SMALL)) > 30, "it looked for nothing that moves"
     counts = np.full((SIZE, SIZE), 255, np.uint8)
     counts[22:42, 22:42] = 0
     path = mask_path(run, next(view.name for view in dataset.train if view.name.endswith("1.png")))
