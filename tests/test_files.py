@@ -77,6 +77,14 @@ def test_a_folder_that_vanishes_meanwhile_is_passed_over(tmp_path, monkeypatch):
     assert not (tmp_path / "a").exists() and [path.name for path in left.parent.iterdir()] == ["kept"]
 
 
+@needs_posix
+def test_a_link_is_no_leftover(tmp_path):
+    name = f".x.{files._this_machine()}-{2**22 + 1}-0123abcd.ply"
+    (tmp_path / name).symlink_to(tmp_path / "elsewhere.ply")
+    remove_leftovers(tmp_path)
+    assert (tmp_path / name).is_symlink()
+
+
 def test_files_are_sorted_by_time_and_vanished_ones_left_out(tmp_path):
     paths = [tmp_path / name for name in "abc"]
     for time, path in zip((1, 3, 2), paths, strict=True):

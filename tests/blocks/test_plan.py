@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import CheckpointError
-from gsplat_edu.blocks.layout import PLAN
+from gsplat_edu.blocks.layout import PLAN, BlocksFolder, Done
 from gsplat_edu.blocks.plan import Block, BlockPlan, Cell, automatic_count, halved, measured_area
 from gsplat_edu.scene.camera import Camera, look_at
 
@@ -93,6 +93,18 @@ def test_a_plan_is_read_as_it_was_written(tmp_path):
     (tmp_path / PLAN).write_text('{"area": 3}')
     with pytest.raises(CheckpointError, match="is damaged"):
         BlockPlan.read(tmp_path)
+
+
+def test_the_record_of_another_block_or_plan_is_refused(tmp_path):
+    folder = BlocksFolder(tmp_path)
+    done = Done(3, "plan", "scene", 100, 30, 1.5, 0, "host", "v4", "1.0")
+    done.write(folder)
+    assert folder.read_done(3, "plan") == done and folder.read_done(2, "plan") is None
+    with pytest.raises(CheckpointError, match="belongs to another plan"):
+        folder.read_done(3, "another")
+    folder.record(3).rename(folder.record(2))
+    with pytest.raises(CheckpointError, match="belongs to another plan"):
+        folder.read_done(2, "plan")
 
 
 def test_one_block_for_every_200_views():

@@ -99,6 +99,10 @@ def test_a_run_reports_its_progress(info, tmp_path):
         assert words in said, words
     assert "train      PSNR" not in said
 
+    scores = {"psnr": 31.5, "ssim": 0.9, "num_images": 21}
+    folder.write_metrics({"test": {"psnr": 23.456, "ssim": 0.8, "num_images": 3}, "train": scores})
+    assert "train      PSNR 31.50 dB, SSIM 0.9000, 21 images" in info(folder.path)
+
 
 def test_a_dataset_is_described_and_no_photo_is_decoded(info, tmp_path, monkeypatch):
     views, points, colors = procedural_capture(size=32, count=9)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.base import ply_table
-from gsplat_edu.base.errors import SceneFormatError, ShapeError
+from gsplat_edu.base import headroom, ply_table
+from gsplat_edu.base.errors import NotEnoughMemoryError, SceneFormatError, ShapeError
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply, read, save_ply, write
@@ -382,3 +382,15 @@ def test_opening_a_scene_takes_little_more_than_its_parameters(tmp_path):
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert most < 1.25 * 200_000 * 59 * 4
+
+
+def test_a_digit_and_a_space_become_eight_bytes_of_memory(tmp_path, monkeypatch):
+    path, names = tmp_path / "a.ply", shuffled_table(random_gaussians(1, 0)).dtype.names
+    header = ["ply", "format ascii 1.0", "element vertex 1000", *(f"property float {name}" for name in names)]
+    path.write_text("\n".join([*header, "end_header", *1_000 * [" ".join("1" * len(names))], ""]))
+    monkeypatch.setattr(headroom, "WORTH_ASKING", 0)
+    monkeypatch.setattr(headroom, "available_memory", lambda: 3 * path.stat().st_size)
+    with pytest.raises(NotEnoughMemoryError, match="needs .* of memory"):
+        read(path)
+    monkeypatch.setattr(headroom, "available_memory", lambda: 5 * path.stat().st_size)
+    assert len(read(path).gaussians) == 1_000

@@ -18,8 +18,6 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer.proposing import MODULE, Proposing
 from waiting import PATIENCE, until
 
-pytestmark = pytest.mark.slow
-
 
 def cloud(n=400, infinite=torch.inf):
     """A ball of small splats, then one of each unusual kind: invisible, infinite, large, alone, large but far away."""
@@ -55,6 +53,14 @@ def test_unusual_shapes_are_named():
         assert judge_shape(few).shape == (count,)
 
 
+def test_a_clump_floats_unless_each_of_its_splats_has_eight_others_near():
+    clump = torch.tensor([-40.0, 0.0, 0.0])
+    for count in (8, 9):
+        scene = cloud()
+        scene.means[:count] = clump + 0.01 * torch.arange(count)[:, None]
+        assert (judge_shape(scene)[:count] == Shape.ALONE).all() == (count == 8)
+
+
 def test_a_scene_file_is_judged_by_shape_and_says_so(tmp_path):
     written(tmp_path)
     found = propose(tmp_path / "cloud.ply")
@@ -77,6 +83,7 @@ def ended(proposing):
     return states
 
 
+@pytest.mark.slow
 def test_a_judgement_runs_in_a_process_and_can_be_repeated(tmp_path):
     written(tmp_path)
     proposing = Proposing(tmp_path / "cloud.ply")
@@ -90,6 +97,7 @@ def test_a_judgement_runs_in_a_process_and_can_be_repeated(tmp_path):
     assert proposing.state() == {"state": "idle"}
 
 
+@pytest.mark.slow
 def test_a_scene_that_cannot_be_read_is_one_line(tmp_path):
     (tmp_path / "odd.ply").write_bytes(b"ply\n")
     proposing = Proposing(tmp_path / "odd.ply")
@@ -98,6 +106,7 @@ def test_a_scene_that_cannot_be_read_is_one_line(tmp_path):
     assert last["state"] == "failed" and "odd.ply" in last["error"] and "\n" not in last["error"]
 
 
+@pytest.mark.slow
 def test_a_judgement_is_stopped_at_once(tmp_path, monkeypatch):
     """The first one would never end by itself."""
     written(tmp_path)
@@ -115,6 +124,7 @@ def test_a_judgement_is_stopped_at_once(tmp_path, monkeypatch):
     assert ended(proposing)[-1]["state"] == "done"
 
 
+@pytest.mark.slow
 def test_the_process_ends_with_its_parent(tmp_path):
     written(tmp_path, 40_000)
     command = [sys.executable, "-m", MODULE, str(tmp_path / "cloud.ply")]
