@@ -2,6 +2,7 @@
 
 import builtins
 import io
+import json
 import sys
 import zlib
 
@@ -365,6 +366,11 @@ def test_the_forecast_knows_that_these_photos_take_more_memory_to_decode(one_pho
     save(folder / "a.heic", quarters()).replace(path)
     heic = Facts.of(load_dataset(folder)).decoding
     assert (plain, heic) == (10, 16) and deep >= 21
+    told = json.loads((folder / "transforms.json").read_text())
+    save(folder / "images" / "b.png", quarters())
+    told["frames"].append(told["frames"][0] | {"file_path": "images/b.png"})
+    (folder / "transforms.json").write_text(json.dumps(told))
+    assert Facts.of(load_dataset(folder)).decoding == heic, "of both photos, the larger"
 
 
 def test_profiles_are_read_from_bytes_as_pillow_gives_them():
