@@ -51,6 +51,7 @@ def images_and_gradients(scene, camera, backend, settings=SETTINGS, channels=0, 
 def check_against_native(
     scene, camera, settings=SETTINGS, *, channels=0, bound=BOUND, but=(), backend="webgpu", device="cpu"
 ):
+    """Compare all images and gradients; return the output."""
     values, gradients, out = images_and_gradients(scene, camera, backend, settings, channels, device)
     truths, expected, oracle = images_and_gradients(scene, camera, "cpu", settings, channels)
     assert len(out.visible) == len(oracle.visible) > 0 and abs(out.num_pairs - oracle.num_pairs) <= 2
@@ -62,3 +63,4 @@ def check_against_native(
         assert truth.abs().max() > 0, key
         parts = len(scene.means) if key.startswith("camera's") else 1
         assert (gradients[key] - truth).abs().max() <= parts * bound * truth.abs().max(), key
+    return out

@@ -54,6 +54,10 @@ class Program:
     def runs(self) -> bool:
         return self.process.is_alive()
 
+    def said(self) -> str:
+        """Return what the program has written to stdout so far."""
+        return self._out.read_text() if self._out.exists() else ""
+
     def send(self, number: int) -> None:
         os.kill(self.process.pid, number)
 

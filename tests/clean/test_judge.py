@@ -77,15 +77,16 @@ def replace_eye(camera, eye):
     return type(camera)(camera.R, eye, camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W)
 
 
-@pytest.mark.parametrize("threads", [2, 5])
-def test_the_same_bits_on_any_number_of_threads(planted, room, rings, set_threads, threads):
-    views = photographed(room, rings[0])
+def test_the_same_bits_on_any_number_of_threads(planted, room, rings, set_threads):
+    views = photographed(room, rings[0][::2])
     verdicts = []
-    for number in (1, threads):
+    for number in (1, 2, 5):
         set_threads(number)
         verdicts.append(judge(planted, views, SETTINGS))
-    assert np.array_equal(verdicts[0].reasons, verdicts[1].reasons)
-    assert verdicts[0].certainty.tobytes() == verdicts[1].certainty.tobytes()
+    assert {Reason.KEPT, Reason.REFUTED} <= set(verdicts[0].reasons)
+    for verdict in verdicts[1:]:
+        assert np.array_equal(verdicts[0].reasons, verdict.reasons)
+        assert verdicts[0].certainty.tobytes() == verdict.certainty.tobytes()
 
 
 def test_masked_pixels_judge_nothing(room, planted, rings):

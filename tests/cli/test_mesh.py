@@ -113,7 +113,7 @@ def test_a_job_shows_the_stage_that_runs(scene, tmp_path, monkeypatch, small_pag
 
 def test_a_collider_of_convex_parts(scene, tmp_path, capsys):
     out = tmp_path / "parts.glb"
-    words = ["--voxel", "0.1", "--faces", "500", "--collider", "convex", "--backend", "cpu"]
+    words = ["--voxel", "0.1", "--faces", "200", "--collider", "convex", "--backend", "cpu"]
     assert main(["mesh", str(scene), str(out), *words]) == 0
     said = capsys.readouterr().out
     number = int(re.search(r"parts.glb: (\d+) convex part", said)[1])

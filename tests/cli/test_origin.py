@@ -21,7 +21,7 @@ from gsplat_edu.runs.source import open_source
 from gsplat_edu.train.checkpoint import list_checkpoints, read_checkpoint
 from gsplat_edu.viewer.export import read_back
 
-ORIGINS = [(1e3, -2e3, 40.0), (1e5, 2e5, -3e3), (3.9e6, 3.1e5, 5.02e6)]
+ORIGINS = [(1e3, -2e3, 40.0), (3.9e6, 3.1e5, 5.02e6)]
 
 EXACT = [".ply", ".glb"]
 """Formats whose splats draw the same pixels as the run's."""
@@ -39,7 +39,7 @@ def moved_views(move, size=24):
     return views, move.s * points @ move.R.T + move.t, colors
 
 
-@pytest.fixture(scope="module", params=ORIGINS, ids=["1e3", "1e5", "5e6"])
+@pytest.fixture(scope="module", params=ORIGINS, ids=["1e3", "5e6"])
 def made(request, tmp_path_factory):
     """A capture at an origin, and a run of it."""
     root = tmp_path_factory.mktemp("far")

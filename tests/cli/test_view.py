@@ -2,13 +2,13 @@
 
 import contextlib
 import dataclasses
+import json
 import os
 import re
 import select
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import time
 import urllib.error
@@ -33,11 +33,23 @@ from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.page_mesh import open_meshes
 from gsplat_edu.viewer.stream import folder_page
+from processes import Program
 from scene_files import small_levels
 from splats import splats_on
 from waiting import PATIENCE, until
 
-COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
+COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
+IN_A_TERMINAL = (
+    """
+import json, os, sys
+os.environ.update(json.loads(sys.argv.pop(1)))
+terminal = os.open(sys.argv.pop(1), os.O_RDWR)
+for number, name in enumerate(("stdin", "stdout", "stderr")):
+    os.dup2(terminal, number)
+    setattr(sys, name, open(number, "w" if number else "r", closefd=False))
+"""
+    + COMMAND
+)
 ORIGIN = (512.0, -64.0, 8.0)
 ORANGE = (1.0, 0.5, 0.0)
 
@@ -60,27 +72,24 @@ def made(tmp_path_factory):
 
 
 @contextmanager
-def viewing(*words, ends_with=signal.SIGINT):
-    """Run the command; yield its output up to the URL, and the URL. It must exit cleanly on the signal `ends_with`."""
-    command = [*COMMAND, *map(str, words)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+def viewing(folder, *words, ends_with=signal.SIGINT):
+    """Run the command, with its output in a folder; yield its output up to the URL, and the URL. It must exit cleanly
+    on the signal `ends_with`."""
+    program, address = (
+        Program(COMMAND, ["view", *words], folder),
+        r"(http://\S+/)   \(press Ctrl-C to stop\)\n",
+    )
     try:
-        printed = ""
-        deadline = time.monotonic() + PATIENCE
-        while not (found := re.search(r"(http://\S+/)   \(press Ctrl-C to stop\)\n", printed)):
-            assert select.select([process.stdout], [], [], deadline - time.monotonic())[0], (
-                f"only {printed!r}"
-            )
-            piece = os.read(process.stdout.fileno(), 1 << 16)
-            assert piece, process.stderr.read()
-            printed += piece.decode()
+        until(lambda: not program.runs or re.search(address, program.said()))
+        printed = program.said()
+        found = re.search(address, printed)
+        assert found, printed
         yield printed, found[1]
-        process.send_signal(ends_with)
-        rest, complaints = process.communicate(timeout=PATIENCE)
-        assert (process.returncode, rest, complaints) == (0, b"ended\n", b"")
+        program.send(ends_with)
+        assert program.ended(PATIENCE) == (0, f"{printed}ended\n", "")
     finally:
-        process.kill()
-        process.communicate()
+        program.process.kill()
+        program.process.join()
 
 
 def fetched(url):
@@ -97,7 +106,7 @@ def test_a_run_is_shown_with_its_cameras_path_and_settings_until_ctrl_c(made, tm
     mesh = Mesh(np.eye(3) + ORIGIN, np.array([[0, 1, 2]]), np.eye(3, dtype=np.float32))
     write_mesh(tmp_path / "a.glb", mesh)
     words = ["--port", "0", "--no-open", "--path", tmp_path / "path.json", "--surface", tmp_path / "a.glb"]
-    with viewing(folder.path, *words) as (printed, url):
+    with viewing(tmp_path, folder.path, *words) as (printed, url):
         source = open_source(folder.path)
         assert len(source.cameras) == 6 and len(source.held_out) == 2
         assert source.settings.background == ORANGE
@@ -124,9 +133,9 @@ def test_a_run_is_shown_with_its_cameras_path_and_settings_until_ctrl_c(made, tm
 
 
 @own_process
-def test_a_scene_of_another_format_has_no_cameras(made):
+def test_a_scene_of_another_format_has_no_cameras(made, tmp_path):
     _, bare = made
-    with viewing(bare, "--port", "0", "--host", "0.0.0.0", "--no-open") as (printed, url):
+    with viewing(tmp_path, bare, "--port", "0", "--host", "0.0.0.0", "--no-open") as (printed, url):
         source = open_source(bare)
         assert fetched(url) == page.html(source.scene, (), source.settings, "bare.splat")
     first, warning, _ = printed.splitlines()
@@ -139,7 +148,7 @@ def test_a_scene_of_another_format_has_no_cameras(made):
 @own_process
 def test_levels_of_detail_are_served_with_their_files(tmp_path):
     path = small_levels(tmp_path)
-    with viewing(path.parent, "--port", "0", "--no-open", "--budget", "30") as (printed, url):
+    with viewing(tmp_path, path.parent, "--port", "0", "--no-open", "--budget", "30") as (printed, url):
         assert fetched(url) == folder_page(path, "levels", 30)[0]
         assert fetched(f"{url}lod-meta.json") == path.read_bytes()
         assert fetched(f"{url}0_1/quats.webp") == (path.parent / "0_1" / "quats.webp").read_bytes()
@@ -174,11 +183,9 @@ def test_the_browser_opens_only_on_a_terminal_with_a_screen(made, tmp_path):
         """Return whether the browser opened the URL before the command was interrupted."""
         noted.unlink(missing_ok=True)
         ours, theirs = pty.openpty()
-        command = [*COMMAND, str(bare), "--port", "0", *words]
-        quiet = {"BROWSER": str(script), "DISPLAY": ":99", "WAYLAND_DISPLAY": ""}
-        process = subprocess.Popen(
-            command, stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, **quiet, **environment}
-        )
+        settings = {"BROWSER": str(script), "DISPLAY": ":99", "WAYLAND_DISPLAY": ""} | environment
+        given = [json.dumps(settings), os.ttyname(theirs), "view", bare, "--port", "0", *words]
+        program = Program(IN_A_TERMINAL, given, tmp_path)
         try:
             printed, deadline = b"", time.monotonic() + PATIENCE
             while b"press Ctrl-C to stop" not in printed:
@@ -189,15 +196,15 @@ def test_the_browser_opens_only_on_a_terminal_with_a_screen(made, tmp_path):
                 pass
             if not words and not environment:
                 until(noted.exists)
-            process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENCE) == 0
+            program.send(signal.SIGINT)
+            assert program.ended(PATIENCE)[0] == 0
             os.close(theirs)
             with contextlib.suppress(OSError):  # once the command and the browser have closed the terminal
                 while os.read(ours, 1 << 16):
                     pass
         finally:
-            process.kill()
-            process.wait()
+            program.process.kill()
+            program.process.join()
             os.close(ours)
         return noted.exists() and noted.read_text().strip() == url
 

@@ -74,7 +74,11 @@ def test_a_bad_file_costs_one_line(capture, tmp_path, capsys, content, told):
     assert train(capture, tmp_path / "run") == 2
     said = capsys.readouterr().err
     assert told in said and said.count("\n") == 1
-    assert train(capture, tmp_path / "run", "--set", "region=none") == 0  # it is not read
+
+
+def test_a_bad_file_that_is_not_wanted_is_not_read(capture, tmp_path):
+    (capture / REGION).write_text("[1, 2]")
+    assert train(capture, tmp_path / "run", "--set", "region=none") == 0
 
 
 @pytest.mark.slow

@@ -90,8 +90,11 @@ def placed(layout, i, count):
 
 
 @functools.cache
-def room(layout="orbit", size=160, count=COUNT, height=None):
-    """Photograph the ball from all sides, one wall, or the whole room from its middle."""
+def room(layout="orbit", size=160, count=COUNT, height=None, ending="bmp"):
+    """Photograph the ball from all sides, one wall, or the whole room from its middle.
+
+    Files named .bmp are written and read fastest.
+    """
     ball = layout in ("orbit", "forward")
     views, points = [], []
     rng = np.random.default_rng(1)
@@ -100,7 +103,7 @@ def room(layout="orbit", size=160, count=COUNT, height=None):
         ends = cast(camera.eye, rays(camera), ball)
         footprint = np.linalg.norm(ends - camera.eye, axis=1) / camera.fx
         image = np.round(255.0 * texture(ends, footprint)).astype(np.uint8).reshape(camera.H, camera.W, 3)
-        views.append(View(camera, image, name=f"view_{i:03d}.png"))
+        views.append(View(camera, image, name=f"view_{i:03d}.{ending}"))
         points.append(ends[rng.choice(len(ends), 60)] + 0.01 * rng.normal(size=(60, 3)))
     return views, np.concatenate(points)
 

@@ -17,7 +17,7 @@ from gsplat_edu.doctor.survey import prepare
 
 @pytest.fixture
 def orbit():
-    return room("orbit", 96, 24)
+    return room("orbit", 96, 24, ending="png")
 
 
 def cut(path, share):
@@ -86,7 +86,7 @@ def test_all_photos_damaged_is_hopeless(diagnosed, orbit):
 
 @pytest.mark.parametrize("count", [1, 5, 17])
 def test_missing_photos_are_counted(diagnosed, count):
-    views, points = room("orbit", 96, 40)
+    views, points = room("orbit", 96, 40, ending="png")
 
     def spoil(folder):
         for view in views[3 : 3 + count]:

@@ -58,7 +58,7 @@ def test_sort_is_numpy_s_stable_one(device, count, kind):
     np.testing.assert_array_equal(values, order)
 
 
-@pytest.mark.parametrize("kind", ["random", "equal", "sorted", "reversed"])
+@pytest.mark.parametrize("kind", ["random", "equal"])
 def test_a_million(device, kind):
     keys = keys_of(kind, 10**6)
     if kind == "random":

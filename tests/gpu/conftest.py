@@ -5,6 +5,10 @@ import torch
 
 pytest.importorskip("triton.language", reason="triton is not installed")
 
+import triton_interpreter
+
+triton_interpreter.speed_up()
+
 
 @pytest.fixture(scope="session")
 def device() -> str:

@@ -5,6 +5,8 @@ that alpha is above its floor and below its clamp at every pixel; no depths swap
 or a pole. `tests/native/test_lenses.py` compares the kernels with autograd on scenes with rims.
 """
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -37,10 +39,11 @@ def images(out):
     return out.image, out.transmittance, out.depth
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
-@pytest.mark.parametrize("name", LENSES)
-def test_finite_differences(name, backend, antialiased):
+@pytest.mark.parametrize(("name", "first"), [*zip(LENSES, itertools.cycle(["torch", "cpu"]))])
+def test_finite_differences(name, first, backend):
+    """Of every lens, one backend is antialiased: the compensation depends on the footprint, whatever its lens."""
+    antialiased = backend == first
     scene, camera = smooth_around(3), window(name)
     settings = RenderSettings(antialiased=antialiased)
     raw, pose, template = differentiable(scene, camera)

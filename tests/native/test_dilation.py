@@ -54,11 +54,18 @@ def test_every_instruction_set_takes_the_dilation(isa):
         np.testing.assert_allclose(ours, truth, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("dilation", [0.0, 0.1, 1.0])
-@pytest.mark.parametrize("backend", ["cpu", "torch"])
+@pytest.mark.parametrize(
+    ("backend", "dilation", "antialiased"),
+    [
+        *(("cpu", dilation, antialiased) for dilation in (0.0, 0.1, 1.0) for antialiased in (False, True)),
+        *(("torch", 0.0, True), ("torch", 0.1, False), ("torch", 1.0, True)),
+    ],
+)
 def test_gradcheck(backend, dilation, antialiased):
-    """The Gaussians are wider than the image, so every alpha is smooth with any dilation."""
+    """The Gaussians are wider than the image, so every alpha is smooth with any dilation.
+
+    The next test compares the backends in the cases that are left out here.
+    """
     scene, settings = smooth_scene(0, n=3), settings_of(dilation, antialiased)
     gaussians = scene.gaussians()
 

@@ -22,8 +22,7 @@ from proofs import proves_gradients
 PARAMETERS = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("seed", "antialiased"), [(0, False), (1, True)])
 def test_gradcheck_of_all_parameters(isa, antialiased, seed):
     scene = smooth_scene(seed)
     settings = RenderSettings(antialiased=antialiased)

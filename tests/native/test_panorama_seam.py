@@ -181,7 +181,7 @@ def test_gradients_of_patches_at_the_seam():
 
     Of the centres, 7 columns apart, those in column 0 have patches across the seam.
     """
-    photo, other = (photographed(posed(eye, "panorama", 26)) for eye in EYES)
+    photo, other = (photographed(posed(eye, "panorama", 18)) for eye in EYES)
     inputs = maps_of(photo.camera, 0.004)
     grid = Grid(7, 0, 6)
 

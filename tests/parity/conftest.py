@@ -9,6 +9,9 @@ def backend(request, monkeypatch):
     """A backend that computes in float32, ready to be used on `where(backend)`."""
     if request.param == "cuda":
         pytest.importorskip("triton.language", reason="triton is not installed")
+        import triton_interpreter
+
+        triton_interpreter.speed_up()
     else:
         from gsplat_edu.render import webgpu
 

@@ -7,6 +7,7 @@ with several; 41 x 35 and 17 x 33 px are not multiples of a tile.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -19,6 +20,11 @@ from native_scenes import BACKGROUND, random
 from parity.conftest import where
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Triton's interpreter computes with NumPy
+
+
+CASES = [*zip(SMALLER, itertools.cycle([True, False]))]
+CASES += [("random", False), ("needles 100:1", True), ("smaller than a pixel", True)]
+"""Every second scene is antialiased, and what the compensation changes most is compared with it and without."""
 
 
 def compare(backend, scene, settings=SETTINGS, bound=3e-4):
@@ -36,8 +42,7 @@ def compare(backend, scene, settings=SETTINGS, bound=3e-4):
     return gradients, out, oracle
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("name", SMALLER)
+@pytest.mark.parametrize(("name", "antialiased"), CASES)
 def test_gradients_match_the_native_kernels_in_float64(backend, name, antialiased):
     """Scenes with ties are included. A camera axis is along z, so depths that are equal in float64 are equal in
     float32."""

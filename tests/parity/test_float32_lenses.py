@@ -37,6 +37,9 @@ from lens_scenes import (
 )
 from parity.conftest import where
 
+SMALL = (33, 27)
+"""Width and height of images, no multiples of a tile: three columns of tiles and two rows."""
+
 EPS = float(np.finfo(np.float32).eps)
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter computes with NumPy
@@ -52,11 +55,16 @@ def rendered(scene, camera, backend, settings=SETTINGS):
     return render(gaussians, camera, settings=settings, backend=backend)
 
 
-@pytest.mark.parametrize(
-    ("name", "limit"), [*((name, None) for name in LENSES), *((name, LIMIT) for name in CLAMPED)]
-)
+IMAGES = [("webgpu", name, None) for name in LENSES]
+IMAGES += [
+    ("cuda", name, None) for name in [*LENSES][1::2]
+]  # the others are compared with the native kernels' below
+IMAGES += [(backend, name, LIMIT) for backend in ("webgpu", "cuda") for name in CLAMPED]
+
+
+@pytest.mark.parametrize(("backend", "name", "limit"), IMAGES, indirect=["backend"])
 def test_images_agree_with_the_reference(backend, name, limit):
-    scene = dataclasses.replace(around(150), camera=lens_camera(name))
+    scene = dataclasses.replace(around(150), camera=lens_camera(name, *SMALL))
     image, T, depth = lens_truth(scene, scene.camera, limit)
     out = rendered(scene, scene.camera, backend, dataclasses.replace(SETTINGS, jacobian_limit=limit))
     assert len(out.visible) > 20
@@ -73,12 +81,14 @@ def test_images_agree_with_the_reference(backend, name, limit):
 @pytest.mark.parametrize(("name", "antialiased"), [*zip(LENSES, itertools.cycle([False, True]))])
 def test_gradients_match_the_native_kernels_in_float64(check, name, antialiased):
     """Every second lens is antialiased: the compensation depends on the footprint, whatever lens it comes from."""
-    check(around(60, seed=3), lens_camera(name), dataclasses.replace(SETTINGS, antialiased=antialiased))
+    check(
+        around(60, seed=3), lens_camera(name, *SMALL), dataclasses.replace(SETTINGS, antialiased=antialiased)
+    )
 
 
 @pytest.mark.parametrize("name", CLAMPED)
 def test_clamped_gradients_match_the_native_kernels(check, name, monkeypatch):
-    scene, camera = around(60, seed=3), lens_camera(name)
+    scene, camera = around(60, seed=3), lens_camera(name, *SMALL)
     inner = tuple((0.4 * low, 0.4 * high) for low, high in camera.jacobian_bounds(LIMIT))
     monkeypatch.setattr(Camera, "jacobian_bounds", lambda camera, limit: inner)
     assert beyond(scene, camera).sum() >= 4
@@ -87,11 +97,11 @@ def test_clamped_gradients_match_the_native_kernels(check, name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["thin prism", "panorama, moving"])
 def test_features(check, name):
-    check(around(40, seed=3), lens_camera(name), channels=6)
+    check(around(40, seed=3), lens_camera(name, *SMALL), channels=6)
 
 
 def test_two_runs_give_the_same_bits(backend):
-    camera = lens_camera("panorama, moving")
+    camera = lens_camera("panorama, moving", *SMALL)
     first, second = (
         images_and_gradients(around(80, seed=1), camera, backend, device=where(backend))[:2] for _ in "ab"
     )
@@ -106,7 +116,7 @@ def test_a_fisheye_near_its_axis_and_past_90_degrees(check, angle):
     The means are rounded to float32 for both backends: near the axis, their rounding is a part of their places on the
     plane. On the axis, the rest of a place is rounding, and so is what decentring's coefficients get.
     """
-    camera, scene = lens_camera("fisheye", 60, 60), around(3, seed=7)
+    camera, scene = lens_camera("fisheye", 30, 30), around(3, seed=7)
     turns, distance = np.array([0.3, 2.2, 4.0]), np.array([1.0, 1.5, 2.0])[:, None]
     across = np.stack([np.cos(turns), np.sin(turns), 0 * turns], axis=1) * np.sin(angle)
     means = CENTRE + distance * (across + np.array([0, 0, np.cos(angle)])) @ camera.R
@@ -119,7 +129,7 @@ def test_a_fisheye_near_its_axis_and_past_90_degrees(check, angle):
 @pytest.mark.parametrize("name", PANORAMAS)
 def test_a_panorama_near_its_poles(check, name, latitudes):
     """On both sides of the bound of the ellipse, `POLE`."""
-    camera = lens_camera(name, 48, 24)
+    camera = lens_camera(name, 32, 16)
     scene, turns = around(6, seed=8), np.array([0.5, 2.4, 4.4, 1.5, 3.4, 5.4])
     up = np.radians(np.repeat(latitudes, 3))
     down = np.array([1, -1, 1, -1, 1, -1]) * np.sin(up)
@@ -128,18 +138,17 @@ def test_a_panorama_near_its_poles(check, name, latitudes):
     check(dataclasses.replace(scene, means=CENTRE + apart * direction @ camera.R), camera)
 
 
-@pytest.mark.parametrize("W", [45, 64])
+@pytest.mark.parametrize("W", [45, 32])
 @pytest.mark.parametrize("name", PANORAMAS)
-def test_the_seam(check, backend, name, W):
+def test_the_seam(check, name, W):
     """Gaussians behind the camera, narrow ones and one that reaches around, in images of whole tiles and of others."""
     camera, scene = lens_camera(name, W, W // 2), around(12, seed=9)
     turns = np.pi + np.linspace(-0.12, 0.12, 12)
     direction = np.stack([np.sin(turns), 0.3 * np.linspace(-1, 1, 12), np.cos(turns)], axis=1)
     moved = dataclasses.replace(scene, means=CENTRE + np.linspace(1, 2, 12)[:, None] * direction @ camera.R)
     moved.log_scales[3] = 0.6
-    weight = 1 - rendered(moved, camera, backend).transmittance
+    weight = 1 - check(moved, camera).transmittance
     assert weight[:, 0].max() > 0.1 and weight[:, -1].max() > 0.1, "the edges show them"
-    check(moved, camera)
 
 
 def test_a_panorama_turned_by_a_tile_is_its_image_moved_by_a_tile(backend):
@@ -175,7 +184,9 @@ def test_coefficients_of_zero_have_a_gradient(backend, kind):
 @pytest.mark.parametrize("readout", ["down", "up", "left", "right"])
 def test_every_readout(check, readout):
     projection = LENSES["opencv"][0]
-    camera = lens_camera("opencv").through(projection, RollingShutter(MOVING.turn, MOVING.shift, readout))
+    camera = lens_camera("opencv", *SMALL).through(
+        projection, RollingShutter(MOVING.turn, MOVING.shift, readout)
+    )
     check(around(60, seed=3), camera)
 
 
@@ -208,7 +219,7 @@ def test_what_moves_too_fast_for_the_shutter_is_not_drawn(backend):
 
 @pytest.mark.parametrize("lens", ["fisheye, moving", "panorama", "orthographic", "opencv"])
 def test_bad_gaussians_do_not_affect_others(backend, lens):
-    camera = lens_camera(lens)
+    camera = lens_camera(lens, *SMALL)
     good = around(40, seed=3).gaussians(torch.float32).to(torch.device(where(backend)))
     bad = good.map(torch.clone)
     for i, (name, value) in enumerate([("means", np.nan), ("means", 1e30), ("log_scales", 60.0)]):
@@ -224,12 +235,12 @@ def test_bad_gaussians_do_not_affect_others(backend, lens):
         assert torch.equal(rest(tensor.grad), without.tensors()[key].grad), key
 
 
-@pytest.mark.parametrize("place", ["at the centre", "at the pole"])
 @pytest.mark.parametrize("lens", ["fisheye", "equidistant", "panorama", "panorama, moving"])
-def test_where_a_lens_has_no_direction(backend, lens, place):
+def test_where_a_lens_has_no_direction(backend, lens):
     """The camera's centre, and straight above it: no number becomes NaN."""
-    camera, scene = lens_camera(lens), around(30, seed=3)
-    scene.means[4] = np.asarray(CENTRE) + (0 if place == "at the centre" else 2.0) * camera.R[1]
+    camera, scene = lens_camera(lens, *SMALL), around(30, seed=3)
+    scene.means[4] = CENTRE
+    scene.means[5] = CENTRE + 2.0 * camera.R[1]
     values, gradients, _ = images_and_gradients(scene, camera, backend, device=where(backend))
     assert all(tensor.isfinite().all() for tensor in (*values.values(), *gradients.values()))
 

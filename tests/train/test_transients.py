@@ -95,39 +95,48 @@ def test_masks_are_found_in_every_recipe(capture, changes):
     assert sum(a and b for a, b in zip(found, right, strict=True)) >= 0.6 * sum(right)
 
 
-@pytest.mark.parametrize("stop", [30, 60, 61, 105])
-def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, stop):
+STOPS = (30, 60, 61, 105)
+
+
+def continued(run, until):
+    run.run(stop=lambda: run.iteration == until)
+    return run
+
+
+@pytest.fixture(scope="module")
+def interrupted(capture, tmp_path_factory):
+    """A run whose state was saved at each of `STOPS`, and the files."""
+    run, paths = trainer(capture, pasted(capture[0])[0], "mask", 300), {}
+    for stop in STOPS:
+        paths[stop] = save_checkpoint(tmp_path_factory.mktemp("saved"), continued(run, stop), 1.0)
+    return continued(run, 152), paths
+
+
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_resumed_run_ends_with_the_same_bits(capture, interrupted, stop):
     """Masks are found before the 31st, 61st, 106th and 151st of 300 steps."""
-    struck, _ = pasted(capture[0])
-    first = trainer(capture, struck, "mask", 300)
-    first.run(stop=lambda: first.iteration == stop)
-    path = save_checkpoint(tmp_path, first, 1.0)
-    second = trainer(capture, struck, "mask", 300)
-    load_checkpoint(path, second)
-    for run in (first, second):
-        run.run(stop=lambda: run.iteration == 160)  # noqa: B023 - called in this round
-    (tensors, numbers), (resumed, resumed_numbers) = first.state(), second.state()
+    first, paths = interrupted
+    second = trainer(capture, pasted(capture[0])[0], "mask", 300)
+    load_checkpoint(paths[stop], second)
+    (tensors, numbers), (resumed, resumed_numbers) = first.state(), continued(second, 152).state()
     assert json.dumps(numbers) == json.dumps(resumed_numbers)
     assert tensors.keys() == resumed.keys() and tensors["transients.masks"].any()
     for name, tensor in tensors.items():
         assert torch.equal(tensor, resumed[name]), name
 
 
-@pytest.mark.parametrize("threads", [2, 5])
-def test_the_bits_do_not_depend_on_the_threads(capture, threads):
+def test_the_bits_do_not_depend_on_the_threads(capture):
     struck, _ = pasted(capture[0])
     before, found = torch.get_num_threads(), []
     try:
-        for count in (1, threads):
+        for count in (1, 2, 5):
             torch.set_num_threads(count)
-            run = trainer(capture, struck, "mask", 200)
-            run.run(stop=lambda: run.iteration == 110)  # noqa: B023 - called in this round
-            found.append(run.state()[0])
+            found.append(continued(trainer(capture, struck, "mask", 200), 75).state()[0])
     finally:
         torch.set_num_threads(before)
     assert found[0]["transients.masks"].any()
     for name, tensor in found[0].items():
-        assert torch.equal(tensor, found[1][name]), name
+        assert torch.equal(tensor, found[1][name]) and torch.equal(tensor, found[2][name]), name
 
 
 def test_given_masks_still_count(capture):
