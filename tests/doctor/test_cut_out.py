@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.doctor.cut_out import outside_masks_for
+from gsplat_edu.doctor.cut_out import outside_masks_for, shape_of
 from gsplat_edu.scene.views import View
 from masked_object import masked_object
 
@@ -44,6 +44,13 @@ def lens(i):
 
 def confetti(i):
     return np.random.default_rng(i).random((H, W)) < 0.3
+
+
+def test_every_side_of_the_border_counts():
+    band = np.zeros((40, 40), dtype=bool)
+    band[:5] = True  # one side, and four more pixels of each of two others
+    for turns in range(4):
+        assert shape_of(np.rot90(band, turns)).border == pytest.approx(48 / 156)
 
 
 @pytest.mark.parametrize(
