@@ -4,7 +4,8 @@ import { plus, radians, transposed } from "./camera.js";
 import { element, refill } from "./common.js";
 import { want } from "./patch.js";
 import { PathCurve } from "./path.js";
-import { restOf, Timeline } from "./timeline.js";
+import { appended, grown } from "./path_edits.js";
+import { Timeline } from "./timeline.js";
 
 export class Keyframes {
   // actions: view() for the current camera, goToView(camera), playPath() to start or stop, pathChanged().
@@ -26,14 +27,9 @@ export class Keyframes {
     this.list();
   }
 
-  // Appends the current view. On a path with times, it follows after the mean time between the others.
+  // Appends the current view.
   save() {
-    const { keyframes } = this.path;
-    const view = this.current();
-    const [first, last] = [keyframes[0], keyframes[keyframes.length - 1]];
-    if (last?.time !== undefined)
-      view.time = last.time + restOf(last) + (last.time - first.time) / (keyframes.length - 1);
-    this.edited({ keyframes: [...keyframes, view] });
+    this.set(appended(this.path, this.current()));
     element("path").open = true;
   }
 
@@ -53,31 +49,13 @@ export class Keyframes {
   }
 
   edited(changes) {
-    this.set(this.grown(changes));
+    this.set(grown(this.path, changes));
   }
 
   set(path) {
     this.path = path;
     this.actions.pathChanged();
     this.list();
-  }
-
-  // The path after a change of its number of segments. It lasts as long as its keyframes' times say, or as long per
-  // segment as before; a loop with times needs time for the way back.
-  grown(changes) {
-    const path = { ...this.path, ...changes, duration: null };
-    const { loop, keyframes } = path;
-    const [first, last] = [keyframes[0], keyframes[keyframes.length - 1]];
-    const segments = (of) => of.keyframes.length - (of.loop ? 0 : 1);
-    if (last?.time === undefined) {
-      const pace =
-        this.path.keyframes[0]?.time === undefined && segments(this.path) > 0
-          ? this.path.duration / segments(this.path)
-          : 0;
-      path.duration = pace * segments(path) || null;
-    } else if (loop)
-      path.duration = last.time + restOf(last) - first.time + (last.time - first.time) / (keyframes.length - 1);
-    return path;
   }
 
   get playable() {

@@ -1,9 +1,8 @@
 // The camera path as a strip of time: a marker for each view, and a playhead.
 
 import { element } from "./common.js";
-import { PathCurve } from "./path.js";
+import { inserted, lasting, PATH_GAP, restOf, swapped, timesOf, withRest, withTime } from "./path_edits.js";
 
-const PATH_GAP = 0.01; // least seconds between views that the page writes
 const NEAR_MARKER = 22; // CSS pixels beside a marker that still press it
 const RULER = 20; // CSS pixels at the strip's top, which move the playhead
 const MOVED = 3; // CSS pixels after which a press becomes a drag
@@ -12,37 +11,6 @@ const FINE_STEP = 0.1;
 const COARSE_STEP = 1; // seconds, with Shift
 
 const shortSeconds = (seconds) => `${Number(seconds.toFixed(2))} s`;
-export const restOf = ({ hold }) => hold ?? 0;
-
-// The times at which a path meets its views, from 0; evenly if they are all at one place.
-function timesOf(path) {
-  const { keyframes } = path;
-  if (keyframes[0].time !== undefined) return keyframes.map(({ time }) => time - keyframes[0].time);
-  const { stops, length, seconds } = new PathCurve(path);
-  const segments = keyframes.length - (path.loop ? 0 : 1);
-  return stops.map((stop, i) => seconds * (length > 0 ? stop / length : i / segments));
-}
-
-// The path with its views in the order of their times: each begins after the rest at the one before, the first at 0.
-// A loop ends after its last view.
-function arranged(path) {
-  const keyframes = [...path.keyframes].sort((a, b) => a.time - b.time);
-  const begin = keyframes[0].time;
-  let free = 0;
-  const moved = keyframes.map((keyframe) => {
-    const time = Math.max(keyframe.time - begin, free);
-    free = time + restOf(keyframe) + PATH_GAP;
-    return { ...keyframe, time };
-  });
-  return { ...path, keyframes: moved, duration: path.loop ? Math.max(path.duration, free) : null };
-}
-
-// The path with a time for each view; the views may get other properties first.
-function timed(path, change = (keyframe) => keyframe) {
-  const times = timesOf(path);
-  const keyframes = path.keyframes.map((keyframe, i) => change({ ...keyframe, time: times[i] }, i));
-  return { ...path, keyframes, duration: path.loop ? new PathCurve(path).seconds : null };
-}
 
 export class Timeline {
   // keyframes: the Keyframes whose path is shown.
@@ -60,9 +28,9 @@ export class Timeline {
     });
     listen("keydown", this.key);
     const fields = {
-      "path-seconds": (value) => this.last(value),
+      "path-seconds": (value) => this.set(lasting(this.path, value)),
       "view-time": (value) => this.setTime(this.chosen, value),
-      "view-rest": (value) => this.rest(value),
+      "view-rest": (value) => this.set(withRest(this.path, this.chosen, value)),
     };
     for (const [id, set] of Object.entries(fields)) {
       element(id).addEventListener("change", ({ target: { value } }) =>
@@ -129,51 +97,15 @@ export class Timeline {
     this.draw();
   }
 
-  // Moves a view to a time, in seconds from the first; others stay, or are pushed later. Returns the path and the view's
-  // place in it.
-  moved(index, seconds) {
-    const path = timed(this.path, (keyframe, i) =>
-      i === index ? { ...keyframe, time: Math.round(seconds * 1000) / 1000, here: true } : keyframe,
-    );
-    const sorted = arranged(path);
-    const chosen = sorted.keyframes.findIndex(({ here }) => here);
-    return { path: { ...sorted, keyframes: sorted.keyframes.map(({ here, ...keyframe }) => keyframe) }, chosen };
-  }
-
   setTime(index, seconds) {
-    const { path, chosen } = this.moved(index, seconds);
+    const { path, chosen } = withTime(this.path, index, seconds);
     this.set(path, chosen);
   }
 
-  rest(seconds) {
-    const hold = seconds >= 0.001 ? seconds : undefined;
-    this.set(arranged(timed(this.path, (keyframe, i) => (i === this.chosen ? { ...keyframe, hold } : keyframe))));
-  }
-
-  // Makes the whole path last a number of seconds.
-  last(seconds) {
-    const all = Math.max(seconds, PATH_GAP * 2 * this.path.keyframes.length);
-    if (this.path.keyframes[0].time === undefined) return this.set({ ...this.path, duration: all });
-    const by = all / this.curve.seconds;
-    const scaled = timed(this.path, ({ hold, ...keyframe }) => ({
-      ...keyframe,
-      time: by * keyframe.time,
-      ...(hold ? { hold: by * hold } : {}),
-    }));
-    return this.set(arranged({ ...scaled, duration: all }));
-  }
-
-  // Exchanges the chosen view with a neighbour; each place keeps its time.
+  // Exchanges the chosen view with a neighbour.
   swap(by) {
-    const { keyframes } = this.path;
     const other = this.chosen + by;
-    if (!keyframes[other]) return;
-    const times = keyframes.map(({ time }) => time);
-    const swapped = [...keyframes];
-    [swapped[this.chosen], swapped[other]] = [swapped[other], swapped[this.chosen]];
-    const placed = swapped.map((keyframe, i) => (times[i] === undefined ? keyframe : { ...keyframe, time: times[i] }));
-    const path = { ...this.path, keyframes: placed };
-    this.set(times[0] === undefined ? path : arranged(path), other);
+    if (this.path.keyframes[other]) this.set(swapped(this.path, this.chosen, other), other);
   }
 
   replace() {
@@ -182,23 +114,10 @@ export class Timeline {
     this.set({ ...this.path, keyframes: this.path.keyframes.map(place) });
   }
 
-  // Adds the current view at the playhead; halfway to the next view if a view is there.
+  // Adds the current view at the playhead.
   insert() {
-    const times = timesOf(this.path);
-    const { keyframes } = this.path;
-    const after = times.filter((time) => time <= this.at + PATH_GAP).length;
-    if (after === keyframes.length && this.at <= times.at(-1) + PATH_GAP) {
-      this.chosen = keyframes.length;
-      return this.keyframes.save();
-    }
-    const end = times[after - 1] + restOf(keyframes[after - 1]);
-    const next = times[after] ?? this.curve.seconds;
-    const time = this.at < end + PATH_GAP || this.at > next - PATH_GAP ? (end + next) / 2 : this.at;
-    const more = [...keyframes.slice(0, after), this.keyframes.current(), ...keyframes.slice(after)];
-    if (keyframes[0].time === undefined) return this.set(this.keyframes.grown({ keyframes: more }), after);
-    const base = keyframes[0].time;
-    const placed = more.map((keyframe, i) => (i === after ? { ...keyframe, time: base + time } : keyframe));
-    return this.set(arranged({ ...this.path, keyframes: placed }), after);
+    const { path, chosen } = inserted(this.path, this.keyframes.current(), this.at);
+    this.set(path, chosen);
   }
 
   // Seconds at a column of the window.
@@ -230,7 +149,7 @@ export class Timeline {
     if (!press) return;
     if (press.index < 0) this.goTo(this.secondsAt(clientX));
     else if (press.moved || Math.abs(clientX - press.x) > MOVED) {
-      press.moved = this.moved(press.index, this.secondsAt(clientX) + press.grip);
+      press.moved = withTime(this.path, press.index, this.secondsAt(clientX) + press.grip);
       this.draw(press.moved.path, press.moved.chosen);
     }
   }
