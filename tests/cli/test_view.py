@@ -75,10 +75,8 @@ def made(tmp_path_factory):
 def viewing(folder, *words, ends_with=signal.SIGINT):
     """Run the command, with its output in a folder; yield its output up to the URL, and the URL. It must exit cleanly
     on the signal `ends_with`."""
-    program, address = (
-        Program(COMMAND, ["view", *words], folder),
-        r"(http://\S+/)   \(press Ctrl-C to stop\)\n",
-    )
+    address = r"(http://\S+/)   \(press Ctrl-C to stop\)\n"
+    program = Program(COMMAND, ["view", *words], folder)
     try:
         until(lambda: not program.runs or re.search(address, program.said()))
         printed = program.said()

@@ -56,10 +56,9 @@ def rendered(scene, camera, backend, settings=SETTINGS):
 
 
 IMAGES = [("webgpu", name, None) for name in LENSES]
-IMAGES += [
-    ("cuda", name, None) for name in [*LENSES][1::2]
-]  # the others are compared with the native kernels' below
+IMAGES += [("cuda", name, None) for name in [*LENSES][1::2]]
 IMAGES += [(backend, name, LIMIT) for backend in ("webgpu", "cuda") for name in CLAMPED]
+"""On cuda, images of the other lenses are compared with those of the native kernels only."""
 
 
 @pytest.mark.parametrize(("backend", "name", "limit"), IMAGES, indirect=["backend"])
