@@ -86,10 +86,10 @@ def test_colours_are_the_texture_the_vertices_or_grey():
     image = picture(colored, found, (1, 2, 3))
     assert tuple(image[0, 0]) == (1, 2, 3) and tuple(image[20, 20]) == (128, 128, 0)
     assert tuple(image[4, 36]) == (255, 0, 0)
-    # the same ramp in a texture, whose outer texel centres lie at -1 and 1
-    row = np.linspace(0, 255, 256).astype(np.uint8)
-    texels = np.stack([np.tile(row, (256, 1)), np.tile(row[:, None], (1, 256)), np.zeros((256, 256))], -1)
-    uvs = ((ramp[:, :2] * 255 + 0.5) / 256).astype("f4")[mesh.faces]
+    # the same ramp in a texture of 6 x 6 texels, whose outer centres lie at -1 and 1
+    row = np.linspace(0, 255, 6).astype(np.uint8)
+    texels = np.stack([np.tile(row, (6, 1)), np.tile(row[:, None], (1, 6)), np.zeros((6, 6))], -1)
+    uvs = ((ramp[:, :2] * 5 + 0.5) / 6).astype("f4")[mesh.faces]
     textured = Mesh(mesh.vertices, mesh.faces, None, Texture(texels.astype(np.uint8), uvs))
     np.testing.assert_allclose(picture(textured, found, (1, 2, 3)), image.astype(int), atol=1)
     assert (picture(mesh, found, (1, 2, 3))[found.covered] == 200).all()
