@@ -51,18 +51,22 @@ def test_what_came_from_an_entry_and_has_its_name_is_renamed():
     assert names_along("runs/best", "good", PARENTS) == {"runs/best": "runs/good"}
 
 
-def test_one_that_fails_puts_the_names_back():
-    now = {"a/x", "b/x", "c/x"}
+@pytest.mark.parametrize(
+    "names", [{"a/x": "a/y", "b/x": "b/y", "c/x": "c/y"}, {"a/x": "a/y", "a/w": "a/x", "c/x": "c/y"}]
+)
+def test_one_that_fails_puts_the_names_back(names):
+    """Also if one entry has got the former name of another."""
+    now = dict(zip(names, range(3), strict=True)) | {"c/y": 3}
+    before = now.copy()
 
     def rename(old, new):
-        if new == "c/y":
-            raise conflict("c/y: exists already; choose another name")
-        now.remove(old)
-        now.add(new)
+        if new in now:
+            raise conflict(f"{new}: exists already; choose another name")
+        now[new] = now.pop(old)
 
     with pytest.raises(RefusedError, match=r"c/y: exists already; .*; all names are as before"):
-        rename_all({"a/x": "a/y", "b/x": "b/y", "c/x": "c/y"}, rename)
-    assert now == {"a/x", "b/x", "c/x"}
+        rename_all(names, rename)
+    assert now == before
 
 
 def test_a_project_is_renamed_with_its_links(page, trained):
