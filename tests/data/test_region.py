@@ -15,7 +15,8 @@ from gsplat_edu.data.region import REGION, read_region, write_region
 from gsplat_edu.data.region_masks import AROUND
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.scene.region import Region
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.region import Region, seen_in
 
 BOX = Region(np.array([0.1, 0.2, 0.3]), np.eye(3), np.array([0.3, 0.4, 0.5]))
 WORDS = ("--iterations", "20", "--backend", "cpu", "--sky", "none", "--appearance", "none")
@@ -47,6 +48,19 @@ def test_a_region_is_written_read_and_removed(capture):
     write_region(capture, None)
     assert not (capture / REGION).exists()
     write_region(capture, None)
+
+
+@pytest.mark.parametrize(("z", "seen"), [(4.0, "some"), (-4.0, "none"), (0.0, "all")])
+def test_a_box_is_seen_by_the_rays_that_enter_it_ahead_of_the_camera(z, seen):
+    """The witness steps along each ray. The box before, behind or around the camera is turned about its axis."""
+    camera = Camera(np.eye(3), (0, 0, 0), 20.0, 20.0, 11.5, 9.5, 20, 24)
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    box = Region(np.array([0.1, 0.0, z]), turn, np.array([1.0, 0.7, 0.5]))
+    places = camera.rays()[..., None, :] * np.linspace(0.0, 6.0, 3_001)[:, None]
+    expected = (np.abs((places - box.center) @ turn) <= box.half).all(axis=-1).any(axis=-1)
+    found = seen_in(box, camera)
+    assert {"some": found.any() and not found.all(), "none": not found.any(), "all": found.all()}[seen]
+    assert (found != expected).sum() <= 2, "a corner that a step passes over"
 
 
 @pytest.mark.parametrize(
