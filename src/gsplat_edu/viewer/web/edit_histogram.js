@@ -13,7 +13,7 @@ export const HISTOGRAM_PANEL = `
 <details id="edit-histogram"><summary>by opacity, size or distance</summary>
 <p class="row"><label>of <select id="edit-quantity"><option value="opacity">opacity</option><option value="size">size</option>
 <option value="distance">distance to the pivot</option></select></label></p>
-<canvas id="edit-chart" role="img"></canvas>
+<canvas id="edit-chart" role="img" aria-label="bar chart"></canvas>
 <p class="row"><label>from <input id="edit-low" type="range" min="0" max="${RANGE_STEPS}" value="0"></label>
 <output id="edit-low-text" for="edit-low"></output></p>
 <p class="row"><label>to <input id="edit-high" type="range" min="0" max="${RANGE_STEPS}" value="${RANGE_STEPS}"></label>

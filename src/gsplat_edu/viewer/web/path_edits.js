@@ -3,7 +3,7 @@
 import { PathCurve } from "./path.js";
 
 export const PATH_GAP = 0.01; // least seconds between views that the page writes
-const SHORTEST_REST = 0.001; // seconds
+const LEAST_REST = 0.001; // seconds
 
 export const restOf = ({ hold }) => hold ?? 0;
 
@@ -89,7 +89,7 @@ export function withTime(path, index, seconds) {
 
 // Rests at a view for some seconds; later views may be pushed later.
 export function withRest(path, index, seconds) {
-  const hold = seconds >= SHORTEST_REST ? seconds : undefined;
+  const hold = seconds >= LEAST_REST ? seconds : undefined;
   return arranged(timed(path, (keyframe, i) => (i === index ? { ...keyframe, hold } : keyframe)));
 }
 
