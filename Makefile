@@ -44,7 +44,7 @@ test:
 	@echo "== test: the first tier"
 	@$(PYTEST) -m "not slow"
 
-# The first tier checks the shapes of all arguments; the second runs the functions as users do, in two thirds of the time.
+# The first tier checks shapes and dtypes; the second calls the functions as users do, in two thirds of a training's time.
 test-slow: sanitize
 	@echo "== test-slow: the second tier"
 	@JAXTYPING_DISABLE=1 $(PYTEST) -m slow

@@ -51,9 +51,10 @@ settings.load_profile("soak" if tiers.SOAK else "repeatable")
 @pytest.fixture
 def as_shipped() -> Iterator[None]:
     """Switch off the shape-checking hook, so that tests see the errors that users get."""
+    before = jaxtyping.config.jaxtyping_disable  # the second tier runs without the hook
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,4 +1,4 @@
-"""Triton's interpreter, without work that it repeats: its results are the same, in half of the time."""
+"""Triton's interpreter without work that it repeats; a render with its gradients takes a third of the time."""
 
 import functools
 
@@ -38,7 +38,7 @@ def _known_dtype(of):
 
 
 def speed_up() -> None:
-    """Replace all of them, where this version of Triton has them."""
+    """Replace the functions of the interpreter above by these, where this version of Triton has them."""
     if hasattr(interpreter, "_LangPatchScope"):
         interpreter._patch_lang, interpreter._get_np_dtype = _patch_once, _known_dtype
         semantic.TritonSemantic.broadcast_impl_value = _broadcast_where_shapes_differ
