@@ -3,6 +3,7 @@ import { test } from "node:test";
 import { gzipSync } from "node:zlib";
 
 import { arraysIn, inflated } from "../../src/gsplat_edu/viewer/web/scene.js";
+import { decodedRun, filledCodebook, halves } from "../../src/gsplat_edu/viewer/web/sog_runs.js";
 import { SortedSplats } from "../../src/gsplat_edu/viewer/web/sorted_splats.js";
 import { arrayOf, assertClose, vectors } from "./vectors.js";
 
@@ -66,4 +67,38 @@ test("damaged splats are reported", async () => {
   const data = gzipSync(Buffer.alloc(100)).subarray(0, 15);
   const elements = [{ textContent: data.toString("base64"), remove() {} }];
   await assert.rejects(inflated(elements, 100), /damaged; download or export the file again/);
+});
+
+// Means are computed in double here and rounded once; Python computes them in float32, with a relative error of a few
+// 2^-24. Quaternions are rounded to steps, and float32 is far finer than one of them.
+test("a run of a streamed scene has the values that Python reads", () => {
+  const expected = vectors("streamed-run");
+  const { meta } = expected;
+  const image = (name) => arrayOf(expected.images[name]);
+  const [low, high] = meta.means.files.map(image);
+  const [palette, labels] = meta.shN.files.map(image);
+  const file = {
+    meta,
+    low,
+    high,
+    palette,
+    labels,
+    quats: image(meta.quats.files[0]),
+    scales: image(meta.scales.files[0]),
+    sh0: image(meta.sh0.files[0]),
+    logScales: Float32Array.from(filledCodebook(meta.scales.codebook)),
+    colors: halves(filledCodebook(meta.sh0.codebook)),
+    harmonics: halves(filledCodebook(meta.shN.codebook)),
+  };
+  const [offset, count] = [100, 150];
+  const rows = (values, width) => values.slice(width * offset, width * (offset + count));
+  const run = decodedRun(file, offset, count, 2);
+  assertClose(Array.from(run.means), rows(expected.means, 1), { absolute: 1e-6, relative: 1e-6 }, "means");
+  assert.deepEqual(run.log_scales, rows(arrayOf(expected.log_scales), 3));
+  assertClose(Array.from(run.quats), rows(expected.quats, 1), { absolute: 0.51 }, "quaternions");
+  assert.deepEqual(run.sh, rows(arrayOf(expected.sh), 27));
+  assert.deepEqual(run.logit_opacities, halves(rows(expected.logit_opacities, 1)));
+  const flat = decodedRun(file, offset, count, 0);
+  const colors = Uint16Array.from({ length: 3 * count }, (_, i) => run.sh[27 * Math.floor(i / 3) + (i % 3)]);
+  assert.deepEqual(flat.sh, colors, "a page of degree 0 takes the first coefficient");
 });

@@ -9,6 +9,7 @@ const TYPES = {
   float32: Float32Array,
   float64: Float64Array,
   int16: Int16Array,
+  uint8: Uint8Array,
   uint16: Uint16Array,
   uint32: Uint32Array,
 };

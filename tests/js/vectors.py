@@ -1,7 +1,10 @@
 """Inputs and expected results of the JavaScript tests, computed by the Python twins, NumPy and SciPy."""
 
 import base64
+import json
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,6 +17,9 @@ from gsplat_edu.edits.cells import EditWork
 from gsplat_edu.edits.membership import Values, members
 from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.io.edit import IDENTITY
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.sog import codec as sog
+from gsplat_edu.io.sog.files import decode, write_bundle
 from gsplat_edu.scene.camera import look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.mesh import Mesh
@@ -250,6 +256,36 @@ def packed_scene() -> dict[str, Any]:
     }
 
 
+def streamed_run() -> dict[str, Any]:
+    """Return the images of a SOG, as a browser decodes them, and what Python reads from it."""
+    generator = torch.Generator().manual_seed(4)
+    shapes = {"means": (300, 3), "quats": (300, 4), "log_scales": (300, 3), "sh0": (300, 1, 3)}
+    tensors = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    tensors["sh_rest"] = 0.3 * torch.randn((300, 8, 3), generator=generator)
+    opacities = 3 * torch.randn(300, generator=generator)
+    gaussians = Gaussians(**tensors, logit_opacities=opacities)
+    contents = sog.packed(Scene(gaussians), sort=False)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.sog"
+        write_bundle(path, contents)
+        scene = sog.read(path).gaussians
+        images = {
+            name: decode(path, name, data).reshape(-1)
+            for name, data in contents.items()
+            if name.endswith(".webp")
+        }
+    return {
+        "count": 300,
+        "meta": json.loads(contents["meta.json"]),
+        "images": {name: numbers(pixels) for name, pixels in images.items()},
+        "means": scene.means.tolist(),
+        "log_scales": numbers(scene.log_scales.numpy().ravel()),
+        "quats": (32767 * scene.quats.double()).tolist(),
+        "sh": numbers(torch.cat([scene.sh0, scene.sh_rest], dim=1).half().numpy().view(np.uint16).ravel()),
+        "logit_opacities": scene.logit_opacities.tolist(),
+    }
+
+
 def mesh_rays() -> dict[str, Any]:
     """Return a mesh, rays from a camera's eye, and the depths at which NumPy finds it; None for a miss."""
     mesh = Mesh(ball().vertices.astype(np.float32).astype(np.float64), ball().faces)
@@ -285,6 +321,7 @@ VECTORS: dict[str, Callable[[], Any]] = {
     "order": order,
     "sample": sample,
     "packed-scene": packed_scene,
+    "streamed-run": streamed_run,
     "mesh-rays": mesh_rays,
     "constants": shader_constants,
 }

@@ -48,6 +48,32 @@ const QUANTITIES = {
   },
 };
 
+// Counts visible and selected splats per bar; a splat without a finite place counts in the nearest bar.
+export function counted(name, values, flags, pivot) {
+  const quantity = QUANTITIES[name];
+  const of = quantity.of(values, pivot);
+  const places = new Float64Array(values.count);
+  let [low, high] = [Infinity, -Infinity];
+  for (let i = 0; i < values.count; ++i) {
+    places[i] = flags[i] <= SELECTED ? of(i) : NaN;
+    if (places[i] < low && places[i] > -Infinity) low = places[i];
+    if (places[i] > high && places[i] < Infinity) high = places[i];
+  }
+  if (name === "distance") low = Math.max(low, high + Math.log(LEAST_DISTANCE));
+  if (quantity.fixed) [low, high] = quantity.fixed;
+  if (!(high > low)) [low, high] = low === high ? [low - 1, high + 1] : [0, 1];
+  const bars = RANGE_STEPS / BAR_STEPS;
+  const [all, selected] = [new Uint32Array(bars), new Uint32Array(bars)];
+  const scale = bars / (high - low);
+  for (let i = 0; i < values.count; ++i) {
+    if (Number.isNaN(places[i])) continue;
+    const bar = Math.min(Math.max(Math.floor((places[i] - low) * scale), 0), bars - 1);
+    ++all[bar];
+    if (flags[i] === SELECTED) ++selected[bar];
+  }
+  return { ends: [low, high], all, selected };
+}
+
 export class EditHistogram {
   constructor(editor) {
     this.editor = editor;
@@ -103,33 +129,14 @@ export class EditHistogram {
     this.changed();
   }
 
-  // Counts visible and selected splats per bar.
   count() {
     const { values, history, viewer } = this.editor;
-    const { flags } = history;
-    const quantity = QUANTITIES[this.quantity];
     this.pivot = [...viewer.view.focus];
-    const of = quantity.of(values, this.pivot);
-    const places = new Float64Array(values.count);
-    let [low, high] = [Infinity, -Infinity];
-    for (let i = 0; i < values.count; ++i) {
-      places[i] = flags[i] <= SELECTED ? of(i) : NaN;
-      if (places[i] < low && places[i] > -Infinity) low = places[i];
-      if (places[i] > high && places[i] < Infinity) high = places[i];
-    }
-    if (this.quantity === "distance") low = Math.max(low, high + Math.log(LEAST_DISTANCE));
-    if (quantity.fixed) [low, high] = quantity.fixed;
-    if (!(high > low)) [low, high] = low === high ? [low - 1, high + 1] : [0, 1];
-    this.ends = [low, high];
-    const bars = RANGE_STEPS / BAR_STEPS;
-    [this.all, this.selected] = [new Uint32Array(bars), new Uint32Array(bars)];
-    const scale = bars / (high - low);
-    for (let i = 0; i < values.count; ++i) {
-      if (Number.isNaN(places[i])) continue;
-      const bar = Math.min(Math.max(Math.floor((places[i] - low) * scale), 0), bars - 1);
-      ++this.all[bar];
-      if (flags[i] === SELECTED) ++this.selected[bar];
-    }
+    ({
+      ends: this.ends,
+      all: this.all,
+      selected: this.selected,
+    } = counted(this.quantity, values, history.flags, this.pivot));
   }
 
   // The value at a step of a handle; null at its end, where it sets no limit.
