@@ -22,7 +22,7 @@ from traced import traced_capture
 
 from gsplat_edu import load_backend, recipe, training
 from gsplat_edu.base.buffers import reused_buffers
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.evaluate.metrics import photo_psnr, psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings

@@ -28,9 +28,9 @@ import hardware
 from captures import capture
 
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.evaluate.metrics import score_views, summarize
+from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.processes import Member, Processes, joined
 from gsplat_edu.runs.training import CaptureRun

@@ -39,7 +39,7 @@ from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.seams import pooled_psnr, strip_masks, strip_width
 from gsplat_edu.blocks.split import SplitOptions, coarse_scene, split_capture
 from gsplat_edu.blocks.task import block_options, pixels_of_block
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import to_bytes

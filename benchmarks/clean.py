@@ -38,7 +38,7 @@ import gsplat_edu.cli.main as command_line
 from fixtures.plant import floaters
 from gsplat_edu.clean.guard import Cleaning, clean
 from gsplat_edu.clean.judge import Reason
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend

@@ -45,14 +45,15 @@ from traced import traced_capture
 
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.arguments import OneLineParser, run_command
-from gsplat_edu.cli.options import train as command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.dataset import load_dataset, scene_extent
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.ops.exposure import stops
+from gsplat_edu.options import train as command
+from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera

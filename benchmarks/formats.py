@@ -20,7 +20,7 @@ from typing import Any
 import hardware
 import torch
 
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings

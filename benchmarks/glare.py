@@ -32,10 +32,11 @@ from traced import LIGHT, Scene, Shape, camera_at, checks, photographed, placed
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.arguments import OneLineParser, run_command
-from gsplat_edu.cli.options import train as command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.writers import write_blender
 from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.options import train as command
+from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.sh import sh_basis

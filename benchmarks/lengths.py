@@ -25,7 +25,7 @@ import torch
 
 from fixtures.outdoors import outdoor_capture
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr

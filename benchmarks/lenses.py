@@ -49,7 +49,7 @@ from train_step import measure
 from gsplat_edu.base.buffers import reused_buffers
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.dataset import TEST_EVERY, DataSettings, load_dataset
 from gsplat_edu.data.lens import FISHEYE, Lens, undistortion
 from gsplat_edu.data.lens_captures import LENS_KINDS, LENS_SCENES, LensCapture, lens_capture, with_rays

@@ -30,8 +30,8 @@ import hardware
 import numpy as np
 import torch
 
-from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.cli.main import main as command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.scene.views import View

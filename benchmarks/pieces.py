@@ -37,7 +37,7 @@ from traced import traced_capture
 from gsplat_edu.base.constants import ALPHA_MIN
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.data.writers import write_blender
 from gsplat_edu.evaluate.metrics import score_views, summarize

@@ -39,11 +39,12 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.arguments import OneLineParser, run_command
-from gsplat_edu.cli.options import train as command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.writers import write_blender
 from gsplat_edu.evaluate.figures import save_figure
 from gsplat_edu.evaluate.metrics import ImageScore, OnImage, score_views, summarize
+from gsplat_edu.options import train as command
+from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.data.region_masks import views_of_region
 from gsplat_edu.data.solids_photos import solids_capture

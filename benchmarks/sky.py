@@ -28,12 +28,13 @@ from jaxtyping import Bool
 from fixtures.outdoors import outdoor_capture, photograph
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.arguments import OneLineParser, run_command
-from gsplat_edu.cli.options import train as command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.remedies import remedies_for
 from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.options import train as command
+from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.runs import skies
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera, look_at

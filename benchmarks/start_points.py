@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from fixtures.room import room_capture
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.data.points import random_cloud, read_points_ply

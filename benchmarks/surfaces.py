@@ -33,7 +33,7 @@ from fixtures.city import City
 from fixtures.city_paint import PITCH, Buildings
 from fixtures.outdoors import box_hits
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.solids import Part, SolidScene
 from gsplat_edu.data.solids_mesh import solids_mesh
 from gsplat_edu.data.solids_photos import (

@@ -21,8 +21,9 @@ from captures import capture
 from train_step import STAGES, measure
 
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.arguments import OneLineParser, run_command
-from gsplat_edu.cli.options import train as command
+from gsplat_edu.cli.running import run_command
+from gsplat_edu.options import train as command
+from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.runs.training import CaptureRun, document
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer

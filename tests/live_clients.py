@@ -11,7 +11,7 @@ import numpy as np
 
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.main import build_parser
-from gsplat_edu.cli.options.train import options_from
+from gsplat_edu.options.train import options_from
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import LiveView

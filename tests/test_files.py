@@ -18,7 +18,7 @@ from gsplat_edu.base.files import (
     written_aside,
 )
 from gsplat_edu.base.reading import open_file, stored_path
-from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.cli.running import run_command
 from systems import needs_posix
 
 

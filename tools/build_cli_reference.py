@@ -14,16 +14,16 @@ import sys
 from pathlib import Path
 
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.cli.arguments import OneLineParser
 from gsplat_edu.cli.main import COMMANDS, build_parser
-from gsplat_edu.cli.options import demo
+from gsplat_edu.options import demo
+from gsplat_edu.options.parser import OneLineParser
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = ROOT / "docs" / "CLI.md"
 
 PREAMBLE = """# Command line
 
-<!-- Written by tools/build_cli_reference.py; edit the help texts in src/gsplat_edu/cli/options instead. -->
+<!-- Written by tools/build_cli_reference.py; edit the help texts in src/gsplat_edu/options instead. -->
 
 Bad input prints one line that says what is wrong and what to do next, and exits with code 2; `--debug` adds the
 traceback. Ctrl-C and SIGTERM exit with code 130 (`view` with 0), and `train` saves a checkpoint first. `doctor` exits

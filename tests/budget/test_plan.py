@@ -25,14 +25,14 @@ from gsplat_edu.budget.plan import Limits, Request, choose, look_ahead, plan
 from gsplat_edu.budget.planned import flags, taken_up
 from gsplat_edu.budget.probe import resident_bytes
 from gsplat_edu.cli import train
-from gsplat_edu.cli.arguments import bytes_text, seconds_text
 from gsplat_edu.cli.main import build_parser, main
-from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.options.train import options_from
+from gsplat_edu.options.values import bytes_text, seconds_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS

@@ -9,11 +9,11 @@ import pytest
 
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.options.train import options_from
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.views import View

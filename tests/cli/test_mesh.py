@@ -8,9 +8,9 @@ import pytest
 
 from gsplat_edu import write_scene
 from gsplat_edu.cli.main import main
-from gsplat_edu.cli.options.mesh import SUFFIXES
 from gsplat_edu.io.mesh_files import MESH_FORMATS, read_mesh, write_mesh
 from gsplat_edu.jobs import emitter
+from gsplat_edu.options.mesh import SUFFIXES
 from gsplat_edu.scene.mesh import Mesh
 from splat_ball import RADIUS, ball
 

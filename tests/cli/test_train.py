@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
-from gsplat_edu.cli.arguments import bytes_text, seconds_text
 from gsplat_edu.cli.main import build_parser, main
-from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
+from gsplat_edu.options.train import options_from
+from gsplat_edu.options.values import bytes_text, seconds_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import check_options
 from gsplat_edu.runs.training import document

@@ -61,7 +61,7 @@ def render(work, purpose):
     ("module", "catches", "line"),
     [
         ("gsplat_edu.cli.main", False, "it was ended"),
-        ("gsplat_edu.cli.options.doctor", True, "gsplat-edu: interrupted"),
+        ("gsplat_edu.options.doctor", True, "gsplat-edu: interrupted"),
         ("gsplat_edu.cli.doctor", False, "interrupted"),
         ("gsplat_edu.cli.doctor", True, "interrupted"),
     ],

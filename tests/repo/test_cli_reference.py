@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gsplat_edu.cli import main as command_line
-from gsplat_edu.cli.options import train
+from gsplat_edu.options import train
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = (ROOT / "docs" / "CLI.md").read_text()

@@ -13,12 +13,12 @@ from PIL import Image
 from gsplat_edu.base.errors import CheckpointError, DatasetError
 from gsplat_edu.base.locks import locked
 from gsplat_edu.cli.main import build_parser, main
-from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.options.train import options_from
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, is_finished
 from gsplat_edu.train.config import TrainConfig, recipe

@@ -8,9 +8,9 @@ import torch
 
 from fixtures.outdoors import outdoor_capture
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.arguments import OneLineParser
-from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.options import train as command
+from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.events import StepEvent

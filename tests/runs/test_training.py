@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from gsplat_edu.cli.main import build_parser, main
-from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import load_ply
+from gsplat_edu.options.train import options_from
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.training import CaptureRun

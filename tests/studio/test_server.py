@@ -303,7 +303,7 @@ def test_a_server_under_attack_answers_its_page_and_works_on(served, tmp_path):
 
 def test_the_server_imports_no_torch():
     code = (
-        "import sys; import gsplat_edu.studio.server, gsplat_edu.cli.studio, gsplat_edu.cli.options.studio;"
+        "import sys; import gsplat_edu.studio.server, gsplat_edu.cli.studio, gsplat_edu.options.studio;"
         "import gsplat_edu.data.images; print(sorted({'torch', 'scipy', 'matplotlib'} & set(sys.modules)))"
     )
     assert (

@@ -10,9 +10,9 @@ import torch
 
 from gsplat_edu import load_backend, recipe, training
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.cli.options import train as train_options
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.textured_box import BOX_FACES, box_orbit, photograph_box
+from gsplat_edu.options import train as train_options
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.views import View

@@ -14,9 +14,9 @@ import torch
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.main import build_parser
-from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.options.train import options_from
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.checkpoint import list_checkpoints
 from gsplat_edu.viewer import live_folder, page_data, snapshots

@@ -25,10 +25,6 @@ from gsplat_edu.cli.block_table import BlockTable
 from gsplat_edu.cli.eval import result_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.findings import with_right_poses
-from gsplat_edu.cli.options.block_parts import parts_of_blocks
-from gsplat_edu.cli.options.blocks import LEAST_VIEWS, SPLIT, block_count
-from gsplat_edu.cli.options.length import quality_of
-from gsplat_edu.cli.options.train import OPEN, left_open, options_from
 from gsplat_edu.cli.process import interruptible
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train import (
@@ -41,6 +37,10 @@ from gsplat_edu.cli.train import (
 )
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.metrics import ImageScore
+from gsplat_edu.options.block_parts import parts_of_blocks
+from gsplat_edu.options.blocks import LEAST_VIEWS, SPLIT, block_count
+from gsplat_edu.options.length import quality_of
+from gsplat_edu.options.train import OPEN, left_open, options_from
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun, is_finished
 from gsplat_edu.viewer.export import check_target

@@ -15,9 +15,7 @@ from scipy.spatial.transform import Rotation
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.locks import locked_file
 from gsplat_edu.base.reading import read_text
-from gsplat_edu.cli.arguments import numbers_text
 from gsplat_edu.cli.exporting import check_and_say
-from gsplat_edu.cli.options.convert import MOVES, photos_asked
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.edits.apply import views_after
 from gsplat_edu.edits.document import read_edits
@@ -28,6 +26,8 @@ from gsplat_edu.io.formats import LOD_META, TILESET
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.lod.tiles import tile_options
 from gsplat_edu.jobs import emitter
+from gsplat_edu.options.convert import MOVES, photos_asked
+from gsplat_edu.options.values import numbers_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.scene.frame import ORIGIN

@@ -16,7 +16,6 @@ from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import plain_of
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.options.depth import check_depth
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.reader import CaptureReader
@@ -32,6 +31,7 @@ from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed
+from gsplat_edu.options.depth import check_depth
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader

@@ -10,18 +10,13 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.printing import complain, escape_unencodable_characters
 from gsplat_edu.base.text import option_flag
-from gsplat_edu.cli.arguments import (
-    EXIT_BAD_INPUT,
-    EXIT_INTERRUPTED,
-    OneLineParser,
-    interruptible_imports,
-    run_command,
-)
-from gsplat_edu.cli.printing import complain, escape_unencodable_characters
-from gsplat_edu.cli.ranks import num_processes
+from gsplat_edu.cli.running import EXIT_INTERRUPTED, interruptible_imports, run_command
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Interrupted
+from gsplat_edu.jobs.ranks import num_processes
+from gsplat_edu.options.parser import EXIT_BAD_INPUT, OneLineParser
 from gsplat_edu.render.settings import check_backend
 from gsplat_edu.train.config import SETTINGS
 from gsplat_edu.train.setting import option_of
@@ -84,7 +79,7 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=summary, description=summary)
         if name not in words:
             continue
-        options = importlib.import_module(f"gsplat_edu.cli.options.{_module(name)}")
+        options = importlib.import_module(f"gsplat_edu.options.{_module(name)}")
         command.epilog = options.EXAMPLE
         options.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="print the traceback of an error")
@@ -104,7 +99,7 @@ def _run(name: str, arguments: argparse.Namespace) -> None:
     """Check the options, import the command, which takes seconds if it needs torch, and run it."""
     if "backend" in arguments:
         check_backend(arguments.backend)
-    options = importlib.import_module(f"gsplat_edu.cli.options.{_module(name)}")
+    options = importlib.import_module(f"gsplat_edu.options.{_module(name)}")
     try:
         if hasattr(options, "check"):
             options.check(arguments)

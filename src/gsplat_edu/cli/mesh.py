@@ -15,7 +15,6 @@ from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.headroom import available_memory
 from gsplat_edu.base.locks import locked, locked_file
 from gsplat_edu.base.text import short_number, spelled_bytes
-from gsplat_edu.cli.options.mesh import ALL, COLLIDER_FACES, COLLIDER_VOXELS, MOST_FACES, TEXTURE_FACES
 from gsplat_edu.cli.terminal import Terminal, stage_bars
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.evaluate.intersections import Intersections
@@ -39,6 +38,7 @@ from gsplat_edu.mesh.trust import (
     seen_truth,
     trust_of,
 )
+from gsplat_edu.options.mesh import ALL, COLLIDER_FACES, COLLIDER_VOXELS, MOST_FACES, TEXTURE_FACES
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import open_subject

@@ -18,7 +18,6 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE, lens_choice
 from gsplat_edu.cli.shot import PLAN, Shot, check_lens, median_depth, plan_asked_for, through_lens
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
@@ -35,6 +34,7 @@ from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
+from gsplat_edu.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE, lens_choice
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend, resolve_backend
 from gsplat_edu.render.field import within_field

@@ -14,7 +14,7 @@ import webbrowser
 from pathlib import Path
 
 from gsplat_edu.base.files import described
-from gsplat_edu.cli.printing import complain
+from gsplat_edu.base.printing import complain
 
 REDIRECT_SECONDS = 60.0
 """Seconds after which the file that redirects a browser to its page is removed; a browser takes a few to start."""

@@ -8,10 +8,10 @@ import shlex
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.text import Told
 from gsplat_edu.cli.findings import say_findings
-from gsplat_edu.cli.options.sfm import options_from
 from gsplat_edu.cli.terminal import Terminal, stage_bars
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.jobs import emitter
+from gsplat_edu.options.sfm import options_from
 from gsplat_edu.sfm.reconstruct import reconstruct
 
 

@@ -18,11 +18,11 @@ from jaxtyping import Float32
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.options.demo import CHAPTER, REDUCED, Budget as Budget
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.ops.losses import l1
+from gsplat_edu.options.demo import CHAPTER, REDUCED, Budget as Budget
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import gpu_of, load_backend, resolve_backend

@@ -8,8 +8,8 @@ import sys
 from dataclasses import replace
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.printing import say
 from gsplat_edu.base.text import install_command
-from gsplat_edu.cli.printing import say
 from gsplat_edu.cli.screen import has_screen, open_in_browser
 from gsplat_edu.viewer.serve import exposure
 

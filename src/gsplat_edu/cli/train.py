@@ -25,11 +25,7 @@ from gsplat_edu.budget.plan import Limits, Plan, look_ahead, plan
 from gsplat_edu.budget.planned import PLANNED
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.findings import with_right_poses
-from gsplat_edu.cli.options.length import quality_of
-from gsplat_edu.cli.options.settings import given
-from gsplat_edu.cli.options.train import AUTO, left_open, options_from
 from gsplat_edu.cli.process import interruptible, process_age
-from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.result import tell_result
 from gsplat_edu.cli.terminal import Bar, Field, Terminal, stage_bars
 from gsplat_edu.data.colmap import find_model
@@ -40,6 +36,10 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.finding import Remedy
 from gsplat_edu.doctor.remedies import CHOICES, remedies_for, transients_for
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
+from gsplat_edu.jobs.ranks import num_processes
+from gsplat_edu.options.length import quality_of
+from gsplat_edu.options.settings import given
+from gsplat_edu.options.train import AUTO, left_open, options_from
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.pilot import refinement_for
 from gsplat_edu.runs.processes import Member, joined

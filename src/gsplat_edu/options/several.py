@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.cli.ranks import num_processes, restarts_are_allowed
+from gsplat_edu.jobs.ranks import num_processes, restarts_are_allowed
 
 
 def check_several(arguments: argparse.Namespace) -> None:

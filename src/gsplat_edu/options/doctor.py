@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.cli.arguments import add_backend, number_text, whole_number_text
-from gsplat_edu.cli.options.depth import add_depth
+from gsplat_edu.options.depth import add_depth
+from gsplat_edu.options.values import add_backend, number_text, whole_number_text
 from gsplat_edu.train.length import DEFAULT_QUALITY
 
 EXAMPLE = "example: gsplat-edu doctor captures/plush"

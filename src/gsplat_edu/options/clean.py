@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.cli.arguments import number_text
+from gsplat_edu.options.values import number_text
 
 EXAMPLE = "example: gsplat-edu clean runs/plush --preview removed.html"
 

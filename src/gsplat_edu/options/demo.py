@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import NamedTuple
 
-from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.options.values import add_backend, whole_number_text
 
 EXAMPLE = "example: gsplat-edu demo --iters 100 --size 48 --out out/quick.png"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.cli.options.blocks import add_run, check_run
+from gsplat_edu.options.blocks import add_run, check_run
+from gsplat_edu.options.values import whole_number_text
 
 EXAMPLE = "example: gsplat-edu block runs/town 3"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from gsplat_edu.base.constants import PAGE_FACES
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.cli.arguments import add_backend, bytes_text, number_text, numbers_text, whole_number_text
+from gsplat_edu.options.values import add_backend, bytes_text, number_text, numbers_text, whole_number_text
 
 EXAMPLE = "example: gsplat-edu mesh runs/plush plush.glb --faces 50000"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.options.values import add_backend, whole_number_text
 from gsplat_edu.render.settings import MAPS
 from gsplat_edu.scene.projection import STEEPEST_FISHEYE
 

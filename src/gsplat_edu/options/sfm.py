@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.base.constants import AUTO
-from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.options.values import whole_number_text
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA, SfmOptions
 from gsplat_edu.sfm.scale_text import MARKS
 

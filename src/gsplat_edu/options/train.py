@@ -10,18 +10,18 @@ from gsplat_edu.base.constants import AUTO as AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import one_of
-from gsplat_edu.cli.arguments import add_backend, bytes_text, number_text, seconds_text, whole_number_text
-from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
-from gsplat_edu.cli.options.depth import add_depth, check_depth
-from gsplat_edu.cli.options.length import length_of, strategy_of
-from gsplat_edu.cli.options.settings import (
+from gsplat_edu.data.settings import LENS_MODES, DataSettings
+from gsplat_edu.options.blocks import add_blocks, add_cluster, check_blocks
+from gsplat_edu.options.depth import add_depth, check_depth
+from gsplat_edu.options.length import length_of, strategy_of
+from gsplat_edu.options.settings import (
     add_settings,
     appendix as appendix,
     explain_unknown as explain_unknown,
 )
-from gsplat_edu.cli.options.several import check_several
-from gsplat_edu.cli.options.sfm import add_panorama, add_scale
-from gsplat_edu.data.settings import LENS_MODES, DataSettings
+from gsplat_edu.options.several import check_several
+from gsplat_edu.options.sfm import add_panorama, add_scale
+from gsplat_edu.options.values import add_backend, bytes_text, number_text, seconds_text, whole_number_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.sfm.options import PANORAMA

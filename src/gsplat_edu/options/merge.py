@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.cli.options.blocks import add_run, check_run
+from gsplat_edu.options.blocks import add_run, check_run
 
 EXAMPLE = "example: gsplat-edu merge runs/town --export town.spz"
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.cli.arguments import add_address, bytes_text, whole_number_text
+from gsplat_edu.options.values import add_address, bytes_text, whole_number_text
 
 EXAMPLE = "example: gsplat-edu studio ~/scenes"
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.cli.arguments import add_backend
+from gsplat_edu.options.values import add_backend
 from gsplat_edu.runs.folder import RunFolder
 
 EXAMPLE = "example: gsplat-edu eval out/plush"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, DatasetError
-from gsplat_edu.cli.arguments import add_backend, add_meshes, number_text, numbers_text, whole_number_text
+from gsplat_edu.options.values import add_backend, add_meshes, number_text, numbers_text, whole_number_text
 from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"

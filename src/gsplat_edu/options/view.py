@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.cli.arguments import add_address, add_meshes, whole_number_text
+from gsplat_edu.options.values import add_address, add_meshes, whole_number_text
 from gsplat_edu.viewer.serve import PORT
 
 EXAMPLE = "example: gsplat-edu view runs/plush"
