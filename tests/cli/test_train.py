@@ -16,9 +16,8 @@ from gsplat_edu.options.values import bytes_text, seconds_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import check_options
 from gsplat_edu.runs.training import document
-from gsplat_edu.train.config import SETTINGS, TrainConfig, recipe
+from gsplat_edu.train.config import FOR_DEPTH, FOR_SURFACE, SETTINGS, TrainConfig, recipe
 from gsplat_edu.train.length import QUALITIES
-from gsplat_edu.train.setting import COURSE_ONLY, FOR_DEPTH, FOR_SURFACE
 
 
 def parsed(words):
@@ -108,7 +107,7 @@ def test_the_help_names_every_setting_and_how_to_give_it(capsys):
     said = capsys.readouterr().out
     for setting in SETTINGS:
         way = f"  {setting.name}=" if setting.settable else f"--{setting.name.replace('_', '-')}"
-        assert (way in said) == (setting.name not in COURSE_ONLY), setting.name
+        assert (way in said) == (setting.only != "course"), setting.name
     assert "example: gsplat-edu train" in said
 
 

@@ -49,7 +49,7 @@ def test_every_field_is_a_setting_with_a_meaning():
     ):
         nested = {"adc", "mcmc", "fast"} if strategy is None else set()
         names = {field.name for field in dataclasses.fields(kind)} - nested
-        found = {setting.field for setting in SETTINGS if setting.strategy == strategy}
+        found = {setting.attribute for setting in SETTINGS if setting.strategy == strategy}
         assert found == names and all(f"    {name}: " in kind.__doc__ for name in names)
     assert all(setting.help.endswith(".") for setting in SETTINGS)
     assert len({setting.name for setting in SETTINGS}) == len(SETTINGS)

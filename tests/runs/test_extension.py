@@ -21,10 +21,9 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.options.train import options_from
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, is_finished
-from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.train.config import BY_NAME, TrainConfig, recipe
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import StepEvent
-from gsplat_edu.train.setting import option_with
 
 pytestmark = pytest.mark.slow
 
@@ -90,7 +89,7 @@ def whole(capture, tmp_path_factory):
     """An uninterrupted run of 30 iterations with the milestones for 20."""
     short, words = recipe(20), []
     for name in ("means_rate_iterations", "sh_every", "densify_stop", "reset_every"):
-        words += option_with(name, short.flat()[name]).split()
+        words += BY_NAME[name].with_value(short.flat()[name]).split()
     out = tmp_path_factory.mktemp("whole") / "egg"
     assert train(capture, out, "--iterations", "30", *words) == 0
     return out
@@ -120,7 +119,7 @@ def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, t
 
     short = recipe(20).flat()
     names = ("means_rate_iterations", "sh_every", "mcmc_stop")
-    given = [word for name in names for word in option_with(name, short[name]).split()]
+    given = [word for name in names for word in BY_NAME[name].with_value(short[name]).split()]
     mcmc("extended", "--iterations", "20")
     mcmc("extended", "--iterations", "30", "--resume")
     mcmc("whole", "--iterations", "30", *given)

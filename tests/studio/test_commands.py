@@ -1,21 +1,14 @@
 """Requests become command lines that the command line accepts; other requests are refused."""
 
-import argparse
+import re
+from pathlib import Path
 
 import pytest
 
 from gsplat_edu.cli.main import build_parser
 from gsplat_edu.jobs.record import Purpose, Work
-from gsplat_edu.studio.command_options import (
-    CLEAN_OPTIONS,
-    CONVERT_OPTIONS,
-    DOCTOR_OPTIONS,
-    MESH_OPTIONS,
-    RENDER_OPTIONS,
-    SFM_OPTIONS,
-    TRAIN_OPTIONS,
-)
-from gsplat_edu.studio.commands import command_line, subject_of, title_of, work_of
+from gsplat_edu.options.offers import offered
+from gsplat_edu.studio.commands import COMMANDS, command_line, subject_of, title_of, work_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.refusal import RefusedError
 from waiting import until
@@ -36,7 +29,7 @@ def library(tmp_path):
         (tmp_path / entry).mkdir()
     (tmp_path / "photos" / "a b" / "1.jpg").touch()
     (tmp_path / "photos" / "film" / "x.mp4").touch()
-    (tmp_path / "runs" / "a" / "config.json").touch()
+    (tmp_path / "runs" / "a" / "config.json").write_text("{}")
     (tmp_path / "scenes" / "a" / "toy.spz").touch()
     return made
 
@@ -159,7 +152,7 @@ def test_a_training_resumes_once_its_run_has_begun(library):
     out = library.root / "runs" / "a-run-2"
     out.mkdir()
     assert command_line(library, work, Purpose.CONTINUE).argv == argv
-    (out / "config.json").touch()
+    (out / "config.json").write_text("{}")
     resumed = command_line(library, work, Purpose.CONTINUE)
     assert resumed.argv == (*argv, "--resume")
     assert {command_line(library, resumed.work, purpose) == resumed for purpose in Purpose} == {True}
@@ -191,7 +184,6 @@ def test_work_follows_a_rename(library):
 
 SAMPLES = {
     "train": {
-        "quality": "draft",
         "time_limit": "20m",
         "max_memory": "4GiB",
         "resolution": 2.5,
@@ -210,30 +202,50 @@ SUBJECTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("command", "options"),
-    [
-        ("train", TRAIN_OPTIONS),
-        ("sfm", SFM_OPTIONS),
-        ("doctor", DOCTOR_OPTIONS),
-        ("clean", CLEAN_OPTIONS),
-        ("convert", CONVERT_OPTIONS),
-        ("mesh", MESH_OPTIONS),
-        ("render", RENDER_OPTIONS),
-    ],
-)
-def test_every_option_is_one_of_the_command_line(library, command, options):
-    parser = build_parser([command])
-    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    known = {flag for action in commands.choices[command]._actions for flag in action.option_strings}
-    assert {f"--{name.replace('_', '-')}" for name in options} <= known
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_manual_lists_the_options_of_a_command(command):
+    """Those of a request; `resume` is a field of its own."""
+    manual = (Path(__file__).parents[2] / "docs" / "STUDIO.md").read_text(encoding="utf-8")
+    (row,) = (line for line in manual.splitlines() if line.startswith(f"| {command} | "))
+    words = set(re.findall(r"[a-z_]+", row.partition("options ")[2]))
+    assert set(offered(command)) - {"resume"} <= words
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_request_names_a_path(command):
+    paths = [name for name, action in offered(command).items() if action.type is Path]
+    assert paths == (["depth"] if command == "train" else [])
+
+
+def test_depth_is_asked_for_by_a_word(library):
+    def line(depth):
+        return begun(library, {"command": "train", "subject": "captures/a", "options": {"depth": depth}})
+
+    assert parsed(line("points")).depth == Path("points")
+    with pytest.raises(RefusedError, match=r"options.depth: is '/etc', but has to be one of points, capture"):
+        line("/etc")
+
+
+def test_a_request_has_the_bounds_of_the_command(library):
+    def words(**options):
+        return begun(library, {"command": "train", "subject": "captures/a", "options": options})
+
+    assert parsed(words(batch=4096, iterations=4096)).batch == 4096
+    with pytest.raises(
+        RefusedError, match="options.batch: is 4097, but has to be a whole number from 1 to 4096"
+    ):
+        words(batch=4097)
+    with pytest.raises(
+        RefusedError, match="options.quality: --iterations or --time-limit already says how long"
+    ):
+        words(quality="draft", iterations=10)
 
 
 def test_the_resolution_may_be_chosen_by_the_command(library):
     options = {"resolution": "auto", "outside_masks": "empty"}
     found = parsed(begun(library, {"command": "train", "subject": "captures/a", "options": options}))
     assert found.resolution == "auto" and found.outside_masks == "empty"
-    with pytest.raises(RefusedError, match="resolution: is big, but has to be a number"):
+    with pytest.raises(RefusedError, match="options.resolution: 'big' is not a number"):
         begun(library, {"command": "train", "subject": "captures/a", "options": {"resolution": "big"}})
 
 
@@ -246,11 +258,12 @@ def test_settings_of_the_recipe_reach_the_training(library):
         "min_opacity": 0.01,
     }
     for settings, said in (
-        ({"out": "/"}, "set.out: is not a setting"),
-        ({"over_cap": "cut"}, "set.over_cap: is not a setting"),
-        ({"sh_every": True}, "set.sh_every: has to be a number or a short word"),
-        ({"sh_every": "9\n"}, "set.sh_every: has to be"),
-        (["sh_every=9"], "set: has to be an object"),
+        ({"out": "/"}, "options.set: 'out' is not a setting"),
+        ({"over_cap": "cut"}, "only the course's trainings change over_cap"),
+        ({"sh_every": True}, "options.set.sh_every: has to be a number or a short text"),
+        ({"sh_every": "9\n"}, "options.set.sh_every: has to be"),
+        ({"sh_every": "nine"}, "options.set: sh_every: 'nine' is not a whole number"),
+        (["sh_every=9"], "options.set: has to be an object"),
     ):
         with pytest.raises(RefusedError, match=said):
             words(settings)
@@ -376,7 +389,7 @@ def test_a_record_names_no_other_place_than_a_request_could(library, work, purpo
 def test_a_training_and_jobs_that_read_its_run_wait_for_each_other(page, studio):
     (studio.library.root / "captures" / "a").mkdir()
     (studio.library.root / "runs" / "r").mkdir()
-    (studio.library.root / "runs" / "r" / "config.json").touch()
+    (studio.library.root / "runs" / "r" / "config.json").write_text("{}")
     (studio.library.root / "runs" / "same").symlink_to(studio.library.root / "runs" / "r")
     requests = (
         {"command": "clean", "subject": "runs/same"},

@@ -7,7 +7,7 @@ import pytest
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.region import read_region, write_region
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.studio.command_options import TRAIN_OPTIONS
+from gsplat_edu.options.offers import questions
 from studio.pages import go, waiting
 
 
@@ -49,7 +49,7 @@ def test_choices_in_words_become_options_of_the_command(visitor, library, plain)
             "Lens": "auto",
             "What moved between the photos": "mask",
             "Sky": "none",
-            "Purpose": "surface",
+            "Purpose": "true",
         },
     )
     assert job.work.options == {
@@ -78,18 +78,19 @@ def test_without_choices_only_the_quality_is_given(visitor, library, plain):
     assert chosen(tab, library, {}).work.options == {"quality": "standard"}
 
 
-def test_every_choice_of_the_page_is_one_of_the_command(visitor, plain):
+def test_the_page_asks_what_the_command_declares(visitor, plain):
     tab = go(visitor().tab, "captures/choices")
     tab.locator("summary", has_text="More").click()
-    offered = tab.evaluate(
-        """[...document.querySelectorAll("[aria-label=training] select")].map(
-            (field) => [field.id, [...field.options].map(({ value }) => value).filter(Boolean)])"""
+    asked = tab.evaluate(
+        """[...document.querySelectorAll("[aria-label=training] .group .grid label > *")].map(
+            (field) => [field.id, field.getAttribute("aria-label"),
+                        [...(field.options ?? [])].map(({ value, text }) => [value, text])])"""
     )
-    assert len(offered) >= 8
-    for name, values in offered:
-        option = name.replace("-", "_")
-        for value in values:
-            assert TRAIN_OPTIONS[option](option, True if option == "surface" else value)
+    assert asked == [
+        [one["name"].replace("_", "-"), one["label"], list(map(list, one["words"]))]
+        for group in questions("train")
+        for one in group["questions"]
+    ]
 
 
 def test_the_box_is_chosen_while_there_is_one(visitor, library, plain):

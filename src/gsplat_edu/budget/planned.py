@@ -7,8 +7,7 @@ from collections.abc import Collection
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.train.config import MILESTONES, ONLY_FOR, recipe
-from gsplat_edu.train.setting import option_with
+from gsplat_edu.train.config import BY_NAME, MILESTONES, ONLY_FOR, recipe
 
 PLANNED = ("iterations", "tempo", *MILESTONES, "densify_every", "max_gaussians", "resolution", "image_memory")
 """Settings that a plan may choose; `given` lists those that the user set."""
@@ -38,11 +37,11 @@ def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = Fa
         )
         idle = {name for key, names in ONLY_FOR.items() if key != config.strategy for name in names}
         words += [
-            option_with(name, chosen[name])
+            BY_NAME[name].with_value(chosen[name])
             for name in MILESTONES
             if name not in {*given, *idle} and chosen[name] != scaled[name]
         ]
-        words += [option_with("tempo", config.tempo)] if config.tempo else []
+        words += [BY_NAME["tempo"].with_value(config.tempo)] if config.tempo else []
     return " ".join(words)
 
 

@@ -15,7 +15,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import plain_of
-from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.reader import CaptureReader
@@ -31,7 +30,6 @@ from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed
-from gsplat_edu.options.depth import check_depth
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
@@ -69,9 +67,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
     settings, reader = DataSettings(resolution=arguments.resolution), CaptureReader(arguments.path)
-    check_depth(arguments.depth)
-    if arguments.iterations is not None:
-        whole_number("--iterations", arguments.iterations, 1)
     backend = resolve_backend(arguments.backend)
     if "forecast" in load_backend(backend).lacks and not arguments.no_forecast:
         raise ArgumentError(

@@ -18,8 +18,7 @@ from gsplat_edu.jobs.events import Interrupted
 from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.parser import EXIT_BAD_INPUT, OneLineParser
 from gsplat_edu.render.settings import check_backend
-from gsplat_edu.train.config import SETTINGS
-from gsplat_edu.train.setting import option_of
+from gsplat_edu.train.config import BY_NAME
 
 COMMANDS = {
     "demo": "train a sphere from 24 renders of it and evaluate the result with a held-out camera",
@@ -121,6 +120,6 @@ def _as_option(message: str, has_set: bool) -> str:
         has_set: Whether the command gives settings by --set.
     """
     name, colon, rest = message.partition(": ")
-    if not colon or name not in {setting.name for setting in SETTINGS}:
+    if not colon or name not in BY_NAME:
         return message
-    return f"{option_of(name) if has_set else option_flag(name)}: {rest}"
+    return f"{BY_NAME[name].written if has_set else option_flag(name)}: {rest}"

@@ -54,7 +54,7 @@ MOST_FRAMES = 100_000
 
 def run(arguments: argparse.Namespace) -> None:
     """Render and report the written files, or write the path."""
-    _check_numbers(arguments)
+    _check_outputs(arguments)
     lens = lens_choice(arguments.camera_model)
     backend = _backend(arguments.backend, lens.kind)
     maps = _chosen_maps(arguments)
@@ -120,12 +120,11 @@ def _backend(name: str, lens: str) -> str:
     return found
 
 
-def _check_numbers(arguments: argparse.Namespace) -> None:
-    for name, least in (("frames", 1), ("fps", 1), ("size", 1), ("keyframes", FEWEST)):
-        if (value := getattr(arguments, name)) is not None:
-            whole_number(f"--{name}", value, least)
+def _check_outputs(arguments: argparse.Namespace) -> None:
     if arguments.out is not None:
         check_output(arguments.out)
+    if arguments.keyframes is not None:
+        whole_number("--keyframes", arguments.keyframes, FEWEST)
     if arguments.save_path is not None:
         check_writable("--save-path", arguments.save_path)
 

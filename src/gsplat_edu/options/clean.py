@@ -11,6 +11,9 @@ from gsplat_edu.options.values import number_text
 
 EXAMPLE = "example: gsplat-edu clean runs/plush --preview removed.html"
 
+OFFERED = ("max_loss",)
+"""Options that requests may give."""
+
 MAX_LOSS = 0.05
 """dB: default of --max-loss."""
 

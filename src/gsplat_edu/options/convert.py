@@ -7,10 +7,14 @@ from pathlib import Path
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.options.values import add_backend, add_meshes, number_text, numbers_text, whole_number_text
 from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
+
+OFFERED = ("sh_degree", "min_opacity", "verify")
+"""Options that requests may give."""
 
 MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 16 numbers, row by row)"
 
@@ -168,12 +172,14 @@ def _add_levels(group: argparse._ArgumentGroup) -> None:
 
 
 def check(arguments: argparse.Namespace) -> None:
-    """Check the options that depend on each other.
+    """Check the numbers, and the options that depend on each other.
 
     Raises:
-        ArgumentError: one needs another, or excludes it.
+        ArgumentError: a number is out of range, or an option needs another, or excludes it.
         DatasetError: there is nothing under --dataset.
     """
+    whole_number("--sh-degree", arguments.sh_degree, 0, SH_MAX_DEGREE)
+    in_range("--min-opacity", arguments.min_opacity, 0.0, 1.0)
     if arguments.edits_anyway and arguments.edits is None:
         raise ArgumentError("--edits-anyway: has an effect only with --edits; add --edits FILE")
     if photos_asked(arguments) is not None:

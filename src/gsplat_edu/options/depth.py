@@ -7,10 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.train.setting import FOR_DEPTH, option_of
+from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
+from gsplat_edu.train.config import BY_NAME, FOR_DEPTH
 
-WORDS = ("points", "capture")
-"""Values that are no folders; `gsplat_edu.data.depths` has them as paths."""
+WORDS = (POINTS_AS_DEPTH, CAPTURE_AS_DEPTH)
+"""Values that are no folders."""
 
 
 def add_depth(group: argparse._ActionsContainer, text: str) -> None:
@@ -42,7 +43,9 @@ def check_depth(path: Path | None, settings: Iterable[str] = ()) -> None:
     """
     if path is None:
         if idle := [name for name in FOR_DEPTH if name in settings]:
-            raise ArgumentError(f"{option_of(idle[0])}: only --depth uses it; leave it out or add --depth")
+            raise ArgumentError(
+                f"{BY_NAME[idle[0]].written}: only --depth uses it; leave it out or add --depth"
+            )
     elif str(path) not in WORDS and not path.is_dir():
         raise ArgumentError(
             f"--depth: {path} is no folder; give the folder of maps, or one of the words {' and '.join(WORDS)}"

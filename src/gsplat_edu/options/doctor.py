@@ -5,11 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.options.depth import add_depth
+from gsplat_edu.base.validation import whole_number
+from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.options.depth import add_depth, check_depth
 from gsplat_edu.options.values import add_backend, number_text, whole_number_text
 from gsplat_edu.train.length import DEFAULT_QUALITY
 
 EXAMPLE = "example: gsplat-edu doctor captures/plush"
+
+OFFERED = ("resolution",)
+"""Options that requests may give."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,3 +48,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     after.add_argument("--all-views", action="store_true", help="list the PSNR of every view, worst first")
     add_backend(parser)
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """Check the numbers and the depth.
+
+    Raises:
+        ArgumentError: a number is out of range, or the folder of depth does not exist.
+    """
+    DataSettings(resolution=arguments.resolution)
+    if arguments.iterations is not None:
+        whole_number("--iterations", arguments.iterations, 1)
+    check_depth(arguments.depth)

@@ -8,9 +8,18 @@ from pathlib import Path
 from gsplat_edu.base.constants import PAGE_FACES
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.options.values import add_backend, bytes_text, number_text, numbers_text, whole_number_text
+from gsplat_edu.options.values import (
+    NumberOr,
+    add_backend,
+    bytes_text,
+    number_text,
+    numbers_text,
+)
 
 EXAMPLE = "example: gsplat-edu mesh runs/plush plush.glb --faces 50000"
+
+OFFERED = ("voxel", "faces", "keep", "max_memory", "texture")
+"""Options that requests may give."""
 
 READ = (".glb", ".ply", ".obj")
 """Suffixes of meshes that are read, as in `gsplat_edu.io.mesh_files`, which imports NumPy."""
@@ -55,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--faces",
-        type=_faces_text,
+        type=NumberOr(ALL, whole=True),
         metavar="N|all",
         help=f"reduce the mesh to about N triangles (extra mesh); {ALL}: as many as the memory holds (default: at most"
         f" {MOST_FACES:,}, by larger voxels, so that a page can show it; with --voxel, by reduction)",
@@ -125,11 +134,6 @@ def _add_truth(parser: argparse.ArgumentParser) -> None:
         metavar="SIZE",
         help="distance below which a point counts as correct for --truth, world units (default: one voxel)",
     )
-
-
-def _faces_text(text: str) -> int | str:
-    """Parse a number of faces, or "all"."""
-    return text if text == ALL else whole_number_text(text)
 
 
 def check(arguments: argparse.Namespace) -> None:

@@ -8,11 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.options.values import add_backend, whole_number_text
 from gsplat_edu.render.settings import MAPS
 from gsplat_edu.scene.projection import STEEPEST_FISHEYE
 
 EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
+
+OFFERED = ("frames", "size", "fps", "orbit", "white_background")
+"""Options that requests may give."""
 
 LENSES = ("pinhole", "fisheye", "equirectangular", "orthographic")
 """Names of the lenses of --camera-model."""
@@ -164,11 +168,14 @@ def lens_choice(text: str) -> LensChoice:
 
 
 def check(arguments: argparse.Namespace) -> None:
-    """Check the options that exclude each other.
+    """Check the numbers, and the options that exclude each other.
 
     Raises:
-        ArgumentError: two of them were given.
+        ArgumentError: a number is out of range, or two of them were given.
     """
+    for name in ("frames", "fps", "size"):
+        if (value := getattr(arguments, name)) is not None:
+            whole_number(f"--{name}", value, 1)
     others = {
         "--dataset": arguments.dataset is not None,
         "--orbit": arguments.orbit,

@@ -9,12 +9,42 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import option_flag
-from gsplat_edu.train.config import FOR_FAST, SETTABLE
-from gsplat_edu.train.setting import COURSE_ONLY, WITH_OPTION, Setting, option_of
+from gsplat_edu.options.values import number_text, whole_number_text
+from gsplat_edu.train.config import BY_NAME, FOR_FAST, SETTABLE, WITH_OPTION
+from gsplat_edu.train.setting import BY_DEFAULT, Setting
 
 WIDEST_HELP = 100
 """Columns of the list in --help-all on a wide terminal."""
+
+
+def add_setting(group: argparse._ActionsContainer, name: str, default: str | None = None) -> None:
+    """Add the option of a setting.
+
+    Args:
+        group: Receives it.
+        name: The setting's name.
+        default: What is used without the option, in words; None for the setting's default.
+    """
+    setting = BY_NAME[name]
+    option = WITH_OPTION[name]
+    if default is None:
+        default = f"{AUTO} for the strategy fast, {setting.default} for the others"
+        default = default if option.auto == BY_DEFAULT else str(setting.default)
+    auto = f'; "{AUTO}": the capture decides' if option.auto else ""
+    text = f"{setting.meaning}{auto}".replace("%", "%%")
+    flag = option_flag(name)
+    if isinstance(setting.default, bool):
+        group.add_argument(flag, action="store_true", help=text)
+    elif isinstance(setting.default, tuple):
+        group.add_argument(
+            flag, type=number_text, nargs=3, metavar=("R", "G", "B"), help=f"{text} (default: {default})"
+        )
+    else:
+        kind = str if setting.names else whole_number_text
+        metavar = "NAME" if setting.names else "N"
+        group.add_argument(flag, type=kind, metavar=metavar, help=f"{text} (default: {default})")
 
 
 def add_settings(group: argparse._ActionsContainer) -> None:
@@ -64,8 +94,8 @@ def given_setting(text: str) -> tuple[str, Any]:
     if not equals:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, for example sh_every=300")
     if name in WITH_OPTION:
-        raise argparse.ArgumentTypeError(f"{name} has an option: give {option_of(name)}")
-    if name in COURSE_ONLY:
+        raise argparse.ArgumentTypeError(f"{name} has an option: give {BY_NAME[name].written}")
+    if name in BY_NAME and BY_NAME[name].only == "course":
         raise argparse.ArgumentTypeError(f"only the course's trainings change {name}; leave it out")
     if name not in SETTABLE:
         alike = difflib.get_close_matches(name, SETTABLE, n=3)

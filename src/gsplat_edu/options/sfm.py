@@ -12,6 +12,12 @@ from gsplat_edu.sfm.scale_text import MARKS
 
 EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
 
+OFFERED = (
+    *("frames", "matcher", "mapper", "camera_model", "panorama", "scale"),
+    *("max_features", "max_image_size", "threads"),
+)
+"""Options that requests may give."""
+
 
 def check(arguments: argparse.Namespace) -> None:
     """Check the ranges; raises as `options_from` does."""

@@ -8,41 +8,41 @@ from typing import Any
 
 from gsplat_edu.base.constants import AUTO as AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
-from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.data.settings import LENS_MODES, DataSettings
 from gsplat_edu.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.options.depth import add_depth, check_depth
 from gsplat_edu.options.length import length_of, strategy_of
 from gsplat_edu.options.settings import (
+    add_setting,
     add_settings,
     appendix as appendix,
     explain_unknown as explain_unknown,
 )
 from gsplat_edu.options.several import check_several
 from gsplat_edu.options.sfm import add_panorama, add_scale
-from gsplat_edu.options.values import add_backend, bytes_text, number_text, seconds_text, whole_number_text
+from gsplat_edu.options.values import NumberOr, add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.sfm.options import PANORAMA
 from gsplat_edu.sfm.scale_text import check_scale
 from gsplat_edu.train.capacity import PLANNED_VIEWS
 from gsplat_edu.train.config import (
-    APPEARANCES,
+    BY_NAME,
     DEFAULT_STRATEGY,
     FAST_FROM_SCENE,
+    FOR_SURFACE,
     FROM_SCENE,
     ONLY_FOR,
     RECIPE_ITERATIONS,
-    REFINEMENTS,
     SETTINGS,
-    SKIES,
-    STRATEGIES,
+    WITH_OPTION,
     TrainConfig,
     recipe,
 )
 from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, UNIT
-from gsplat_edu.train.setting import FOR_SURFACE, OUTSIDE_MASKS, TRANSIENTS, WITH_OPTION, option_of
+from gsplat_edu.train.setting import BY_DEFAULT, LENGTH, PHOTOS, PURPOSE, Plain
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
 
@@ -79,16 +79,40 @@ COMMON = (
 RANDOM_POINTS = Path("random")
 """Value of --points: do not triangulate start points."""
 
-OPEN = {
-    "appearance": APPEARANCES,
-    "sky": SKIES,
-    "transients": TRANSIENTS,
-    "refine": REFINEMENTS,
-    "outside_masks": OUTSIDE_MASKS,
+OFFERED = {
+    "time_limit": Plain("Time instead of a quality", group=LENGTH, example="30m"),
+    "max_memory": Plain("Memory limit", group=LENGTH, example="8GiB"),
+    "resolution": Plain(
+        "Size of the photos: 2 for half, longest side in px, or auto", group=LENGTH, example="full size"
+    ),
+    "lens": Plain(
+        "Lens",
+        {
+            "": "straighten the photos",
+            "auto": "keep wide lenses, panoramas, rolling shutters",
+            "native": "keep every lens as it is",
+        },
+        PHOTOS,
+    ),
+    "depth": Plain(
+        "Depth to learn from",
+        {
+            "": "none",
+            POINTS_AS_DEPTH: "the points that photos share",
+            CAPTURE_AS_DEPTH: "the capture's own depth maps",
+        },
+        PURPOSE,
+    ),
+    **{setting.name: setting.option.plain for setting in SETTINGS if setting.option and setting.is_single},
+    **dict.fromkeys(("quality", "resume", "test_every", "panorama", "scale", "eval_every", "save_every")),
+    **dict.fromkeys(("clean", "white_background", "set")),
 }
-"""Settings that can be left open by `AUTO`, and their other values."""
+"""Options that requests may give, and how pages ask for them; a page does not ask for those with None."""
 
-OPEN_FOR_FAST = ("appearance", "sky", "outside_masks")
+OPEN = tuple(name for name, option in WITH_OPTION.items() if option.auto)
+"""Settings that can be left open by `AUTO`."""
+
+OPEN_FOR_FAST = tuple(name for name in OPEN if WITH_OPTION[name].auto == BY_DEFAULT)
 """Those that the strategy fast leaves open unless they are given."""
 
 
@@ -118,11 +142,11 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     run.add_argument(
         "--resume",
         action="store_true",
-        help="continue from the last checkpoint in RUN; a larger --iterations extends the run, keeping its milestones"
-        " and learning rates",
+        help="continue from the last checkpoint in RUN; a larger --iterations extends the run, keeping its"
+        " milestones and learning rates",
     )
     _add_start(run.add_mutually_exclusive_group())
-    _add_number(run, "--seed", "seed of every random draw (default: 0)", 0)
+    add_setting(run, "seed")
     add_backend(run)
     _add_length(parser.add_argument_group("length and limits"))
     photos = parser.add_argument_group("photos")
@@ -139,8 +163,10 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     _add_recipe(parser.add_argument_group("recipe", "docs/RECIPE.md explains it."))
 
 
-def _add_number(group: argparse._ActionsContainer, flag: str, text: str, default: int | None = None) -> None:
-    group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
+def _add_number(
+    group: argparse._ActionsContainer, flag: str, text: str, default: int | None = None
+) -> argparse.Action:
+    return group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
 
 
 def _add_start(start: argparse._MutuallyExclusiveGroup) -> None:
@@ -162,11 +188,11 @@ def _add_start(start: argparse._MutuallyExclusiveGroup) -> None:
 
 
 def _add_length(group: argparse._ArgumentGroup) -> None:
-    _add_number(
+    add_setting(
         group,
-        "--iterations",
-        f"number of images to train on (default: those of --quality, or as many as fit --time-limit;"
-        f" {RECIPE_ITERATIONS:,} for strategies other than fast)",
+        "iterations",
+        "those of --quality, or as many as fit --time-limit;"
+        f" {RECIPE_ITERATIONS:,} for strategies other than fast",
     )
     group.add_argument(
         "--no-rescale",
@@ -184,28 +210,19 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
         "--max-memory",
         type=bytes_text,
         metavar="SIZE",
-        help="keep the process below this size, for example 4GiB, by choosing the photos' resolution, how many photos"
-        " stay in memory, and the cap on Gaussians; based on a forecast",
+        help="keep the process below this size, for example 4GiB, by choosing the photos' resolution, how many"
+        " photos stay in memory, and the cap on Gaussians; based on a forecast",
     )
-    names = ", ".join(STRATEGIES)
-    group.add_argument(
-        "--strategy",
-        metavar="NAME",
-        help=f"recipe of the training: {names} (default: {DEFAULT_STRATEGY}, or that of the run to resume)",
-    )
+    add_setting(group, "strategy", f"{DEFAULT_STRATEGY}, or that of the run to resume")
     lengths = ", ".join(f"{name} {share * UNIT:,}" for name, share in QUALITIES.items())
     group.add_argument(
         "--quality",
         metavar="NAME",
         help=f"length of the recipe fast in iterations: {lengths}, more for captures of more than {PLANNED_VIEWS}"
-        f" photos and less where more would hurt (default: {DEFAULT_QUALITY}, unless --iterations or --time-limit is"
-        " given)",
+        f" photos and less where more would hurt (default: {DEFAULT_QUALITY}, unless --iterations or --time-limit"
+        " is given)",
     )
-    _add_number(
-        group,
-        "--max-gaussians",
-        "cap on the number of Gaussians (default: fast plans one from the capture, mcmc requires one, adc has none)",
-    )
+    add_setting(group, "max_gaussians", "fast plans one from the capture; others have none")
 
 
 def _add_results(group: argparse._ArgumentGroup) -> None:
@@ -258,17 +275,17 @@ def _add_view(group: argparse._ArgumentGroup) -> None:
 def _add_photos(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--resolution",
-        type=_number_or_auto,
+        type=NumberOr(AUTO),
         metavar="R",
-        help="below 32: divide the photos' size by this; from 32 on: their longest side in px; auto: what the planned"
-        " Gaussians resolve, if the photos are much larger (default: full size)",
+        help="below 32: divide the photos' size by this; from 32 on: their longest side in px; auto: what the"
+        " planned Gaussians resolve, if the photos are much larger (default: full size)",
     )
     group.add_argument(
         "--lens",
         choices=LENS_MODES,
-        help="native: train through the photos' own lenses and rolling shutters, without resampling or cropping them;"
-        " auto: only fisheyes, panoramas, rolling shutters and photos that would lose a tenth; undistort: none"
-        " (default: undistort)",
+        help="native: train through the photos' own lenses and rolling shutters, without resampling or cropping"
+        " them; auto: only fisheyes, panoramas, rolling shutters and photos that would lose a tenth; undistort:"
+        " none (default: undistort)",
     )
     _add_number(
         group,
@@ -281,38 +298,11 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         metavar="SIZE",
         help="memory for decoded photos, for example 500MB; others are read again for each use (default: 4GiB)",
     )
-    group.add_argument(
-        "--appearance",
-        metavar="NAME",
-        help='"exposure" corrects the exposure and white balance of each photo; "vignetting" also its darker corners;'
-        ' "none" does not; "auto" lets the photos decide on exposure (default: auto for the strategy fast, none for the'
-        " others)",
-    )
-    group.add_argument(
-        "--transients",
-        metavar="NAME",
-        help='"mask" finds what moved from photo to photo, such as passers-by, and masks it; "none" does not; "auto"'
-        " does if there are enough photos (default: none)",
-    )
-    group.add_argument(
-        "--outside-masks",
-        metavar="NAME",
-        help='"empty" keeps the scene empty where masks exclude pixels, as around an object; "ignore" lets it show'
-        ' anything there; "auto" lets the masks decide (default: auto for the strategy fast, ignore for the others)',
-    )
+    for name in ("appearance", "transients", "outside_masks"):
+        add_setting(group, name)
     add_depth(group, "learn from depth")
-    group.add_argument(
-        "--refine",
-        metavar="NAME",
-        help='"poses", "intrinsics", "both", "lens", "shutter" or "all" are learned with the scene; "none" are not;'
-        ' "auto" decides by short trainings (default: none)',
-    )
-    group.add_argument(
-        "--sky",
-        metavar="NAME",
-        help='"shell" places splats far away wherever photos show the sky; "none" does not; "auto" lets the photos'
-        " decide (default: auto for the strategy fast, none for the others)",
-    )
+    for name in ("refine", "sky"):
+        add_setting(group, name)
     _add_background(group)
 
 
@@ -321,42 +311,16 @@ def _add_background(group: argparse._ArgumentGroup) -> None:
     behind.add_argument(
         "--white-background",
         action="store_true",
-        help="white background (default: black); photos with alpha are laid on it, and the scene learns the white",
+        help="white background; as --background 1 1 1",
     )
-    behind.add_argument(
-        "--background",
-        type=number_text,
-        nargs=3,
-        metavar=("R", "G", "B"),
-        help="background colour, 0 to 1; as --white-background",
-    )
-    group.add_argument(
-        "--random-background",
-        action="store_true",
-        default=None,
-        help="draw a new background colour for every iteration",
-    )
+    add_setting(behind, "background", "black")
+    add_setting(group, "random_background")
 
 
 def _add_recipe(group: argparse._ArgumentGroup) -> None:
-    meanings = {setting.name: setting.meaning for setting in SETTINGS}
-    group.add_argument(
-        "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
-    )
-    for name in ("batch", "sh_degree"):
-        text = f"{meanings[name]} (default: {getattr(TrainConfig, name)})"
-        _add_number(group, option_flag(name), text)
-    group.add_argument(
-        "--surface",
-        action="store_true",
-        help="learn a surface, for meshes: normals and neighbouring photos that agree with the depth, and flat splats."
-        " It takes 2.2 to 2.8 times as long and costs about 0.3 dB of PSNR, 1 dB on the object",
-    )
+    for name in ("antialiased", "batch", "sh_degree", "surface"):
+        add_setting(group, name)
     add_settings(group)
-
-
-def _number_or_auto(text: str) -> float | str:
-    return text if text == AUTO else number_text(text)
 
 
 def check(arguments: argparse.Namespace) -> None:
@@ -437,8 +401,8 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
     changes: dict[str, Any] = {"strategy": strategy}
     changes |= {
         name: getattr(arguments, name)
-        for name in WITH_OPTION - {"iterations", "background"}
-        if getattr(arguments, name) is not None
+        for name in WITH_OPTION
+        if name not in ("iterations", "background") and getattr(arguments, name) is not None
     }
     changes |= arguments.settings
     changes |= {name: _given_or_stored(arguments, name) for name in OPEN}
@@ -448,15 +412,17 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
     for only, names in ONLY_FOR.items():
         if only != strategy and (idle := [name for name in names if name in changes]):
             raise ArgumentError(
-                f"{option_of(idle[0])}: only --strategy {only} uses it; leave it out or choose that strategy"
+                f"{BY_NAME[idle[0]].written}: only --strategy {only} uses it; leave it out or choose that strategy"
             )
     if not arguments.surface and (idle := [name for name in FOR_SURFACE if name in changes]):
-        raise ArgumentError(f"{option_of(idle[0])}: only --surface uses it; leave it out or add --surface")
+        raise ArgumentError(
+            f"{BY_NAME[idle[0]].written}: only --surface uses it; leave it out or add --surface"
+        )
     planned = arguments.max_memory is not None or (
         arguments.time_limit is not None and arguments.iterations is None
     )
     if _starts_from_scene(arguments):
-        if idle := [option_of(name) for name in FOR_POINTS if changes.get(name, "none") != "none"]:
+        if idle := [BY_NAME[name].written for name in FOR_POINTS if changes.get(name, "none") != "none"]:
             raise ArgumentError(f"{idle[0]}: only a start from points uses it, not --from; leave it out")
         changes = FROM_SCENE | (FAST_FROM_SCENE if strategy == "fast" else {}) | changes
     iterations = length_of(arguments, strategy)
@@ -467,15 +433,15 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
 
 
 def _given_or_stored(arguments: argparse.Namespace, name: str) -> str:
-    """Return the value of one of `OPEN`: given, of the run to resume, or the first value (see `left_open`)."""
-    given = getattr(arguments, name)
+    """Return the value of one of `OPEN`: given, of the run to resume, or the default (see `left_open`)."""
+    given, setting = getattr(arguments, name), BY_NAME[name]
     if given is not None:
-        one_of(option_of(name), given, (*OPEN[name], AUTO))
+        one_of(setting.written, given, (*setting.names, AUTO))
     if given not in (None, AUTO):
         return str(given)
     folder = RunFolder(arguments.out)
     stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
-    return str(stored.get(name, OPEN[name][0])) if isinstance(stored, dict) else OPEN[name][0]
+    return str(stored.get(name, setting.default) if isinstance(stored, dict) else setting.default)
 
 
 def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -99,6 +100,25 @@ def number_text(text: str) -> float:
     if not math.isfinite(number):
         raise argparse.ArgumentTypeError(f"{text!r} is not a number")
     return number
+
+
+@dataclass(frozen=True)
+class NumberOr:
+    """Parses a finite number, or one word, which stays text.
+
+    Args:
+        word: The word.
+        whole: Whether the number has to be whole.
+    """
+
+    word: str
+    whole: bool = False
+
+    def __call__(self, text: str) -> float | int | str:
+        """Parse a text."""
+        if text == self.word:
+            return text
+        return whole_number_text(text) if self.whole else number_text(text)
 
 
 def seconds_text(text: str) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from collections.abc import AsyncIterator
 from importlib.resources import files
 from pathlib import Path
@@ -16,6 +17,7 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute
 
 from gsplat_edu.base.constants import LOOPBACK
+from gsplat_edu.options.offers import questions
 from gsplat_edu.studio import (
     capture_routes,
     floater_routes,
@@ -65,6 +67,7 @@ def application(
 
     routes: list[BaseRoute] = [
         act("/", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio", "index.html")),
+        act("/web/questions.js", "GET", lambda studio, request, body: _questions()),
         act("/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio")),
         # with the path that it has in the package, so that an import leads to the same file here and in node
         act("/viewer/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.viewer")),
@@ -81,6 +84,12 @@ def application(
     app = Starlette(routes=routes, middleware=[guard, patience], lifespan=lifespan)
     app.state.studio = studio
     return app
+
+
+def _questions() -> Response:
+    """Return what the page asks for a training, as a module; it follows from the options of the command."""
+    text = f"export const GROUPS = {json.dumps(questions('train'))};\n"
+    return Response(text, media_type=TYPES[".js"])
 
 
 def _web(request: Request, package: str, name: str | None = None) -> Response:

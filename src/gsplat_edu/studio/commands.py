@@ -10,20 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.text import legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
+from gsplat_edu.options.offers import check_words, offered, words_of
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
-from gsplat_edu.studio.command_options import (
-    CLEAN_OPTIONS,
-    CONVERT_OPTIONS,
-    DOCTOR_OPTIONS,
-    MESH_OPTIONS,
-    RENDER_OPTIONS,
-    SFM_OPTIONS,
-    TRAIN_OPTIONS,
-    Option,
-    Words,
-)
 from gsplat_edu.studio.contents import files_within
 from gsplat_edu.studio.library import Library, scene_file
 from gsplat_edu.studio.listing import is_unfinished
@@ -137,18 +128,15 @@ class _Asked:
             raise RefusedError(f"outputs: {shortened(name)!r} is not in Unicode's composed form; rename it")
         return entry / EXPORTS / path
 
-    def options(self) -> Words:
+    def options(self) -> list[str]:
         """Return the words of the options."""
         kind = self.work.inputs[0].partition("/")[0]
-        known = self.command.options if kind not in self.command.without_options else {}
-        words: Words = []
-        for name, value in self.work.options.items():
-            if name not in known:
-                raise RefusedError(
-                    f"options.{shortened(str(name))}: is not one of {', '.join(known) or 'none'}"
-                )
-            words += known[name](name, value)
-        return words
+        if kind in self.command.without_options and self.work.options:
+            raise RefusedError(f"options: {self.work.command} has none for {kind}; leave them out")
+        try:
+            return words_of(self.work.command, self.work.options)
+        except ArgumentError as error:
+            raise RefusedError(f"options.{error}") from None
 
     def edits(self) -> Line:
         """Return the words that apply the edits of the entry that is read."""
@@ -268,7 +256,6 @@ class _Command:
     Args:
         line: Makes the command line of a work.
         title: A few words for people; INPUT and OUTPUT stand for the names of what it reads and writes.
-        options: The options that it accepts.
         reads: Kinds of the entries that it works on.
         makes: Kind of the entry that it makes; empty if it makes none.
         suffix: Added to the name of what it reads, for the default name of the entry that it makes.
@@ -280,7 +267,6 @@ class _Command:
 
     line: Callable[[_Asked], Line]
     title: str
-    options: Mapping[str, Option]
     reads: tuple[str, ...]
     makes: str = ""
     suffix: str = ""
@@ -297,21 +283,13 @@ class _Command:
 
 
 COMMANDS: Mapping[str, _Command] = {
-    "sfm": _Command(_sfm, "poses of INPUT", SFM_OPTIONS, ("photos",), "captures", word="poses"),
-    "train": _Command(
-        _train, "training of OUTPUT", TRAIN_OPTIONS, ("captures", "photos"), "runs", word="run"
-    ),
-    "doctor": _Command(
-        _doctor, "doctor of INPUT", DOCTOR_OPTIONS, ("captures", "runs"), without_options=("runs",)
-    ),
-    "clean": _Command(_clean, "cleaning of INPUT", CLEAN_OPTIONS, ("runs",), "scenes", "-clean", edits=True),
-    "convert": _Command(
-        _convert, "export of OUTPUT", CONVERT_OPTIONS, ("runs", "scenes"), forms=FORMATS, edits=True
-    ),
-    "mesh": _Command(_mesh, "mesh of INPUT", MESH_OPTIONS, ("runs", "scenes"), forms=(SURFACE, COLLIDER)),
-    "render": _Command(
-        _render, "video of INPUT", RENDER_OPTIONS, ("runs", "scenes"), forms=("mp4",), edits=True
-    ),
+    "sfm": _Command(_sfm, "poses of INPUT", ("photos",), "captures", word="poses"),
+    "train": _Command(_train, "training of OUTPUT", ("captures", "photos"), "runs", word="run"),
+    "doctor": _Command(_doctor, "doctor of INPUT", ("captures", "runs"), without_options=("runs",)),
+    "clean": _Command(_clean, "cleaning of INPUT", ("runs",), "scenes", "-clean", edits=True),
+    "convert": _Command(_convert, "export of OUTPUT", ("runs", "scenes"), forms=FORMATS, edits=True),
+    "mesh": _Command(_mesh, "mesh of INPUT", ("runs", "scenes"), forms=(SURFACE, COLLIDER)),
+    "render": _Command(_render, "video of INPUT", ("runs", "scenes"), forms=("mp4",), edits=True),
 }
 """The commands that can be asked for."""
 
@@ -338,7 +316,7 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
     if not isinstance(options, dict):
         raise RefusedError("options: has to be an object")
     options = {option: value for option, value in options.items() if value is not None}
-    if request.get("resume") is True and "resume" in command.options:
+    if request.get("resume") is True and "resume" in offered(str(name)):
         options["resume"] = True
     outputs: tuple[str, ...] = ()
     if command.makes:
@@ -374,7 +352,7 @@ def command_line(library: Library, work: Work, purpose: Purpose) -> Rendered:
     asked = _Asked(library, work, purpose)
     if (
         purpose is Purpose.CONTINUE
-        and "resume" in command.options
+        and "resume" in offered(work.command)
         and (asked.made() / "config.json").is_file()
     ):
         asked = replace(asked, work=replace(work, options={**work.options, "resume": True}))
@@ -385,7 +363,19 @@ def command_line(library: Library, work: Work, purpose: Purpose) -> Rendered:
         if isinstance(word, Path):
             library.check_within(word)
         argv.append(str(word))
+    try:
+        check_words(work.command, argv[1:], check=purpose is not Purpose.SHOW)
+    except SplatError as error:
+        raise RefusedError(_in_request(work.command, str(error))) from None
     return Rendered(asked.work, tuple(argv))
+
+
+def _in_request(command: str, message: str) -> str:
+    """Return an error of the command line in the words of a request: "--batch: is" becomes "options.batch: is"."""
+    said = message.removeprefix("argument ")
+    flag, colon, rest = said.partition(": ")
+    name = flag.removeprefix("--").replace("-", "_")
+    return f"options.{name}: {rest}" if colon and name in offered(command) else said
 
 
 def _command_of(name: str) -> _Command:

@@ -1,14 +1,33 @@
-"""Checks of the settings' values: each raises an `ArgumentError` that names the setting, or returns such a check."""
+"""Checks of the settings' values: each raises an `ArgumentError` that names the setting."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from gsplat_edu.base.validation import LARGEST_WHOLE, float64_array, in_range, one_of, whole_number
-from gsplat_edu.train.setting import Check
 
 
-def accept_whole(low: int, high: int = LARGEST_WHOLE) -> Check:
-    """Return a check for whole numbers within bounds."""
-    return lambda name, value: whole_number(name, value, low, high)
+@dataclass(frozen=True)
+class Whole:
+    """Accepts whole numbers from `low` to `high`."""
+
+    low: int
+    high: int = LARGEST_WHOLE
+
+    def __call__(self, name: str, value: object) -> None:
+        """Check a value."""
+        whole_number(name, value, self.low, self.high)
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Accepts one of some names."""
+
+    names: tuple[str, ...]
+
+    def __call__(self, name: str, value: object) -> None:
+        """Check a value."""
+        one_of(name, value, self.names)
 
 
 def accept_positive(name: str, value: float) -> None:
@@ -51,11 +70,6 @@ def accept_cap(name: str, value: int | None) -> None:
 def accept_color(name: str, value: object) -> None:
     """Accept three numbers."""
     float64_array(name, value, (3,))  # type: ignore[arg-type]
-
-
-def accept_name_of(names: tuple[str, ...]) -> Check:
-    """Return a check for one of some names."""
-    return lambda name, value: one_of(name, value, names)
 
 
 def accept_flag(name: str, value: object) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from gsplat_edu.base.text import option_flag
+from gsplat_edu.train.checks import OneOf
 
 Check = Callable[[str, Any], object]
 """Raises an `ArgumentError` that names the setting if a value is out of range."""
@@ -26,23 +27,42 @@ REGIONS = ("capture", "none")
 DEPTH_KINDS = ("auto", "z", "ray", "inverse")
 """What the values of the user's depth maps are."""
 
-WITH_OPTION = frozenset(
-    {
-        *("iterations", "batch", "seed", "sh_degree", "strategy", "max_gaussians", "antialiased"),
-        *("appearance", "sky", "refine", "transients", "outside_masks", "background", "random_background"),
-        "surface",
-    }
-)
-"""Settings that `gsplat-edu train` has an option for; the others are given by `--set NAME=VALUE`."""
+LENGTH, PHOTOS, PURPOSE = "Length and size", "What the photos are like", "What the scene is for"
+"""Headings above the questions of a page."""
 
-FOR_SURFACE = ("surface_start", "surface_every", "normal_weight", "patch_weight", "flat_weight")
-"""Settings that only a training with `surface` uses."""
+ASKED, BY_DEFAULT = "asked", "by default"
+"""When a training decides on a setting from its capture: if the option is `auto`, or also if it is not given and the
+strategy is fast."""
 
-FOR_DEPTH = ("depth_kind", "depth_unit", "depth_weight", "points_weight", "depth_every")
-"""Settings that only a training with the user's depth uses."""
 
-COURSE_ONLY = frozenset({"over_cap", "view_order"})
-"""Settings that only the course's trainings change (`gsplat_edu.train.course`); `gsplat-edu train` has none of them."""
+@dataclass(frozen=True)
+class Plain:
+    """How a page asks for the value of an option.
+
+    Args:
+        label: What is asked for, in a few words.
+        words: Its values and what they mean; the value "" leaves the choice to the program. Empty: any text or number.
+        group: Heading above the question.
+        example: A value, for an option without `words`.
+    """
+
+    label: str
+    words: Mapping[str, str] = field(default_factory=dict)
+    group: str = "Further settings"
+    example: str = ""
+
+
+@dataclass(frozen=True)
+class Option:
+    """A setting's own option of `gsplat-edu train`; settings without one are given by `--set NAME=VALUE`.
+
+    Args:
+        auto: `ASKED` or `BY_DEFAULT` if the capture can decide; "" if not.
+        plain: How pages ask for it; None if they do not.
+    """
+
+    auto: str = ""
+    plain: Plain | None = None
 
 
 @dataclass(frozen=True)
@@ -51,23 +71,28 @@ class Setting:
 
     Args:
         name: Flat name: the field's name, with the prefix "mcmc_" for `McmcConfig` and "fast_" for `FastConfig`.
-        field: The field's name in its class.
+        attribute: Its name in its class.
         strategy: The only strategy that uses it; None for the settings of `TrainConfig` itself.
         default: Its default for 30,000 iterations.
         help: Its meaning.
         source: Source of the default; "" if it is ours.
         milestone: Whether `recipe` scales it with the length of the run.
         check: Raises if a value is out of range.
+        option: The setting's own option; None if it has none.
+        only: What uses the setting: "surface" or "depth" for a training with that option, "course" for a training of
+            the course (`gsplat_edu.train.course`), which the command line does not have; "" for any training.
     """
 
     name: str
-    field: str
+    attribute: str
     strategy: str | None
     default: Any
     help: str
     source: str
     milestone: bool
     check: Check
+    option: Option | None
+    only: str
 
     @property
     def meaning(self) -> str:
@@ -76,16 +101,25 @@ class Setting:
         return f"{only}{self.help[0].lower()}{self.help[1:].rstrip('.')}"
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Its values, if they are names."""
+        return self.check.names if isinstance(self.check, OneOf) else ()
+
+    @property
+    def is_single(self) -> bool:
+        """Whether its value is one number, name or switch."""
+        return not isinstance(self.default, tuple)
+
+    @property
     def settable(self) -> bool:
         """Whether `--set NAME=VALUE` gives it."""
-        return self.name not in WITH_OPTION | COURSE_ONLY
+        return self.option is None and self.only != "course"
 
+    @property
+    def written(self) -> str:
+        """How the command line names it: "--batch", or "--set sh_every" where it has no option."""
+        return f"--set {self.name}" if self.option is None else option_flag(self.name)
 
-def option_of(name: str) -> str:
-    """Return how the command line names a setting: "--batch", or "--set sh_every" where it has no option."""
-    return option_flag(name) if name in WITH_OPTION else f"--set {name}"
-
-
-def option_with(name: str, value: object) -> str:
-    """Return the words of the command line that give a setting: "--batch 4", or "--set sh_every=300"."""
-    return f"{option_of(name)}{' ' if name in WITH_OPTION else '='}{value}"
+    def with_value(self, value: object) -> str:
+        """Return the words of the command line that give it a value: "--batch 4", or "--set sh_every=300"."""
+        return f"{self.written}{'=' if self.option is None else ' '}{value}"

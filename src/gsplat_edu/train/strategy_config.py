@@ -10,24 +10,40 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 from gsplat_edu.train.checks import (
+    OneOf,
+    Whole,
     accept_at_least_1 as _at_least_1,
-    accept_name_of as _one_of,
     accept_not_negative as _not_negative,
     accept_opacity as _opacity,
     accept_positive as _positive,
     accept_share as _share,
-    accept_whole as _whole,
 )
-from gsplat_edu.train.setting import Check
+from gsplat_edu.train.setting import Check, Option
 
 OVER_CAP = ("strongest", "cut")
 
 Class = TypeVar("Class", bound=type)
 
 
-def number(default: Any, check: Check, help: str, source: str = "", *, milestone: bool = False) -> Any:  # noqa: A002, ANN401
-    """Declare a setting: default, range, meaning, source, and whether `recipe` scales it with the run's length."""
-    metadata = {"check": check, "help": help, "source": source, "milestone": milestone}
+def number(
+    default: Any,  # noqa: ANN401
+    check: Check,
+    help: str,  # noqa: A002
+    source: str = "",
+    *,
+    milestone: bool = False,
+    option: Option | None = None,
+    only: str = "",
+) -> Any:  # noqa: ANN401
+    """Declare a setting; see `gsplat_edu.train.setting.Setting` for the arguments."""
+    metadata = {
+        "check": check,
+        "help": help,
+        "source": source,
+        "milestone": milestone,
+        "option": option,
+        "only": only,
+    }
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -45,13 +61,14 @@ class AdcConfig:
 
     over_cap: str = number(
         "strongest",
-        _one_of(OVER_CAP),
+        OneOf(OVER_CAP),
         'Which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with the largest'
         ' gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors, clones,'
         " children, which the Gaussians then keep; the parent of dropped children is removed too (the course).",
+        only="course",
     )
     densify_stop: int = number(
-        15_000, _whole(0), "Densification ends before this iteration.", "2023", milestone=True
+        15_000, Whole(0), "Densification ends before this iteration.", "2023", milestone=True
     )
     grad_threshold: float = number(
         2e-4,
@@ -78,7 +95,7 @@ class AdcConfig:
     )
     reset_every: int = number(
         3_000,
-        _whole(0),
+        Whole(0),
         "Iterations between resets of the opacities while densifying; 0 never resets.",
         "2023",
         milestone=True,
@@ -92,7 +109,7 @@ class McmcConfig:
     """Settings of Markov chain Monte Carlo: relocate, grow, add noise, regularise."""
 
     stop: int = number(
-        25_000, _whole(0), "Relocation and growth end before this iteration.", "2024's code", milestone=True
+        25_000, Whole(0), "Relocation and growth end before this iteration.", "2024's code", milestone=True
     )
     start_opacity: float = number(0.5, _opacity, "Opacity of the initial Gaussians.", "2024's code")
     start_scale: float = number(
@@ -133,14 +150,14 @@ class FastConfig:
         "DashGaussian",
     )
     full_size: int = number(
-        18_000, _whole(0), "Iteration from which photos have their full size.", "ours", milestone=True
+        18_000, Whole(0), "Iteration from which photos have their full size.", "ours", milestone=True
     )
     stop: int = number(
-        18_000, _whole(0), "Iteration at which the planned number is reached.", "ours", milestone=True
+        18_000, Whole(0), "Iteration at which the planned number is reached.", "ours", milestone=True
     )
     decay_start: int = number(
         21_000,
-        _whole(0),
+        Whole(0),
         "Iteration at which all rates but the means' begin to fall.",
         "ours",
         milestone=True,

@@ -1,86 +1,20 @@
 // What can be chosen for a training beside its quality, in plain words. An empty value leaves the choice to the program.
 
 import { button, h } from "./dom.js";
+import { GROUPS } from "./questions.js"; // made by the server from the options of the command
 
-const NUMBER_OR_AUTO = "auto|[0-9]+([.][0-9]+)?";
+const INPUTS = {
+  number: { type: "number", min: 1, inputmode: "numeric" },
+  text: { type: "text", autocomplete: "off" },
+  either: { type: "text", autocomplete: "off" },
+};
 
-const number = (label, max) => ({ label, attributes: { type: "number", min: 1, max, inputmode: "numeric" } });
-const text = (label, placeholder, more = {}) => ({
-  label,
-  attributes: { type: "text", autocomplete: "off", placeholder, ...more },
-});
-const choice = (label, ...choices) => ({ label, choices });
-
-const GROUPS = [
-  [
-    "Length and size",
-    {
-      iterations: number("Iterations instead of a quality", 1000000),
-      time_limit: text("Time instead of a quality", "30m"),
-      resolution: text("Size of the photos: 2 for half, longest side in px, or auto", "full size", {
-        pattern: NUMBER_OR_AUTO,
-      }),
-      max_memory: text("Memory limit", "8G"),
-      max_gaussians: number("Splats at most"),
-      strategy: choice(
-        "Recipe",
-        ["", "the fast one"],
-        ["mcmc", "MCMC: random moves, needs a number of splats"],
-        ["adc", "the one of 2023, 30,000 iterations"],
-      ),
-    },
-  ],
-  [
-    "What the photos are like",
-    {
-      appearance: choice(
-        "Brightness",
-        ["", "decide from the photos"],
-        ["exposure", "even out brightness and colour"],
-        ["vignetting", "even out dark corners too"],
-        ["none", "keep as photographed"],
-      ),
-      refine: choice(
-        "Poses",
-        ["", "as they are"],
-        ["auto", "correct what held-out photos confirm"],
-        ["poses", "correct the poses"],
-        ["both", "correct poses and focal lengths"],
-      ),
-      lens: choice(
-        "Lens",
-        ["", "straighten the photos"],
-        ["auto", "keep wide lenses, panoramas, rolling shutters"],
-        ["native", "keep every lens as it is"],
-      ),
-      transients: choice("What moved between the photos", ["", "keep it"], ["mask", "leave it out"]),
-      sky: choice(
-        "Sky",
-        ["", "decide from the photos"],
-        ["shell", "put it far away"],
-        ["none", "treat it like the rest"],
-      ),
-      outside_masks: choice(
-        "Outside of the photos' masks",
-        ["", "decide from the masks"],
-        ["empty", "empty: the masks cut out an object"],
-        ["ignore", "ignore: the masks hide something in front"],
-      ),
-    },
-  ],
-  [
-    "What the scene is for",
-    {
-      surface: choice("Purpose", ["", "to look at"], ["surface", "for a mesh: learn surfaces"]),
-      depth: choice(
-        "Depth to learn from",
-        ["", "none"],
-        ["points", "the points that photos share"],
-        ["capture", "the capture's own depth maps"],
-      ),
-    },
-  ],
-];
+// The value of a field as the request has it; the server says what is wrong with one.
+function asked(kind, value) {
+  if (kind === "switch") return value === "true";
+  const isNumber = kind === "number" || (kind === "either" && Number.isFinite(Number(value)));
+  return isNumber ? Number(value) : value;
+}
 
 const DETAIL = {
   none: "No box is drawn, so all that the photos show is learned.",
@@ -114,18 +48,19 @@ function detail(draw) {
 export function choices(draw) {
   const fields = {};
   const where = detail(draw);
-  const field = (key, { label, choices: values, attributes }) => {
-    const id = key.replaceAll("_", "-");
-    fields[key] = values
+  const field = ({ name, label, words, kind, example }) => {
+    const id = name.replaceAll("_", "-");
+    const attributes = { id, "aria-label": label };
+    fields[name] = words.length
       ? h(
           "select",
-          { id, "aria-label": label },
-          values.map(([value, words]) => h("option", { value }, words)),
+          attributes,
+          words.map(([value, meaning]) => h("option", { value }, meaning)),
         )
-      : h("input", { id, "aria-label": label, ...attributes });
-    return fields[key];
+      : h("input", { ...attributes, ...INPUTS[kind], placeholder: example });
+    return fields[name];
   };
-  const groups = GROUPS.map(([title, group]) =>
+  const groups = GROUPS.map(({ title, questions }) =>
     h(
       "fieldset",
       { class: "group" },
@@ -133,7 +68,7 @@ export function choices(draw) {
       h(
         "div",
         { class: "grid" },
-        Object.entries(group).map(([key, what]) => h("label", {}, what.label, field(key, what))),
+        questions.map((question) => h("label", {}, question.label, field(question))),
       ),
     ),
   );
@@ -147,10 +82,9 @@ export function choices(draw) {
       const own = ["iterations", "time_limit", "strategy"].some((key) => fields[key].value);
       const found = own ? {} : { quality };
       if (where.everywhere()) found.set = { region: "none" };
-      for (const [key, { type, value }] of Object.entries(fields)) {
-        if (!value) continue;
-        const numeric = type === "number" || (key === "resolution" && value !== "auto");
-        found[key] = key === "surface" || (numeric ? Number(value) : value);
+      for (const { name, kind } of GROUPS.flatMap(({ questions }) => questions)) {
+        const { value } = fields[name];
+        if (value) found[name] = asked(kind, value);
       }
       return found;
     },
