@@ -123,6 +123,16 @@ def test_a_time_limit_does_not_train_longer_than_the_trial(given, monkeypatch, l
     assert plan(options, generous, ["iterations"], reader=reader).iterations == options.config.iterations
 
 
+def test_a_trial_is_judged_on_the_background_of_the_run(given, monkeypatch):
+    _, options, reader = given
+    monkeypatch.setattr("gsplat_edu.runs.thin.LENGTHS", (1,))
+    scores = []
+    for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
+        config = options.config.changed(background=background)
+        scores.append(try_lengths(dataclasses.replace(options, config=config), reader).scores[1])
+    assert scores[0] != scores[1]
+
+
 @pytest.mark.slow
 def test_trials_end_after_a_quarter_of_the_time(given):
     _, options, reader = given

@@ -17,6 +17,7 @@ from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.options.train import options_from
@@ -327,6 +328,22 @@ def test_a_damaged_run_folder_costs_one_line(small, begun, capsys, name, change)
 def test_a_scene_that_is_pruned_away_is_reported(small, tmp_path, capsys):
     assert train(small, tmp_path / "run", *SHORT, "--set", "min_opacity=1") == 2
     assert "every Gaussian was pruned" in capsys.readouterr().err
+
+
+def test_evaluations_during_a_training_score_the_test_views(small, tmp_path):
+    words = ["train", str(small), "--out", str(tmp_path / "run"), "--strategy", "none"]
+    words += ["--iterations", "3", "--eval-every", "2"]
+    run = CaptureRun(options_from(build_parser(words).parse_args(words)))
+    scores = []
+
+    def score(trainer, event):
+        if trainer.iteration == 2:
+            found = score_views(trainer.gaussians, run.dataset.test, run.options.renderer, (0.0, 0.0, 0.0))
+            scores.append(summarize(found)["psnr"])
+
+    run.train(callbacks=[score])
+    rows = [json.loads(line) for line in run.folder.log_file.read_text().splitlines()]
+    assert [row["psnr"] for row in rows if "psnr" in row] == scores[-1:]
 
 
 def test_nonfinite_gaussians_are_left_out(small, tmp_path):

@@ -181,6 +181,16 @@ def test_the_fingerprint_depends_on_names_and_contents(tmp_path):
         fingerprint([a, b], tmp_path)
 
 
+def test_the_fingerprint_depends_on_the_end_of_a_large_file(tmp_path):
+    video = tmp_path / "a.mp4"
+    data = bytearray(3 * 65536)
+    video.write_bytes(data)
+    first = fingerprint([video], tmp_path)
+    data[-1] = 1
+    video.write_bytes(data)
+    assert fingerprint([video], tmp_path) != first
+
+
 def test_own_captures_and_runs_are_not_searched_for_photos(tmp_path):
     wanted = photo(tmp_path / "a.png")
     for made in ("capture/images/b.png", "run/test/c.png", "run/test/d.png"):
