@@ -58,7 +58,7 @@ from gsplat_edu.train.length import planned_iterations
 from gsplat_edu.train.objective import PHOTO, Rendered, Term, make_objective
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import milestone, photo_factor
-from gsplat_edu.train.stepper import StepParts, TensorStepper
+from gsplat_edu.train.step import StepParts, TensorStepper
 from gsplat_edu.train.trainer import Trainer
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))

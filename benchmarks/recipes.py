@@ -48,6 +48,7 @@ from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
+from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.length import QUALITIES, UNIT
@@ -240,14 +241,12 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
 def with_density(run: CaptureRun, density: type[PlannedDensity]) -> Trainer:
     """Make the trainer of a run again, before its first step, with another density control."""
     made, config = run.trainer, run.options.config
-    return Trainer(
-        made.gaussians,
-        run.dataset.train,
+    return training(
         config,
+        Views(run.dataset.train),
         load_backend(run.options.backend),
-        extent=made.extent,
+        Start(made.gaussians, made.stepper.parts.shell, made.extent),
         density=density(config, made.gaussians),
-        parts=made.stepper.parts,
     )
 
 

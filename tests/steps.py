@@ -1,6 +1,6 @@
 """The views of a step, for tests of gradients without a training."""
 
-from gsplat_edu.train.stepper import StepView
+from gsplat_edu.train.step import StepView
 from gsplat_edu.train.trainer import Trainer
 
 

@@ -11,7 +11,6 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.train import Start, Views
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.objective import Objective, PhotoTerm
-from gsplat_edu.train.trainer import StepParts, Trainer
 
 CAMERA = Camera.looking_at((0, 0, -3), (0, 0, 0), 30, 30, 20, 24)
 
@@ -151,24 +150,24 @@ CONFIG = recipe(2, strategy="none")
         (lambda views: training(CONFIG, Views([]), load_backend()), "^dataset: has no training views"),
         (lambda views: training(CONFIG, Views(views), load_backend()), "^points: is empty"),
         (
-            lambda views: Trainer(ball(), views, recipe(2), load_backend(), density=HalfAStrategy()),
-            "^density: .* lacks load_state, state, update; see DensityStrategy",
-        ),
-        (
-            lambda views: Trainer(
-                ball(), views, CONFIG, load_backend(), parts=StepParts(view_model=object())
+            lambda views: training(
+                recipe(2), Views(views), load_backend(), Start(ball()), density=HalfAStrategy()
             ),
-            "^parts.view_model: .* lacks camera, correct, groups, measure, needs_depth, parameters",
+            "^parts.density: .* lacks load_state, state, update; see DensityStrategy",
         ),
         (
-            lambda views: Trainer(
-                ball(),
-                views,
+            lambda views: training(CONFIG, Views(views), load_backend(), Start(ball()), view_model=object()),
+            "^parts.view_model: .* lacks camera, correct, groups, measure, needs, parameters",
+        ),
+        (
+            lambda views: training(
                 CONFIG,
+                Views(views),
                 load_backend(),
-                parts=StepParts(Objective({"photo": PhotoTerm(0.0), "depth": Depth()})),
+                Start(ball()),
+                objective=Objective({"photo": PhotoTerm(0.0), "depth": Depth()}),
             ).run(),
-            r"^terms\['depth'\]: uses output.depth, .* needs_depth = True",
+            r"^terms\['depth'\]: reads output.depth, .* needs = Needs\(depth=True\)",
         ),
     ],
 )

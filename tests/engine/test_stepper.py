@@ -18,7 +18,7 @@ from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.resident import ResidentStepper, why_not
-from gsplat_edu.train.stepper import TensorStepper
+from gsplat_edu.train.step import TensorStepper
 from gsplat_edu.train.team import Alone
 
 pytestmark = pytest.mark.usefixtures("webgpu")

@@ -18,11 +18,11 @@ from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.initialize import random_ball
-from gsplat_edu.train.trainer import Trainer
 
 pytestmark = pytest.mark.slow
 
@@ -42,12 +42,11 @@ def test_the_first_iterations_give_the_numbers_of_the_chapter(backend, iteration
     generator = torch.Generator().manual_seed(9)
     start = random_ball(400, generator)
     densified = []
-    trainer = Trainer(
-        start,
-        capture.train,
+    trainer = training(
         config,
+        Views(capture.train),
         load_backend(backend),
-        extent=EXTENT,
+        Start(start, extent=EXTENT),
         density=AdaptiveDensityControl(config, EXTENT, generator, start),
         callbacks=[lambda _, event: densified.append(event) if isinstance(event, DensifyEvent) else None],
     )

@@ -7,10 +7,10 @@ from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.initialize import random_ball
-from gsplat_edu.train.trainer import Trainer
 from native_scenes import random
 
 
@@ -23,7 +23,9 @@ def test_300_training_iterations_do_not_depend_on_threads(set_threads):
         generator = torch.Generator().manual_seed(9)
         start = random_ball(400, generator)
         control = AdaptiveDensityControl(config, EXTENT, generator, start)
-        trainer = Trainer(start, views, config, load_backend("cpu"), extent=EXTENT, density=control)
+        trainer = training(
+            config, Views(views), load_backend("cpu"), Start(start, extent=EXTENT), density=control
+        )
         trainer.run()
         runs.append(trainer.gaussians.tensors())
     assert len(runs[0]["means"]) == 800

@@ -19,12 +19,11 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent, StepEvent
-from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
+from gsplat_edu.train.initialize import from_points, make_transients
 from gsplat_edu.train.objective import Objective, PhotoTerm
 from gsplat_edu.train.optimizer import Adam, ParameterGroup
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.team import ALONE
-from gsplat_edu.train.trainer import StepParts, Trainer
 from ranks import together
 from steps import step_views
 
@@ -45,16 +44,14 @@ def trainer(settings, team=ALONE, splats=900, callbacks=(), **parts):
     """Make a training of a procedural capture whose 600 Gaussians fill two pages and a part of a third."""
     views, points, colors = procedural_capture(24, 6, splats=splats)
     start = from_points(points, colors, settings)
-    model = make_view_model(settings, [view.camera for view in views], 2.0, start)
-    return Trainer(
-        start,
-        views,
+    return training(
         settings,
+        Views(views),
         load_backend("cpu"),
-        extent=2.0,
-        density=make_strategy(settings, 2.0, start),
+        Start(start, extent=2.0),
         callbacks=callbacks,
-        parts=StepParts(view_model=model, team=team, **parts),
+        team=team,
+        **parts,
     )
 
 
@@ -125,8 +122,9 @@ def test_the_gradient_of_a_batch_is_the_mean_over_its_views():
             parameter.grad = None
 
     def make(reduce):
-        parts = StepParts(objective, reduce=reduce)
-        return Trainer(start, views, settings.changed(strategy="none"), load_backend("cpu"), parts=parts)
+        config = settings.changed(strategy="none")
+        parts = {"objective": objective, "reduce": reduce}
+        return training(config, Views(views), load_backend("cpu"), Start(start, extent=1.0), **parts)
 
     single, alone = [], make(note)
     for view in step_views(alone, 4):

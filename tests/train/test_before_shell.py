@@ -25,7 +25,7 @@ from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.objective import Objective
 from gsplat_edu.train.patches import Neighbourhood, PatchTerm
 from gsplat_edu.train.rendered import surface_before
-from gsplat_edu.train.stepper import StepParts, StepView, TensorStepper
+from gsplat_edu.train.step import StepParts, StepView, TensorStepper
 from gsplat_edu.train.surface import NormalTerm, Turns
 from gsplat_edu.train.view_model import Identity
 from lens_scenes import LENSES
@@ -96,9 +96,7 @@ def test_depth_before_a_shell_is_that_of_the_scene_alone(backend):
 def stepper(term, gaussians, shell):
     """Return a stepper whose objective is one term."""
     objective = Objective({"photo": lambda rendered: 0.0 * rendered.image.sum(), "tested": term})
-    return TensorStepper(
-        gaussians, load_backend("cpu"), {}, objective, None, StepParts(objective, shell=shell), batch=1
-    )
+    return TensorStepper(gaussians, load_backend("cpu"), {}, StepParts(objective, shell=shell), batch=1)
 
 
 def views():

@@ -22,7 +22,6 @@ from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.poses import LENSES, TWISTS, Refinement, refinement_of
-from gsplat_edu.train.trainer import Trainer
 
 CPU = load_backend("cpu")
 
@@ -129,7 +128,7 @@ def test_a_sky_needs_its_splats(capture):
     shell = Shell(np.zeros(3), 50.0)
     start = Start(random_ball(30, torch.Generator()), shell)
     run = training(config, capture, CPU, start)
-    assert run.stepper.objective.terms["scale"].shell is shell and run.density.shell is shell
+    assert run.stepper.parts.objective.terms["scale"].shell is shell and run.density.shell is shell
 
 
 def test_the_extent_and_generator_of_a_start_are_used(capture):
@@ -140,22 +139,6 @@ def test_the_extent_and_generator_of_a_start_are_used(capture):
     assert run.extent == 7.0 and run.density.generator is generator
     rates = run.stepper.optimizer.groups["means"].rate_at(0)
     assert rates == pytest.approx(7.0 * run.config.means_rate)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"strategy": "fast", "max_gaussians": 80},
-        {"strategy": "none", "refine": "poses"},
-        {"strategy": "none", "appearance": "exposure"},
-        {"strategy": "none", "transients": "mask"},
-    ],
-)
-def test_a_trainer_without_a_part_that_its_configuration_asks_for_is_refused(capture, changes):
-    with pytest.raises(
-        ArgumentError, match=r"is missing, but the configuration has .* gsplat_edu\.train\.training"
-    ):
-        Trainer(random_ball(5, torch.Generator()), capture.train, recipe(4, **changes), CPU)
 
 
 def test_every_kernel_of_the_backend_is_used(capture):

@@ -7,11 +7,12 @@ import torch
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.views import View
-from gsplat_edu.train import stepper
+from gsplat_edu.train import step
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import Objective, PhotoTerm, make_objective
+from gsplat_edu.train.rendered import NOTHING, Needs
 from gsplat_edu.train.view_model import Chain, Identity
 from masked_object import masked_object
 
@@ -39,7 +40,7 @@ def trained(monkeypatch, draws_all, **settings):
         pairs.append((out.num_pairs, needed is None))
         return out
 
-    monkeypatch.setattr(stepper, "render", counted)
+    monkeypatch.setattr(step, "render", counted)
     views, points, colors = views_with_masks()
     given = {"max_gaussians": 300, "sh_degree": 1, "fast_start_factor": 1.0} | settings
     config = recipe(60, strategy="fast", **given)
@@ -75,8 +76,8 @@ def test_own_terms_and_models_are_drawn_whole_unless_they_say_so():
         pass
 
     terms = {"photo": PhotoTerm(0.2)}
-    assert Identity().counted_only and not Own().counted_only
-    assert Chain([Identity()]).counted_only and not Chain([Identity(), Own()]).counted_only
-    assert Objective(terms).counted_only and not OwnObjective(terms).counted_only
-    assert not Objective(terms | {"mine": lambda rendered: rendered.image.sum()}).counted_only
-    assert make_objective(recipe(10, strategy="mcmc")).counted_only
+    assert Identity().needs == Chain([Identity()]).needs == NOTHING
+    assert Own().needs == Chain([Identity(), Own()]).needs == Needs(every_pixel=True)
+    assert Objective(terms).needs(0) == make_objective(recipe(10, strategy="mcmc")).needs(0) == NOTHING
+    own = (OwnObjective(terms), Objective(terms | {"mine": lambda rendered: rendered.image.sum()}))
+    assert all(objective.needs(0) == Needs(every_pixel=True) for objective in own)

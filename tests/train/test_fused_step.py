@@ -14,11 +14,12 @@ from gsplat_edu.ops.adam import adam_natively
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.views import View
+from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import MeanOpacity, MeanScale, Objective, PhotoTerm
-from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.train.rendered import Needs
 
 SCHEDULE = {"densify_start": 2, "densify_every": 6, "sh_every": 7, "grad_threshold": 5e-5}
 CASES = {
@@ -64,10 +65,10 @@ class Deferrals:
 def trainer(capture, config, parts=None, **changes):
     views, *cloud = capture
     start = from_points(*cloud, config)
-    density = changes.pop("density", make_strategy(config, 2.0, start))
     deferrals = changes.pop("deferrals", Deferrals())
-    options = {"extent": 2.0, "density": density, "parts": parts} | changes
-    made = Trainer(start, options.pop("views", views), config, deferrals.backend, **options)
+    views = Views(changes.pop("views", views))
+    started = Start(start, extent=2.0)
+    made = training(config, views, deferrals.backend, started, **(parts or {}), **changes)
     return made, deferrals.seen
 
 
@@ -78,7 +79,7 @@ def check_same(one, other):
         assert torch.equal(tensor.nan_to_num(123.0), tensors[name].nan_to_num(123.0)), name
 
 
-def pair(capture, config, make_parts=StepParts, **changes):
+def pair(capture, config, make_parts=dict, **changes):
     """Train both ways; return the fused trainer."""
     fused, deferred = trainer(capture, config, make_parts(fused=True), **changes)
     two_steps, stored = trainer(capture, config, make_parts(fused=False), **changes)
@@ -105,7 +106,7 @@ def test_masks_depth_view_models_and_several_regularisers(capture):
         masked.append(View(view.camera, image, mask=rng.random(image.shape[:2]) < 0.8, name=view.name))
 
     class Depth:
-        needs_depth = True
+        needs = Needs(depth=True)
 
         def __call__(self, rendered):
             return 1e-3 * (rendered.output.depth.square().mean() + rendered.output.transmittance.mean())
@@ -114,7 +115,7 @@ def test_masks_depth_view_models_and_several_regularisers(capture):
     terms |= {"more": MeanScale(0.07), "depth": Depth()}
     # its gradient is an expanded tensor
     terms["means"] = lambda rendered: 1e-3 * rendered.gaussians.means.sum()
-    make = lambda fused: StepParts(objective=Objective(terms), view_model=Gains(4), fused=fused)  # noqa: E731
+    make = lambda fused: {"objective": Objective(terms), "view_model": Gains(4), "fused": fused}  # noqa: E731
     run = pair(capture, CASES["adc"], make, views=masked)
     assert not torch.equal(run.stepper.parameters()["gains"].detach(), torch.ones(4))
 
@@ -129,14 +130,14 @@ def test_poisoned_gradients_and_parameters(capture):
 
     views, points, colors = capture
     terms = {"photo": PhotoTerm(0.2), "poison": poison}
-    make = lambda fused: StepParts(objective=Objective(terms), fused=fused)  # noqa: E731
+    make = lambda fused: {"objective": Objective(terms), "fused": fused}  # noqa: E731
     config = recipe(4, strategy="none")
 
     def run(fused):
         start = from_points(points, colors, config)
         start.means[7], start.means[11], start.log_scales[13] = float("nan"), 1e30, float("inf")
         deferrals = Deferrals()
-        made = Trainer(start, views, config, deferrals.backend, parts=make(fused))
+        made = training(config, Views(views), deferrals.backend, Start(start, extent=1.0), **make(fused))
         losses = made.run().losses
         return made, losses, deferrals.seen
 
@@ -184,10 +185,10 @@ def test_gradients_are_stored_if_something_reads_them(capture):
 
     config, strategy = recipe(2, strategy="none"), Watching()
     for parts, changes in (
-        (StepParts(reduce=lambda parameters, count: None), {}),
-        (StepParts(adam=functools.partial(adam_natively)), {}),
-        (StepParts(objective=Twice({"photo": PhotoTerm(0.2)})), {}),
-        (StepParts(), {"density": strategy}),
+        ({"reduce": lambda parameters, count: None}, {}),
+        ({"adam": functools.partial(adam_natively)}, {}),
+        ({"objective": Twice({"photo": PhotoTerm(0.2)})}, {}),
+        ({}, {"density": strategy}),
     ):
         run, deferred = trainer(capture, config, parts, **changes)
         assert not run.stepper.fuses

@@ -16,11 +16,12 @@ from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.scene.views import View
+from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
-from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.train.rendered import Needs
 from steps import step_views
 
 CONFIG = recipe(40, densify_start=2, densify_every=5, grad_threshold=5e-5, sh_degree=0)
@@ -34,15 +35,14 @@ def capture():
 
 def trainer(capture, config, parts=None, callbacks=(), views=None):
     start = from_points(*capture[1:], config)
-    return Trainer(
-        start,
-        views or capture[0],
+    started = Start(start, extent=2.0)
+    return training(
         config,
+        Views(views or capture[0]),
         load_backend("cpu"),
-        extent=2.0,
-        density=make_strategy(config, 2.0, start),
+        started,
         callbacks=callbacks,
-        parts=parts,
+        **(parts or {}),
     )
 
 
@@ -53,7 +53,7 @@ def grads(run):
 def test_regularisers_match_the_paper(capture):
     """Values and gradients equal those of autograd of weight mean(opacity) + weight mean(scale)."""
     run, seen = trainer(capture, MCMC), []
-    run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.stepper.parts.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
     run.stepper.gradients(step_views(run), 0)
     (rendered,) = seen
     assert isinstance(rendered, Rendered) and rendered.iteration == 0
@@ -83,7 +83,7 @@ def test_fast_regularises_the_opacity_of_visible_gaussians_if_they_are_few(captu
     more = np.concatenate([points, *(points + np.array([0.0, 100.0 + 10 * k, 0.0]) for k in range(4))])
     config = recipe(60, strategy="fast", max_gaussians=5 * len(points), sh_degree=0)
     run, seen = trainer((views, more, np.concatenate([colors] * 5)), config), []
-    run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.stepper.parts.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
     run.stepper.gradients(step_views(run), 0)
     (rendered,) = seen
     term, twin = make_objective(config).terms["opacity"], run.gaussians.trainable()
@@ -94,7 +94,7 @@ def test_fast_regularises_the_opacity_of_visible_gaussians_if_they_are_few(captu
     value.backward()
     expected.backward()
     torch.testing.assert_close(run.gaussians.logit_opacities.grad, twin.logit_opacities.grad)
-    del run.stepper.objective.terms["seen"]
+    del run.stepper.parts.objective.terms["seen"]
     far = run.gaussians.means[:, 1] > 50
     before = run.gaussians.logit_opacities[far].detach().clone()
     run.run()
@@ -103,7 +103,7 @@ def test_fast_regularises_the_opacity_of_visible_gaussians_if_they_are_few(captu
 
 def test_fast_regularises_the_opacity_of_all_if_many_are_visible(capture):
     run, seen = trainer(capture, recipe(60, strategy="fast", max_gaussians=100, sh_degree=0)), []
-    run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.stepper.parts.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
     run.stepper.gradients(step_views(run), 0)
     (rendered,) = seen
     output = rendered.output
@@ -150,7 +150,7 @@ def test_only_gradients_left_by_reduce_are_applied(capture):
         for parameter in parameters.values():
             parameter.grad = None
 
-    run = trainer(capture, recipe(2, strategy="none", sh_degree=0), StepParts(reduce=nothing))
+    run = trainer(capture, recipe(2, strategy="none", sh_degree=0), {"reduce": nothing})
     before = run.gaussians.map(torch.clone)
     run.run()
     for name, tensor in run.gaussians.tensors().items():
@@ -171,7 +171,7 @@ def test_terms_are_summed_and_logged_by_name(capture, tmp_path):
         log.record(event, 1.0)
 
     config = recipe(10, strategy="none", sh_degree=0)
-    run = trainer(capture, config, StepParts(objective=objective), [note])
+    run = trainer(capture, config, {"objective": objective}, [note])
     plain = trainer(capture, config)
     result = run.run()
     assert result.losses[0] == plain.run().losses[0], "the reported loss is that of the photo term"
@@ -190,7 +190,7 @@ def test_a_depth_term_gets_the_depth_and_moves_the_gaussians(capture):
     found = []
 
     class Depth:
-        needs_depth = True
+        needs = Needs(depth=True)
 
         def __call__(self, rendered):
             value = rendered.output.depth.mean()
@@ -198,7 +198,7 @@ def test_a_depth_term_gets_the_depth_and_moves_the_gaussians(capture):
             return value
 
     objective = Objective({"photo": PhotoTerm(0.2), "depth": Depth()})
-    trainer(capture, recipe(20, strategy="none", sh_degree=0), StepParts(objective=objective)).run()
+    trainer(capture, recipe(20, strategy="none", sh_degree=0), {"objective": objective}).run()
     assert found[-1] < 0.9 * found[0]
 
 
@@ -215,9 +215,7 @@ def test_a_view_model_learns_brightness_differences(capture):
         for view, factor in zip(views, brightness, strict=True)
     ]
     model = Gains(4)
-    run = trainer(
-        capture, recipe(150, strategy="none", sh_degree=0), StepParts(view_model=model), views=dimmed
-    )
+    run = trainer(capture, recipe(150, strategy="none", sh_degree=0), {"view_model": model}, views=dimmed)
     run.run()
     gains = model.gains.detach()
     ratio = float((gains[1] + gains[3]) / (gains[0] + gains[2]))
@@ -228,7 +226,7 @@ def test_a_view_model_learns_brightness_differences(capture):
 @pytest.mark.parametrize("at", [3, 13])
 def test_a_view_model_resumes_to_the_bit_across_density_surgery(capture, tmp_path, at):
     def make():
-        return trainer(capture, CONFIG, StepParts(view_model=Gains(4)))
+        return trainer(capture, CONFIG, {"view_model": Gains(4)})
 
     whole, first, second = make(), make(), make()
     whole.run()
@@ -248,12 +246,12 @@ def test_a_view_model_resumes_to_the_bit_across_density_surgery(capture, tmp_pat
 def test_a_checkpoint_with_another_view_model_is_refused(capture, tmp_path):
     from gsplat_edu.base.errors import CheckpointError
 
-    with_gains = trainer(capture, CONFIG, StepParts(view_model=Gains(4)))
+    with_gains = trainer(capture, CONFIG, {"view_model": Gains(4)})
     path = save_checkpoint(tmp_path, with_gains, 0.0)
     with pytest.raises(CheckpointError, match="view_model: 'gains' is unknown"):
         load_checkpoint(path, trainer(capture, CONFIG))
     with pytest.raises(CheckpointError, match=r"view_model\.gains: is .*\(4,\), but has to be .*\(3,\)"):
-        load_checkpoint(path, trainer(capture, CONFIG, StepParts(view_model=Gains(3))))
+        load_checkpoint(path, trainer(capture, CONFIG, {"view_model": Gains(3)}))
 
 
 def test_a_view_model_cannot_reuse_a_parameter_name(capture):
@@ -262,4 +260,4 @@ def test_a_view_model_cannot_reuse_a_parameter_name(capture):
             return {"means": self.gains}
 
     with pytest.raises(ArgumentError, match="^view_model: 'means'"):
-        trainer(capture, CONFIG, StepParts(view_model=Greedy(4)))
+        trainer(capture, CONFIG, {"view_model": Greedy(4)})

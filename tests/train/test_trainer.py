@@ -11,12 +11,12 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent, StepEvent
 from gsplat_edu.train.initialize import random_ball
-from gsplat_edu.train.trainer import Trainer
 
 RENDER, DENSE = functools.partial(render, backend="torch"), load_backend("torch")
 SHORT = course_config(iterations=12, max_gaussians=80).changed(densify_stop=12, densify_every=4)
@@ -36,7 +36,9 @@ def trainer(views, callbacks=()):
     generator = torch.Generator().manual_seed(9)
     start = random_ball(60, generator)
     control = AdaptiveDensityControl(SHORT, EXTENT, generator, start)
-    return Trainer(start, views, SHORT, DENSE, extent=EXTENT, density=control, callbacks=callbacks)
+    return training(
+        SHORT, Views(views), DENSE, Start(start, extent=EXTENT), callbacks=callbacks, density=control
+    )
 
 
 @pytest.fixture
@@ -75,7 +77,7 @@ def test_callbacks_get_every_step_and_densification_in_order(views):
 def test_the_start_is_not_modified(views):
     start = random_ball(20, torch.Generator().manual_seed(0))
     before = start.map(torch.clone)
-    Trainer(start, views, fixed(2), DENSE).run()
+    training(fixed(2), Views(views), DENSE, Start(start)).run()
     for name, tensor in start.tensors().items():
         assert torch.equal(tensor, before.tensors()[name])
 
@@ -88,7 +90,7 @@ def test_views_are_drawn_with_the_seed(views):
         return DENSE.rasterize(gaussians, camera, settings, extra)
 
     watched = replace(DENSE, rasterize=watching)
-    Trainer(random_ball(10, torch.Generator()), views, fixed(6, seed=3), watched).run()
+    training(fixed(6, seed=3), Views(views), watched, Start(random_ball(10, torch.Generator()))).run()
     rng = np.random.default_rng(3)
     assert seen == [int(rng.integers(24)) for _ in range(6)]
 
@@ -108,7 +110,7 @@ def test_one_gaussian_fits_one_blob(views):
     )
     target = View(camera, RENDER(blob, camera).image.numpy())
     start = blob.map(lambda t: t + 0.05)
-    result = Trainer(start, [target], fixed(150), DENSE, extent=EXTENT).run()
+    result = training(fixed(150), Views([target]), DENSE, Start(start, extent=EXTENT)).run()
     assert result.losses[-1] < 0.1 * result.losses[0]
 
 
@@ -117,16 +119,18 @@ def test_a_scene_that_vanishes_does_not_stop_the_run(views):
     faint.logit_opacities.fill_(-9.0)
     config = course_config(iterations=4).changed(densify_stop=3, densify_every=1)
     control = AdaptiveDensityControl(config, EXTENT, torch.Generator(), faint)
-    run = Trainer(faint, views, config, DENSE, density=control)
+    run = training(config, Views(views), DENSE, Start(faint, extent=1.0), density=control)
     assert run.run().counts == [3, 3, 0, 0]
 
 
 def test_no_views_or_no_gaussians_are_refused(views):
     some = random_ball(3, torch.Generator())
-    with pytest.raises(ArgumentError, match="^views: "):
-        Trainer(some, [], SHORT, DENSE)
+    with pytest.raises(ArgumentError, match="^dataset: has no training views"):
+        training(SHORT, Views([]), DENSE, Start(some))
     with pytest.raises(ArgumentError, match="^gaussians: "):
-        Trainer(random_ball(0, torch.Generator()), views, SHORT, DENSE)
+        training(SHORT, Views(views), DENSE, Start(random_ball(0, torch.Generator())))
+    with pytest.raises(ArgumentError, match="^part: "):
+        training(SHORT, Views(views), DENSE, Start(some), gradient=None)
 
 
 @pytest.mark.parametrize(

@@ -6,14 +6,14 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.validation import of_type, offers
+from gsplat_edu.base.validation import of_type, offers, one_of
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend, check_backend_value
 from gsplat_edu.scene.gaussians import Gaussians
@@ -28,8 +28,7 @@ from gsplat_edu.train.objective import make_objective
 from gsplat_edu.train.overlap import separate_views
 from gsplat_edu.train.patches import neighbourhood_for
 from gsplat_edu.train.poses import NEED_LENSES
-from gsplat_edu.train.stepper import StepParts
-from gsplat_edu.train.team import ALONE, Team
+from gsplat_edu.train.step import StepParts
 from gsplat_edu.train.trainer import Callback, Trainer
 
 
@@ -90,8 +89,7 @@ def training(
     start: Start | None = None,
     *,
     callbacks: Sequence[Callback] = (),
-    team: Team = ALONE,
-    fused: bool = True,
+    **parts: Any,  # noqa: ANN401
 ) -> Trainer:
     """Put a training together: everything that the configuration asks for is made and wired, or refused.
 
@@ -101,8 +99,8 @@ def training(
         backend: The kernels; see `gsplat_edu.render.backends.load_backend`.
         start: Where to start instead of at the dataset's points.
         callbacks: Called after every step and every change of the Gaussians.
-        team: The processes that share each step.
-        fused: Whether Adam may take its step in the backward pass; see `StepParts.fused`.
+        parts: Parts of a step to use instead of those that the configuration asks for, by the names of `StepParts`:
+            another `objective` or `density`, a `team` of processes, `fused=False`, and so on.
 
     Returns:
         The trainer; `Trainer.run` trains.
@@ -112,6 +110,8 @@ def training(
             without a cap, a sky without its splats in `start`, masks of things that move with too few views.
     """
     of_type("config", config, TrainConfig)
+    for name in parts:
+        one_of("part", name, [each.name for each in dataclasses.fields(StepParts)])
     check_backend_value(backend)
     offers("dataset", dataset, TrainingData)
     config, start = _begin(config, dataset, start)
@@ -123,22 +123,21 @@ def training(
     view_model = make_view_model(config, cameras, extent, gaussians, backend.recolored)
     around = neighbourhood_for(config, dataset.train, view_model, extent)
     has_depth = any(view.depth is not None for view in dataset.train)
+    made = StepParts(
+        make_objective(config, shell, backend.loss, extent, around, has_depth),
+        make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
+        view_model,
+        transients=make_transients(config, dataset.train, features),
+        shell=shell,
+    )
     return Trainer(
         gaussians,
         dataset.train,
         config,
         backend,
+        dataclasses.replace(made, **parts),
         extent=extent,
-        density=make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
         callbacks=callbacks,
-        parts=StepParts(
-            make_objective(config, shell, backend.loss, extent, around, has_depth),
-            view_model,
-            transients=make_transients(config, dataset.train, features),
-            fused=fused,
-            team=team,
-            shell=shell,
-        ),
     )
 
 

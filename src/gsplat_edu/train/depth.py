@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.ops.depth import DepthRule, depth_error
-from gsplat_edu.train.rendered import Rendered
-from gsplat_edu.train.surface import Turns
+from gsplat_edu.train.rendered import Needs, Rendered, Turns
 
 DEPTH = "depth"
 """Name of the term."""
@@ -42,9 +41,10 @@ class DepthTerm:
     turns: Turns
     _kept: dict[int, tuple[Tensor, ...]] = field(default_factory=dict, repr=False, compare=False)
 
-    def needs_depth_in(self, iteration: int) -> bool:
-        """Whether the step of this iteration needs the depth."""
-        return self.turns.due(iteration)
+    @property
+    def needs(self) -> Needs:
+        """The depth, in its turns."""
+        return Needs(depth=True, turns=self.turns)
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight every mean rho; 0 for a view without depth.

@@ -30,6 +30,7 @@ from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measu
 from gsplat_edu.ops.recolor import Backdrop, RecolorKernel
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
+from gsplat_edu.train.rendered import NOTHING, Needs
 from gsplat_edu.train.view_model import Identity, Rows, ViewRender
 
 NAME = "exposures"
@@ -74,9 +75,9 @@ class Exposure(Identity):
         self._recolor, self._vignetting = recolor, vignetting
 
     @property
-    def counted_only(self) -> bool:
-        """Return true: the correction is pixel by pixel, and the measurement applies the mask."""
-        return True
+    def needs(self) -> Needs:
+        """Nothing more: the correction is pixel by pixel, and the measurement applies the mask."""
+        return NOTHING
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return the state, (views, 4) or (views, 5)."""

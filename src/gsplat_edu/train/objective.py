@@ -6,6 +6,8 @@ and the checkpoints need no change.
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -24,8 +26,8 @@ from gsplat_edu.train.depth import DEPTH, DepthTerm
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.patches import PATCHES, Neighbourhood, PatchTerm
-from gsplat_edu.train.rendered import Rendered as Rendered
-from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
+from gsplat_edu.train.rendered import NOTHING, Needs, Rendered as Rendered, Turns
+from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm
 
 FEW_VISIBLE = 0.25
 """Regularise only the visible Gaussians if they are fewer than this fraction of all. Views of one subject show at least
@@ -41,10 +43,8 @@ inside (benchmarks/RESULTS.md)."""
 class Term(Protocol):
     """One summand of an objective.
 
-    A term that uses `output.depth` has a true attribute `needs_depth`. One that in some steps uses the depth and the
-    composited normals (`gsplat_edu.render.planes.facing_normals`), in `output.features`, has a method
-    `needs_normals(iteration)`. One that in some steps uses the depth only has a method `needs_depth_in(iteration)`.
-    One that uses no pixel that the mask of the photo excludes has a true attribute `counted_only`.
+    An attribute `needs` (`Needs`) says what it reads of a render besides image and transmittance; without it, those of
+    every pixel.
     """
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
@@ -67,26 +67,11 @@ class Objective:
             raise ArgumentError(f"terms: have to include {PHOTO!r}, which logs and progress call the loss")
         self.terms = dict(terms)
 
-    @property
-    def needs_depth(self) -> bool:
-        """Whether a term uses the depth; only then is it rendered."""
-        return any(getattr(term, "needs_depth", False) for term in self.terms.values())
-
-    @property
-    def counted_only(self) -> bool:
-        """Whether no term uses pixels that the mask of the photo excludes, so that they need not be drawn."""
-        plain = type(self) is Objective  # a subclass may use more than its terms
-        return plain and all(getattr(term, "counted_only", False) for term in self.terms.values())
-
-    def needs_normals(self, iteration: int) -> bool:
-        """Whether a term uses depth and normals in the step of this iteration; only then are they rendered."""
-        asked = (getattr(term, "needs_normals", None) for term in self.terms.values())
-        return any(needs(iteration) for needs in asked if needs is not None)
-
-    def needs_depth_in(self, iteration: int) -> bool:
-        """Whether a term uses the depth in the step of this iteration."""
-        asked = (getattr(term, "needs_depth_in", None) for term in self.terms.values())
-        return any(needs(iteration) for needs in asked if needs is not None)
+    def needs(self, iteration: int) -> Needs:
+        """Return what the terms read in the step of an iteration."""
+        own = NOTHING if type(self) is Objective else Needs()  # a subclass may read more than its terms
+        each = (getattr(term, "needs", Needs()).at(iteration) for term in self.terms.values())
+        return functools.reduce(operator.or_, each, own)
 
     def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
         """Add the gradients of the sum to the `grad` of its leaves; return the value of every term, detached."""
@@ -98,7 +83,7 @@ class Objective:
         """Return a term's value.
 
         Raises:
-            ArgumentError: the term uses the depth without saying so.
+            ArgumentError: the term reads the depth without saying so.
         """
         try:
             return self.terms[name](rendered)
@@ -106,7 +91,7 @@ class Objective:
             if rendered.output.depth is not None or "NoneType" not in str(error):
                 raise
             raise ArgumentError(
-                f"terms[{name!r}]: uses output.depth, which is rendered only for terms with needs_depth = True"
+                f"terms[{name!r}]: reads output.depth, which is rendered only for terms with needs = Needs(depth=True)"
             ) from error
 
 
@@ -186,7 +171,7 @@ class PhotoTerm:
 
     ssim_weight: float
     loss: LossKernel | None = None
-    counted_only: ClassVar[bool] = True
+    needs: ClassVar[Needs] = NOTHING
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return (1 - k) L1 + k (1 - SSIM)."""
@@ -207,7 +192,7 @@ class MeanOpacity:
     weight: float
     until: int | None = None
     least_share: float = 0.0
-    counted_only: ClassVar[bool] = True
+    needs: ClassVar[Needs] = NOTHING
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(opacity)."""
@@ -249,7 +234,7 @@ class MeanScale:
 
     weight: float
     shell: Shell | None = None
-    counted_only: ClassVar[bool] = True
+    needs: ClassVar[Needs] = NOTHING
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(scale)."""

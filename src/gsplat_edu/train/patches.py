@@ -16,8 +16,7 @@ from gsplat_edu.render.camera_tensors import split_camera
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig
-from gsplat_edu.train.rendered import Rendered
-from gsplat_edu.train.surface import Turns
+from gsplat_edu.train.rendered import Needs, Rendered, Turns
 from gsplat_edu.train.view_model import ViewModel
 
 PATCHES = "patches"
@@ -146,9 +145,10 @@ class PatchTerm:
     def __init__(self, weight: float, turns: Turns, around: Neighbourhood, seed: int) -> None:
         self.weight, self._turns, self._around, self._seed = weight, turns, around, seed
 
-    def needs_normals(self, iteration: int) -> bool:
-        """Whether the step of this iteration needs the depth, and `facing_normals` composited."""
-        return self._turns.due(iteration)
+    @property
+    def needs(self) -> Needs:
+        """Depth and normals, in its turns."""
+        return Needs(normals=True, turns=self._turns)
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight every mean min(1 - ncc, MOST), 0 if the view has no neighbour.

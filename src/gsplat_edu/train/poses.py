@@ -42,6 +42,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
 from gsplat_edu.train.pose_step import pose_step
+from gsplat_edu.train.rendered import Needs
 from gsplat_edu.train.view_model import Chain, Identity, Rows, ViewModel, ViewRender
 
 TWISTS, LENSES, DISTORTIONS, MOTIONS = "twists", "lenses", "distortions", "motions"
@@ -111,9 +112,9 @@ class Refinement(Identity):
         self._group = ParameterGroup(rate, eps=config.adam_eps, per_gaussian=False)
 
     @property
-    def needs_depth(self) -> bool:
-        """Return whether poses or motions are refined."""
-        return TWISTS in self._names() or MOTIONS in self._names()
+    def needs(self) -> Needs:
+        """Every pixel, and the median depth if poses or motions are refined."""
+        return Needs(median_depth=TWISTS in self._names() or MOTIONS in self._names())
 
     def _names(self) -> tuple[str, ...]:
         return LEARNED[self._learns]

@@ -1,4 +1,4 @@
-"""The render of one view of a step, as the terms of an objective read it."""
+"""What the terms of an objective and the view models read of a render, and the render of one view of a step."""
 
 from __future__ import annotations
 
@@ -11,6 +11,61 @@ from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.feed import Draw, Target
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Some steps of a training.
+
+    Args:
+        start: First iteration.
+        every: Steps from one to the next.
+        batch: Iterations of a step.
+    """
+
+    start: int = 0
+    every: int = 1
+    batch: int = 1
+
+    def due(self, iteration: int) -> bool:
+        """Whether the step of this iteration is one of them."""
+        return iteration >= self.start and (iteration // self.batch) % self.every == 0
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a term or a view model reads of a render besides image and transmittance; only that is rendered.
+
+    Args:
+        depth: The mean depth, `RenderOutput.depth`.
+        normals: The composited `gsplat_edu.render.planes.facing_normals`, `RenderOutput.features`, and the depth.
+        median_depth: `RenderOutput.median_depth`.
+        every_pixel: Also pixels that the mask of the photo excludes.
+        turns: The steps in which it reads any of that.
+    """
+
+    depth: bool = False
+    normals: bool = False
+    median_depth: bool = False
+    every_pixel: bool = True
+    turns: Turns = Turns()
+
+    def at(self, iteration: int) -> Needs:
+        """Return what is read in the step of an iteration."""
+        return self if self.turns.due(iteration) else Needs(every_pixel=self.every_pixel)
+
+    def __or__(self, other: Needs) -> Needs:
+        """Return what either reads, in every step."""
+        return Needs(
+            self.depth or other.depth,
+            self.normals or other.normals,
+            self.median_depth or other.median_depth,
+            self.every_pixel or other.every_pixel,
+        )
+
+
+NOTHING = Needs(every_pixel=False)
+"""The needs of what reads only pixels that count, of image and transmittance."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from gsplat_edu.train.density.base import DensityStrategy, FollowsDevice
 from gsplat_edu.train.events import PHOTO, Change
 from gsplat_edu.train.objective import MeanOpacity, MeanScale, Objective, PhotoTerm
 from gsplat_edu.train.optimizer import ParameterGroup
-from gsplat_edu.train.stepper import (
+from gsplat_edu.train.step import (
     Loaded,
     Shown,
     StepParts,
@@ -46,8 +46,6 @@ def make_stepper(
     gaussians: Gaussians,
     backend: Backend,
     groups: Mapping[str, ParameterGroup],
-    objective: Objective,
-    density: DensityStrategy | None,
     parts: StepParts,
     batch: int,
 ) -> Stepper:
@@ -57,9 +55,7 @@ def make_stepper(
         gaussians: The start Gaussians; not changed.
         backend: The kernels.
         groups: Settings of the optimiser by the names of the parameters.
-        objective: What to minimise.
-        density: The density strategy, or None.
-        parts: The other parts of a step.
+        parts: The parts of a step.
         batch: Views of a step, of all processes.
 
     Raises:
@@ -68,10 +64,10 @@ def make_stepper(
     Warns:
         BackendWarning: the training does not stay on the device; the message says why.
     """
-    host = TensorStepper(gaussians, backend, groups, objective, density, parts, batch)
+    host = TensorStepper(gaussians, backend, groups, parts, batch)
     if backend.resident is None:
         return host
-    if reason := why_not(gaussians, backend, objective, density, parts, batch):
+    if reason := why_not(gaussians, backend, parts, batch):
         warnings.warn(
             f"backend {backend.name!r}: Gaussians and images pass through the host at every step, because {reason}",
             BackendWarning,
@@ -81,14 +77,12 @@ def make_stepper(
     run = backend.resident(gaussians.sh_rest.shape[1], backend.photo_room)
     # who limits the photos on the device keeps those of the processor too
     room = PHOTO_ROOM if backend.photo_room is None else None
-    return ResidentStepper(host, run, density, room)
+    return ResidentStepper(host, run, room)
 
 
 def why_not(
     gaussians: Gaussians,
     backend: Backend,
-    objective: Objective,
-    density: DensityStrategy | None,
     parts: StepParts,
     batch: int,
 ) -> str | None:
@@ -102,13 +96,13 @@ def why_not(
         "reduce or adam is another function": parts.reduce is not mean_over_views or parts.adam is not None,
         "gradients are to be stored (fused=False)": not parts.fused,
         f"the Gaussians are {gaussians.means.dtype}": gaussians.means.dtype != torch.float32,
-        "the density strategy does not follow a device": not _follows(density),
-        "the objective is another class": type(objective) is not Objective,
+        "the density strategy does not follow a device": not _follows(parts.density),
+        "the objective is another class": type(parts.objective) is not Objective,
     }
     for reason, holds in reasons.items():
         if holds:
             return reason
-    for name, term in objective.terms.items():
+    for name, term in parts.objective.terms.items():
         if not _known(name, term, backend):
             return f"the objective has the term {name!r}"
     return None
@@ -177,7 +171,6 @@ class ResidentStepper:
     Args:
         host: Has the start; holds what was read last.
         run: The training on the device.
-        density: The density strategy of the host.
         photo_room: Bytes of targets that the feed is to keep; None for its own rule.
     """
 
@@ -185,13 +178,13 @@ class ResidentStepper:
         self,
         host: TensorStepper,
         run: ResidentRun,
-        density: DensityStrategy | None,
         photo_room: int | None = PHOTO_ROOM,
     ) -> None:
         self.photo_room = photo_room
+        density = host.parts.density
         assert density is None or isinstance(density, FollowsDevice)
         self._host, self._run, self._density = host, run, density
-        self.objective, self.parts, self.places = host.objective, host.parts, host.places
+        self.parts, self.places = host.parts, host.places
         self._loaded = False  # whether the device has the run
         self._ahead = False  # whether it has taken steps since the host read it
         self._view: StepView | None = None
@@ -229,11 +222,11 @@ class ResidentStepper:
             view.draw.view.camera, view.settings, target, optimizer.advance(), self._rules(iteration)
         )
         self._ahead, self._view, self._image = True, view, None
-        return _LateTerms(tuple(self.objective.terms), sums)
+        return _LateTerms(tuple(self.parts.objective.terms), sums)
 
     def _rules(self, iteration: int) -> RunRules:
         """Return the weights of the terms at an iteration."""
-        terms = self.objective.terms
+        terms = self.parts.objective.terms
         photo, opacity, scale = (terms.get(name) for name in (PHOTO, OPACITY, SCALE))
         assert isinstance(photo, PhotoTerm)
         rules = RunRules(photo.ssim_weight, shell=self._shell)

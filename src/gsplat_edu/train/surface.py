@@ -14,29 +14,10 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.surface import normal_error
 from gsplat_edu.train.far import Shell
-from gsplat_edu.train.rendered import Rendered
+from gsplat_edu.train.rendered import Needs, Rendered, Turns
 
 NORMAL, FLAT = "normal", "flat"
 """Names of the terms."""
-
-
-@dataclass(frozen=True)
-class Turns:
-    """Which steps evaluate the terms of a surface.
-
-    Args:
-        start: First iteration.
-        every: Steps from one evaluation to the next; values are multiplied by it, and 0 in the other steps.
-        batch: Iterations of a step.
-    """
-
-    start: int
-    every: int = 1
-    batch: int = 1
-
-    def due(self, iteration: int) -> bool:
-        """Whether the step of this iteration evaluates them."""
-        return iteration >= self.start and (iteration // self.batch) % self.every == 0
 
 
 @dataclass(frozen=True)
@@ -51,9 +32,10 @@ class NormalTerm:
     weight: float
     turns: Turns
 
-    def needs_normals(self, iteration: int) -> bool:
-        """Whether the step of this iteration needs the depth, and `facing_normals` composited."""
-        return self.turns.due(iteration)
+    @property
+    def needs(self) -> Needs:
+        """Depth and normals, in its turns."""
+        return Needs(normals=True, turns=self.turns)
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight every mean a (a - N . m).

@@ -25,13 +25,11 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Change, Event, Losses, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
-from gsplat_edu.train.objective import make_objective
 from gsplat_edu.train.optimizer import MOMENTS
-from gsplat_edu.train.patches import neighbourhood_for
 from gsplat_edu.train.resident import make_stepper
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
-from gsplat_edu.train.stepper import StepParts as StepParts, StepView
+from gsplat_edu.train.step import StepParts as StepParts, StepView
 from gsplat_edu.train.tempo import Tempo
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import ViewModel
@@ -65,22 +63,19 @@ class Trainer:
     """Optimises Gaussians until their renders match the views.
 
     Each step computes the gradients of the objective for the views it draws, reduces them, and applies the result.
-    Then the density strategy may change the Gaussians. `gsplat_edu.train.training` makes a trainer with everything that
-    a configuration asks for; this constructor takes the parts one by one.
+    Then the density strategy may change the Gaussians. `gsplat_edu.train.training` makes a trainer.
 
     Args:
         gaussians: The start Gaussians; not changed.
         views: Training views, at least one.
         config: Budget, rates, schedule and seed.
         backend: The kernels.
+        parts: The parts of a step.
         extent: Size of the scene, world units: the means' learning rate is a fraction of it.
-        density: The density strategy of the configuration; None for the strategy "none".
         callbacks: Called after every step and every change, in this order.
-        parts: The other parts of a step; the recipe's if None.
 
     Raises:
-        ArgumentError: there are no views, no Gaussians, more Gaussians than the cap, parts that do not fit a batch, or
-            the configuration asks for a part that is not given.
+        ArgumentError: there are no Gaussians, more Gaussians than the cap, or parts that do not fit a batch.
 
     Attributes:
         stepper: Holds the Gaussians and what moves them.
@@ -93,33 +88,26 @@ class Trainer:
         views: Sequence[View],
         config: TrainConfig,
         backend: Backend,
+        parts: StepParts,
         *,
         extent: float = 1.0,
-        density: DensityStrategy | None = None,
         callbacks: Sequence[Callback] = (),
-        parts: StepParts | None = None,
     ) -> None:
-        parts = parts or StepParts()
-        _check_kinds(gaussians, config, backend, density, parts)
-        if not views:
-            raise ArgumentError("views: is empty; give at least one view to learn from")
+        _check_kinds(gaussians, config, backend, parts)
         if not len(gaussians):
             raise ArgumentError("gaussians: is empty; give at least one Gaussian to start from")
         if config.max_gaussians is not None and len(gaussians) > config.max_gaussians:
             raise ArgumentError(
                 f"gaussians: are {len(gaussians)}, more than max_gaussians = {config.max_gaussians}; start with fewer"
             )
-        _check_parts(config, density, parts)
-        self.config, self.extent, self.density = config, extent, density
+        self.config, self.extent, self.density = config, extent, parts.density
         self.iteration = 0
         self._callbacks = tuple(callbacks)
         drawn = config.random_background or config.alpha_background == "random"
         behind, device = None if drawn else config.background, gaussians.means.device
         empty = config.outside_masks == "empty"
-        around = neighbourhood_for(config, views, parts.view_model, extent)
-        objective = parts.objective or make_objective(config, loss=backend.loss, extent=extent, around=around)
         groups = gaussian_groups(config, extent)
-        self.stepper = make_stepper(gaussians, backend, groups, objective, density, parts, config.batch)
+        self.stepper = make_stepper(gaussians, backend, groups, parts, config.batch)
         room = self.stepper.photo_room
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, room, empty)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
@@ -261,8 +249,6 @@ class Trainer:
             sh_degree=sh_degree(self.config, self.position),
             antialiased=self.config.antialiased,
             jacobian_limit=self.config.jacobian_limit,
-            depth=self.stepper.objective.needs_depth,
-            median_depth=self.view_model.needs_depth,
         )
 
     def _tell(self, event: Event, receivers: Sequence[Callback]) -> None:
@@ -340,13 +326,7 @@ class Trainer:
         self._backgrounds.bit_generator.state = given["backgrounds"]
 
 
-def _check_kinds(
-    gaussians: Gaussians,
-    config: TrainConfig,
-    backend: Backend,
-    density: DensityStrategy | None,
-    parts: StepParts,
-) -> None:
+def _check_kinds(gaussians: Gaussians, config: TrainConfig, backend: Backend, parts: StepParts) -> None:
     """Check that every part has the methods that a step calls, before the first step.
 
     Raises:
@@ -355,25 +335,7 @@ def _check_kinds(
     of_type("gaussians", gaussians, Gaussians)
     of_type("config", config, TrainConfig)
     check_backend_value(backend)
+    of_type("parts", parts, StepParts)
     offers("parts.view_model", parts.view_model, ViewModel)
-    if density is not None:
-        offers("density", density, DensityStrategy)
-
-
-def _check_parts(config: TrainConfig, density: DensityStrategy | None, parts: StepParts) -> None:
-    """Check that everything that the configuration asks for is given.
-
-    Raises:
-        ArgumentError: a part is missing.
-    """
-    asked = {
-        "strategy": (config.strategy, "none", density is None, "density"),
-        "refine": (config.refine, "none", not parts.view_model.parameters(), "parts.view_model"),
-        "appearance": (config.appearance, "none", not parts.view_model.parameters(), "parts.view_model"),
-        "transients": (config.transients, "none", parts.transients is None, "parts.transients"),
-    }
-    for name, (value, none, missing, part) in asked.items():
-        if value != none and missing:
-            raise ArgumentError(
-                f"{part}: is missing, but the configuration has {name}={value!r}; gsplat_edu.train.training makes it"
-            )
+    if parts.density is not None:
+        offers("parts.density", parts.density, DensityStrategy)

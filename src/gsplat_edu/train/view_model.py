@@ -7,6 +7,8 @@ correcting it are two methods, and neither changes the model: the trainer stores
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -17,6 +19,7 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.train.feed import Color, Target
 from gsplat_edu.train.optimizer import ParameterGroup
+from gsplat_edu.train.rendered import NOTHING, Needs
 
 
 class ViewRender(NamedTuple):
@@ -27,7 +30,7 @@ class ViewRender(NamedTuple):
         transmittance: (H, W) fraction of light that passes all Gaussians.
         background: Colour behind the Gaussians.
         camera: The camera that the render shows; None if no model asks for it.
-        depth: (H, W) its median depth, 0 where nothing solid is shown; None unless a model has `needs_depth`.
+        depth: (H, W) its median depth, 0 where nothing solid is shown; None unless a model needs it.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -50,13 +53,11 @@ class ViewModel(Protocol):
     view, which the trainer replaces by what `measure` returns, once all views of a step are rendered. Names must differ
     from those of the Gaussians' parameters.
 
-    A model that uses no pixel of a render that the photo's mask excludes may have a true attribute `counted_only`. If
-    the objective has one too, such pixels are not drawn.
     """
 
     @property
-    def needs_depth(self) -> bool:
-        """Whether `measure` uses the depth of the render; only then is it rendered."""
+    def needs(self) -> Needs:
+        """What it reads of a render besides image and transmittance."""
         ...
 
     def parameters(self) -> Mapping[str, Tensor]:
@@ -103,14 +104,9 @@ class Identity:
     """Corrects nothing and learns nothing; a base class for models that correct only one of camera and image."""
 
     @property
-    def counted_only(self) -> bool:
-        """Return true for this class, and false for a subclass that does not say so itself."""
-        return type(self) is Identity
-
-    @property
-    def needs_depth(self) -> bool:
-        """Return false."""
-        return False
+    def needs(self) -> Needs:
+        """Nothing; image and transmittance of every pixel for a subclass that does not say so itself."""
+        return NOTHING if type(self) is Identity else Needs()
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return none."""
@@ -144,14 +140,9 @@ class Chain:
         self.models = tuple(models)
 
     @property
-    def counted_only(self) -> bool:
-        """Return whether no model uses pixels that the photo's mask excludes."""
-        return all(getattr(model, "counted_only", False) for model in self.models)
-
-    @property
-    def needs_depth(self) -> bool:
-        """Return whether any model needs the depth."""
-        return any(model.needs_depth for model in self.models)
+    def needs(self) -> Needs:
+        """What any of them reads."""
+        return functools.reduce(operator.or_, (model.needs for model in self.models), NOTHING)
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return the parameters of all models."""

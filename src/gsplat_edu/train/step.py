@@ -56,10 +56,11 @@ def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
 
 @dataclass(frozen=True)
 class StepParts:
-    """The replaceable parts of a step.
+    """The parts of a step; `gsplat_edu.train.training` makes those that a configuration asks for.
 
     Args:
-        objective: The objective to minimise; `make_objective` of the configuration if None.
+        objective: The objective to minimise.
+        density: Clones, splits, prunes or moves Gaussians after a step; None keeps them.
         view_model: Corrects the camera and the image of a view before the loss compares it.
         reduce: Combines the gradients of a step's views before they are applied.
         adam: Updates one tensor by Adam's rule; that of the backend if None.
@@ -70,7 +71,8 @@ class StepParts:
         shell: Where far splats lie, which terms of depth and normals leave out; None if there are none.
     """
 
-    objective: Objective | None = None
+    objective: Objective
+    density: DensityStrategy | None = None
     view_model: ViewModel = field(default_factory=Identity)
     reduce: Reduce = mean_over_views
     adam: AdamKernel | None = None
@@ -134,8 +136,7 @@ class Stepper(Protocol):
         gaussians: The current Gaussians; a stepper on a device reads them back.
         count: Their number.
         shown: The last image that was compared; None before the first step.
-        objective: What is minimised.
-        parts: The other parts of a step.
+        parts: The parts of a step.
         places: The places of a batch whose views this process renders.
         photo_room: Bytes of targets that the feed is to keep; None for the rule of `ViewFeed`.
     """
@@ -151,9 +152,6 @@ class Stepper(Protocol):
 
     @property
     def shown(self) -> Shown | None: ...  # noqa: D102
-
-    @property
-    def objective(self) -> Objective: ...  # noqa: D102
 
     @property
     def parts(self) -> StepParts: ...  # noqa: D102
@@ -201,9 +199,7 @@ class TensorStepper:
         gaussians: The start Gaussians; not changed.
         backend: The kernels.
         groups: Settings of the optimiser by the names of the parameters.
-        objective: What to minimise.
-        density: The density strategy, or None.
-        parts: The other parts of a step.
+        parts: The parts of a step.
         batch: Views of a step, of all processes.
 
     Raises:
@@ -217,14 +213,12 @@ class TensorStepper:
         gaussians: Gaussians,
         backend: Backend,
         groups: Mapping[str, ParameterGroup],
-        objective: Objective,
-        density: DensityStrategy | None,
         parts: StepParts,
         batch: int,
     ) -> None:
-        self.gaussians, self.objective, self.parts = gaussians.trainable(), objective, parts
+        self.gaussians, self.parts = gaussians.trainable(), parts
         self.shown: Shown | None = None
-        self._backend, self._density, self._batch = backend, density, batch
+        self._backend, self._batch = backend, batch
         self._learned = dict(parts.view_model.parameters())
         if taken := sorted(set(self._learned) & set(self.gaussians.tensors())):
             raise ArgumentError(f"view_model: {taken[0]!r} is the name of a parameter of the Gaussians")
@@ -233,7 +227,7 @@ class TensorStepper:
         self.places = places_of(parts.team, batch)
         if parts.team.size > 1:
             backend.require("processes", f"team: of {parts.team.size} processes")
-            if not self._density_reads_output_only:
+            if not self._reads_output_only:
                 raise ArgumentError("density: observes more than renders; train it in one process")
         self.optimizer = self._make_optimizer(self.parameters())
 
@@ -252,12 +246,13 @@ class TensorStepper:
         the same Gaussians.
         """
         parts = self.parts
-        plain = parts.reduce is mean_over_views and parts.adam is None and type(self.objective) is Objective
-        return parts.fused and plain and self._density_reads_output_only
+        plain = parts.reduce is mean_over_views and parts.adam is None and type(parts.objective) is Objective
+        return parts.fused and plain and self._reads_output_only
 
     @property
-    def _density_reads_output_only(self) -> bool:
-        return self._density is None or getattr(self._density, "observes_renders_only", False)
+    def _reads_output_only(self) -> bool:
+        density = self.parts.density
+        return density is None or getattr(density, "observes_renders_only", False)
 
     def _make_optimizer(self, parameters: Mapping[str, Tensor]) -> Adam:
         kernel, team = self.parts.adam or self._backend.adam, self.parts.team
@@ -286,7 +281,7 @@ class TensorStepper:
         rendered, rows = self._rendered(view, iteration)
         defer = rendered.output.defer if self.fuses else None
         in_backward = None if defer is None else defer()
-        terms = self.objective.backward(rendered)
+        terms = self.parts.objective.backward(rendered)
         self._store(view.draw.index, rows)
         if in_backward is None:
             self._observe(rendered)
@@ -311,7 +306,7 @@ class TensorStepper:
         """
         if len(views) == 1:
             rendered, rows = self._rendered(views[0], iteration)
-            terms = self.objective.backward(rendered)
+            terms = self.parts.objective.backward(rendered)
             self._store(views[0].draw.index, rows)
             self._observe(rendered)
             return terms
@@ -327,10 +322,13 @@ class TensorStepper:
         """Render and differentiate views of a batch of `count`; return their results, and the terms' names."""
         learned = {name: tensor for name, tensor in self.parameters().items() if name in self._groups}
         batch, names = Batch(count, learned), list[str]()
-        alone, listens = len(places) == count, self._density and not getattr(self._density, "is_over", False)
+        alone, listens = (
+            len(places) == count,
+            self.parts.density and not getattr(self.parts.density, "is_over", False),
+        )
         for place, view in zip(places, views, strict=True):
             rendered, rows = self._rendered(view, iteration)
-            terms = self.objective.backward(rendered)
+            terms = self.parts.objective.backward(rendered)
             names = list(terms)
             self._observe(rendered, alone)
             output = rendered.output if listens and not alone else None
@@ -345,9 +343,9 @@ class TensorStepper:
         sums = share_results(team, batch, optimizer.outgoing(batch.sums))
         batch.store_rows(self._measured)
         for place in range(count):
-            if self._density is not None:
+            if self.parts.density is not None:
                 with one_thread():
-                    self._density.observe(self.gaussians, batch.results[place].output())
+                    self.parts.density.observe(self.gaussians, batch.results[place].output())
         rows = optimizer.own(self.parameters())
         for name, gradient in optimizer.summed(list(batch.learned), sums, count).items():
             rows[name].grad = gradient
@@ -362,20 +360,18 @@ class TensorStepper:
         index, target, model = view.draw.index, view.target, self.parts.view_model
         camera = model.camera(index, view.draw.view.camera)
         at, _ = split_camera(camera)
-        needs_normals = self.objective.needs_normals(iteration)
-        settings, features = view.settings, facing_normals(self.gaussians, at) if needs_normals else None
-        if needs_normals or self.objective.needs_depth_in(iteration):
-            settings = replace(settings, depth=True)
-        shell = self.parts.shell if settings.depth else None
+        needs = self.parts.objective.needs(iteration) | model.needs.at(iteration)
+        depth = needs.depth or needs.normals
+        features = facing_normals(self.gaussians, at) if needs.normals else None
+        shell = self.parts.shell if depth else None
         if shell is not None:
             features = features_before(shell, self.gaussians, at, features)
-        counted_only = self.objective.counted_only and getattr(model, "counted_only", False)
         output = render(
             self.gaussians,
             camera,
-            settings=settings,
+            settings=replace(view.settings, depth=depth, median_depth=needs.median_depth),
             features=features,
-            needed=target.mask if counted_only else None,
+            needed=None if needs.every_pixel else target.mask,
             backend=self._backend,
         )
         given = ViewRender(
@@ -392,9 +388,9 @@ class TensorStepper:
             tensor[index] = rows[name]
 
     def _observe(self, rendered: Rendered, tell: bool = True) -> None:
-        if self._density is not None and tell:
+        if self.parts.density is not None and tell:
             with one_thread():
-                self._density.observe(self.gaussians, rendered.output)
+                self.parts.density.observe(self.gaussians, rendered.output)
         self.shown = Shown(rendered.image.detach(), rendered.target, rendered.draw.view.name)
 
     def apply(self, iteration: int, in_backward: AdamInBackward | None = None) -> None:
@@ -409,10 +405,10 @@ class TensorStepper:
 
     def change(self, iteration: int) -> list[Change]:
         """Let the density strategy change the Gaussians; see `Stepper.change`."""
-        if self._density is None:
+        if self.parts.density is None:
             return []
         with one_thread():
-            self.gaussians, events = self._density.update(iteration, self.gaussians, self.optimizer)
+            self.gaussians, events = self.parts.density.update(iteration, self.gaussians, self.optimizer)
         return events
 
     def state(self) -> tuple[dict[str, dict[str, Tensor]], int]:
