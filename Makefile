@@ -101,7 +101,6 @@ sanitize:
 
 bench:
 	@tools/set_up.sh demo
-	@$(BIN)/python benchmarks/raster.py $(BENCH) --out out/bench/raster.json
 	@$(BIN)/python benchmarks/sphere.py $(BENCH) --out out/bench/sphere.json
 	@$(BIN)/python benchmarks/dense.py $(BENCH) --out out/bench/dense.json
 	@$(BIN)/python benchmarks/ladder $(BENCH) --out out/bench/ladder.json

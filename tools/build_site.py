@@ -56,7 +56,6 @@ BUILD_ON = {
     "docs/decisions/index.md": "Decision records",
     "docs/PRECISION.md": "Precision",
     "docs/KERNELS.md": "Kernels",
-    "benchmarks/archive/RESULTS-2026-11.md": "Earlier measurements",
     "conformance/README.md": "Conformance kit",
     "conformance/SPECIFICATION.md": "Specification of a renderer",
     "conformance/LENSES.md": "Specification of lenses",

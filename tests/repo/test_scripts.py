@@ -19,10 +19,7 @@ BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchm
 SHARED = {"captures.py", "hardware.py", "kernel_operations.py", "traced.py"}
 """Modules that the benchmarks and chapters import."""
 
-MADE = {
-    f"benchmarks/{name}"
-    for name in ("raster.py", "sphere.py", "dense.py", "ladder", "train_step.py", "serial.py")
-}
+MADE = {f"benchmarks/{name}" for name in ("sphere.py", "dense.py", "ladder", "train_step.py", "serial.py")}
 """Benchmarks that `make bench` runs."""
 
 TRAININGS = {
