@@ -51,7 +51,6 @@ BUILD_ON = {
     "docs/GSPLAT.md": "From gsplat",
     "reference/index.md": "Reference",
     "ARCHITECTURE.md": "Architecture",
-    "docs/MODULES.md": "Modules",
     "docs/DECISIONS.md": "Conventions",
     "docs/decisions/index.md": "Decision records",
     "docs/PRECISION.md": "Precision",

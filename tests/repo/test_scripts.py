@@ -44,7 +44,6 @@ ELSEWHERE = {
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
     "make_city.py": "tests/data/test_city.py",
-    "module_map.py": "tests/repo/test_docs.py",
     "neon.sh": "Makefile",
     "sanitize.sh": "Makefile",
     "stress.sh": "Makefile",
