@@ -18,7 +18,6 @@ import hardware
 import numpy as np
 import torch
 from jaxtyping import Float64
-from traced import traced_capture
 
 from gsplat_edu import load_backend, recipe, training
 from gsplat_edu.base.buffers import reused_buffers
@@ -29,6 +28,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Views
+from lab.captures.traced import traced_capture
 
 WHITE = (1.0, 1.0, 1.0)
 

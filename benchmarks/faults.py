@@ -41,7 +41,6 @@ import numpy as np
 import torch
 from captures import capture
 from jaxtyping import Bool, Float64
-from traced import traced_capture
 
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.budget.plan import Limits, plan
@@ -60,6 +59,7 @@ from gsplat_edu.scene.views import Photo, View
 from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.poses import Refinement, gauge
 from gsplat_edu.train.transients import resized_mask
+from lab.captures.traced import traced_capture
 
 TRACED = "traced"
 """Name of the ray-traced capture."""

@@ -27,7 +27,6 @@ import hardware
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
-from traced import LIGHT, Scene, Shape, camera_at, checks, photographed, placed
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.validation import whole_number
@@ -40,6 +39,7 @@ from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.sh import sh_basis
 from gsplat_edu.scene.views import View
+from lab.captures.traced import LIGHT, Scene, Shape, camera_at, checks, photographed, placed
 
 PLATE, GREY = 0.6, (0.22, 0.3, 0.24)
 """Strength of the plate's highlight and its darker colour; the brighter one is a tenth brighter."""

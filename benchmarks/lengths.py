@@ -2,7 +2,7 @@
 
     python benchmarks/lengths.py [--photos N] [--seeds N] [--smoke] [--out FILE.json]
 
-Many: traces N photos of boxes under a sky (tests/fixtures), without and with the noise of a sensor, and trains them
+Many: traces N photos of boxes under a sky (lab/captures), without and with the noise of a sensor, and trains them
 for the iterations that standard plans and for four times as many. Few: `truck11`, and 12 training photos each of
 `snowmiku97` and `fox` (in $GSPLAT_EDU_DATA or ../shared/data), as `gsplat_edu.runs.thin` tries them: three quarters of
 the training photos, 240 px wide, for lengths up to 3,200; PSNR and `psnr_shifted` of the other quarter. One thread.
@@ -23,7 +23,6 @@ import hardware
 import numpy as np
 import torch
 
-from fixtures.outdoors import outdoor_capture
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
@@ -38,6 +37,7 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.length import planned_iterations
+from lab.captures.outdoors import outdoor_capture
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 

@@ -52,7 +52,6 @@ from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.dataset import TEST_EVERY, DataSettings, load_dataset
 from gsplat_edu.data.lens import FISHEYE, Lens, undistortion
-from gsplat_edu.data.lens_captures import LENS_KINDS, LENS_SCENES, LensCapture, lens_capture, with_rays
 from gsplat_edu.data.panorama import cut_face, face_pinhole, face_rotations, face_side
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
@@ -68,6 +67,7 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.length import QUALITIES, planned_iterations
+from lab.captures.lens_captures import LENS_KINDS, LENS_SCENES, LensCapture, lens_capture, with_rays
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))
 

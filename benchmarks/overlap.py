@@ -2,7 +2,7 @@
 
     python benchmarks/overlap.py [--photos N] [--seeds N] [--smoke] [--out FILE.json]
 
-Trains a traced room seen from within and a procedural city seen from the air (tests/fixtures), where few photos show
+Trains a traced room seen from within and a procedural city seen from the air (lab/captures), where few photos show
 the same, and `snowmiku97` at a third of its width (in $GSPLAT_EDU_DATA or ../shared/data), all of whose photos show
 one toy, at standard quality with multiples of the number of Gaussians that the recipe would plan if the photos
 overlapped. Prints PSNR on held-out photos and processor time; one thread.
@@ -23,8 +23,6 @@ import hardware
 import numpy as np
 import torch
 
-from fixtures.city import City, write_city
-from fixtures.room import room_capture
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
@@ -38,6 +36,8 @@ from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.length import planned_iterations
 from gsplat_edu.train.overlap import separate_views
+from lab.captures.city import City, write_city
+from lab.captures.room import room_capture
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 

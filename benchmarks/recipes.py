@@ -33,7 +33,6 @@ import numpy as np
 import torch
 from captures import capture
 from matplotlib.figure import Figure
-from traced import traced_capture
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import written_aside
@@ -51,6 +50,7 @@ from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.length import QUALITIES, UNIT
 from gsplat_edu.train.trainer import Trainer
+from lab.captures.traced import traced_capture
 
 try:
     import flip_evaluator

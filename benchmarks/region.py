@@ -27,7 +27,6 @@ from jaxtyping import Bool
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.data.region_masks import views_of_region
-from gsplat_edu.data.solids_photos import solids_capture
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.subject import subject_region
 from gsplat_edu.evaluate.metrics import psnr
@@ -41,6 +40,7 @@ from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.length import QUALITIES, planned_iterations
+from lab.captures.solids_photos import solids_capture
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 

@@ -3,7 +3,7 @@
     python benchmarks/surfaces.py [--captures NAME ...] [--iterations N] [--seed S] [--ball] [--smoke] [--out FILE.json]
 
 Captures: the textured box, the solids with textured, plain and glossy surfaces, and a block of the procedural city
-(tests/fixtures/city.py) from the air. Each is trained by the recipe `fast`, from start points that are off the surface
+(lab/captures/city.py) from the air. Each is trained by the recipe `fast`, from start points that are off the surface
 by 0.01, in the city by 0.05. Median depths of the training views are compared with the true ones at each pixel, and as
 points in space with the true surface: F1 at 0.01 world units, in the city 0.05, where only surface that a photo sees
 counts for recall. Ground far from the objects is left out. Then each scene is meshed, and the mesh compared.
@@ -29,23 +29,8 @@ import hardware
 import numpy as np
 import torch
 
-from fixtures.city import City
-from fixtures.city_paint import PITCH, Buildings
-from fixtures.outdoors import box_hits
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import run_command
-from gsplat_edu.data.solids import Part, SolidScene
-from gsplat_edu.data.solids_mesh import solids_mesh
-from gsplat_edu.data.solids_photos import (
-    FINISHES,
-    START_NOISE,
-    photograph_solids,
-    scan_solids,
-    solids_capture,
-    solids_orbit,
-)
-from gsplat_edu.data.solids_shapes import Block
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.surface import Comparison, Counts, score_points, score_surface, visible_points
 from gsplat_edu.mesh.extract import MeshResult, extract_mesh
@@ -62,6 +47,21 @@ from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import SETTINGS, recipe
+from lab.captures.city import City
+from lab.captures.city_paint import PITCH, Buildings
+from lab.captures.outdoors import box_hits
+from lab.captures.solids import Part, SolidScene
+from lab.captures.solids_mesh import solids_mesh
+from lab.captures.solids_photos import (
+    FINISHES,
+    START_NOISE,
+    photograph_solids,
+    scan_solids,
+    solids_capture,
+    solids_orbit,
+)
+from lab.captures.solids_shapes import Block
+from lab.captures.textured_box import box_orbit, photograph_box
 
 TAU = 0.01
 """Threshold of F1, world units. A point of the truth is seen if it is at most this far behind the true depth."""

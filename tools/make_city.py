@@ -11,9 +11,9 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from fixtures.city import City, write_city
+from lab.captures.city import City, write_city
 
 
 def main() -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fixtures.city import City, write_city
 from gsplat_edu.data.dataset import load_dataset
+from lab.captures.city import City, write_city
 
 SMALL = City(photos=9, width=48, street=0.25, points=30, seed=3)
 
