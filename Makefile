@@ -105,7 +105,6 @@ bench:
 	@$(BIN)/python benchmarks/dense.py $(BENCH) --out out/bench/dense.json
 	@$(BIN)/python benchmarks/ladder $(BENCH) --out out/bench/ladder.json
 	@$(BIN)/python benchmarks/train_step.py $(BENCH) --out out/bench/train_step.json
-	@$(BIN)/python benchmarks/serial.py $(BENCH) --out out/bench/serial.json
 
 notebooks:
 	@tools/set_up.sh dev

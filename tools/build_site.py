@@ -70,7 +70,6 @@ PICTURES = (
     "docs/images/capture.jpg",
     "docs/images/exposure-before-after.jpg",
     "docs/images/sky-before-after.jpg",
-    "docs/images/recipes-snowmiku97.png",
     "docs/images/studio.jpg",
 )
 TILES = ("notebooks/11_tiles.ipynb", 0)

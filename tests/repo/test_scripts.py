@@ -16,10 +16,10 @@ from processes import Program
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchmarks").glob("*/__main__.py"))
-SHARED = {"captures.py", "hardware.py", "kernel_operations.py", "traced.py"}
+SHARED = {"captures.py", "hardware.py", "kernel_operations.py"}
 """Modules that the benchmarks and chapters import."""
 
-MADE = {f"benchmarks/{name}" for name in ("sphere.py", "dense.py", "ladder", "train_step.py", "serial.py")}
+MADE = {f"benchmarks/{name}" for name in ("sphere.py", "dense.py", "ladder", "train_step.py")}
 """Benchmarks that `make bench` runs."""
 
 TRAININGS = {
