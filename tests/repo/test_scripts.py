@@ -43,7 +43,6 @@ ELSEWHERE = {
     "figure_photos.py": "tests/repo/test_figures.py",
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
-    "make_city.py": "tests/data/test_city.py",
     "neon.sh": "Makefile",
     "sanitize.sh": "Makefile",
     "stress.sh": "Makefile",
