@@ -121,7 +121,7 @@ def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
         f"--rootdir={ROOT}",
         f"--config-file={ROOT / 'pyproject.toml'}",
         "-o",
-        "pythonpath=tests conformance",
+        "pythonpath=tests conformance .",
     ]
     words += ["-q", "-x", "-p", "no:cacheprovider", "-p", "only_installed", "-m", "not own_process"]
     done = run_installed(
