@@ -1,1 +1,1 @@
-"""What measures and teaches the package and is not part of it: wheels do not contain it."""
+"""What tests, benchmarks and chapters need and users do not: wheels do not contain it."""
