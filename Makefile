@@ -101,12 +101,10 @@ sanitize:
 
 bench:
 	@tools/set_up.sh demo
-	@$(BIN)/python benchmarks/raster.py $(BENCH) --out out/bench/raster.json
 	@$(BIN)/python benchmarks/sphere.py $(BENCH) --out out/bench/sphere.json
 	@$(BIN)/python benchmarks/dense.py $(BENCH) --out out/bench/dense.json
 	@$(BIN)/python benchmarks/ladder $(BENCH) --out out/bench/ladder.json
 	@$(BIN)/python benchmarks/train_step.py $(BENCH) --out out/bench/train_step.json
-	@$(BIN)/python benchmarks/serial.py $(BENCH) --out out/bench/serial.json
 
 notebooks:
 	@tools/set_up.sh dev

@@ -3,7 +3,7 @@
     python benchmarks/blocks.py [CAPTURE] [--photos N] [--width PX] [--blocks N] [--iterations N] [--gaussians N]
                                 [--keep FOLDER] [--smoke] [--out FILE.json]
 
-Without CAPTURE, writes a procedural city (tests/fixtures/city.py) from the air. The capture is trained as a whole,
+Without CAPTURE, writes a procedural city (lab/captures/city.py) from the air. The capture is trained as a whole,
 and in blocks. The coarse model takes `COARSE` of the iterations. The blocks share the others: each photo is visited
 equally often in each of its blocks, and so often that as many pixels count in total as in the training of the whole.
 (A photo that shows two cells is visited in both blocks, where the other cell's pixels neither count nor are drawn.)
@@ -30,7 +30,6 @@ from typing import Any
 import hardware
 import numpy as np
 
-from fixtures.city import City, write_city
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
@@ -48,6 +47,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
+from lab.captures.city import City, write_city
 
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 

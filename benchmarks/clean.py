@@ -2,7 +2,7 @@
 
     python benchmarks/clean.py [RUN] [--count N] [--seed S] [--million] [--smoke] [--out FILE.json]
 
-Floaters are planted in the scene of a run (tests/fixtures/plant.py), between its training cameras and the surfaces
+Floaters are planted in the scene of a run (lab/captures/plant.py), between its training cameras and the surfaces
 that they see. Then the scene is cleaned with the run's photos. Recall is the fraction of planted floaters that are
 removed. Precision is the fraction of planted floaters among all splats that are removed as floaters, so removing a
 splat of the scene lowers it, whether or not the scene needs this splat. Splats that no view sees are listed
@@ -35,7 +35,6 @@ import torch
 from captures import capture
 
 import gsplat_edu.cli.main as command_line
-from fixtures.plant import floaters
 from gsplat_edu.clean.guard import Cleaning, clean
 from gsplat_edu.clean.judge import Reason
 from gsplat_edu.cli.running import run_command
@@ -44,6 +43,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import Subject, open_subject
 from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
+from lab.captures.plant import floaters
 
 MILLION = 1_000_000
 

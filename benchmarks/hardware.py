@@ -1,6 +1,6 @@
 """Describe the machine of a measurement and store the result.
 
-Importing this module puts tests/ on the path, so that benchmarks can import its fixtures.
+Importing this module puts the repository's root on the path, so that benchmarks can import `lab.captures`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 
 from gsplat_edu import _native
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 
 def describe() -> dict[str, str | int]:

@@ -33,7 +33,6 @@ import numpy as np
 import torch
 from captures import capture
 from matplotlib.figure import Figure
-from traced import traced_capture
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import written_aside
@@ -45,14 +44,12 @@ from gsplat_edu.evaluate.figures import save_figure
 from gsplat_edu.evaluate.metrics import ImageScore, OnImage, score_views, summarize
 from gsplat_edu.options import train as command
 from gsplat_edu.options.parser import OneLineParser
-from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
-from gsplat_edu.train import Start, Views, training
-from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.length import QUALITIES, UNIT
 from gsplat_edu.train.trainer import Trainer
+from lab.captures.traced import traced_capture
 
 try:
     import flip_evaluator
@@ -69,14 +66,6 @@ CAP = 100_000
 """Cap of mcmc if no run of adc has determined the number of Gaussians."""
 
 
-class Uniform(PlannedDensity):
-    """Density control of the fast recipe without its score: all visible Gaussians are equally likely to be split."""
-
-    def _score(self) -> torch.Tensor:
-        generator = torch.Generator().manual_seed(len(self.norm_sums))
-        return torch.rand(len(self.norm_sums), generator=generator) * (self.times_visible > 0)
-
-
 @dataclass(frozen=True)
 class Recipe:
     """A recipe to compare.
@@ -84,55 +73,12 @@ class Recipe:
     Args:
         strategy: Density control.
         iterations: Length of the run, before `--length`.
-        options: Further options of `gsplat-edu train`.
-        density: Replaces the density control of the fast recipe.
         quality: Lets the plan choose the length from the capture, unless `--length` scales `iterations`.
     """
 
     strategy: str
     iterations: int
-    options: tuple[str, ...] = ()
-    density: type[PlannedDensity] | None = None
     quality: str | None = None
-
-
-STANDARD = QUALITIES["standard"] * UNIT
-
-
-@dataclass(frozen=True)
-class Piece:
-    """The settings that omit a piece of the fast recipe.
-
-    Args:
-        options: Options of `gsplat-edu train`.
-        density: The density control without it.
-    """
-
-    options: tuple[str, ...] = ()
-    density: type[PlannedDensity] | None = None
-
-
-HALF_RATES = ("--set", "quats_rate=1e-3", "--set", "scales_rate=5e-3", "--set", "sh0_rate=2.5e-3")
-HALF_RATES += ("--set", "sh_rest_rate=1.25e-4", "--set", "opacities_rate=5e-2")
-
-PIECES = {
-    "small-photos": Piece(("--set", "fast_start_factor=1")),
-    "late-decay": Piece(("--set", "fast_decay=1")),
-    "score": Piece(density=Uniform),
-    "opacity-term": Piece(("--set", "fast_opacity_weight=0")),
-    "doubled-rates": Piece(HALF_RATES),
-    "late-means": Piece(("--set", "means_rate_final=1.6e-6")),
-}
-"""Pieces of the fast recipe by name."""
-
-
-def without(*names: str) -> Recipe:
-    """Return the fast recipe at standard quality without some of its pieces."""
-    left_out = [PIECES[name] for name in names]
-    options = tuple(word for piece in left_out for word in piece.options)
-    return Recipe(
-        "fast", STANDARD, options, next((piece.density for piece in left_out if piece.density), None)
-    )
 
 
 RECIPES = {
@@ -140,15 +86,8 @@ RECIPES = {
     "mcmc-7k": Recipe("mcmc", 7_000),
     "adc-30k": Recipe("adc", 30_000),
     **{f"fast-{name}": Recipe("fast", share * UNIT, quality=name) for name, share in QUALITIES.items()},
-    **{f"without-{name}": without(name) for name in PIECES},
-    **{f"only-{name}": without(*(other for other in PIECES if other != name)) for name in PIECES},
-    "no-piece": without(*PIECES),
-    "fast-4200": Recipe("fast", 4_200),
-    "adc-3k": Recipe("adc", STANDARD),
-    "mcmc-3k": Recipe("mcmc", STANDARD),
 }
-"""Recipes by name: adc and mcmc, the qualities of the fast recipe, and the fast recipe without a piece, with only
-one, and with none."""
+"""Recipes by name: adc and mcmc, and the qualities of the fast recipe."""
 
 DEFAULT = ("adc-7k", "mcmc-7k", *(f"fast-{name}" for name in QUALITIES))
 
@@ -219,11 +158,11 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
         else ["--iterations", str(max(1, round(recipe.iterations * arguments.length)))]
     )
     words = ["--strategy", recipe.strategy, *length, "--seed", str(seed)]
-    words += [*recipe.options, "--eval-every", "0", "--save-every", "0"]
+    words += ["--eval-every", "0", "--save-every", "0"]
     if arguments.resolution is not None:
         words += ["--resolution", str(arguments.resolution)]
     if recipe.strategy == "mcmc":
-        adc = [run["gaussians"] for run in results.of("adc-7k") or results.of("adc-3k")]
+        adc = [run["gaussians"] for run in results.of("adc-7k")]
         words += ["--max-gaussians", str(round(float(np.mean(adc))) if adc else CAP)]
     parser = OneLineParser(prog="recipes.py")
     command.add_arguments(parser)
@@ -231,23 +170,9 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
         folder = str(Path(scratch) / "run")
         options = command.options_from(parser.parse_args([str(arguments.data), *words, "--out", folder]))
         run = CaptureRun(plan(options, Limits(), quality=quality).options)
-        if recipe.density is not None:
-            run.trainer = with_density(run, recipe.density)
         config = settings_of(run)
         results.check(name, config)
         return {"recipe": name, "seed": seed, "options": " ".join(words), "config": config, **measured(run)}
-
-
-def with_density(run: CaptureRun, density: type[PlannedDensity]) -> Trainer:
-    """Make the trainer of a run again, before its first step, with another density control."""
-    made, config = run.trainer, run.options.config
-    return training(
-        config,
-        Views(run.dataset.train),
-        load_backend(run.options.backend),
-        Start(made.gaussians, made.stepper.parts.shell, made.extent),
-        density=density(config, made.gaussians),
-    )
 
 
 def settings_of(run: CaptureRun) -> dict[str, Any]:

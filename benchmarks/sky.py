@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from fixtures.outdoors import outdoor_capture, photograph
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.running import run_command
@@ -41,6 +40,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import View
+from lab.captures.outdoors import outdoor_capture, photograph
 
 Judges = Sequence[tuple[View, Bool[np.ndarray, "_ _"]]]
 """Views, and their pixels of sky."""

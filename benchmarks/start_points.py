@@ -25,7 +25,6 @@ import hardware
 import numpy as np
 import torch
 
-from fixtures.room import room_capture
 from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
@@ -40,6 +39,7 @@ from gsplat_edu.scene.rig import point_nearest_axes, scene_extent
 from gsplat_edu.sfm.triangulate import triangulate
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import recipe
+from lab.captures.room import room_capture
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 

@@ -1,18 +1,13 @@
 """How far from the true surface are the depths of trained scenes, with and without the setting `surface`?
 
-    python benchmarks/surfaces.py [--captures NAME ...] [--iterations N] [--seed S] [--ball] [--smoke] [--out FILE.json]
+    python benchmarks/surfaces.py [--captures NAME ...] [--iterations N] [--seed S] [--smoke] [--out FILE.json]
 
-Captures: the textured box, the solids with textured, plain and glossy surfaces, and a block of the procedural city
-(tests/fixtures/city.py) from the air. Each is trained by the recipe `fast`, from start points that are off the surface
-by 0.01, in the city by 0.05. Median depths of the training views are compared with the true ones at each pixel, and as
-points in space with the true surface: F1 at 0.01 world units, in the city 0.05, where only surface that a photo sees
-counts for recall. Ground far from the objects is left out. Then each scene is meshed, and the mesh compared.
-Last, the mesh gets a texture of the photos. It is drawn from held-out cameras between the training's, and compared with
-their photos at the pixels that it covers, beside renders of the splats at the same pixels.
-
-    python benchmarks/surfaces.py --ball
-
-places a coloured ball in three of the training photos. It shows what something that moved does to the texture.
+Captures: the textured box, and the solids with textured, plain and glossy surfaces (lab/captures). Each is trained by
+the recipe `fast`, from start points that are off the surface by 0.01. Median depths of the training views are compared
+with the true ones at each pixel, and as points in space with the true surface: F1 at 0.01 world units, where only
+surface that a photo sees counts for recall. Ground far from the objects is left out. Then each scene is meshed, and the
+mesh compared. Last, the mesh gets a texture of the photos. It is drawn from held-out cameras between the training's,
+and compared with their photos at the pixels that it covers, beside renders of the splats at the same pixels.
 """
 
 from __future__ import annotations
@@ -29,23 +24,8 @@ import hardware
 import numpy as np
 import torch
 
-from fixtures.city import City
-from fixtures.city_paint import PITCH, Buildings
-from fixtures.outdoors import box_hits
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.running import run_command
-from gsplat_edu.data.solids import Part, SolidScene
-from gsplat_edu.data.solids_mesh import solids_mesh
-from gsplat_edu.data.solids_photos import (
-    FINISHES,
-    START_NOISE,
-    photograph_solids,
-    scan_solids,
-    solids_capture,
-    solids_orbit,
-)
-from gsplat_edu.data.solids_shapes import Block
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.surface import Comparison, Counts, score_points, score_surface, visible_points
 from gsplat_edu.mesh.extract import MeshResult, extract_mesh
@@ -61,13 +41,22 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import training
-from gsplat_edu.train.config import SETTINGS, recipe
+from gsplat_edu.train.config import recipe
+from lab.captures.solids import Part, SolidScene
+from lab.captures.solids_mesh import solids_mesh
+from lab.captures.solids_photos import (
+    FINISHES,
+    START_NOISE,
+    photograph_solids,
+    scan_solids,
+    solids_capture,
+    solids_orbit,
+)
+from lab.captures.solids_shapes import Block
+from lab.captures.textured_box import box_orbit, photograph_box
 
 TAU = 0.01
 """Threshold of F1, world units. A point of the truth is seen if it is at most this far behind the true depth."""
-
-TAU_OF_CITY = 0.05
-"""The same in the city, whose photos are taken from ten units away: a pixel covers 0.03."""
 
 POINTS = 400_000
 """Number of points from depth maps that are compared; so dense that gaps between them do not limit recall."""
@@ -84,10 +73,7 @@ TEXTURES = {
 }
 """Textures that are compared."""
 
-BALL = np.array([0.0, -0.45, -0.75]), 0.3, np.array([0.95, 0.1, 0.8])
-"""Centre, radius and colour of the ball of --ball, world units and 0 to 1."""
-
-CAPTURES = ("box", *FINISHES, "city")
+CAPTURES = ("box", *FINISHES)
 """Names of the captures."""
 
 
@@ -102,7 +88,6 @@ class Capture:
         scans: True depth (H, W) and normals (H, W, 3) of each view.
         truth: The true surface.
         bounds: (2, 3) corners of the box that is compared.
-        tau: Threshold of F1, and largest depth behind the true one at which a point is seen, world units.
         held_out: Views between those of the training, from which textures are compared.
     """
 
@@ -112,8 +97,7 @@ class Capture:
     scans: list[tuple[np.ndarray, np.ndarray]]
     truth: Mesh
     bounds: np.ndarray
-    tau: float = TAU
-    held_out: Sequence[View] = ()
+    held_out: Sequence[View]
 
     @functools.cached_property
     def cameras(self) -> list[Camera]:
@@ -166,76 +150,10 @@ def box_of(size: int, count: int, seed: int, step: float) -> Capture:
     return Capture(views, noisy, np.concatenate(colors), scans, truth, bounds, held_out=held_out)
 
 
-def city_of(size: int, count: int, seed: int, step: float) -> Capture:
-    """Make the capture of a block of the city, whose truth are the faces of its boxes and the ground."""
-    del step  # its faces are flat
-    city = City(count, size, points=max(4_000 // count, 1), seed=seed)
-    views, points, colors = [], [], []
-    for index, (name, camera) in enumerate(city.cameras):
-        photo, places, paint = city.photograph(index)
-        views.append(View(camera, photo, name=name))
-        points.append(places)
-        colors.append(paint)
-    exact, rng = np.concatenate(points), np.random.default_rng(seed)
-    noisy = exact + TAU_OF_CITY * rng.normal(size=exact.shape)
-    scans = [scan_city(city.buildings, camera) for _, camera in city.cameras]
-    half = city.side / 2
-    bounds = np.array([[-half, -20.0, -half], [half, 0.1, half]])
-    truth = mesh_of_city(city.buildings, half + PITCH)
-    return Capture(views, noisy, np.concatenate(colors), scans, truth, bounds, TAU_OF_CITY)
-
-
-def scan_city(buildings: Buildings, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the exact depth (H, W) and normals (H, W, 3) of a photo's pixels; 0 where the sky is."""
-    rays = camera.rays().reshape(-1, 3)
-    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
-    eyes, directions = np.broadcast_to(camera.eye, rays.shape), rays / lengths
-    with np.errstate(divide="ignore"):
-        nearest = np.where(directions[:, 1] > 1e-9, -eyes[:, 1] / directions[:, 1], np.inf)
-    normals = np.where(np.isfinite(nearest)[:, None], [0.0, -1.0, 0.0], 0.0)
-    for number in range(len(buildings.places)):
-        distance, facing = box_hits(eyes, directions, *buildings.box(number))
-        hit = distance < nearest
-        nearest, normals = np.where(hit, distance, nearest), np.where(hit[:, None], facing, normals)
-    depth = np.where(np.isfinite(nearest), nearest / lengths[:, 0], 0.0)
-    return depth.reshape(camera.H, camera.W), normals.reshape(camera.H, camera.W, 3)
-
-
-def mesh_of_city(buildings: Buildings, half: float) -> Mesh:
-    """Return walls and roofs of all boxes, and a square of ground with sides of twice `half`; faces outward."""
-    corners = buildings.corners()  # numbered by x, then bottom and top, then z: 4 i + 2 j + k
-    walls = [(0, 1, 3, 2), (5, 4, 6, 7), (4, 0, 2, 6), (1, 5, 7, 3), (2, 3, 7, 6)]
-    quads = [[8 * b + c for c in wall] for b in range(len(corners)) for wall in walls]
-    ground = half * np.array([[-1.0, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]])
-    quads.append([8 * len(corners) + c for c in (0, 1, 2, 3)])
-    faces = np.array(quads)
-    return Mesh(
-        np.concatenate([corners.reshape(-1, 3), ground]),
-        np.concatenate([faces[:, [0, 2, 1]], faces[:, [0, 3, 2]]]),
-    )
-
-
 def between_views(cameras: list[Camera]) -> list[Camera]:
     """Return at most `HELD_OUT` of the odd ones among twice as many cameras as the training has."""
     odd = cameras[1::2]
     return odd[:: max(len(odd) // HELD_OUT, 1)][:HELD_OUT]
-
-
-def with_ball(capture: Capture) -> Capture:
-    """Return the capture with a ball in three of its photos; depths and held-out photos do not show it."""
-    (centre, radius, color), views = BALL, list(capture.train)
-    for index in range(0, len(views), -(-len(views) // 3)):
-        camera, image = views[index].camera, views[index].image.copy()
-        rays = camera.rays()
-        away = camera.eye - centre
-        a, b = (rays * rays).sum(axis=-1), (rays * away).sum(axis=-1)
-        inside = b * b - a * (away @ away - radius * radius)
-        depth = (-b - np.sqrt(np.maximum(inside, 0.0))) / a
-        behind = capture.scans[index][0]
-        hit = (inside > 0) & ((behind == 0) | (depth < behind))
-        image[hit] = np.rint(255.0 * color)
-        views[index] = View(camera, image, name=views[index].name)
-    return dataclasses.replace(capture, train=views)
 
 
 def lifted(camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -295,9 +213,9 @@ def measure_one(capture: Capture, iterations: int, seed: int, surface: bool) -> 
         visible_points,
         cameras=capture.cameras,
         depths=[depth for depth, _ in capture.scans],
-        tolerance=capture.tau,
+        tolerance=TAU,
     )
-    comparison = Comparison(capture.tau, seed=seed, bounds=capture.bounds)
+    comparison = Comparison(TAU, seed=seed, bounds=capture.bounds)
     scores = score_points(depths.points[chosen], capture.truth, comparison, counts)
     row |= mesh_scores(capture, trainer.gaussians, settings, comparison, counts)
     return row | {
@@ -347,8 +265,6 @@ def texture_scores(
     capture: Capture, found: MeshResult, gaussians: Gaussians, settings: RenderSettings
 ) -> dict[str, Any]:
     """Paint the mesh, and compare it with held-out photos at the pixels that it covers, beside the splats."""
-    if not capture.held_out:
-        return {}
     near = inside(found.mesh.corners.reshape(-1, 3), capture.bounds).reshape(-1, 3).all(axis=1)
     cut = Mesh(
         found.mesh.vertices, found.mesh.faces[near], found.mesh.colors
@@ -389,18 +305,13 @@ def measure(arguments: Any) -> dict[str, Any]:  # noqa: ANN401
     """Train and compare every capture."""
     size, count, step = (32, 6, 0.06) if arguments.smoke else (320, 32, 0.015)
     iterations = 10 if arguments.smoke else arguments.iterations
-    offered = any(setting.name == "surface" for setting in SETTINGS)
-    if not offered:
-        print("this version has no setting `surface`: trained without it only")
     table: dict[str, Any] = {"iterations": iterations}
     for name in arguments.captures:
         began = time.perf_counter()
-        make = {"box": box_of, "city": city_of}.get(name) or functools.partial(solids_of, name)
+        make = box_of if name == "box" else functools.partial(solids_of, name)
         capture = make(size, count, arguments.seed, step)
-        if arguments.ball and name != "city":  # its place is among the solids
-            capture = with_ball(capture)
         print(f"{name}: {count} photos and {capture.truth} in {time.perf_counter() - began:.1f} s")
-        for surface in (False, True) if offered else (False,):
+        for surface in (False, True):
             row = measure_one(capture, iterations, arguments.seed, surface)
             table[f"{name}, surface {'on' if surface else 'off'}"] = row
             print(
@@ -416,7 +327,6 @@ def main() -> int:
     parser.add_argument("--captures", nargs="+", choices=CAPTURES, default=CAPTURES, help="default: all")
     parser.add_argument("--iterations", type=int, default=2_000, help="steps (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed (default: %(default)s)")
-    parser.add_argument("--ball", action="store_true", help="place a ball in three of the photos")
     parser.add_argument("--threads", type=int, help="threads (default: torch's choice)")
     arguments = parser.parse_args()
     if arguments.threads is not None:

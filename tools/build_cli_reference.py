@@ -1,4 +1,4 @@
-"""Write docs/CLI.md, the command-line reference, from the parsers and the Makefile.
+"""Write docs/CLI.md, the command-line reference, from the parsers.
 
     python tools/build_cli_reference.py
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import re
 import sys
 from pathlib import Path
 
@@ -49,7 +48,6 @@ def reference() -> str:
     parts += [
         _section("python train/train_2d.py", _script("train_2d.py").build_parser()),
         _train_3d(),
-        _make(),
     ]
     return "\n".join(parts)
 
@@ -128,17 +126,9 @@ def _train_3d() -> str:
     )
 
 
-def _make() -> str:
-    """List the targets of the Makefile with the texts of `make help`."""
-    texts = re.findall(r'@echo "make ([a-z-]+) +(.*)"', (ROOT / "Makefile").read_text(encoding="utf-8"))
-    rows = [f"| `make {name}` | {_cell(text.replace('$(OUT)', 'out/sphere.png'))} |" for name, text in texts]
-    head = "## make\n\nEvery target sets up `.venv` first and skips that if it is up to date.\n\n"
-    return head + "\n".join(["| target | what it does |", "|---|---|", *rows]) + "\n"
-
-
 def main() -> None:
     """Write the file."""
-    argparse.ArgumentParser(description="Write docs/CLI.md from the parsers and the Makefile.").parse_args()
+    argparse.ArgumentParser(description="Write docs/CLI.md from the parsers.").parse_args()
     with written_aside(REFERENCE) as aside:
         aside.write_text(reference(), encoding="utf-8")
     print(f"wrote {REFERENCE.relative_to(ROOT)}")

@@ -51,12 +51,10 @@ BUILD_ON = {
     "docs/GSPLAT.md": "From gsplat",
     "reference/index.md": "Reference",
     "ARCHITECTURE.md": "Architecture",
-    "docs/MODULES.md": "Modules",
     "docs/DECISIONS.md": "Conventions",
     "docs/decisions/index.md": "Decision records",
     "docs/PRECISION.md": "Precision",
     "docs/KERNELS.md": "Kernels",
-    "benchmarks/archive/RESULTS-2026-11.md": "Earlier measurements",
     "conformance/README.md": "Conformance kit",
     "conformance/SPECIFICATION.md": "Specification of a renderer",
     "conformance/LENSES.md": "Specification of lenses",
@@ -72,7 +70,6 @@ PICTURES = (
     "docs/images/capture.jpg",
     "docs/images/exposure-before-after.jpg",
     "docs/images/sky-before-after.jpg",
-    "docs/images/recipes-snowmiku97.png",
     "docs/images/studio.jpg",
 )
 TILES = ("notebooks/11_tiles.ipynb", 0)

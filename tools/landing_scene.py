@@ -3,7 +3,7 @@
     python tools/landing_scene.py FOLDER        writes FOLDER/scene.html and FOLDER/scene.jpg
 
 Nothing is trained, so that the site builds in seconds: each face of a box and the ground carry Gaussians on a grid,
-with the colours that the ray tracer of `tests/fixtures/city.py` paints there.
+with the colours that the ray tracer of `lab/captures/city.py` paints there.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.append(str(ROOT / "tests"))
+sys.path.append(str(ROOT))
 
-from fixtures.city_paint import PITCH, Buildings, facade_colors, ground_colors  # noqa: E402
-from fixtures.outdoors import SUN  # noqa: E402
 from gsplat_edu.base.constants import C0, SH_OFFSET  # noqa: E402
 from gsplat_edu.evaluate.metrics import to_bytes  # noqa: E402
 from gsplat_edu.io.scene import Scene  # noqa: E402
@@ -31,6 +29,8 @@ from gsplat_edu.scene.camera import Camera  # noqa: E402
 from gsplat_edu.scene.gaussians import Gaussians  # noqa: E402
 from gsplat_edu.viewer import page  # noqa: E402
 from gsplat_edu.viewer.page_start import Start  # noqa: E402
+from lab.captures.city_paint import PITCH, Buildings, facade_colors, ground_colors  # noqa: E402
+from lab.captures.outdoors import SUN  # noqa: E402
 
 Rows = Float64[np.ndarray, "N 3"]
 

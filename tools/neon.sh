@@ -73,7 +73,7 @@ if [ -n "${WHEEL:-}" ]; then
     rm -rf "$here/wheel"
     "$python" -m zipfile -e "$WHEEL" "$here/wheel" || fail "$WHEEL is no wheel; make wheels TARGETS=linux-aarch64 builds one"
     package=$here/wheel
-    set -- -o pythonpath="tests conformance benchmarks" "$@"
+    set -- -o pythonpath="tests conformance benchmarks ." "$@"
     [ $# -gt 2 ] || set -- "$@" tests/test_losses.py tests/test_noise.py tests/native/test_parity.py -m "not own_process"
     unset GSPLAT_TEST_NATIVE
 else

@@ -12,7 +12,7 @@ from gsplat_edu.render.numpy_reference import project
 from gsplat_edu.scene.camera import Camera
 
 SIGMA = 2.0
-"""px: standard deviation of the splats of `scene` before their dilation, as in benchmarks/raster.py."""
+"""px: standard deviation of the splats of `scene` before their dilation."""
 
 
 class Splats(NamedTuple):
@@ -75,7 +75,7 @@ def projected(
 
 
 def scene(count: int, size: int, seed: int = 0, stretch: float = 1.0) -> Splats:
-    """Scatter splats of 2 px over a square screen, as benchmarks/raster.py does.
+    """Scatter splats of 2 px over a square screen.
 
     Args:
         count: Number of splats.

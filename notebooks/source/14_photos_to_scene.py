@@ -19,7 +19,7 @@
 # reliable, and one photo in twenty is blurred by motion. [Chapter 12](12_the_backward_pass.ipynb) made training
 # fast, but fast training on cameras that are wrong arrives early at nothing.
 #
-# The photos of this page show a house in a garden ([gsplat_edu.data.garden](../src/gsplat_edu/data/garden.py)). A ray
+# The photos of this page show a house in a garden ([lab.captures.garden](../lab/captures/garden.py)). A ray
 # tracer takes them of solid walls, roofs and tree crowns, so no set of splats can match them exactly. The window panes
 # mirror the sky, and the sky is infinitely far away, as outdoors.
 
@@ -41,9 +41,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from gsplat_edu import Z_NEAR, Camera, _native
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.garden import GARDEN_DISTANCE, MATERIALS, garden_camera, photograph_garden
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.data.textured_box import align_cameras
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import advice_lines, diagnosis_lines
@@ -57,11 +55,14 @@ from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.train.config import recipe
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
-sys.path.append(str(ROOT / "benchmarks"))
+sys.path += [str(ROOT), str(ROOT / "benchmarks")]
 from kernel_operations import operations
 from ladder.forward import tight
 from ladder.splats import from_cov2d
 from train_step import measure
+
+from lab.captures.garden import GARDEN_DISTANCE, MATERIALS, garden_camera, photograph_garden
+from lab.captures.textured_box import align_cameras
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 COUNT, WIDTH, ITERATIONS, BRIEFLY = (36, 320, 400, 200) if SHORT else (41, 480, 3000, 300)
@@ -226,7 +227,7 @@ assert np.median(off["found"]) < 1 < np.median(off["guess"])
 #
 # Photos know no north and no metre. Turn, move and enlarge the whole world, cameras and all, and every photo stays as
 # it is. So poses are compared with the truth after the similarity $x' = s R x + t$ that brings the centres closest
-# ([align_cameras](../src/gsplat_edu/data/textured_box.py), after Umeyama 1991).
+# ([align_cameras](../lab/captures/textured_box.py), after Umeyama 1991).
 #
 # The size of the remaining error can be predicted. A lens of $f$ pixels sees a pixel as $1/f$ radians, and at the
 # distance $D$ of the house a pixel is $D/f$ world units. Features are better than a pixel, but focal length and

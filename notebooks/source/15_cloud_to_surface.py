@@ -19,11 +19,13 @@
 # outside, and every pixel mixes many splats. This page takes a depth from a pixel, finds out why that depth is wrong,
 # and makes one mesh of the depths of many views.
 #
-# The scene is `solids` ([gsplat_edu.data.solids_photos](../src/gsplat_edu/data/solids_photos.py)): a bowl, rods, slots
-# and a torus on a floor, photographed by a ray tracer. The exact distance of any point to the surface is known.
+# The scene is `solids` ([lab.captures.solids_photos](../lab/captures/solids_photos.py)): a bowl, rods, slots and a
+# torus on a floor, photographed by a ray tracer. The exact distance of any point to the surface is known.
 
 # %%
 import os
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -36,7 +38,6 @@ from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from gsplat_edu import ALPHA_MAX, Z_NEAR, Camera
-from gsplat_edu.data.solids_photos import photograph_solids, solids_capture
 from gsplat_edu.evaluate.surface import sample_surface, visible_points
 from gsplat_edu.mesh.extract import extract_mesh
 from gsplat_edu.mesh.volume import SparseVolume
@@ -46,6 +47,10 @@ from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import recipe
+
+ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "lab" / "captures").is_dir())
+sys.path.append(str(ROOT))
+from lab.captures.solids_photos import photograph_solids, solids_capture
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 WIDTH, COUNT, ITERATIONS, SPLATS, WALLS = (100, 12, 150, 1500, 60) if SHORT else (200, 24, 1500, 6000, 600)

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from block_runs import RECIPE
-from fixtures.city import City, write_city
 from gsplat_edu.cli.main import main
+from lab.captures.city import City, write_city
 
 
 @pytest.fixture(scope="session")

@@ -10,11 +10,11 @@ from block_runs import RECIPE
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.cli.main import main
-from gsplat_edu.data.lens_captures import lens_capture
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.scene.projection import Projection
+from lab.captures.lens_captures import lens_capture
 from lens_captures import FISHEYE, write_room
 
 pytestmark = pytest.mark.slow

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from fixtures.plant import floaters
 from gsplat_edu.base.constants import C0
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
@@ -14,6 +13,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+from lab.captures.plant import floaters
 
 CPU = load_backend("cpu")
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import gsplat_edu.cli.main as command_line
-from fixtures.plant import floaters
 from gsplat_edu.base.constants import C0
 from gsplat_edu.clean.judge import SENTENCES
 from gsplat_edu.data.dataset import DataSettings, load_dataset
@@ -25,6 +24,7 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
+from lab.captures.plant import floaters
 from splats import splats_on
 
 SETTINGS = RenderSettings(depth=False, jacobian_limit=1.3)

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from fixtures.city import City, write_city
 from gsplat_edu.cli.main import main
 from gsplat_edu.data import images, reader
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs import pilot
+from lab.captures.city import City, write_city
 
 COUNTED = ((reader, "read_capture"), (images, "image_header"), (images, "image_size"))
 

@@ -18,9 +18,9 @@ from gsplat_edu.cli.sfm import options_from
 from gsplat_edu.cli.terminal import stage_bars
 from gsplat_edu.cli.train import with_poses
 from gsplat_edu.data.dataset import load_dataset
-from gsplat_edu.data.textured_box import box_camera, box_orbit, photograph_box
 from gsplat_edu.options.train import options_from as train_options_from
 from gsplat_edu.sfm.reconstruct import SfmOptions
+from lab.captures.textured_box import box_camera, box_orbit, photograph_box
 
 
 @pytest.fixture

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from doctor.rooms import room
-from fixtures.outdoors import outdoor_capture
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import View
+from lab.captures.outdoors import outdoor_capture
 
 pytestmark = pytest.mark.slow
 

@@ -5,9 +5,9 @@ import functools
 import numpy as np
 from PIL import Image
 
-from gsplat_edu.data.solids_photos import scan_solids, solids_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.scene.camera import Camera
+from lab.captures.solids_photos import scan_solids, solids_capture
 
 SIZE = (128, 96)
 """Width and height of the maps, px: twice the photos'."""

@@ -1,15 +1,14 @@
 """The cameras, points and photos of the city agree, and a seed determines every byte."""
 
 import hashlib
-import runpy
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fixtures.city import City, write_city
 from gsplat_edu.data.dataset import load_dataset
+from lab.captures import city as procedural
+from lab.captures.city import City, write_city
 
 SMALL = City(photos=9, width=48, street=0.25, points=30, seed=3)
 
@@ -53,9 +52,9 @@ def test_several_processes_write_the_same_bytes(written, tmp_path):
         assert len(digests) == 1, file
 
 
-def test_the_tool_writes_a_city(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_a_city(tmp_path, monkeypatch, capsys):
     words = [
-        "make_city.py",
+        "city",
         str(tmp_path / "city"),
         "--photos",
         "3",
@@ -67,7 +66,7 @@ def test_the_tool_writes_a_city(tmp_path, monkeypatch, capsys):
         "3",
     ]
     monkeypatch.setattr(sys, "argv", words)
-    runpy.run_path(str(Path(__file__).resolve().parents[2] / "tools" / "make_city.py"), run_name="__main__")
+    procedural.main()
     assert "3 photos of 16x12 px" in capsys.readouterr().out
     assert len(list((tmp_path / "city" / "images").iterdir())) == 3
 

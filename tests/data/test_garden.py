@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from gsplat_edu.data.garden import (
+from lab.captures.garden import (
     GARDEN_DISTANCE,
     GARDEN_TARGET,
     SOLIDS,
     garden_camera,
     photograph_garden,
 )
-from gsplat_edu.data.garden_paint import MATERIALS, SUN, noise_tile, sky_colors
+from lab.captures.garden_paint import MATERIALS, SUN, noise_tile, sky_colors
 
 SIZE = 96, 72
 

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from gsplat_edu import ArgumentError, Camera
-from gsplat_edu.data.fine_rays import fine_rays
-from gsplat_edu.data.garden import photograph_garden
-from gsplat_edu.data.lens_captures import (
+from gsplat_edu.scene.projection import Distortion, Projection
+from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
+from lab.captures.fine_rays import fine_rays
+from lab.captures.garden import photograph_garden
+from lab.captures.lens_captures import (
     LENS_KINDS,
     LENS_SCENES,
     fisheye_180,
@@ -15,10 +17,8 @@ from gsplat_edu.data.lens_captures import (
     shaken,
     with_rays,
 )
-from gsplat_edu.data.solids import solids
-from gsplat_edu.data.solids_photos import photograph_solids, solids_orbit
-from gsplat_edu.scene.projection import Distortion, Projection
-from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
+from lab.captures.solids import solids
+from lab.captures.solids_photos import photograph_solids, solids_orbit
 
 SIZE = 48
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fixtures.outdoors import outdoor_capture, photograph, sky_colors
+from lab.captures.outdoors import outdoor_capture, photograph, sky_colors
 
 
 @pytest.fixture(scope="module")

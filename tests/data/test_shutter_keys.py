@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.data.lens import Lens
-from gsplat_edu.data.lens_captures import LENS_SCENES, lens_capture
 from gsplat_edu.data.loading_notes import IgnoredShutters, MotionBlurs, RollingShutters
 from gsplat_edu.data.notes import UnusablePhotos
 from gsplat_edu.data.reader import CaptureReader
@@ -21,6 +20,7 @@ from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.projection import PINHOLE
 from gsplat_edu.scene.shutter import AT_ONCE, READOUTS, RollingShutter
+from lab.captures.lens_captures import LENS_SCENES, lens_capture
 
 NATIVE = DataSettings(lens="native", test_every=0)
 KEYS = {

@@ -11,17 +11,6 @@ from scipy.stats import chi2_contingency, chisquare
 from skimage.measure import marching_cubes
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.data.solids import Part, SolidScene, solids
-from gsplat_edu.data.solids_mesh import solids_mesh
-from gsplat_edu.data.solids_photos import (
-    LIGHT,
-    SolidsPhoto,
-    photograph_solids,
-    solids_capture,
-    solids_orbit,
-    texture_colors,
-)
-from gsplat_edu.data.solids_shapes import Block, Bowl, Rod, Torus, gradient
 from gsplat_edu.evaluate.surface import (
     Comparison,
     sample_surface,
@@ -31,6 +20,17 @@ from gsplat_edu.evaluate.surface import (
 )
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.scene.mesh import Mesh
+from lab.captures.solids import Part, SolidScene, solids
+from lab.captures.solids_mesh import solids_mesh
+from lab.captures.solids_photos import (
+    LIGHT,
+    SolidsPhoto,
+    photograph_solids,
+    solids_capture,
+    solids_orbit,
+    texture_colors,
+)
+from lab.captures.solids_shapes import Block, Bowl, Rod, Torus, gradient
 
 AXIS = np.array([2.0, -3.0, 6.0]) / 7
 SHAPES = {

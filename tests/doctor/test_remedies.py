@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from doctor.rooms import replaced, room, with_photo
-from fixtures.outdoors import outdoor_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.doctor.remedies import remedies_for, transients_for
 from gsplat_edu.scene.views import View
+from lab.captures.outdoors import outdoor_capture
 
 
 def written(folder, views, points):

@@ -46,6 +46,7 @@ def test_the_contracts_hold(copy):
         ("train/optimizer.py", "import gsplat_edu.ops.kernels"),
         ("render/torch_reference.py", "import gsplat_edu.render.numpy_reference"),
         ("scene/sh.py", "import torch"),
+        ("cli/main.py", "from lab.captures import solids"),
         ("ops/losses.py", "import gsplat_edu.data"),
         ("train/density/surgery.py", "import gsplat_edu.train.density.adc"),
     ],

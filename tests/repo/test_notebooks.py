@@ -15,7 +15,7 @@ from nbclient.exceptions import CellExecutionError
 
 from chapters import CHAPTERS, LINK, ROOT, SOURCES, redefinitions, tool
 
-LONGEST = 450  # largest number of lines of a chapter's source
+LONGEST = 460  # largest number of lines of a chapter's source
 
 
 @CHAPTERS
@@ -190,7 +190,7 @@ def test_links_of_chapters_lead_somewhere_and_modules_link_back(source):
             continue
         target = (ROOT / "notebooks" / link.partition("#")[0]).resolve()
         assert target.is_file(), f"{source.name}: {link} leads nowhere"
-        if target.is_relative_to(ROOT / "src"):
+        if target.is_relative_to(ROOT / "src") or target.is_relative_to(ROOT / "lab"):
             documented = ast.get_docstring(ast.parse(target.read_text())) or ""
             said = re.search(r"^Chapters?: (.*)$", documented, flags=re.MULTILINE)
             assert said and source.stem in said[1].rstrip(".").split(", "), (
@@ -199,7 +199,7 @@ def test_links_of_chapters_lead_somewhere_and_modules_link_back(source):
 
 
 def test_chapters_that_modules_name_link_them():
-    for module in sorted((ROOT / "src" / "gsplat_edu").rglob("*.py")):
+    for module in [*(ROOT / "src" / "gsplat_edu").rglob("*.py"), *(ROOT / "lab").rglob("*.py")]:
         documented = ast.get_docstring(ast.parse(module.read_text())) or ""
         for named in re.findall(r"^Chapters?: (.*)$", documented, flags=re.MULTILINE):
             for chapter in named.rstrip(".").split(", "):

@@ -16,13 +16,10 @@ from processes import Program
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchmarks").glob("*/__main__.py"))
-SHARED = {"captures.py", "hardware.py", "kernel_operations.py", "traced.py"}
+SHARED = {"captures.py", "hardware.py", "kernel_operations.py"}
 """Modules that the benchmarks and chapters import."""
 
-MADE = {
-    f"benchmarks/{name}"
-    for name in ("raster.py", "sphere.py", "dense.py", "ladder", "train_step.py", "serial.py")
-}
+MADE = {f"benchmarks/{name}" for name in ("sphere.py", "dense.py", "ladder", "train_step.py")}
 """Benchmarks that `make bench` runs."""
 
 TRAININGS = {
@@ -46,8 +43,6 @@ ELSEWHERE = {
     "figure_photos.py": "tests/repo/test_figures.py",
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
-    "make_city.py": "tests/data/test_city.py",
-    "module_map.py": "tests/repo/test_docs.py",
     "neon.sh": "Makefile",
     "sanitize.sh": "Makefile",
     "stress.sh": "Makefile",

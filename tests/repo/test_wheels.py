@@ -121,7 +121,7 @@ def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
         f"--rootdir={ROOT}",
         f"--config-file={ROOT / 'pyproject.toml'}",
         "-o",
-        "pythonpath=tests conformance",
+        "pythonpath=tests conformance .",
     ]
     words += ["-q", "-x", "-p", "no:cacheprovider", "-p", "only_installed", "-m", "not own_process"]
     done = run_installed(
@@ -182,9 +182,9 @@ def test_a_wheel_has_every_file_of_the_package(wheel):
 def test_wheels_have_no_modules_that_only_tests_and_benchmarks_use(wheel):
     archive = zipfile.ZipFile(wheel)
     packed = {archive.read(name) for name in archive.namelist()}
-    fixtures = {path.name: path.read_bytes() for path in (ROOT / "tests" / "fixtures").glob("[!_]*.py")}
-    assert {"city.py", "outdoors.py", "plant.py"} <= fixtures.keys()
-    assert not [name for name, data in fixtures.items() if data in packed]
+    captures = {path.name: path.read_bytes() for path in (ROOT / "lab" / "captures").glob("[!_]*.py")}
+    assert {"city.py", "garden.py", "outdoors.py", "plant.py", "solids.py"} <= captures.keys()
+    assert not [name for name, data in captures.items() if data in packed]
 
 
 def imports(source, module):
@@ -201,13 +201,13 @@ def test_packages_that_had_fixtures_have_only_modules_for_users(room):
     package = ROOT / "src" / "gsplat_edu"
     sources = list(package.rglob("*.py"))
     shown = [*ROOT.glob("notebooks/source/*.py"), ROOT / "README.md", *ROOT.glob("docs/*.md")]
-    text = "".join(path.read_text() for path in shown if path.name != "MODULES.md")
+    text = "".join(path.read_text() for path in shown)
     modules = {path: f"gsplat_edu.{room}.{path.stem}" for path in (package / room).glob("*.py")}
     del modules[package / room / "__init__.py"]
     assert len(modules) > 3
     for path, module in modules.items():
         users = [source for source in sources if source != path and imports(source, module)]
-        assert users or module in text, f"{module}: only tests use it; move it to tests/fixtures"
+        assert users or module in text, f"{module}: only tests use it; move it to lab/captures"
 
 
 def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):

@@ -9,7 +9,6 @@ import torch
 import panorama_room
 from gsplat_edu import Camera
 from gsplat_edu.budget.deadline import Deadline, TrialTime
-from gsplat_edu.data.lens_captures import LENS_SCENES, lens_photos, nearer
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
@@ -23,6 +22,7 @@ from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
+from lab.captures.lens_captures import LENS_SCENES, lens_photos, nearer
 from lens_captures import moving_photo, room_cameras
 
 

@@ -17,7 +17,6 @@ from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.runs.options import DataSettings, RunOptions
 from gsplat_edu.runs.processes import check_alike, facts, pack, unpack
@@ -25,6 +24,7 @@ from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.team import ALONE
+from lab.captures.textured_box import box_orbit, photograph_box
 from ranks import together
 from waiting import HERE, PATIENCE
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from fixtures.outdoors import outdoor_capture
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.options import train as command
@@ -15,6 +14,7 @@ from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.poses import LENSES, TWISTS
+from lab.captures.outdoors import outdoor_capture
 from passers_by import pasted
 
 pytestmark = pytest.mark.slow

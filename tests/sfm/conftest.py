@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from lab.captures.textured_box import box_orbit, photograph_box
 from sfm.textured_box import LIMIT
 
 

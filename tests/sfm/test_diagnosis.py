@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.diagnosis import FEW_FEATURES, Evidence, diagnosis, evidence, texture
+from lab.captures.textured_box import box_orbit, photograph_box
 from sfm.databases import write_database, write_photos
 
 GOOD = Evidence(16, 16, 900, 120, 100, 60, 0.1, 0.2, 1.0)

@@ -12,7 +12,6 @@ from PIL import Image
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.lens import FISHEYE, Lens
-from gsplat_edu.data.textured_box import align_cameras
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.scene.projection import Distortion, Projection
@@ -21,6 +20,7 @@ from gsplat_edu.sfm.options import SfmOptions, lens_choice
 from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import reconstruct
 from gsplat_edu.sfm.wide_lenses import angle_of_radius, camera_groups, lens_lines, rim_line
+from lab.captures.textured_box import align_cameras
 from panorama_room import SHARPER, averaged, colours_of, walk
 
 COUNT, W, H = 16, 360, 340

@@ -11,10 +11,10 @@ from PIL import Image
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import decode_mask
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.masks import find_masks, unused_folders, upright_masks
 from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from lab.captures.textured_box import box_orbit, photograph_box
 
 HIDDEN = np.s_[:, :120]
 """The part of photos 320 px wide that masks exclude; without masks, it has features."""

@@ -16,7 +16,6 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.depths import DepthSource, judged_depths
 from gsplat_edu.data.panorama import FACES, face_pinhole, face_rotations
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.data.textured_box import align_cameras
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.io.formats import read_scene
@@ -27,6 +26,7 @@ from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.scene.views import View
 from gsplat_edu.sfm.panoramas import are_panoramas, cut_panoramas
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from lab.captures.textured_box import align_cameras
 from panorama_room import held_out, panorama, photo, walk
 from sfm.engine_check import printed
 

@@ -11,9 +11,9 @@ from gsplat_edu.data.colors import make_profile
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import PhotoFile, load_photo
 from gsplat_edu.data.lens import Lens
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from lab.captures.textured_box import box_orbit, photograph_box
 from phone_photos import ORIENTATIONS, P3, as_stored, p3_as_srgb, quarters, save
 from sfm.textured_box import LIMIT, cameras_of, check
 

@@ -13,13 +13,13 @@ from PIL import Image
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.data.colmap import read_cameras
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.mapping import attempts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.result import publish, published
 from gsplat_edu.sfm.source import needs_poses
+from lab.captures.textured_box import align_cameras, box_orbit, photograph_box
 from sfm.textured_box import LIMIT, TURNED, cameras_of, check
 
 pytestmark = pytest.mark.usefixtures("colmap")

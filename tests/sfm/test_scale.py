@@ -12,7 +12,6 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.scale import Scale, read_scale
-from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.camera import Camera
@@ -20,6 +19,7 @@ from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.scale import Sight, placed
 from gsplat_edu.sfm.scale_text import Mark, marks_of, points_of
+from lab.captures.textured_box import align_cameras, box_orbit, photograph_box
 from sfm.textured_box import LIMIT, cameras_of
 
 A, B = np.array([-0.7, -1.0, -0.5]), np.array([0.7, -1.0, 0.5])

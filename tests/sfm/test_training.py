@@ -9,9 +9,9 @@ from PIL import Image
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.textured_box import align_cameras, box_camera, box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.views import View
+from lab.captures.textured_box import align_cameras, box_camera, box_orbit, photograph_box
 from sfm.test_video import write_video
 from sfm.textured_box import cameras_of, check
 

@@ -17,7 +17,6 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.data.textured_box import BOX_FACES, box_orbit, photograph_box
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
@@ -27,6 +26,7 @@ from gsplat_edu.sfm import colmap
 from gsplat_edu.sfm.colmap import _listen
 from gsplat_edu.sfm.triangulate import LEAST_POINTS, STAGES, triangulate
 from gsplat_edu.train.config import recipe
+from lab.captures.textured_box import BOX_FACES, box_orbit, photograph_box
 from waiting import PATIENCE
 
 pytestmark = pytest.mark.slow

@@ -12,9 +12,9 @@ import pytest
 
 import gsplat_edu
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.data.textured_box import box_camera, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
+from lab.captures.textured_box import box_camera, photograph_box
 from sfm.textured_box import cameras_of, check
 from systems import needs_posix
 

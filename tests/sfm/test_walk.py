@@ -6,9 +6,9 @@ import re
 import pytest
 from PIL import Image
 
-from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
 from gsplat_edu.sfm.candidates import SEQUENCE
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from lab.captures.textured_box import align_cameras, box_orbit, photograph_box
 from sfm.textured_box import MOVED, TURNED, cameras_of
 
 COARSER = 2

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.data.textured_box import align_cameras, box_camera, photograph_box
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from lab.captures.textured_box import align_cameras, box_camera, photograph_box
 from sfm.textured_box import cameras_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("colmap")]

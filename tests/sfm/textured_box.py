@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.textured_box import align_cameras
+from lab.captures.textured_box import align_cameras
 
 # At a focal length of 352 px, a pixel is 1/352 rad, or 4/352 of a unit at the distance of the box. Reprojection
 # errors are a quarter of a pixel. Poses also have errors of the lens, which so few and small photos hardly determine,

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap
+from lab.captures.textured_box import box_orbit, photograph_box
 from studio.pages import DROP, encoded, go, png, repeated, train_and_download, visitor_of
 from waiting import until_in
 

@@ -6,7 +6,7 @@ import re
 import cv2
 import pytest
 
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
+from lab.captures.textured_box import box_orbit, photograph_box
 from studio.pages import DROP, encoded, png
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
+from lab.captures.textured_box import box_orbit, photograph_box
 from studio.pages import DROP, encoded, go
 from waiting import until_in
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from fixtures.room import room_capture
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.train.capacity import PLANNED, PLANNED_PIXELS, PLANNED_VIEWS, SEPARATE, planned_gaussians
 from gsplat_edu.train.overlap import MOST_VIEWS, separate_views
+from lab.captures.room import room_capture
 
 
 def row(count, step):

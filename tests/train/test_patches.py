@@ -6,7 +6,6 @@ import torch
 
 from gsplat_edu import load_backend, recipe, training
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
 from gsplat_edu.train import patches
@@ -15,6 +14,7 @@ from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.objective import make_objective
 from gsplat_edu.train.patches import NEIGHBOURS, PATCHES, Neighbourhood, neighbours_of
 from gsplat_edu.train.view_model import Identity
+from lab.captures.textured_box import box_orbit, photograph_box
 
 
 class Box:

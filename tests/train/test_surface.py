@@ -11,7 +11,6 @@ import torch
 from gsplat_edu import load_backend, recipe, training
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.textured_box import BOX_FACES, box_orbit, photograph_box
 from gsplat_edu.options import train as train_options
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
@@ -21,6 +20,7 @@ from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.rendered import Rendered
 from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
+from lab.captures.textured_box import BOX_FACES, box_orbit, photograph_box
 
 
 @dataclass

@@ -31,7 +31,7 @@ Pair = tuple[float, float]
 
 MARGIN = 0.025
 """Width of the margin around a cell, as a fraction of the cell's side; both blocks learn what it shows. 0.05 costs
-0.04 dB (benchmarks/archive/RESULTS-2026-11.md)."""
+0.04 dB (the earlier results that benchmarks/RESULTS.md names)."""
 
 OUTLIERS = 0.01
 """The ground's rectangle leaves out this fraction of the points on each side, but no camera."""

@@ -1,7 +1,7 @@
 """Cost model of a training: memory and time for any number of Gaussians, pixels and iterations.
 
 Memory is the sum of everything held at the same time, added to the process's own; the constants were measured from
-outside on whole runs (benchmarks/archive/RESULTS-2026-11.md). Time is fitted to the steps measured by
+outside on whole runs (the earlier results that benchmarks/RESULTS.md names). Time is fitted to the steps measured by
 `gsplat_edu.budget.probe`.
 """
 
@@ -52,7 +52,7 @@ PER_PAIR = 75
 """Bytes per pair of Gaussian and tile: the pair, its gradient slot, a quarter for growth, and outgrown buffers."""
 
 TRAINED_PAIRS = 5
-"""Pairs per Gaussian in a trained scene; those in benchmarks/archive/RESULTS-2026-11.md have 3.4 to 5.0."""
+"""Pairs per Gaussian in a trained scene; the captures of benchmarks/RESULTS.md have 3.4 to 5.0."""
 
 PER_PIXEL = 180
 """Bytes per pixel during evaluation: float64 images and their differences. A training step takes fewer."""
@@ -72,14 +72,15 @@ GREY_BYTES = 2
 
 SURFACE_TIME = 3.0
 """Further time of a step that learns from normals and flatness, in times of a plain one
-(benchmarks/archive/RESULTS-2026-11.md, "Surfaces")."""
+("Surfaces" in the earlier results that benchmarks/RESULTS.md names)."""
 
 RAY_BYTES = 12
 """Bytes of a pixel's ray in float32."""
 
 DEPTH_TIME = {"points": 0.2, "maps": 1.0}
 """Further time of a step that compares its depth with given depth, in times of a plain one, by what gives it. Maps are
-taken to have a value for each pixel of a photo (benchmarks/archive/RESULTS-2026-11.md, "What the depth term costs")."""
+taken to have a value for each pixel of a photo
+("What the depth term costs" in the earlier results that benchmarks/RESULTS.md names)."""
 
 Amount = TypeVar("Amount", float, np.ndarray)
 """A number, or an array with one number for each iteration."""

@@ -7,7 +7,8 @@ training corrected exposures too, the colours are fitted with the pose.
 A photo of a rolling shutter has a motion of its own, too. It can be aligned with the pose (`moving`).
 
 The halves are the light and the dark squares of a chessboard. The left half alone determines some moves of the camera
-poorly. On a clean capture, alignment on it cost 0.4 dB on the right half (benchmarks/archive/RESULTS-2026-11.md).
+poorly. On a clean capture, alignment on it cost 0.4 dB on the right half (the earlier results
+that benchmarks/RESULTS.md names).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Depth maps of a scene for a mesh: rendered, checked against their neighbours, and weighted.
 
 A pixel's depth is the median depth, which ignores fog: on a textured box, meshes of mean depths had an F1 of 0.91 and
-those of median depths one of 0.97 (the archive of benchmarks/RESULTS.md). A depth is dropped where the scene is not
-opaque, where the surface is seen edge-on, where it is too far for the voxels, and where two neighbouring views see
-through it.
+those of median depths one of 0.97 (the earlier results that benchmarks/RESULTS.md names). A depth is dropped
+where the scene is not opaque, where the surface is seen edge-on, where it is too far for the voxels, and where two
+neighbouring views see through it.
 
 Weight of a pixel: cos(angle between ray and normal) / z², at most 1 at the nearest depth of the scene.
 

@@ -18,7 +18,8 @@ surface design")."""
 
 ROUNDS = 20
 """Pairs of steps. With 12 and 25, normals of the mesh of the benchmark's box are off by 5.6 and 5.0 degrees instead of
-8.4, and points by 0.0020 instead of 0.0022 (benchmarks/archive/RESULTS-2026-11.md, "Surfaces")."""
+8.4, and points by 0.0020 instead of 0.0022 ("Surfaces" in the earlier results that benchmarks/RESULTS.md
+names)."""
 
 
 def smoothed(mesh: Mesh, rounds: int = ROUNDS) -> Mesh:

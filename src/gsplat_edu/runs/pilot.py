@@ -50,7 +50,7 @@ PILOT_STEPS, PILOT_CAP = 600, 10_000
 
 LEAST_GAIN = 0.3
 """Refine more only if it gains at least this, dB. Pilots of captures with correct cameras differed by less
-(benchmarks/archive/RESULTS-2026-11.md)."""
+(the earlier results that benchmarks/RESULTS.md names)."""
 
 REPEATED_GAIN = 0.5
 """Refine the lens after its second pilot only if that gains at least this, dB. The second one gains 0.6 to 1.0 dB of a

@@ -50,7 +50,7 @@ NEWEST = 0.3
 """Smallest weight of a new measurement in a photo's running mean; its first measurements weigh 1, 1/2 and 1/3."""
 
 VIGNETTING_ERROR = 0.05
-"""Standard error of one photo's measured k (benchmarks/archive/RESULTS-2026-11.md)."""
+"""Standard error of one photo's measured k (the earlier results that benchmarks/RESULTS.md names)."""
 
 
 class Exposure(Identity):

@@ -32,7 +32,7 @@ from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm
 FEW_VISIBLE = 0.25
 """Regularise only the visible Gaussians if they are fewer than this fraction of all. Views of one subject show at least
 a third of the start's Gaussians, views of an aerial capture of a city a tenth
-(benchmarks/archive/RESULTS-2026-11.md)."""
+(the earlier results that benchmarks/RESULTS.md names)."""
 
 OUTSIDE_WEIGHT = 0.3
 """Weight of the mean alpha outside the masks of an object. 0.1 leaves 1.4 times the alpha outside, 3 costs 1.3 dB

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt8
 
 from gsplat_edu.base.validation import one_of, whole_number
-from gsplat_edu.data.fine_rays import fine_rays
-from gsplat_edu.data.solids import SolidScene, solids
-from gsplat_edu.data.solids_shapes import Points, SolidShape, Values, along_and_beside, gradient, lengths
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.views import View
+from lab.captures.fine_rays import fine_rays
+from lab.captures.solids import SolidScene, solids
+from lab.captures.solids_shapes import Points, SolidShape, Values, along_and_beside, gradient, lengths
 
 SOLIDS_TARGET = np.array([0.0, -0.25, 0.0])
 """Target of the cameras, world units."""

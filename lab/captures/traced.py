@@ -149,7 +149,8 @@ def _unit(vectors: Points) -> Points:
 
 
 def _bytes(values: Float64[np.ndarray, "..."]) -> np.ndarray:
-    return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    levels: np.ndarray = np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return levels
 
 
 def _traced(scene: Scene, eye: Float64[np.ndarray, "3 1"], directions: Points) -> Float64[np.ndarray, "4 N"]:
@@ -172,9 +173,8 @@ def _shaded(scene: Scene, shape: Shape, points: Points, directions: Points) -> P
     lit = np.all([np.isinf(other.hit(above, LIGHT)) for other in scene.shapes], axis=0)
     mirrored = 2 * diffuse * normals - LIGHT
     highlight = np.maximum(-(mirrored * directions).sum(axis=0), 0) ** scene.shininess * lit
-    return np.clip(
-        shape.texture(points) * (0.3 + 0.7 * np.maximum(diffuse, 0) * lit) + shape.gloss * highlight, 0, 1
-    )
+    colors: Points = shape.texture(points) * (0.3 + 0.7 * np.maximum(diffuse, 0) * lit)
+    return np.clip(colors + shape.gloss * highlight, 0, 1, out=colors)
 
 
 def checks(scale: float, dark: tuple[float, ...], bright: tuple[float, ...]) -> Texture:
@@ -192,7 +192,8 @@ def _waves(points: Points) -> Points:
     x, y, z = points
     ripple = 0.15 * np.sin(40 * x + 9 * np.sin(5 * y)) * np.sin(35 * z + 3 * x)
     base = [0.6 + 0.3 * np.sin(3 * x + z), 0.4 + 0.3 * np.cos(4 * y), 0.5 - 0.3 * np.sin(5 * z)]
-    return np.clip(np.stack(base) + ripple, 0, 1)
+    colors: Points = np.clip(np.stack(base) + ripple, 0, 1)
+    return colors
 
 
 def _stripes(points: Points) -> Points:

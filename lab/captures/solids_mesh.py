@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64, Int8, Int64
 
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.data.solids import SolidScene
 from gsplat_edu.scene.mesh import Mesh
+from lab.captures.solids import SolidScene
 
 BLOCK = 16
 """Cells along each side of the largest blocks that are skipped if the surface is too far away; a power of 2."""

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int8, UInt8
 
-from gsplat_edu.data.fine_rays import fine_rays
-from gsplat_edu.data.garden_paint import MATERIALS, SUN, Directions, Values, ground_colors, paint, sky_colors
 from gsplat_edu.scene.camera import Camera, look_at
+from lab.captures.fine_rays import fine_rays
+from lab.captures.garden_paint import MATERIALS, SUN, Directions, Values, ground_colors, paint, sky_colors
 
 GARDEN_TARGET = np.array([0.0, -0.6, 0.0])
 """Target of the cameras, world units; y points down, the ground is y = 0."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.data.solids_shapes import (
+from lab.captures.solids_shapes import (
     DOWN,
     Block,
     Bowl,

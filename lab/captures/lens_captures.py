@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from gsplat_edu.base.validation import one_of, whole_number
-from gsplat_edu.data.garden import GARDEN_TARGET, garden_camera, photograph_garden
-from gsplat_edu.data.solids import solids
-from gsplat_edu.data.solids_photos import SOLIDS_TARGET, photograph_solids, solids_orbit
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.projection import PINHOLE, Projection
 from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
 from gsplat_edu.scene.views import View
+from lab.captures.garden import GARDEN_TARGET, garden_camera, photograph_garden
+from lab.captures.solids import solids
+from lab.captures.solids_photos import SOLIDS_TARGET, photograph_solids, solids_orbit
 
 LENS_KINDS = ("fisheye", "panorama", "shutter_20", "shutter_40", "blur_8")
 """The kinds of cameras: a fisheye of 180 degrees, a whole sphere, pinholes that move during the readout, by 20 or 40 px

@@ -1,0 +1,1 @@
+"""What tests, benchmarks and chapters need and users do not: wheels do not contain it."""
