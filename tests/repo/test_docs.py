@@ -206,6 +206,25 @@ DOCUMENTS = sorted(
 )
 
 
+def anchors(text):
+    """Return the anchors of a document's headings, as GitHub and the site name them."""
+    headings = re.findall(
+        r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE
+    )
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_sections_that_links_name_exist():
+    links = 0
+    for path in DOCUMENTS:
+        for target, anchor in re.findall(r"\]\(([\w./-]*)#([\w-]+)\)", path.read_text()):
+            named = path.parent / target if target else path
+            if named.suffix == ".md":
+                assert anchor in anchors(named.read_text()), f"{path.relative_to(ROOT)}: {target}#{anchor}"
+                links += 1
+    assert links > 50
+
+
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_that_documents_name_exist(path):
     text = path.read_text()
