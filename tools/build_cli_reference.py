@@ -29,7 +29,7 @@ traceback. Ctrl-C and SIGTERM exit with code 130 (`view` with 0), and `train` sa
 with 1 if training would be pointless. Output paths are checked before long work starts. Options cannot be abbreviated.
 Every command explains itself with `--help`; `train --help` shows the common options, `train --help-all` all of them.
 
-Durations are written as `90s`, `20m`, `1h30m`; sizes as `500MB`, `4GiB`. [GUIDE.md](GUIDE.md) shows the commands at
+Durations are written as `90s`, `20m`, `1h30m`; sizes as `500MB`, `4GiB`. [TOUR.md](TOUR.md) shows the commands at
 work, [FORMATS.md](FORMATS.md) lists the scene formats, [RECIPE.md](RECIPE.md) explains the training parameters.
 """
 

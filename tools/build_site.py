@@ -32,7 +32,8 @@ PACKAGE = ROOT / "src" / "gsplat_edu"
 USE = {
     "README.md": "Install and first run",
     "docs/INSTALL.md": "Wheels and platforms",
-    "docs/GUIDE.md": "Guide",
+    "docs/TOUR.md": "Tour",
+    "docs/howto/README.md": "How-tos",
     "docs/EDITS.md": "Edited scenes",
     "docs/SCALE.md": "Larger than one machine",
     "docs/STUDIO.md": "The studio and its HTTP API",
@@ -161,8 +162,12 @@ def gather(stage: Path) -> None:
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
     documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if not name.endswith("/index.md")]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
-    for page in [*documents, *records]:
+    how_tos = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "howto").glob("*.md"))
+    for page in [*documents, *records, *how_tos]:
         _write(stage / page, relinked((ROOT / page).read_text(encoding="utf-8"), page, stage))
+    index = stage / "docs" / "howto" / "README.md"
+    pages = [page.stem for page in how_tos if page.stem != "README"]
+    _write(index, index.read_text(encoding="utf-8") + "\n" + _toctree("hidden:", pages))
     for page in chapters:
         notebook = json.loads((ROOT / page).read_text(encoding="utf-8"))
         for cell in notebook["cells"]:

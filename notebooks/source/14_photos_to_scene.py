@@ -370,7 +370,7 @@ compare([(f"{v.name} ({name})", v.image, balanced(name, v)[1]) for name in waver
 # gains twice as large would be as good. The gain of a held-out photo is measured on its left half, and the right half
 # is scored: that is "exposure fitted". `gsplat-edu train` looks at the photos and chooses by itself. Other faults have
 # their own remedies: `--refine` for poses that are a little off, `--transients` for passers-by, and `gsplat-edu clean`
-# for floaters. [GUIDE.md](../docs/GUIDE.md) shows what they do.
+# for floaters. The [how-tos](../docs/howto/README.md) show what they do.
 #
 # ## Where the time went
 #

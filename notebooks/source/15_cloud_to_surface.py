@@ -451,4 +451,4 @@ plt.show()
 #
 # With a capture of your own, `gsplat-edu train CAPTURE --out RUN --surface` trains with both losses of this page,
 # `gsplat-edu mesh RUN mesh.glb --texture` makes the mesh, and `--truth SCAN` measures it
-# ([GUIDE.md](../docs/GUIDE.md)). It began with [a point](01_points.ipynb).
+# ([Meshes](../docs/howto/mesh.md)). It began with [a point](01_points.ipynb).

@@ -15,6 +15,8 @@ from gsplat_edu.scene import projection, projection_formulas, shutter, sight
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "gsplat_edu"
 README = (ROOT / "README.md").read_text()
+TOUR = ROOT / "docs" / "TOUR.md"
+HOW_TOS = sorted((ROOT / "docs" / "howto").glob("*.md"))
 EXAMPLES = {
     f"{name}-{number}": example
     for name in ("README.md", "docs/PYTHON.md", "docs/GSPLAT.md")
@@ -44,16 +46,38 @@ def test_the_readme_stays_short_and_shows_two_pictures():
 
 
 def test_the_commands_that_the_documents_show_parse():
-    """Shell lines of the README and the guide, without running them."""
+    """Shell lines of the README, the tour and the how-tos, without running them."""
     shown = 0
-    for name in ("README.md", "docs/GUIDE.md"):
-        for block in re.findall(r"```\n(.*?)```", (ROOT / name).read_text(), flags=re.DOTALL):
-            for line in block.splitlines():
-                if line.startswith("gsplat-edu "):
-                    words = shlex.split(line, comments=True)[1:]
+    for path in (ROOT / "README.md", TOUR, *HOW_TOS):
+        for block in re.findall(r"^```\w*\n(.*?)^```$", path.read_text(), flags=re.DOTALL | re.MULTILINE):
+            for line in block.replace("\\\n", " ").splitlines():
+                command = re.sub(r"^torchrun .* -m gsplat_edu ", "gsplat-edu ", line)
+                if command.startswith("gsplat-edu "):
+                    words = shlex.split(command, comments=True)[1:]
                     build_parser(words).parse_args(words)
                     shown += 1
-    assert shown > 10
+    assert shown > 80
+
+
+def test_the_options_that_the_tour_and_the_how_tos_name_exist():
+    existing = set(re.findall(r"`(--[a-z-]+)", (ROOT / "docs" / "CLI.md").read_text()))
+    named = {option for path in (TOUR, *HOW_TOS) for option in re.findall(r"`(--[a-z-]+)", path.read_text())}
+    assert len(named) > 50
+    assert named - existing == {"--max-restarts"}, "which is torchrun's"
+
+
+def test_the_tour_and_the_how_tos_are_short():
+    assert len(HOW_TOS) > 20
+    for path in (TOUR, *HOW_TOS):
+        text = path.read_text()
+        assert len(text.split()) <= (1500 if path == TOUR else 700), path.name
+        assert longest_line(text) <= 120, path.name
+
+
+def test_the_index_names_every_how_to():
+    index = ROOT / "docs" / "howto" / "README.md"
+    named = re.findall(r"\]\(([\w-]+\.md)\)", index.read_text())
+    assert sorted([*named, "README.md"]) == [path.name for path in HOW_TOS]
 
 
 def test_every_make_target_is_explained_by_make_help():
@@ -155,6 +179,25 @@ DOCUMENTS = sorted(
         *ROOT.glob("benchmarks/**/*.md"),
     ]
 )
+
+
+def anchors(text):
+    """Return the anchors of a document's headings, as GitHub and the site name them."""
+    headings = re.findall(
+        r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE
+    )
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_sections_that_links_name_exist():
+    links = 0
+    for path in DOCUMENTS:
+        for target, anchor in re.findall(r"\]\(([\w./-]*)#([\w-]+)\)", path.read_text()):
+            named = path.parent / target if target else path
+            if named.suffix == ".md":
+                assert anchor in anchors(named.read_text()), f"{path.relative_to(ROOT)}: {target}#{anchor}"
+                links += 1
+    assert links > 50
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -90,7 +90,14 @@ def test_every_chapter_document_and_module_has_a_page(site):
     pages, out = site
     names = {str(path.relative_to(out).with_suffix("")) for path in pages}
     assert {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")} <= names
-    assert {"README", "ARCHITECTURE", "docs/DECISIONS", "reference/gsplat_edu.scene.camera"} <= names
+    assert {
+        "README",
+        "ARCHITECTURE",
+        "docs/DECISIONS",
+        "docs/TOUR",
+        "reference/gsplat_edu.scene.camera",
+    } <= names
+    assert {f"docs/howto/{path.stem}" for path in (ROOT / "docs" / "howto").glob("*.md")} <= names
     assert len([name for name in names if name.startswith("reference/gsplat_edu")]) == len(MODULES)
     course = [page for path, page in pages.items() if path.parent.name == "notebooks"]
     assert all("img" in page.tags for page in course), "the page has figures"

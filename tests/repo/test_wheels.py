@@ -200,7 +200,7 @@ def test_packages_that_had_fixtures_have_only_modules_for_users(room):
     """Each module of these packages is imported by the package, or used in the course or the documents."""
     package = ROOT / "src" / "gsplat_edu"
     sources = list(package.rglob("*.py"))
-    shown = [*ROOT.glob("notebooks/source/*.py"), ROOT / "README.md", *ROOT.glob("docs/*.md")]
+    shown = [*ROOT.glob("notebooks/source/*.py"), ROOT / "README.md", *ROOT.glob("docs/**/*.md")]
     text = "".join(path.read_text() for path in shown)
     modules = {path: f"gsplat_edu.{room}.{path.stem}" for path in (package / room).glob("*.py")}
     del modules[package / room / "__init__.py"]

@@ -38,7 +38,7 @@ COMMANDS = {
     "mask": "exclude parts of a photo by its mask, or restore the mask as it was",
     "info": "summarise a capture, a run, a scene file or this computer on one screen",
 }
-"""Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `cli.options`."""
+"""Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `gsplat_edu.options`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
