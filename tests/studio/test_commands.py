@@ -6,6 +6,7 @@ import pytest
 
 from gsplat_edu.cli.main import build_parser
 from gsplat_edu.jobs.record import Purpose, Work
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.command_options import (
     CLEAN_OPTIONS,
     CONVERT_OPTIONS,
@@ -17,7 +18,6 @@ from gsplat_edu.studio.command_options import (
 )
 from gsplat_edu.studio.commands import command_line, subject_of, title_of, work_of
 from gsplat_edu.studio.library import Library
-from gsplat_edu.studio.refusal import RefusedError
 from waiting import until
 
 

@@ -19,7 +19,7 @@ import pytest
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.viewer.serve import REQUEST_SECONDS
+from gsplat_edu.server.serving import REQUEST_SECONDS
 from processes import Program
 from waiting import HERE, PATIENCE, until
 

@@ -11,7 +11,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import install_command
 from gsplat_edu.cli.printing import say
 from gsplat_edu.cli.screen import has_screen, open_in_browser
-from gsplat_edu.viewer.serve import exposure
+from gsplat_edu.server.address import exposure
 
 NEEDED = ("starlette", "uvicorn", "h11")
 """Modules of the extra `studio`."""

@@ -46,6 +46,7 @@ from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
+from gsplat_edu.server.address import PORT, exposure, free_port
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
 from gsplat_edu.train.capacity import advised_side
@@ -57,7 +58,6 @@ from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
 from gsplat_edu.viewer.live import NAMES, LiveView
 from gsplat_edu.viewer.live_folder import LiveFolder
-from gsplat_edu.viewer.serve import PORT, exposure, free_port
 from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, Watcher, page_facts
 
 LINES = 20

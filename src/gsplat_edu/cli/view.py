@@ -18,11 +18,12 @@ from gsplat_edu.io.formats import LOD_META, SOG_META, file_in
 from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.server.address import exposure
 from gsplat_edu.viewer import export, page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 from gsplat_edu.viewer.page_mesh import open_meshes
-from gsplat_edu.viewer.serve import PageServer, exposure
+from gsplat_edu.viewer.serve import PageServer
 from gsplat_edu.viewer.stream import folder_page
 
 

@@ -11,9 +11,9 @@ from gsplat_edu.base.quantities import bytes_of, seconds_of
 from gsplat_edu.base.text import option_flag, shortened
 from gsplat_edu.data.settings import LENS_MODES
 from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.sfm.scale_text import check_scale
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.train.config import APPEARANCES, REFINEMENTS, SETTABLE, SKIES, STRATEGIES
 from gsplat_edu.train.length import QUALITIES
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS

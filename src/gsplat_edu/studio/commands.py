@@ -12,6 +12,7 @@ from typing import Any
 
 from gsplat_edu.base.text import legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
+from gsplat_edu.server.refusal import RefusedError, conflict
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.command_options import (
     CLEAN_OPTIONS,
@@ -28,7 +29,6 @@ from gsplat_edu.studio.contents import files_within
 from gsplat_edu.studio.library import Library, scene_file
 from gsplat_edu.studio.listing import is_unfinished
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
-from gsplat_edu.studio.refusal import RefusedError, conflict
 
 EXPORTS = "exports"
 """Folder of an entry with the files that were exported from it."""

@@ -22,7 +22,7 @@ from gsplat_edu.base.errors import SplatError
 from gsplat_edu.base.files import described, unreadable
 from gsplat_edu.base.reading import open_file, parse_json
 from gsplat_edu.base.text import bounded, legible, shortened, whole_of
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
+from gsplat_edu.server.refusal import RefusedError, conflict, not_found, too_large
 from gsplat_edu.studio.state import Studio
 
 MOST_JSON = 16 << 20

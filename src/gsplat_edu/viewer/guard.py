@@ -2,7 +2,7 @@
 
 Browsers let any page send requests to any address. So each request must pass three checks:
 
-- Host names this computer (`gsplat_edu.viewer.serve.names_this_computer`); this prevents DNS rebinding.
+- Host names this computer (`gsplat_edu.server.address.names_this_computer`); this prevents DNS rebinding.
 - Origin, required unless the method only reads, has the same host and port: the page was served here. A request that
   only reads must come from the server's own page too, if the browser sends Sec-Fetch-Site. Only the page itself may be
   opened from elsewhere, with the token.
@@ -19,7 +19,7 @@ import secrets
 import urllib.parse
 from collections.abc import Callable, Sequence
 
-from gsplat_edu.viewer.serve import names_this_computer
+from gsplat_edu.server.address import names_this_computer
 
 TOKEN_BYTES = 16
 """Random bytes of a token: 2^128 possibilities cannot be guessed."""

@@ -37,10 +37,11 @@ from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.server.address import PORT, url_of
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.guard import Guard
 from gsplat_edu.viewer.live_folder import WAIT
-from gsplat_edu.viewer.serve import CHUNK, PORT, PageHandler, PageServer, url_of
+from gsplat_edu.viewer.serve import CHUNK, PageHandler, PageServer
 from gsplat_edu.viewer.snapshots import page_facts
 
 NAMES = ("--view-host", "--view-port")
