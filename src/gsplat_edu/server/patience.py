@@ -58,8 +58,9 @@ class Patience:
 
         async def yielding(message: Message) -> None:
             whole = memoryview(message.get("body", b""))
-            for begin in range(0, len(whole) - CHUNK, CHUNK):
+            for begin in range(0, max(len(whole) - CHUNK, 0), CHUNK):
                 await send({**message, "body": whole[begin : begin + CHUNK], "more_body": True})
+                await asyncio.sleep(0)
             if len(whole) > CHUNK:
                 message = {**message, "body": whole[(len(whole) - 1) // CHUNK * CHUNK :]}
             await send(message)

@@ -24,7 +24,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.server.address import bound_socket, url_of
 
-logging.getLogger("uvicorn.error").setLevel(logging.ERROR)  # not a line for each request that is no HTTP
+LOG = logging.getLogger("uvicorn.error")
+"""uvicorn's log of errors, which goes to the terminal."""
+
+LOG.setLevel(logging.ERROR)  # not a line for each request that is no HTTP
 
 TOKEN_BYTES = 16
 """Random bytes of a token: 2^128 possibilities cannot be guessed."""
@@ -49,6 +52,15 @@ GRACEFUL = 2
 
 Own = TypeVar("Own")
 """The class of a server."""
+
+
+def _is_fault(record: logging.LogRecord) -> bool:
+    """Return whether a record is about a fault, and not about a request that the server's end has cut off."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, asyncio.CancelledError) and not record.getMessage().startswith("Cancel ")
+
+
+LOG.addFilter(_is_fault)
 
 
 class Server:
