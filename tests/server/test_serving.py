@@ -1,4 +1,4 @@
-"""The server in the foreground: Ctrl-C ends it without a complaint, whatever its browsers do."""
+"""The server's begin and end: Ctrl-C ends it without a complaint, and one that cannot begin says so."""
 
 import re
 import signal
@@ -6,6 +6,7 @@ import socket
 
 import pytest
 
+from gsplat_edu.server.serving import Server
 from processes import Program
 from waiting import PATIENCE, until
 
@@ -38,3 +39,19 @@ def test_ctrl_c_ends_a_server_although_a_browser_does_not_read(tmp_path):
     finally:
         program.process.kill()
         program.process.join()
+
+
+async def broken(scope, receive, send):
+    """An application that does not start."""
+    await receive()
+    await send({"type": "lifespan.startup.failed", "message": "broken"})
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_server_whose_application_does_not_start_says_so():
+    with Server() as server:
+        with pytest.raises(RuntimeError, match="ended before it answered"):
+            server.start(broken)
+        port = server.port
+    with Server(port=port):
+        pass

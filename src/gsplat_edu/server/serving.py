@@ -119,6 +119,9 @@ class Server:
         Args:
             app: The application.
             ending: As for `run`.
+
+        Raises:
+            RuntimeError: it ended before it answered, because the application did not start.
         """
         ready = threading.Event()
         server = self._server = _Uvicorn(app, ready.set, ending)
@@ -132,6 +135,8 @@ class Server:
         self._thread = threading.Thread(target=answer, name="server", daemon=True)
         self._thread.start()
         ready.wait()
+        if not server.started:
+            raise RuntimeError("the server ended before it answered")
 
     def stop(self) -> None:
         """Stop answering, if it was started, and stop listening."""
