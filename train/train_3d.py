@@ -11,10 +11,9 @@ from __future__ import annotations
 import argparse
 import sys
 
-from gsplat_edu.cli.options.demo import add_arguments
-
 from gsplat_edu.cli.running import run_command
 from gsplat_edu.cli.sphere import options_from, run_sphere
+from gsplat_edu.options.demo import add_arguments
 from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.train.events import DensifyEvent, StepEvent
 from gsplat_edu.train.trainer import Trainer

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
-from gsplat_edu.cli import view
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, write_path
 from gsplat_edu.io.formats import write_scene
@@ -50,6 +49,13 @@ for number, name in enumerate(("stdin", "stdout", "stderr")):
 """
     + COMMAND
 )
+PRESSED = """
+import signal
+from gsplat_edu.cli import view
+view.has_screen = lambda: signal.raise_signal(signal.SIGINT) or False
+"""
+"""Presses Ctrl-C once the address was printed."""
+
 ORIGIN = (512.0, -64.0, 8.0)
 ORANGE = (1.0, 0.5, 0.0)
 
@@ -153,17 +159,12 @@ def test_levels_of_detail_are_served_with_their_files(tmp_path):
     assert printed.splitlines()[0] == f"{path}: levels of 40, 20 splats, 25 files"
 
 
-def test_ctrl_c_right_after_the_address_was_printed_ends_the_command_cleanly(made, monkeypatch, capsys):
+@own_process
+def test_ctrl_c_right_after_the_address_was_printed_ends_the_command_cleanly(made, tmp_path):
     """The line says that Ctrl-C stops it; the server may not have begun to answer yet."""
-
-    def pressed():
-        signal.raise_signal(signal.SIGINT)
-        return False
-
-    monkeypatch.setattr(view, "has_screen", pressed)
-    assert command_line.main(["view", str(made[1]), "--port", "0"]) == 0
-    said = capsys.readouterr()
-    assert said.out.endswith("   (press Ctrl-C to stop)\nended\n") and said.err == ""
+    program = Program(PRESSED + COMMAND, ["view", made[1], "--port", "0"], tmp_path)
+    code, said, complaints = program.ended(PATIENCE)
+    assert (code, complaints) == (0, "") and said.endswith("   (press Ctrl-C to stop)\nended\n")
 
 
 @pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")

@@ -28,14 +28,13 @@ def test_a_capture_is_served_with_its_photos_and_findings(tmp_path):
         url, token = re.fullmatch(
             r"(http://\S+/)(\?token=\S+)   \(press Ctrl-C to stop\)\n", lines[2]
         ).groups()
-        page = urllib.request.urlopen(f"{url}{token}", timeout=PATIENCE)
+        visitor = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        page = visitor.open(f"{url}{token}", timeout=PATIENCE)
         assert "script-src 'sha256-" in page.headers["Content-Security-Policy"]
         assert b"view_003.png" in page.read()
-        photo = urllib.request.urlopen(
-            f"{url}thumbs/images/view_003.png{token}&side=128", timeout=PATIENCE
-        ).read()
+        photo = visitor.open(f"{url}thumbs/images/view_003.png?side=128", timeout=PATIENCE).read()
         assert photo[:2] == b"\xff\xd8"
-        until(lambda: json.load(urllib.request.urlopen(f"{url}findings{token}", timeout=PATIENCE))["done"])
+        until(lambda: json.load(visitor.open(f"{url}findings", timeout=PATIENCE))["done"])
         process.send_signal(signal.SIGINT)
         rest, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, rest, complaints) == (0, "ended\n", "")

@@ -11,8 +11,8 @@ from starlette.testclient import TestClient
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.app import application
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.uploads import Limits
 from gsplat_edu.studio.worker import answer

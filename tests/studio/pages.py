@@ -5,20 +5,16 @@ import contextlib
 import io
 import re
 import shlex
-import socket
-import threading
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from gsplat_edu.server.serving import Server
 from gsplat_edu.studio.app import application
-from gsplat_edu.studio.server import _config, _Server
 from gsplat_edu.studio.state import Studio
 from processes import Program
-from waiting import PATIENCE, awaited, until_in
-
-TOKEN = "a-token"
+from waiting import awaited, until_in
 
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main(sys.argv[1:]))"
 """The command line as a program."""
@@ -60,19 +56,13 @@ def served(folder, worker, limits=None):
     studio = Studio(folder, limits=limits)
     studio.worker.close()
     studio.worker = studio.painter.worker = worker
-    with socket.create_server(("127.0.0.1", 0)) as sock:
-        port = sock.getsockname()[1]
-        ready = threading.Event()
-        app = application(studio, TOKEN, cookie=f"studio_{port}")
-        server = _Server(_config(app), ready.set, studio.stream.close)
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]})
-        thread.start()
-        assert ready.wait(PATIENCE)
+    with Server(token=True) as server:
+        app = application(studio, server.token, cookie=server.cookie)
+        server.start(app, studio.stream.close)
         try:
-            yield studio, f"http://127.0.0.1:{port}/?token={TOKEN}"
+            yield studio, server.url
         finally:
-            server.should_exit = True
-            thread.join(PATIENCE)
+            server.stop()
             studio.close()
 
 

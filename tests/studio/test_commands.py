@@ -8,9 +8,9 @@ import pytest
 from gsplat_edu.cli.main import build_parser
 from gsplat_edu.jobs.record import Purpose, Work
 from gsplat_edu.options.offers import offered
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.commands import COMMANDS, command_line, subject_of, title_of, work_of
 from gsplat_edu.studio.library import Library
-from gsplat_edu.studio.refusal import RefusedError
 from waiting import until
 
 

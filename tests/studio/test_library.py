@@ -8,10 +8,10 @@ from importlib.resources import files
 
 import pytest
 
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio import contents as contents_module, library as library_module
 from gsplat_edu.studio.library import scene_file
 from gsplat_edu.studio.projects import newest_export
-from gsplat_edu.studio.refusal import RefusedError
 from photos import blank_png
 from studio.conftest import picture
 

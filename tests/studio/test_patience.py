@@ -9,11 +9,11 @@ import pytest
 
 from gsplat_edu.base.text import LONGEST_LINE, LONGEST_WORD, bounded
 from gsplat_edu.cli.main import main
-from gsplat_edu.studio.patience import LEAST_GAIN, Patience
-from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.server.patience import LEAST_GAIN, Patience
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.uploads import Limits
 from studio.conftest import Inline
-from studio.pages import TOKEN, served
+from studio.pages import served
 from studio.test_stream import ODD
 from waiting import finished
 
@@ -74,8 +74,9 @@ REQUESTS = {
 
 
 def connected(url):
-    port = int(url.partition("127.0.0.1:")[2].partition("/")[0])
-    head = f"HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAuthorization: Bearer {TOKEN}\r\n"
+    address, _, token = url.removeprefix("http://127.0.0.1:").partition("/?token=")
+    port = int(address)
+    head = f"HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAuthorization: Bearer {token}\r\n"
     return socket.create_connection(("127.0.0.1", port), timeout=180), head
 
 

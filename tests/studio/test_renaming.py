@@ -8,7 +8,7 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.jobs.record import Work
-from gsplat_edu.studio.refusal import RefusedError, conflict
+from gsplat_edu.server.refusal import RefusedError, conflict
 from gsplat_edu.studio.renaming import FORMER, FormerNames, names_along, rename_all
 from gsplat_edu.studio.state import Studio
 

@@ -16,10 +16,9 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.viewer.serve import REQUEST_SECONDS
+from gsplat_edu.server.serving import REQUEST_SECONDS
 from processes import Program
 from waiting import HERE, PATIENCE, until
 
@@ -310,10 +309,3 @@ def test_the_server_imports_no_torch():
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         == "[]\n"
     )
-
-
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys, tmp_path):
-    monkeypatch.setitem(sys.modules, "uvicorn", None)
-    assert main(["studio", str(tmp_path / "library")]) == 2
-    line = 'gsplat-edu studio: studio: uvicorn is not installed; pip install -c constraints.txt ".[studio]"\n'
-    assert capsys.readouterr().err == line and not (tmp_path / "library").exists()

@@ -10,8 +10,8 @@ import zipfile
 import pytest
 
 from gsplat_edu.base.zip_directory import TAIL
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio import uploads
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.unpack import ZipLimits, _check_directory, unpack
 from gsplat_edu.studio.uploads import Limits
 from studio.conftest import picture

@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio import workers
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.worker import answer
 from gsplat_edu.studio.workers import Worker
 from waiting import PATIENCE, until

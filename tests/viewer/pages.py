@@ -1,7 +1,6 @@
 """The viewer's pages in a tab: what a person does there and sees there. A redesign of a page changes its class here."""
 
 import base64
-import threading
 from contextlib import contextmanager
 
 import numpy as np
@@ -9,7 +8,6 @@ import numpy as np
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.scene.camera import Camera
 from viewer.handles import until
-from waiting import PATIENCE
 
 PIXELS = """async (camera) => {
   const { pixels } = await viewer.setCamera(camera);
@@ -30,13 +28,11 @@ RESTS = "Boolean(window.viewer?.isWhole && !viewer.frameAsked && !viewer.catchin
 @contextmanager
 def running(server):
     """Let a server of pages answer from a thread of this process."""
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
+    server.start(server.application())
     try:
         yield server
     finally:
-        server.shutdown()
-        thread.join(PATIENCE)
+        server.stop()
 
 
 def described(camera):

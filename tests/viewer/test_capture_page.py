@@ -360,10 +360,9 @@ def test_the_list_of_photos_works_without_seeing(opened):
 
 def ask(server, path, data=None, token=True, **headers):
     """Send a request; return the status and the body."""
-    address = f"http://127.0.0.1:{server.server_port}{path}"
     if token:
-        address += f"{'&' if '?' in path else '?'}token={server.guard.token}"
-    request = urllib.request.Request(address, data, headers)
+        headers = {"Cookie": f"{server.cookie}={server.token}"} | headers
+    request = urllib.request.Request(f"http://127.0.0.1:{server.port}{path}", data, headers)
     try:
         with urllib.request.urlopen(request, timeout=180) as answer:
             return answer.status, answer.read()
@@ -397,17 +396,17 @@ def test_photos_are_upright_small_and_only_those_of_the_capture(served, folder):
 def test_only_the_page_itself_with_its_token_may_ask(served, folder):
     name = next(iter(served.photos))
     body = json.dumps({"photos": [name], "back": False}).encode()
-    origin = {"Origin": f"http://127.0.0.1:{served.server_port}"}
+    origin = {"Origin": f"http://127.0.0.1:{served.port}"}
     for path in ("/", "/findings", f"/thumbs/{name}?side=128"):
         assert ask(served, path, token=False)[0] == 403, path
         assert ask(served, path)[0] == 200, path
         assert ask(served, path, Host="attacker.example")[0] == 403, path
-    cookie = {"Cookie": f"gsplat_edu_{served.server_port}={served.guard.token}"}
+    cookie = {"Cookie": f"{served.cookie}={served.token}"}
     assert ask(served, "/left-out", body, token=False, **origin)[0] == 403
     assert ask(served, "/left-out", body, token=False, **cookie)[0] == 403  # without an Origin
     assert ask(served, "/left-out", body, token=False, **cookie, Origin="http://a.example")[0] == 403
     assert read_left_out(folder) == ()
-    assert ask(served, "/findings", body, token=False, **cookie, **origin)[0] == 404
+    assert ask(served, "/findings", body, token=False, **cookie, **origin)[0] == 405
     for bad in (
         b"{",
         b"[]",

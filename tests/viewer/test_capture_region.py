@@ -126,8 +126,8 @@ def test_on_a_phone_the_box_stays_in_sight_and_nothing_is_grave(opened):  # noqa
 def test_a_request_that_is_no_box_is_refused(served, folder, given):  # noqa: F811
     write_region(folder, Region(np.zeros(3), np.eye(3), np.ones(3)))
     sent = {
-        "Cookie": f"gsplat_edu_{served.server_port}={served.guard.token}",
-        "Origin": f"http://127.0.0.1:{served.server_port}",
+        "Cookie": f"{served.cookie}={served.token}",
+        "Origin": f"http://127.0.0.1:{served.port}",
     }
     assert ask(served, "/region", given, token=False, **sent)[0] == 400
     assert ask(served, "/region", b'{"region": null}', token=False, Cookie=sent["Cookie"])[0] == 403

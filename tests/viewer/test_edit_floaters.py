@@ -144,15 +144,18 @@ def test_a_late_answer_does_not_hide_a_running_judgement(opened):
 
 def test_only_the_page_may_start_a_judgement(served):
     own = {
-        "Cookie": served.guard.cookie.partition(";")[0],
-        "Origin": f"http://127.0.0.1:{served.server_port}",
+        "Cookie": f"{served.cookie}={served.token}",
+        "Origin": f"http://127.0.0.1:{served.port}",
     }
 
     def ask(method, path=FLOATERS, **headers):
-        connection = http.client.HTTPConnection(*served.server_address[:2], timeout=180)
-        connection.request(method, path, headers=headers)
-        answer = connection.getresponse()
-        return answer.status, answer.read()
+        connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=180)
+        try:
+            connection.request(method, path, headers=headers)
+            answer = connection.getresponse()
+            return answer.status, answer.read()
+        finally:
+            connection.close()
 
     for method in ("GET", "POST", "DELETE"):
         assert ask(method)[0] == 403

@@ -14,8 +14,8 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.source import file_settings
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.server.page_server import PageServer
 from gsplat_edu.viewer import page_parts
-from gsplat_edu.viewer.serve import PageServer
 from gsplat_edu.viewer.stream import folder_page
 from viewer.pages import running
 
@@ -58,7 +58,7 @@ def served(folder):
     with ExitStack() as stack:
 
         def make(budget):
-            server = stack.enter_context(PageServer(b"", policy=page_parts.policy(page_parts.LEVELS)))
+            server = stack.enter_context(PageServer(page_parts.policy(page_parts.LEVELS)))
             server.page, server.served = folder_page(folder, "scene", budget)
             return stack.enter_context(running(server))
 
@@ -146,13 +146,12 @@ def test_a_file_that_vanished_is_named(served, visit):
         ("/0_0/", 404),
         ("/0_0/../secret.json", 404),
         ("/../scene/lod-meta.json", 404),
-        ("/%6cod-meta.json", 404),
-        ("/lod-meta.json?x", 404),
+        ("/%2e%2e/scene/lod-meta.json", 404),
     ],
 )
 def test_only_files_that_the_index_names_are_served(folder, served, path, status):
     server = served(COUNT)
-    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=180)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=180)
     connection.request("GET", path)
     answer = connection.getresponse()
     body = answer.read()

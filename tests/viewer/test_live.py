@@ -16,10 +16,10 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.server.page_server import PageServer
 from gsplat_edu.train.checkpoint import list_checkpoints
 from gsplat_edu.viewer import live, snapshots
 from gsplat_edu.viewer.live import picture_camera
-from gsplat_edu.viewer.serve import PageServer
 from live_clients import (
     PATIENCE,
     STRATEGIES,
@@ -250,18 +250,34 @@ def test_clients_that_send_nonsense_do_no_harm(capture, tmp_path, capfd):
             ("/picture", b"{}"),
             ("/picture", b"[" * 8000),
             ("/picture", json.dumps(GOOD | {"W": 10**12}).encode()),
-            ("/", b"{}"),
-            ("/nothing", b"{}"),
         ):
             assert client.ask("POST", path, body)[0] == 400, (path, body)
         assert client.ask("POST", "/picture", b" " * 9000)[0] == 413
         assert client.ask("GET", "/../../etc/passwd")[0] == client.ask("GET", "/scene/")[0] == 404
-        assert client.ask("PUT", "/control")[0] == 405 == client.ask("HEAD", "/")[0]
+        for method, path in (("PUT", "/control"), ("POST", "/"), ("POST", "/nothing")):
+            assert client.ask(method, path, b"{}")[0] == 405, (method, path)
+        assert client.ask("HEAD", "/")[::2] == (200, b"")
         for after in ("x", "-7", "9" * 40, "%D9%A3", ""):
             assert client.ask("GET", f"/state?after={after}")[0] in (200, 204)
         before = made.iteration
         until(lambda: made.iteration > before + 5, "more iterations")
     assert capfd.readouterr() == ("", ""), "the terminal stays clean"
+
+
+def test_only_its_own_page_may_watch(capture, tmp_path):
+    """What the guard refuses is in tests/server/test_guard.py."""
+    made = Training(capture, tmp_path / "run", "--iterations", "30")
+    made.view.take_state({})  # requests for a state do not wait
+    with made.view:
+        client = Client(made.view.url)
+        for method, path in (("GET", "/state"), ("GET", "/"), ("POST", "/control"), ("POST", "/picture")):
+            assert client.ask(method, path, b"{}", {"Origin": client.own["Origin"]})[0] == 403, path
+            headers = client.own | {"Origin": "http://example.org"}
+            assert client.ask(method, path, b"{}", headers)[0] == 403, path
+        code, headers, body = client.ask("GET", f"/?token={client.token}", None, {})
+        assert code == 200 and b"<html" in body[:300].lower() and client.token.encode() not in body
+        assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+        assert client.ask("GET", "/state")[0] == 200
 
 
 def new_threads(before):
@@ -276,7 +292,7 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
     with pytest.raises(RuntimeError), made.view:
         raise RuntimeError
     until(lambda: new_threads(threads) == set(), "the end of its threads")
-    with PageServer(b"", port=port):
+    with PageServer(port=port):
         pass
 
 

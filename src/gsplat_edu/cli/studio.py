@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import sys
 from dataclasses import replace
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.printing import say
-from gsplat_edu.base.text import install_command
 from gsplat_edu.cli.screen import has_screen, open_in_browser
-from gsplat_edu.viewer.serve import exposure
-
-NEEDED = ("starlette", "uvicorn", "h11")
-"""Modules of the extra `studio`."""
+from gsplat_edu.server.address import exposure
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C.
 
     Raises:
-        ArgumentError: the extra `studio` is not installed, or the system has no signals for its jobs.
+        ArgumentError: the system has no signals for its jobs.
     """
     if sys.platform == "win32":
         raise ArgumentError("studio: does not run on Windows; use sfm, train and view, or run it in WSL")
-    for name in NEEDED:
-        try:
-            importlib.import_module(name)
-        except ModuleNotFoundError:
-            how = install_command("studio")
-            raise ArgumentError(f"studio: {name} is not installed; {how}") from None
     from gsplat_edu.studio.server import serve
     from gsplat_edu.studio.uploads import Limits
 

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
@@ -46,6 +46,7 @@ from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
+from gsplat_edu.server.address import PORT, exposure, free_port
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
 from gsplat_edu.train.capacity import advised_side
@@ -55,10 +56,11 @@ from gsplat_edu.train.poses import NEED_LENSES
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
-from gsplat_edu.viewer.live import NAMES, LiveView
 from gsplat_edu.viewer.live_folder import LiveFolder
-from gsplat_edu.viewer.serve import PORT, exposure, free_port
 from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, Watcher, page_facts
+
+if TYPE_CHECKING:
+    from gsplat_edu.viewer.live import LiveView
 
 LINES = 20
 """Number of progress lines if there is no terminal for a progress bar."""
@@ -144,6 +146,8 @@ def _run(
             return
         host, port = arguments.view_host or LOOPBACK, arguments.view_port
         if arguments.view:
+            from gsplat_edu.viewer.live import NAMES
+
             port = PORT if port is None else port
             free_port(host, port, NAMES)  # before the run writes anything
         with progress_bar(console, "") as bar:
@@ -208,6 +212,8 @@ def _view(
     capture: CaptureRun, host: str, port: int, say: Callable[[str], None], closing: ExitStack
 ) -> LiveView:
     """Open the live view and say where it is."""
+    from gsplat_edu.viewer.live import LiveView  # imports a web server
+
     view = closing.enter_context(LiveView(capture, host, port))
     say(f"live view: {view.url}")
     if warning := exposure(host, "sees the training and can pause it", token=True):

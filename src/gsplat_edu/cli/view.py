@@ -18,11 +18,12 @@ from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.options.view import BESIDE
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.server.address import exposure
+from gsplat_edu.server.page_server import PageServer
 from gsplat_edu.viewer import export, page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 from gsplat_edu.viewer.page_mesh import open_meshes
-from gsplat_edu.viewer.serve import PageServer, exposure
 from gsplat_edu.viewer.stream import folder_page
 
 
@@ -91,11 +92,14 @@ def _serve(
     """Print the address of a server's page, open it, and answer until Ctrl-C."""
     if warning := exposure(arguments.host, does, token=token):
         console.print(warning, soft_wrap=True)
-    try:  # Ctrl-C may come as soon as the line is printed
+
+    def opened() -> None:
         console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
         if not arguments.no_open and has_screen():
             open_in_browser(server.url)
-        server.serve_forever()
+
+    try:
+        server.run(server.application(), opened)
     except KeyboardInterrupt:
         console.print("ended")
 
@@ -103,7 +107,7 @@ def _serve(
 def _server(arguments: argparse.Namespace, levels: bool) -> PageServer:
     if arguments.edit is None:
         kind = page_parts.LEVELS if levels else page_parts.PLAIN
-        return PageServer(b"", arguments.host, arguments.port, policy=page_parts.policy(kind))
+        return PageServer(page_parts.policy(kind), arguments.host, arguments.port)
     file = _edits_file(arguments)
     check_writable("--edit", file)
     return EditServer(arguments.host, arguments.port, page_parts.policy(page_parts.EDITOR), file)

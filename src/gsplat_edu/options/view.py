@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.options.values import add_address, add_meshes, whole_number_text
-from gsplat_edu.viewer.serve import PORT
+from gsplat_edu.server.address import PORT
 
 EXAMPLE = "example: gsplat-edu view runs/plush"
 

@@ -18,6 +18,9 @@ from starlette.routing import BaseRoute
 
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.options.offers import questions
+from gsplat_edu.server.guard import Guard
+from gsplat_edu.server.patience import Patience
+from gsplat_edu.server.refusal import not_found
 from gsplat_edu.studio import (
     capture_routes,
     floater_routes,
@@ -27,9 +30,6 @@ from gsplat_edu.studio import (
     run_routes,
     scene_routes,
 )
-from gsplat_edu.studio.guard import Guard
-from gsplat_edu.studio.patience import Patience
-from gsplat_edu.studio.refusal import not_found
 from gsplat_edu.studio.replies import act, file_answer
 from gsplat_edu.studio.state import Studio
 
@@ -42,6 +42,23 @@ TYPES = {
 }
 """Types of the page's files."""
 
+POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' data: blob:",
+        "media-src 'self' blob:",
+        "connect-src 'self'",
+        "worker-src 'self' blob:",
+        "frame-src 'self'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+"""Content-Security-Policy: no inline scripts or styles, nothing from elsewhere."""
+
 
 def application(
     studio: Studio, token: str, host: str = LOOPBACK, cookie: str = "gsplat_edu_studio"
@@ -50,7 +67,7 @@ def application(
 
     Args:
         studio: The library and its jobs.
-        token: See `gsplat_edu.studio.guard.Guard`.
+        token: See `gsplat_edu.server.guard.Guard`.
         host: Address that the server listens on.
         cookie: See `Guard`.
     """
@@ -79,7 +96,7 @@ def application(
         *floater_routes.routes(),
         *library_routes.routes(),
     ]
-    guard = Middleware(Guard, token=token, host=host, cookie=cookie)
+    guard = Middleware(Guard, host=host, policy=POLICY, token=token, cookie=cookie)
     patience = Middleware(Patience, seconds=studio.uploads.limits.stall)
     app = Starlette(routes=routes, middleware=[guard, patience], lifespan=lifespan)
     app.state.studio = studio

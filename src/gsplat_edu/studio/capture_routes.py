@@ -15,9 +15,9 @@ from starlette.routing import BaseRoute
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import legible
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.contents import files_within
 from gsplat_edu.studio.photo_masks import draw_on, mask_of
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, fields
 from gsplat_edu.studio.scene_routes import cached_page
 from gsplat_edu.studio.state import Studio

@@ -14,12 +14,12 @@ from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.text import legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
 from gsplat_edu.options.offers import check_words, offered, words_of
+from gsplat_edu.server.refusal import RefusedError, conflict
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.contents import files_within
 from gsplat_edu.studio.library import Library, scene_file
 from gsplat_edu.studio.listing import is_unfinished
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
-from gsplat_edu.studio.refusal import RefusedError, conflict
 
 EXPORTS = "exports"
 """Folder of an entry with the files that were exported from it."""

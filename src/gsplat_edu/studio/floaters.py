@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
-from gsplat_edu.studio.refusal import conflict
+from gsplat_edu.server.refusal import conflict
 from gsplat_edu.viewer.proposing import Proposing
 
 KEPT = 8

@@ -15,7 +15,7 @@ from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import shortened, whole_of
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
+from gsplat_edu.server.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.replies import act, fields
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.stream import event_document, job_document

@@ -27,10 +27,10 @@ from gsplat_edu.base.links import is_inside, links_in, resolved
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import as_file_name, legible, shortened, whole_of
 from gsplat_edu.data.capture import is_folder
+from gsplat_edu.server.refusal import RefusedError, conflict, not_found
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.adopted import adopted, note_adopted
 from gsplat_edu.studio.names import checked_name, name_after
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 
 KINDS = ("photos", "captures", "runs", "scenes")
 """Kinds of entries, and their folders."""

@@ -12,12 +12,13 @@ from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.record import State
+from gsplat_edu.server.bodies import Json, content_length
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.listing import summaries, summary
 from gsplat_edu.studio.origins import makers, origins
 from gsplat_edu.studio.pictures import leave_out, photo_list, thumbnail
 from gsplat_edu.studio.projects import projects
-from gsplat_edu.studio.refusal import RefusedError
-from gsplat_edu.studio.replies import Json, act, answered, content_length, entry_of, fields, file_answer
+from gsplat_edu.studio.replies import act, answered, entry_of, fields, file_answer
 from gsplat_edu.studio.state import Studio
 
 MOST_LINES = 3

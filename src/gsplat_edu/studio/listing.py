@@ -14,9 +14,9 @@ from gsplat_edu.base.files import described
 from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.contents import extent_of
 from gsplat_edu.studio.library import KINDS, Library, scene_file
-from gsplat_edu.studio.refusal import RefusedError
 
 
 def summaries(library: Library, trouble: list[str] | None = None) -> dict[str, list[dict[str, Any]]]:

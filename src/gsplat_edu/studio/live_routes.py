@@ -21,8 +21,9 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.jobs.record import ACTIVE, Job, State
-from gsplat_edu.studio.refusal import RefusedError, conflict
-from gsplat_edu.studio.replies import Json, act, answered
+from gsplat_edu.server.bodies import Json
+from gsplat_edu.server.refusal import RefusedError, conflict
+from gsplat_edu.studio.replies import act, answered
 from gsplat_edu.studio.scene_routes import BINARY, page_answer
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.viewer.live_folder import WAIT, LiveFolder, header_of

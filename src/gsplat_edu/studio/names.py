@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gsplat_edu.base.links import is_inside
 from gsplat_edu.base.text import as_file_name, printable
-from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.server.refusal import RefusedError
 
 LONGEST = 120
 """Bytes of the name of an entry in UTF-8; file systems have 255, and some names get an ending."""

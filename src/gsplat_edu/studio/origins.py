@@ -12,10 +12,10 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.record import Job, State
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.sfm.photos import fingerprint, photo_files
 from gsplat_edu.studio.commands import photos_source
 from gsplat_edu.studio.library import Library, scene_file
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.renaming import FormerNames
 
 MAKERS = {"captures": "sfm", "runs": "train", "scenes": "clean"}

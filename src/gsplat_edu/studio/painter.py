@@ -10,7 +10,7 @@ from http import HTTPStatus
 from typing import Any
 
 from gsplat_edu.base.locks import POLL
-from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.workers import Worker
 
 NICE = 10

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import legible
+from gsplat_edu.server.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.contents import photo_names
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.state import Studio
 
 if TYPE_CHECKING:

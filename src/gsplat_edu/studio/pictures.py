@@ -11,11 +11,11 @@ from typing import Any
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.text import legible
+from gsplat_edu.server.refusal import RefusedError, not_found
 from gsplat_edu.studio.contents import photo_names
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.names import below, listed_path
 from gsplat_edu.studio.photo_masks import masked
-from gsplat_edu.studio.refusal import RefusedError, not_found
 from gsplat_edu.studio.workers import Worker
 
 SIDES = (128, 256, 512, 1024)

@@ -10,8 +10,8 @@ from urllib.parse import quote
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.jobs.events import Found
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.origins import renamed_capture
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.state import Studio
 
 LABELS = {

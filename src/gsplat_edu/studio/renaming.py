@@ -11,7 +11,7 @@ from pathlib import Path
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.base.files import described, written_aside
 from gsplat_edu.base.reading import parse_json, read_bytes
-from gsplat_edu.studio.refusal import conflict
+from gsplat_edu.server.refusal import conflict
 
 FORMER = "renamed.json"
 """File in the studio's own folder: the former names of entries."""

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import email.utils
-import json
-import math
 import os
 from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
@@ -21,8 +17,9 @@ from starlette.routing import Route
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.base.files import described, unreadable
 from gsplat_edu.base.reading import open_file, parse_json
-from gsplat_edu.base.text import bounded, legible, shortened, whole_of
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
+from gsplat_edu.base.text import bounded, legible, shortened
+from gsplat_edu.server.bodies import Json, content_length, drain
+from gsplat_edu.server.refusal import RefusedError, conflict, not_found, too_large
 from gsplat_edu.studio.state import Studio
 
 MOST_JSON = 16 << 20
@@ -36,34 +33,6 @@ CLOSE = {"Connection": "close"}
 
 FRAMED = {"Content-Security-Policy": "default-src 'none'; frame-ancestors 'self'"}
 """Header of a refusal: where the studio's page wanted to show a scene in a frame, the frame gets it."""
-
-MOST_DRAINED = 64 << 20
-"""Largest number of bytes of a refused body that are still received; see `drain`."""
-
-LONGEST_DRAIN = 5.0
-"""Longest time for receiving them, s."""
-
-
-class Json(JSONResponse):
-    """A JSON answer, valid for any text and numbers from a file.
-
-    Text that no encoding accepts is escaped; JSON has no NaN and no infinities, so these become null.
-    """
-
-    def render(self, content: Any) -> bytes:  # noqa: ANN401
-        """Return the bytes."""
-        try:
-            return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
-        except ValueError:
-            return json.dumps(_finite(content), allow_nan=False, separators=(",", ":")).encode("ascii")
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401
-    if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 QUIET = "quiet"
@@ -104,34 +73,6 @@ def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Re
     return safe
 
 
-async def drain(request: Request, status: HTTPStatus) -> None:
-    """Receive the rest of a refused body, because a browser that is still sending would lose the answer.
-
-    A body that is refused for its size or because it stalls, or announced to be larger than `MOST_DRAINED`, is not
-    received.
-
-    Args:
-        request: The request.
-        status: With which it is refused.
-    """
-    length = whole_of(request.headers.get("content-length", "0"))
-    given_up = (
-        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-        HTTPStatus.INSUFFICIENT_STORAGE,
-        HTTPStatus.REQUEST_TIMEOUT,
-    )
-    if status in given_up or length is None or length > MOST_DRAINED:
-        return
-    size = 0
-    # RuntimeError: the body was received already; RefusedError: it stalls
-    with contextlib.suppress(ClientDisconnect, RuntimeError, TimeoutError, RefusedError):
-        async with asyncio.timeout(LONGEST_DRAIN):
-            async for piece in request.stream():
-                size += len(piece)
-                if size > MOST_DRAINED:
-                    return
-
-
 def refusal(line: str, status: HTTPStatus) -> JSONResponse:
     """Return an error as an answer: {"error": the line}."""
     return JSONResponse({"error": bounded(legible(line))}, status, headers=CLOSE | FRAMED)
@@ -162,17 +103,6 @@ async def json_body(request: Request) -> Any:  # noqa: ANN401
         return parse_json(b"".join(pieces), _no_constant)
     except ValueError as error:
         raise RefusedError(f"body: is not JSON ({str(error)[:80]})") from None
-
-
-def content_length(request: Request) -> int | None:
-    """Return the announced length of a body; None if it has none."""
-    text = request.headers.get("content-length")
-    if text is None:
-        return None if "transfer-encoding" in request.headers else 0
-    length = whole_of(text)
-    if length is None:
-        raise RefusedError("Content-Length: is not a number of bytes")
-    return length
 
 
 def entry_of(studio: Studio, request: Request) -> tuple[str, Path]:

@@ -19,12 +19,12 @@ from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.contents import photo_names
 from gsplat_edu.studio.origins import renamed_capture
 from gsplat_edu.studio.photo_masks import masked
 from gsplat_edu.studio.pictures import left_out
 from gsplat_edu.studio.proposals import proposals, train_again
-from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer
 from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture
 from gsplat_edu.studio.state import Studio

@@ -18,8 +18,8 @@ from gsplat_edu.base.text import whole_of
 from gsplat_edu.evaluate.comparison import comparison_size, read_comparison
 from gsplat_edu.photos.image_files import UNDECODABLE
 from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.server.refusal import RefusedError, not_found
 from gsplat_edu.studio.pictures import cache_name
-from gsplat_edu.studio.refusal import RefusedError, not_found
 from gsplat_edu.studio.workers import Worker
 
 MOST_READ = 8 << 20

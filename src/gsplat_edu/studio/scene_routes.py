@@ -22,11 +22,12 @@ from gsplat_edu.jobs.events import Metric
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import State
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.server.bodies import content_length, drain
+from gsplat_edu.server.refusal import RefusedError, conflict, not_found, too_large
 from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, MESHES, scene_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
-from gsplat_edu.studio.replies import CLOSE, act, content_length, drain, entry_of, file_answer
+from gsplat_edu.studio.replies import CLOSE, act, entry_of, file_answer
 from gsplat_edu.studio.state import Studio
 
 KEPT_PAGES = 12

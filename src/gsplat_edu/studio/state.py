@@ -11,11 +11,11 @@ from typing import Any
 from gsplat_edu.jobs.following import last_stage
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job, State, Work
+from gsplat_edu.server.refusal import conflict
 from gsplat_edu.studio.commands import command_line, title_of, work_of
 from gsplat_edu.studio.floaters import Proposals
 from gsplat_edu.studio.library import HIDDEN, Library
 from gsplat_edu.studio.painter import Painter
-from gsplat_edu.studio.refusal import conflict
 from gsplat_edu.studio.renaming import FormerNames, names_along, rename_all
 from gsplat_edu.studio.stream import Stream
 from gsplat_edu.studio.uploads import Limits, Uploads

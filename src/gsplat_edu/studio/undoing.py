@@ -7,7 +7,7 @@ from http import HTTPStatus
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import printable, shortened
 from gsplat_edu.jobs.record import ACTIVE, Job, State
-from gsplat_edu.studio.refusal import RefusedError, conflict
+from gsplat_edu.server.refusal import RefusedError, conflict
 from gsplat_edu.studio.replies import fields
 from gsplat_edu.studio.state import Studio
 

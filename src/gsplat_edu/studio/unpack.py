@@ -19,8 +19,8 @@ from pathlib import Path
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.zip_directory import TooManyEntriesError, check_directory
+from gsplat_edu.server.refusal import RefusedError, too_large
 from gsplat_edu.studio.names import checked_path
-from gsplat_edu.studio.refusal import RefusedError, too_large
 
 CHUNK = 1 << 20
 

@@ -17,11 +17,11 @@ from starlette.concurrency import run_in_threadpool
 
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.photos.image_files import is_image
+from gsplat_edu.server.refusal import RefusedError, conflict, too_large
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.contents import size_of
 from gsplat_edu.studio.library import SCENE_ENDINGS, Library
 from gsplat_edu.studio.names import below, checked_path
-from gsplat_edu.studio.refusal import RefusedError, conflict, too_large
 from gsplat_edu.studio.unpack import ZipLimits, unpack
 
 COUNTED_FOR = 5.0
@@ -41,7 +41,7 @@ class Limits:
         spare: Bytes of the disk that stay free.
         entry_files: Files of one entry.
         zipped: What a zip file may hold.
-        stall: Seconds after which a request is aborted if its body makes no progress (`gsplat_edu.studio.patience`).
+        stall: Seconds after which a request is aborted if its body makes no progress (`gsplat_edu.server.patience`).
     """
 
     file: int = 4 << 30

@@ -12,7 +12,7 @@ from typing import Any
 
 from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.reading import parse_json
-from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.server.refusal import RefusedError
 
 PATIENCE = 180.0
 """Seconds after which a worker that does not answer is ended."""

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import functools
-import http
-import json
 import threading
-import urllib.parse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError, SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.reading import parse_json
 from gsplat_edu.base.text import bounded, legible
-from gsplat_edu.viewer.guarded import GuardedHandler, GuardedServer
+from gsplat_edu.server.bodies import Json, body_of
+from gsplat_edu.server.page_server import PageServer
+from gsplat_edu.server.refusal import RefusedError
 
 if TYPE_CHECKING:
     from gsplat_edu.viewer.capture_data import CaptureFacts
@@ -36,7 +41,7 @@ MOST_JSON = 1 << 20
 """Bytes of a request that changes the list of photos to leave out, or the region."""
 
 
-class CaptureServer(GuardedServer):
+class CaptureServer(PageServer):
     """Serves the page of one capture, to browsers that have its token.
 
     Args:
@@ -55,8 +60,7 @@ class CaptureServer(GuardedServer):
     """
 
     def __init__(self, host: str, port: int, policy: str, capture: Path) -> None:
-        super().__init__(host, port, policy)
-        self.RequestHandlerClass = _Handler
+        super().__init__(policy, host, port, token=True)
         self.capture = capture
         self.photos: dict[str, Path] = {}
         self.marks: Mapping[str, Sequence[str]] | None = None
@@ -135,6 +139,56 @@ class CaptureServer(GuardedServer):
 
         write_region(self.capture, requested_region(given))
 
+    def routes(self) -> list[BaseRoute]:
+        """Return the addresses of the findings, the region, the photos and the list of those to leave out."""
+        return [
+            Route(FINDINGS, self._send_findings, methods=["GET"]),
+            Route(REGION, self._answer_region, methods=["GET", "POST"]),
+            Route(f"{THUMBS}{{name:path}}", self._send_photo, methods=["GET"]),
+            Route(LEFT_OUT, self._change_left_out, methods=["POST"]),
+        ]
+
+    def _send_findings(self, request: Request) -> Response:
+        marks, trouble = self.marks, self.trouble
+        found = {"done": marks is not None or bool(trouble), "marks": marks or {}, "trouble": trouble}
+        return Json(found)
+
+    async def _answer_region(self, request: Request) -> Response:
+        if request.method != "POST":
+            return await run_in_threadpool(self._send_region)
+        given = await _json_of(request)
+        return await run_in_threadpool(_changed, functools.partial(self.change_region, given))
+
+    def _send_region(self) -> Response:
+        """Answer with the region, or refuse it: the page may be older than the file."""
+        from gsplat_edu.data.region import document_of, read_region
+
+        try:
+            region = read_region(self.capture)
+        except DatasetError as error:
+            raise RefusedError(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
+        return Json({"region": None if region is None else document_of(region)})
+
+    def _send_photo(self, request: Request) -> Response:
+        side = request.query_params.get("side", "256")
+        if side not in map(str, SIDES):
+            raise RefusedError(f"side: has to be one of {', '.join(map(str, SIDES))}")
+        try:
+            data = self.photo(request.path_params["name"], int(side))
+        except KeyError:
+            raise RefusedError("the capture has no such photo", HTTPStatus.NOT_FOUND) from None
+        except (SplatError, OSError) as error:
+            reason = described(error) if isinstance(error, OSError) else str(error)
+            raise RefusedError(reason, HTTPStatus.UNPROCESSABLE_ENTITY) from None
+        return Response(data, media_type="image/jpeg")
+
+    async def _change_left_out(self, request: Request) -> Response:
+        given = await _json_of(request)
+        if not _is_request(given):
+            raise RefusedError("give photos, a list of names, and back, true or false")
+        change = functools.partial(self.leave_out, given["photos"], given["back"])
+        return await run_in_threadpool(_changed, lambda: {"left_out": change()})
+
 
 class Examination(threading.Thread):
     """Asks the doctor about a capture and gives a server the findings by photo.
@@ -174,93 +228,27 @@ class Examination(threading.Thread):
         self._stopping.set()
 
 
-class _Handler(GuardedHandler):
-    server: CaptureServer
-
-    def _answer(self) -> bytes:
-        address = urllib.parse.urlsplit(self.path)
-        if address.path not in (FINDINGS, REGION) and not address.path.startswith(THUMBS):
-            return super()._answer()
-        if (fault := self._fault()) is not None:
-            self._refuse(http.HTTPStatus.FORBIDDEN, fault)
-            return b""
-        if address.path == FINDINGS:
-            marks, trouble = self.server.marks, self.server.trouble
-            return self._sent(
-                {"done": marks is not None or bool(trouble), "marks": marks or {}, "trouble": trouble}
-            )
-        return self._region() if address.path == REGION else self._thumbnail(address)
-
-    def _region(self) -> bytes:
-        """Send the headers of the region and return its JSON, or refuse it: the page may be older than the file."""
-        from gsplat_edu.data.region import document_of, read_region
-
-        try:
-            region = read_region(self.server.capture)
-        except DatasetError as error:
-            self._refuse(http.HTTPStatus.UNPROCESSABLE_ENTITY, bounded(legible(str(error))))
-            return b""
-        return self._sent({"region": None if region is None else document_of(region)})
-
-    def _thumbnail(self, address: urllib.parse.SplitResult) -> bytes:
-        """Send the headers of a photo and return its bytes, or refuse it."""
-        name = urllib.parse.unquote(address.path.removeprefix(THUMBS))
-        side = urllib.parse.parse_qs(address.query).get("side", ["256"])[0]
-        if side not in map(str, SIDES):
-            self._refuse(http.HTTPStatus.BAD_REQUEST, f"side: has to be one of {', '.join(map(str, SIDES))}")
-            return b""
-        try:
-            data = self.server.photo(name, int(side))
-        except KeyError:
-            self._refuse(http.HTTPStatus.NOT_FOUND, "the capture has no such photo")
-            return b""
-        except (SplatError, OSError) as error:
-            reason = described(error) if isinstance(error, OSError) else str(error)
-            self._refuse(http.HTTPStatus.UNPROCESSABLE_ENTITY, bounded(legible(reason)))
-            return b""
-        self.send_response(http.HTTPStatus.OK)
-        self._headers("image/jpeg", len(data))
-        return data
-
-    def do_POST(self) -> None:
-        """Change the list of photos to leave out, or the region."""
-        if (fault := self._fault()) is not None:
-            return self._refuse(http.HTTPStatus.FORBIDDEN, fault)
-        if self.path not in (LEFT_OUT, REGION):
-            return self._refuse(http.HTTPStatus.NOT_FOUND, "there is nothing to change")
-        if (data := self._body(MOST_JSON)) is None:
-            return None
-        try:
-            given = parse_json(data)
-        except ValueError:
-            given = None
-        if self.path == LEFT_OUT and not _is_request(given):
-            return self._refuse(
-                http.HTTPStatus.BAD_REQUEST, "give photos, a list of names, and back, true or false"
-            )
-        try:
-            if self.path == REGION:
-                self.server.change_region(given)
-                answer: dict[str, Any] = {}
-            else:
-                answer = {"left_out": self.server.leave_out(given["photos"], given["back"])}
-        except (DatasetError, ArgumentError) as error:
-            return self._refuse(http.HTTPStatus.BAD_REQUEST, bounded(legible(str(error))))
-        except OSError as error:
-            return self._refuse(http.HTTPStatus.INTERNAL_SERVER_ERROR, bounded(legible(described(error))))
-        self.wfile.write(self._sent(answer))
-        return None
-
-    def _sent(self, value: Any) -> bytes:  # noqa: ANN401
-        """Send the headers of a JSON answer and return its bytes."""
-        data = json.dumps(value).encode("ascii")
-        self.send_response(http.HTTPStatus.OK)
-        self._headers("application/json", len(data))
-        return data
-
-
 def _is_request(given: Any) -> bool:  # noqa: ANN401
     if not isinstance(given, dict) or not isinstance(given.get("back"), bool):
         return False
     photos = given.get("photos")
     return isinstance(photos, list) and all(isinstance(photo, str) for photo in photos)
+
+
+async def _json_of(request: Request) -> Any:  # noqa: ANN401
+    """Return the JSON of a request's body; None if it is none."""
+    body = await body_of(request, MOST_JSON)
+    try:
+        return parse_json(body)
+    except ValueError:
+        return None
+
+
+def _changed(change: Callable[[], Mapping[str, Any] | None]) -> Response:
+    """Change the capture and answer with what the change returns, an object."""
+    try:
+        return Json(change() or {})
+    except (DatasetError, ArgumentError) as error:
+        raise RefusedError(str(error)) from None
+    except OSError as error:
+        raise RefusedError(described(error), HTTPStatus.INTERNAL_SERVER_ERROR) from None

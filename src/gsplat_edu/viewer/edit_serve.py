@@ -1,23 +1,29 @@
 """Serve a page with the editor, and write the edits file that it sends.
 
-`gsplat_edu.viewer.guard` checks every request. A write is refused unless the page has the newest version of the file,
+`gsplat_edu.server.guard` checks every request. A write is refused unless the page has the newest version of the file,
 because another tab or program may have written it.
 """
 
 from __future__ import annotations
 
-import http
-import json
 import threading
+from http import HTTPStatus
 from pathlib import Path
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.files import described, written_aside
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.stored import MOST_BYTES, version_of
+from gsplat_edu.server.bodies import Json, body_of
+from gsplat_edu.server.page_server import PageServer
+from gsplat_edu.server.refusal import RefusedError, conflict
 from gsplat_edu.viewer.edit_page import read_content
-from gsplat_edu.viewer.guarded import GuardedHandler, GuardedServer
 from gsplat_edu.viewer.proposing import NAME, Proposing
 
 ADDRESS = "/edits.json"
@@ -27,7 +33,7 @@ FLOATERS = f"/{NAME}"
 """Where the page asks for splats to delete."""
 
 
-class EditServer(GuardedServer):
+class EditServer(PageServer):
     """Serves one page with the editor, to browsers that have its token.
 
     Args:
@@ -41,8 +47,7 @@ class EditServer(GuardedServer):
     """
 
     def __init__(self, host: str, port: int, policy: str, file: Path) -> None:
-        super().__init__(host, port, policy)
-        self.RequestHandlerClass = _Handler
+        super().__init__(policy, host, port, token=True)
         self.file = file
         self.scene: Identity | None = None
         self.writing = threading.Lock()
@@ -63,9 +68,9 @@ class EditServer(GuardedServer):
         self.proposing = None if source is None else Proposing(source)
         self.content()
 
-    def server_close(self) -> None:
-        """Close the server, and end the process that judges the scene."""
-        super().server_close()
+    def stop(self) -> None:
+        """Stop the server, and end the process that judges the scene."""
+        super().stop()
         if self.proposing is not None:
             self.proposing.stop()
 
@@ -101,86 +106,53 @@ class EditServer(GuardedServer):
                 aside.write_bytes(data)
         return version_of(data)
 
+    def routes(self) -> list[BaseRoute]:
+        """Return the addresses of the edits and of the proposals."""
+        return [
+            Route(ADDRESS, self._answer_edits, methods=["GET", "PUT"]),
+            Route(FLOATERS, self._answer_proposals, methods=["GET", "POST", "DELETE"]),
+        ]
 
-class _Handler(GuardedHandler):
-    server: EditServer
+    async def _answer_edits(self, request: Request) -> Response:
+        if request.method != "PUT":
+            return await run_in_threadpool(self._send)
+        expected = request.headers.get("If-Match", "").strip('"')
+        data = await body_of(request, MOST_BYTES)
+        return await run_in_threadpool(self._save, data, expected)
 
-    def _answer(self) -> bytes:
-        if self.path.partition("?")[0] != ADDRESS:
-            return self._proposals() if self.path == FLOATERS else super()._answer()
-        if (fault := self._fault()) is not None:
-            self._refuse(http.HTTPStatus.FORBIDDEN, fault)
-            return b""
-        return self._edits()
-
-    def _edits(self) -> bytes:
-        """Send the headers of the edits file and return its content, or refuse one that the page could not apply."""
+    def _send(self) -> Response:
+        """Answer with the edits file, or refuse one that the page could not apply."""
         try:
-            data = self.server.content()
+            data = self.content()
         except (SplatError, OSError) as error:
             reason = described(error) if isinstance(error, OSError) else str(error)
-            self._refuse(http.HTTPStatus.CONFLICT, reason)
-            return b""
-        body = b"null\n" if data is None else data
-        self.send_response(http.HTTPStatus.OK)
-        self.send_header("ETag", f'"{version_of(data)}"')
-        self._headers("application/json", len(body))
-        return body
+            raise conflict(reason) from None
+        headers = {"ETag": f'"{version_of(data)}"'}
+        return Response(b"null\n" if data is None else data, headers=headers, media_type="application/json")
 
-    def _proposals(self) -> bytes:
-        """Send the headers of the state of the proposals and return it."""
-        if (fault := self._fault()) is not None:
-            self._refuse(http.HTTPStatus.FORBIDDEN, fault)
-            return b""
-        if (proposing := self.server.proposing) is None:
-            self._refuse(http.HTTPStatus.NOT_FOUND, "there are no proposals")
-            return b""
-        if self.command == "POST":
+    def _save(self, data: bytes, expected: str) -> Response:
+        """Write the edits file."""
+        try:
+            version = self.store(data, expected)
+        except ArgumentError as error:
+            raise RefusedError(str(error)) from None
+        except (SplatError, OSError) as error:
+            reason = described(error) if isinstance(error, OSError) else str(error)
+            raise RefusedError(reason, HTTPStatus.INTERNAL_SERVER_ERROR) from None
+        if version is None:
+            changed = f"{self.file.name} was changed elsewhere; download these edits, then reload the page"
+            raise RefusedError(changed, HTTPStatus.PRECONDITION_FAILED)
+        return PlainTextResponse("saved\n", headers={"ETag": f'"{version}"'})
+
+    def _answer_proposals(self, request: Request) -> Response:
+        """Start to judge the scene, stop that, or only tell its state."""
+        if (proposing := self.proposing) is None:
+            raise RefusedError("there are no proposals", HTTPStatus.NOT_FOUND)
+        if request.method == "POST":
             try:
                 proposing.start()
             except OSError as error:
-                self._refuse(http.HTTPStatus.INTERNAL_SERVER_ERROR, described(error))
-                return b""
-        elif self.command == "DELETE":
+                raise RefusedError(described(error), HTTPStatus.INTERNAL_SERVER_ERROR) from None
+        elif request.method == "DELETE":
             proposing.stop()
-        body = json.dumps(proposing.state()).encode() + b"\n"
-        self.send_response(http.HTTPStatus.OK)
-        self._headers("application/json", len(body))
-        return body
-
-    def do_POST(self) -> None:
-        """Start to judge the scene."""
-        if self.path != FLOATERS:
-            return self._say(http.HTTPStatus.METHOD_NOT_ALLOWED)
-        self.wfile.write(self._proposals())
-        return None
-
-    def do_DELETE(self) -> None:
-        """Stop judging it."""
-        self.do_POST()
-
-    def do_PUT(self) -> None:
-        """Write the edits file."""
-        if (fault := self._fault()) is not None:
-            return self._refuse(http.HTTPStatus.FORBIDDEN, fault)
-        if self.path != ADDRESS:
-            return self._refuse(http.HTTPStatus.NOT_FOUND, "there is nothing to write")
-        expected = self.headers.get("If-Match", "").strip('"')
-        if (data := self._body(MOST_BYTES)) is None:
-            return None
-        try:
-            version = self.server.store(data, expected)
-        except ArgumentError as error:
-            return self._refuse(http.HTTPStatus.BAD_REQUEST, str(error))
-        except OSError as error:
-            return self._refuse(http.HTTPStatus.INTERNAL_SERVER_ERROR, described(error))
-        except SplatError as error:
-            return self._refuse(http.HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
-        if version is None:
-            changed = (
-                f"{self.server.file.name} was changed elsewhere; download these edits, then reload the page"
-            )
-            return self._refuse(http.HTTPStatus.PRECONDITION_FAILED, changed)
-        self.send_response(http.HTTPStatus.OK)
-        self.send_header("ETag", f'"{version}"')
-        return self._text("saved")
+        return Json(proposing.state())

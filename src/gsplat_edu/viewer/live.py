@@ -1,7 +1,7 @@
 """Watch a training in the browser while it runs: our page, from a server on this computer.
 
 The server's threads only record requests. The training thread packs snapshots and renders pictures between two
-iterations; see `gsplat_edu.viewer.snapshots`. `gsplat_edu.viewer.guard` checks every request.
+iterations; see `gsplat_edu.viewer.snapshots`. `gsplat_edu.server.guard` checks every request.
 
     GET  /                   the page; needs the token in the URL or the cookie
     GET  /state?after=V      the state as JSON (`gsplat_edu.viewer.snapshots.state_of`, and `version`) as soon as its
@@ -14,33 +14,40 @@ iterations; see `gsplat_edu.viewer.snapshots`. `gsplat_edu.viewer.guard` checks 
 
 from __future__ import annotations
 
-import http
+import asyncio
+import functools
 import io
-import json
 import math
 import threading
 import time
-import urllib.parse
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from http import HTTPStatus
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from PIL import Image
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.text import whole_of
 from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.server.address import PORT
+from gsplat_edu.server.bodies import Json, body_of
+from gsplat_edu.server.page_server import PageServer
+from gsplat_edu.server.refusal import RefusedError
+from gsplat_edu.server.serving import MOST_CONNECTIONS
 from gsplat_edu.viewer import page, page_parts
-from gsplat_edu.viewer.guard import Guard
 from gsplat_edu.viewer.live_folder import WAIT
-from gsplat_edu.viewer.serve import CHUNK, PORT, PageHandler, PageServer, url_of
 from gsplat_edu.viewer.snapshots import page_facts
 
 NAMES = ("--view-host", "--view-port")
@@ -59,6 +66,9 @@ LONGEST_BODY = 8 << 10
 """Bytes of a request's body; a camera takes less than one KB."""
 
 JPEG_QUALITY = 85
+
+Found = TypeVar("Found")
+"""What a request waits for."""
 
 
 class LiveView:
@@ -81,11 +91,10 @@ class LiveView:
     def __init__(self, capture: CaptureRun, host: str = LOOPBACK, port: int = PORT) -> None:
         self._trainer = capture.trainer
         html = page.live_html(page_facts(capture))
-        self._server = _LiveServer(self, html, page_parts.policy(page_parts.LIVE), host, port)
-        token = self._server.guard.token
-        self.url = f"{url_of(host, self._server.server_port)}?token={token}"
-        self._closing = ExitStack()
-        self._closing.callback(self._server.server_close)
+        self._server = _LiveServer(self, page_parts.policy(page_parts.LIVE), host, port)
+        self._server.page = html
+        self.url = self._server.url
+        self._is_over = False
         self._news = threading.Condition()
         self._state: dict[str, Any] = {}
         self._version, self._shown, self._snapshot = 0, -1, b""
@@ -98,19 +107,17 @@ class LiveView:
 
     def __enter__(self) -> LiveView:
         """Start answering."""
-        thread = threading.Thread(
-            target=self._server.serve_forever, args=(0.05,), name="live view", daemon=True
-        )
-        thread.start()
-        self._closing.callback(thread.join)
-        self._closing.callback(self._server.shutdown)
+        self._server.start(self._server.application())
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the server."""
-        self._closing.close()
+        """End the requests that wait, and stop the server."""
+        with self._news:
+            self._is_over = True
+            self._news.notify_all()
+        self._server.stop()
 
     @property
     def watched(self) -> bool:
@@ -165,8 +172,8 @@ class LiveView:
     def newer_state(self, version: int) -> dict[str, Any] | None:
         """Wait for a state of another version; None if there is none within `WAIT` seconds."""
         with self._news:
-            found = self._news.wait_for(lambda: self._version not in (0, version), WAIT)
-            return self._state if found else None
+            is_newer = self._wait(lambda: self._version not in (0, version), WAIT)
+            return self._state if is_newer else None
 
     def newer_scene(self, iteration: int) -> bytes | None:
         """Wait for a snapshot of another iteration; None if there is none within `WAIT` seconds.
@@ -179,8 +186,8 @@ class LiveView:
                 return self._snapshot
             before = self._shown
             self._asked_at = time.perf_counter()
-            found = self._news.wait_for(lambda: self._shown not in (before, iteration), WAIT)
-            return self._snapshot if found else None
+            is_newer = self._wait(lambda: self._shown not in (before, iteration), WAIT)
+            return self._snapshot if is_newer else None
 
     def control(self, what: object) -> bool:
         """Pause, resume or take a single step; return whether the command is known."""
@@ -198,110 +205,84 @@ class LiveView:
         """Return a JPEG from a camera, or the reason why there is none. Only one request waits at a time."""
         with self._one_picture, self._news:
             self._wanted, self._picture = camera, ""
-            self._news.wait_for(lambda: self._picture != "", PICTURE_WAIT)
+            self._wait(lambda: self._picture != "", PICTURE_WAIT)
             self._wanted = None
             return self._picture or "not drawn: the training is busy"
 
-
-class _LiveHandler(PageHandler):
-    server: _LiveServer
-
-    def do_HEAD(self) -> None:
-        self._refuse(http.HTTPStatus.METHOD_NOT_ALLOWED)
-
-    def do_GET(self) -> None:
-        if not self._let_in():
-            return
-        view, target = self.server.view, urllib.parse.urlsplit(self.path)
-        view.noticed()
-        after = _number(urllib.parse.parse_qs(target.query).get("after", [""])[0])
-        if target.path == "/":
-            policy = f"{self.server.policy}; frame-ancestors 'none'"
-            more = {"Set-Cookie": self.server.guard.cookie, "Content-Security-Policy": policy}
-            self._reply(http.HTTPStatus.OK, self.server.page, "text/html; charset=utf-8", more)
-        elif target.path == "/state":
-            state = view.newer_state(after)
-            self._offer(None if state is None else json.dumps(state).encode("ascii"), "application/json")
-        elif target.path == "/scene":
-            self._offer(view.newer_scene(after), "application/octet-stream")
-        else:
-            self._refuse(http.HTTPStatus.NOT_FOUND)
-        view.noticed()
-
-    def do_POST(self) -> None:
-        if not self._let_in():
-            return
-        self.server.view.noticed()
-        length = _number(self.headers.get("Content-Length", ""))
-        if not 0 <= length <= LONGEST_BODY:
-            self.rfile.read(min(max(length, 0), 8 * LONGEST_BODY))  # an answer before it would be lost
-            self._refuse(http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-            return
-        try:
-            body = parse_json(self.rfile.read(length))
-        except ValueError:
-            body = None
-        if self.path == "/control" and isinstance(body, dict) and self.server.view.control(body.get("do")):
-            self._offer(None, "")
-        elif self.path == "/picture":
-            self._draw(body)
-        else:
-            self._refuse(http.HTTPStatus.BAD_REQUEST)
-
-    def _draw(self, body: object) -> None:
-        try:
-            camera = picture_camera(body)
-        except ArgumentError as error:
-            self._refuse(http.HTTPStatus.BAD_REQUEST, str(error))
-            return
-        picture = self.server.view.picture(camera)
-        if isinstance(picture, str):
-            self._refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, picture)
-        else:
-            self._offer(picture, "image/jpeg")
-
-    def _let_in(self) -> bool:
-        fault = self.server.guard.fault(
-            self.command, self.path, lambda name: self.headers.get_all(name) or []
-        )
-        if fault is not None:
-            self._refuse(http.HTTPStatus.FORBIDDEN, fault)
-        return fault is None
-
-    def _offer(self, body: bytes | None, kind: str) -> None:
-        """Send the body with status 200, or status 204 without one."""
-        if body is None:
-            self._reply(http.HTTPStatus.NO_CONTENT, b"", "text/plain")
-        else:
-            self._reply(http.HTTPStatus.OK, body, kind)
-
-    def _refuse(self, status: http.HTTPStatus, reason: str = "") -> None:
-        """Send an error, with one line for the user."""
-        text = f"{status.value} {status.phrase}{reason and ': '}{reason}\n".encode()
-        more = {"Allow": "GET, POST"} if status is http.HTTPStatus.METHOD_NOT_ALLOWED else None
-        self._reply(status, text, "text/plain; charset=utf-8", more)
-
-    def _reply(
-        self, status: http.HTTPStatus, body: bytes, kind: str, more: Mapping[str, str] | None = None
-    ) -> None:
-        self.send_response(status)
-        self.send_header("Referrer-Policy", "no-referrer")  # the URL is a secret
-        for name, value in (more or {}).items():
-            self.send_header(name, value)
-        self._headers(kind, len(body))
-        whole = memoryview(body if self.command != "HEAD" else b"")
-        for begin in range(0, len(whole), CHUNK):
-            self.wfile.write(whole[begin : begin + CHUNK])
+    def _wait(self, is_there: Callable[[], bool], seconds: float) -> bool:
+        """Wait for something to be there, with the lock held; return whether it is. The view's end ends all waiting."""
+        return self._news.wait_for(lambda: self._is_over or is_there(), seconds) and is_there()
 
 
 class _LiveServer(PageServer):
-    """Serves the page of a training and answers its requests."""
+    """Serves the page of a training and answers its requests.
 
-    def __init__(self, view: LiveView, html: bytes, policy: str, host: str, port: int) -> None:
-        super().__init__(html, host, port, NAMES, policy)
-        self.RequestHandlerClass = _LiveHandler
-        self.view = view
-        self.guard = Guard(host, self.server_port)
+    Requests that wait for the training do so in threads of their own, so that they keep no other request waiting.
+    """
+
+    def __init__(self, view: LiveView, policy: str, host: str, port: int) -> None:
+        super().__init__(policy, host, port, NAMES, token=True)
+        self._view = view
+        self._threads = ThreadPoolExecutor(MOST_CONNECTIONS, "live view")
+
+    def stop(self) -> None:
+        """Stop the server and its threads."""
+        super().stop()
+        self._threads.shutdown()
+
+    def routes(self) -> list[BaseRoute]:
+        """Return the addresses that the module's description lists."""
+        return [
+            Route("/state", self._send_state, methods=["GET"]),
+            Route("/scene", self._send_scene, methods=["GET"]),
+            Route("/control", self._control, methods=["POST"]),
+            Route("/picture", self._draw, methods=["POST"]),
+        ]
+
+    def _page(self, request: Request) -> Response:
+        self._view.noticed()
+        return super()._page(request)
+
+    async def _send_state(self, request: Request) -> Response:
+        state = await self._waited(functools.partial(self._view.newer_state, _after(request)))
+        return _nothing() if state is None else Json(state)
+
+    async def _send_scene(self, request: Request) -> Response:
+        scene = await self._waited(functools.partial(self._view.newer_scene, _after(request)))
+        return _nothing() if scene is None else Response(scene, media_type="application/octet-stream")
+
+    async def _control(self, request: Request) -> Response:
+        body = await self._json_of(request)
+        if not isinstance(body, dict) or not self._view.control(body.get("do")):
+            raise RefusedError("do: has to be pause, resume or step")
+        return _nothing()
+
+    async def _draw(self, request: Request) -> Response:
+        given = await self._json_of(request)
+        try:
+            camera = picture_camera(given)
+        except ArgumentError as error:
+            raise RefusedError(str(error)) from None
+        picture = await self._waited(functools.partial(self._view.picture, camera))
+        if isinstance(picture, str):
+            raise RefusedError(picture, HTTPStatus.SERVICE_UNAVAILABLE)
+        return Response(picture, media_type="image/jpeg")
+
+    async def _json_of(self, request: Request) -> Any:  # noqa: ANN401
+        """Return the JSON of a request's body; None if it is none."""
+        self._view.noticed()
+        body = await body_of(request, LONGEST_BODY)
+        try:
+            return parse_json(body)
+        except ValueError:
+            return None
+
+    async def _waited(self, ask: Callable[[], Found]) -> Found:
+        """Wait for an answer of the view in a thread, while a browser counts as connected."""
+        self._view.noticed()
+        found = await asyncio.get_running_loop().run_in_executor(self._threads, ask)
+        self._view.noticed()
+        return found
 
 
 def picture_camera(value: object) -> Camera:
@@ -336,6 +317,11 @@ def jpeg_of(output: RenderOutput) -> bytes:
     return made.getvalue()
 
 
-def _number(text: str) -> int:
-    """Return a whole number in ASCII digits; -1 for anything else."""
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else -1
+def _nothing() -> Response:
+    return Response(status_code=HTTPStatus.NO_CONTENT)
+
+
+def _after(request: Request) -> int:
+    """Return the number of what the page has already; -1 for anything that is no number."""
+    number = whole_of(request.query_params.get("after", ""))
+    return -1 if number is None else number

@@ -7,7 +7,10 @@ from http import HTTPStatus
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.server.refusal import RefusedError
+
+CHUNK = 1 << 20
+"""Bytes per write. The time limit of a slow reader holds for each chunk, not for a page of many MB."""
 
 LEAST_GAIN = 4096
 """Number of new bytes of a body that count as progress, so that single bytes do not keep a connection open."""
@@ -54,6 +57,12 @@ class Patience:
             return message
 
         async def yielding(message: Message) -> None:
+            whole = memoryview(message.get("body", b""))
+            for begin in range(0, max(len(whole) - CHUNK, 0), CHUNK):
+                await send({**message, "body": whole[begin : begin + CHUNK], "more_body": True})
+                await asyncio.sleep(0)
+            if len(whole) > CHUNK:
+                message = {**message, "body": whole[(len(whole) - 1) // CHUNK * CHUNK :]}
             await send(message)
             if message.get("more_body", False):
                 # else many parts are written before the loop can tell that the connection is gone, and asyncio
