@@ -356,7 +356,7 @@ print(f"{ITERATIONS} iters -> {milliseconds:.0f} ms/iter at {SIZE} px")
 # `course_config`, the backend is `torch`. Its renderer, its rule for densification and its loop
 # ([render.torch_reference](../src/gsplat_edu/render/torch_reference.py),
 # [density.adc](../src/gsplat_edu/train/density/adc.py), [trainer](../src/gsplat_edu/train/trainer.py),
-# [stepper](../src/gsplat_edu/train/stepper.py)) serve every other training too, so they are longer. Here they
+# [step](../src/gsplat_edu/train/step.py)) serve every other training too, so they are longer. Here they
 # have to give the same numbers, to the last bit of every loss.
 #
 # That takes the same operations in the same order. With the determinant as $ac - b^2$ and the exponent as a sum of
