@@ -49,6 +49,7 @@ LEARN = {"docs/GLOSSARY.md": "Glossary"}
 
 BUILD_ON = {
     "docs/PYTHON.md": "Python examples",
+    "docs/PLUGINS.md": "Plug-ins",
     "docs/GSPLAT.md": "From gsplat",
     "reference/index.md": "Reference",
     "ARCHITECTURE.md": "Architecture",

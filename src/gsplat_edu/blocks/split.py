@@ -67,7 +67,7 @@ class SplitOptions:
 def recipe_of(options: RunOptions) -> dict[str, Any]:
     """Return the options of the blocks that a plan stores."""
     return {
-        "train": options.config.flat(),
+        "train": options.config.record(),
         "data": dataclasses.asdict(options.data_settings),
         "backend": options.backend,
         "eval_every": options.eval_every,

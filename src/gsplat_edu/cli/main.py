@@ -10,15 +10,16 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.printing import complain, escape_unencodable_characters
 from gsplat_edu.base.text import option_flag
 from gsplat_edu.cli.running import EXIT_INTERRUPTED, interruptible_imports, run_command
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Interrupted
 from gsplat_edu.jobs.ranks import num_processes
+from gsplat_edu.options.offers import module_of
 from gsplat_edu.options.parser import EXIT_BAD_INPUT, OneLineParser
 from gsplat_edu.render.settings import check_backend
-from gsplat_edu.train.config import BY_NAME
 
 COMMANDS = {
     "demo": "train a sphere from 24 renders of it and evaluate the result with a held-out camera",
@@ -55,7 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     emitter.start_reporting()
     try:
         with interruptible_imports():
-            parser = build_parser(words)
+            try:
+                parser = build_parser(words)
+            except ArgumentError as error:  # a plug-in that cannot be loaded
+                complain(f"gsplat-edu: {error}")
+                return EXIT_BAD_INPUT
         parsed = parser.parse_args(words)
         if parsed.command is None:
             parser.print_help()
@@ -74,11 +79,12 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
     parser = OneLineParser(prog="gsplat-edu", description="3D Gaussian Splatting on the computer you have.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('gsplat-edu')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
-    for name, summary in COMMANDS.items():
+    summaries = COMMANDS | {name: module.SUMMARY for name, module in plugins("commands").items()}
+    for name, summary in summaries.items():
         command = commands.add_parser(name, help=summary, description=summary)
         if name not in words:
             continue
-        options = importlib.import_module(f"gsplat_edu.options.{_module(name)}")
+        options = module_of(name)
         command.epilog = options.EXAMPLE
         options.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="print the traceback of an error")
@@ -89,22 +95,17 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _module(command: str) -> str:
-    """Return the name of a command's modules."""
-    return command.replace("-", "_")
-
-
 def _run(name: str, arguments: argparse.Namespace) -> None:
     """Check the options, import the command, which takes seconds if it needs torch, and run it."""
     if "backend" in arguments:
         check_backend(arguments.backend)
-    options = importlib.import_module(f"gsplat_edu.options.{_module(name)}")
+    options = module_of(name)
     try:
         if hasattr(options, "check"):
             options.check(arguments)
-        module = options.runner(arguments) if hasattr(options, "runner") else _module(name)
+        module = options.runner(arguments) if hasattr(options, "runner") else name.replace("-", "_")
         with interruptible_imports():
-            command = importlib.import_module(f"gsplat_edu.cli.{module}")
+            command = options if name not in COMMANDS else importlib.import_module(f"gsplat_edu.cli.{module}")
         command.run(arguments)
     except ArgumentError as error:
         if (told := _as_option(str(error), "settings" in arguments)) == str(error):
@@ -119,6 +120,8 @@ def _as_option(message: str, has_set: bool) -> str:
         message: The error.
         has_set: Whether the command gives settings by --set.
     """
+    from gsplat_edu.train.config import BY_NAME  # it loads plug-ins, whose errors `main` tells
+
     name, colon, rest = message.partition(": ")
     if not colon or name not in BY_NAME:
         return message

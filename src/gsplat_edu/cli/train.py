@@ -233,7 +233,7 @@ def _is_over(options: RunOptions, team: Member, say: Callable[[str], None]) -> b
     if team.size > 1 and options.backend != "cpu":
         raise ArgumentError(f"--backend: is {options.backend}, but several processes train on cpu; give that")
     finished = is_finished(options)
-    settings = {"train": options.config.flat(), "data": asdict(options.data_settings)}
+    settings = {"train": options.config.record(), "data": asdict(options.data_settings)}
     team.shared({"finished": finished, **settings})
     if finished:
         say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.plugins import plugins
 from gsplat_edu.data.blender import TRAIN_FILE, read_blender
 from gsplat_edu.data.capture import (
     PHOTO_ENDINGS,
@@ -97,6 +99,9 @@ def read_capture(path: Path) -> Capture:
     Raises:
         DatasetError: it holds no capture, or a damaged one.
     """
+    if (foreign := _plugged_reader(path)) is not None:
+        reader: Reader = plugins("readers")[foreign]
+        return reader.read(path)
     if path.suffix.lower() == ".json" and is_file(path):
         return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
     if not is_folder(path):
@@ -125,8 +130,47 @@ def is_capture(path: Path) -> bool:
     Args:
         path: The folder.
     """
-    files = (path / TRAIN_FILE, path / "transforms.json")
-    return any(map(is_file, files)) or find_model(path) is not None or _has_photos(path)
+    return layout_of(path) is not None or _has_photos(path)
+
+
+def layout_of(path: Path) -> str | None:
+    """Return the layout of a capture by its files: "Blender", "transforms.json", "COLMAP" or a plug-in's name.
+
+    Args:
+        path: The folder, or the capture's file.
+
+    Returns:
+        The layout that `read_capture` reads; None if there are no poses.
+    """
+    if (foreign := _plugged_reader(path)) is not None:
+        return foreign
+    if path.suffix.lower() == ".json" and is_file(path):
+        return "Blender" if path.name == TRAIN_FILE else "transforms.json"
+    for layout, name in (("Blender", TRAIN_FILE), ("transforms.json", "transforms.json")):
+        if is_file(path / name):
+            return layout
+    return None if find_model(path) is None else "COLMAP"
+
+
+class Reader(Protocol):
+    """Reads a layout of captures that a plug-in adds; see docs/PLUGINS.md."""
+
+    def finds(self, path: Path) -> bool:
+        """Return whether a path holds such a capture, by its names and first bytes."""
+        ...
+
+    def read(self, path: Path) -> Capture:
+        """Read poses and names, without photos.
+
+        Raises:
+            DatasetError: the capture is damaged.
+        """
+        ...
+
+
+def _plugged_reader(path: Path) -> str | None:
+    """Return the name of the plug-in, a `Reader`, that reads a path; None if none does."""
+    return next((name for name, reader in plugins("readers").items() if reader.finds(path)), None)
 
 
 def _has_photos(path: Path) -> bool:

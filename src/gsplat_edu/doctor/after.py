@@ -101,6 +101,7 @@ class Trained:
         strategy: The run's recipe.
         corrected: Whether the training corrected exposures; the residuals then compare corrected renders, and
             `beforehand` is empty.
+        plugged: What plug-ins found: sentences, each with what to do about it.
         moved: Name and affected fraction of each training photo that shows objects which other photos do not; empty if
             the training masked them.
     """
@@ -121,6 +122,7 @@ class Trained:
     strategy: str = "adc"
     corrected: bool = False
     moved: Sequence[tuple[str, float]] = ()
+    plugged: Sequence[tuple[str, str]] = ()
 
     @property
     def usual(self) -> int:
@@ -189,13 +191,14 @@ def examine_run(run: Trained) -> Diagnosis:
         *([("cut-outs", _spilled)] if _outsides(run) else []),
         ("splats", _splats),
     )
+    foreign = [Finding("plug-in", Severity.NOTE, sentence, advice) for sentence, advice in run.plugged]
     findings, fine = list[Finding](), list[str]()
     for name, check in checks:
         found = check(run)
         findings += found
         if not found:
             fine.append(name)
-    return Diagnosis(_facts(run), tuple(findings), tuple(fine), _otherwise(run))
+    return Diagnosis(_facts(run), (*findings, *foreign), tuple(fine), _otherwise(run))
 
 
 def _otherwise(run: Trained) -> tuple[Advice, ...]:

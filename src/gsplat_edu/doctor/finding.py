@@ -26,7 +26,7 @@ CAUSES = (
     *("same photo", "duplicates", "same pose", "blurred", "exposure", "white balance", "few photos", "hole"),
     *("far points", "unseen points", "few points", "depth", "overfitted", "short training", "unexplained"),
     *("moved", "outside cut-outs", "floaters", "huge splats", "one side", "one height", "sky", "masks"),
-    *("resolution", "faint splats"),
+    *("resolution", "faint splats", "plug-in"),
 )
 """Names of the findings, causes before what they cause. Of two pieces of advice that contradict each other, that of the
 more serious finding counts, and of equally serious ones that of the earlier in this order."""

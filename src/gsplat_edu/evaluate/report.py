@@ -191,6 +191,7 @@ class Report:
         masked: Pictures of photos with parts that were masked as moving.
         notes: Notes for the reader, one sentence each.
         meshes: What is known of the meshes of the scene.
+        further: Headings and sentences of further sections.
         machine: Facts about the machine; by default, this one.
     """
 
@@ -203,6 +204,7 @@ class Report:
     masked: Sequence[MaskedPicture] = ()
     notes: Sequence[str] = ()
     meshes: Sequence[MeshEntry] = ()
+    further: Sequence[tuple[str, Sequence[str]]] = ()
     machine: Mapping[str, str] = field(default_factory=machine_facts)
 
 
@@ -238,6 +240,7 @@ def write_report(path: Path, report: Report) -> None:
         section("Masked things that moved", masked_figures(report.masked)),
         mesh_section(report.meshes),
         _exports(report.metrics.get("exports")),
+        *(section(heading, bullets(sentences)) for heading, sentences in report.further),
         section("Notes", bullets(report.notes)),
         section("Configuration", folded("all settings of this run", facts_table(_flat(config)))),
         *_machines(report),

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.validation import of_type
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.frame import ORIGIN
@@ -22,7 +23,7 @@ class Format:
 
     Args:
         suffix: Suffix of its files, in lower case; for a folder, the whole name of the file that represents it.
-        module: Module of `gsplat_edu.io` with `read(path) -> Scene` and `write(path, scene)`.
+        module: Module with `read(path) -> Scene` and `write(path, scene)`; it is imported when it is needed.
         name: Its common name.
         sh_degree: Highest SH degree that it stores.
         metadata: Whether it can store the scene's origin, up direction, unit and antialiasing.
@@ -36,24 +37,24 @@ class Format:
 
     def read(self, path: Path) -> Scene:
         """Read a file of the format; see `read_scene`."""
-        scene: Scene = importlib.import_module(f"gsplat_edu.io.{self.module}").read(path)
+        scene: Scene = importlib.import_module(self.module).read(path)
         return scene
 
     def write(self, path: Path, scene: Scene) -> None:
         """Write a file of the format; see `write_scene`."""
-        importlib.import_module(f"gsplat_edu.io.{self.module}").write(path, scene)
+        importlib.import_module(self.module).write(path, scene)
 
 
-FORMATS = (
-    Format(".compressed.ply", "compressed_ply", "SuperSplat compressed PLY"),
-    Format(".ply", "ply", "Inria PLY"),
-    Format(".splat", "splat", "antimatter splat", sh_degree=0, metadata=False),
-    Format(".spz", "spz", "Niantic SPZ"),
-    Format(".sog", "sog.codec", "PlayCanvas SOG"),
-    Format(".glb", "glb", "glTF with KHR_gaussian_splatting"),
+FORMATS: tuple[Format, ...] = (
+    Format(".compressed.ply", "gsplat_edu.io.compressed_ply", "SuperSplat compressed PLY"),
+    Format(".ply", "gsplat_edu.io.ply", "Inria PLY"),
+    Format(".splat", "gsplat_edu.io.splat", "antimatter splat", sh_degree=0, metadata=False),
+    Format(".spz", "gsplat_edu.io.spz", "Niantic SPZ"),
+    Format(".sog", "gsplat_edu.io.sog.codec", "PlayCanvas SOG"),
+    Format(".glb", "gsplat_edu.io.glb", "glTF with KHR_gaussian_splatting"),
+    *plugins("formats").values(),
 )
-"""The first matching suffix wins."""
-
+"""The first matching suffix wins; those of plug-ins come last."""
 
 SOG_META = "meta.json"
 """File that represents a SOG stored as a folder."""
@@ -64,9 +65,9 @@ LOD_META = "lod-meta.json"
 TILESET = "tileset.json"
 """File that represents a folder of 3D Tiles, which is written only."""
 
-LOD_FORMATS = (
-    Format(LOD_META, "lod.codec", "PlayCanvas streamed SOG"),
-    Format(TILESET, "lod.tiles", "3D Tiles"),
+LOD_FORMATS: tuple[Format, ...] = (
+    Format(LOD_META, "gsplat_edu.io.lod.codec", "PlayCanvas streamed SOG"),
+    Format(TILESET, "gsplat_edu.io.lod.tiles", "3D Tiles"),
 )
 """Folders with levels of detail, by the whole name of the file that represents them."""
 

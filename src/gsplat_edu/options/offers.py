@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.text import option_flag, shortened
 from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.options.values import NumberOr, number_text, whole_number_text
@@ -25,7 +26,9 @@ LONGEST_TEXT = 200
 
 
 def module_of(command: str) -> Any:  # noqa: ANN401 - a module
-    """Return the module that declares a command's options."""
+    """Return the module that declares a command's options; that of a plug-in also runs it."""
+    if command in (added := plugins("commands")):
+        return added[command]
     return importlib.import_module(f"gsplat_edu.options.{command.replace('-', '_')}")
 
 

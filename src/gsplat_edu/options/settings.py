@@ -42,7 +42,8 @@ def add_setting(group: argparse._ActionsContainer, name: str, default: str | Non
             flag, type=number_text, nargs=3, metavar=("R", "G", "B"), help=f"{text} (default: {default})"
         )
     else:
-        kind = str if setting.names else whole_number_text
+        kind: Any = str if setting.names else whole_number_text
+        kind = number_text if isinstance(setting.default, float) else kind
         metavar = "NAME" if setting.names else "N"
         group.add_argument(flag, type=kind, metavar=metavar, help=f"{text} (default: {default})")
 

@@ -320,6 +320,9 @@ def _add_background(group: argparse._ArgumentGroup) -> None:
 def _add_recipe(group: argparse._ArgumentGroup) -> None:
     for name in ("antialiased", "batch", "sh_degree", "surface"):
         add_setting(group, name)
+    for setting in SETTINGS:
+        if setting.plugin and setting.option:
+            add_setting(group, setting.name)
     add_settings(group)
 
 
@@ -360,6 +363,9 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
 
 
 def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
+    folder = RunFolder(arguments.out)
+    if arguments.resume and folder.exists():
+        folder.check_plugins()
     config = _config(arguments)
     flattened = config.alpha_background == "fixed" and not config.random_background
     settings = DataSettings(

@@ -19,6 +19,7 @@ from gsplat_edu.evaluate.report import SKIPPED, Picture, Report, write_report
 from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.runs.meshes import mesh_entries
+from gsplat_edu.runs.plugged import plugin_sections
 from gsplat_edu.runs.transients import masked_pictures
 from gsplat_edu.runs.trials import RefineTrials
 from gsplat_edu.scene.gaussians import Gaussians
@@ -125,7 +126,8 @@ def evaluate_run(
     }
     masked = masked_pictures(folder, metrics, train_views, gaussians, render, judged.background)
     title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", _notes(judged, config)
-    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, mesh_entries(folder))
+    meshes, further = mesh_entries(folder), plugin_sections(config, log)
+    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, meshes, further)
     write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated

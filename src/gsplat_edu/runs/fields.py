@@ -55,6 +55,7 @@ CONFIG: Mapping[str, Check] = {
     "version": _text,
     "backend": _text,
     "fingerprint": _text,
+    "plugins": _section,
     "origin": _place,
     "scale": _section,
     "scale.unit": _text,

@@ -30,6 +30,7 @@ import numpy as np
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import as_file_name
 from gsplat_edu.base.validation import ArrayLike, float64_array, quoted
@@ -125,6 +126,19 @@ class RunFolder:
                 f"{self.path}: is not a run: it has no config.json; give the folder of a run"
             )
         return checked(_read_object(self.config), CONFIG, str(self.config))
+
+    def check_plugins(self) -> None:
+        """Check that the plug-ins that the run was trained with are installed.
+
+        Raises:
+            CheckpointError: one is not, or config.json is damaged.
+        """
+        for name, package in self.read_config().get("plugins", {}).items():
+            if name not in {**plugins("parts"), **plugins("strategies")}:
+                raise CheckpointError(
+                    f"--resume: {self.path} was trained with the plug-in {str(name)[:60]} of {str(package)[:60]},"
+                    " which is not installed; install the package, or give another --out"
+                )
 
     def write_config(self, config: dict[str, Any]) -> None:
         """Write the settings of the run.

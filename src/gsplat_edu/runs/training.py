@@ -52,6 +52,7 @@ from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points
+from gsplat_edu.train.part import packages_of
 from gsplat_edu.train.poses import refinement_of
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.team import ALONE
@@ -73,7 +74,8 @@ def document(options: RunOptions) -> dict[str, Any]:
             "scene": None if options.scene is None else str(scene_file(options.scene).resolve()),
             **({} if options.depth is None else {"depth": depth_name(options.depth)}),
         },
-        "train": options.config.flat(),
+        "train": options.config.record(),
+        **({} if not (used := options.config.plugins) else {"plugins": packages_of(used)}),
         "render": dataclasses.asdict(options.render_settings),
         "backend": options.backend,
         "machine": machine_facts(),

@@ -12,10 +12,9 @@ from gsplat_edu.base.files import check_folder
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import spelled_seconds
-from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import entries, is_file, is_folder
-from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.images import image_size
+from gsplat_edu.data.reader import layout_of
 from gsplat_edu.sfm.photos import is_photo, is_run, photo_files
 from gsplat_edu.sfm.result import PARTS, published
 from gsplat_edu.sfm.video import is_video
@@ -46,11 +45,11 @@ def needs_poses(path: str | Path) -> bool:
     """
     path = Path(path)
     if is_file(path):
-        if path.suffix.lower() == ".json":
+        if path.suffix.lower() == ".json" or layout_of(path) is not None:
             return False
         _check_file(path, OR_CAPTURE)
         return True
-    if not is_folder(path) or _is_capture(path):
+    if not is_folder(path) or layout_of(path) is not None:
         return False
     _check_run(path)
     if not any(place.name[0] != "." for place in entries(path)):
@@ -198,13 +197,6 @@ def _holds_others(out: Path) -> bool:
     work = out / "sfm"
     if not (work / "stages.json").is_file():
         in_use = is_folder(work) and any(path.name[0] != "." for path in entries(work))
-        return in_use or _is_capture(out) or any((out / part).exists() for part in PARTS)
+        return in_use or layout_of(out) is not None or any((out / part).exists() for part in PARTS)
     others = {"images", "sparse"}.difference(published(work))
     return any((out / part).exists() for part in others)
-
-
-def _is_capture(path: Path) -> bool:
-    """Return whether a folder has poses in a supported layout."""
-    return (
-        any(is_file(path / name) for name in (TRAIN_FILE, "transforms.json")) or find_model(path) is not None
-    )

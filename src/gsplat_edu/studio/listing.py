@@ -13,6 +13,7 @@ from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.base.text import legible
+from gsplat_edu.data.reader import layout_of
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.contents import extent_of
@@ -65,7 +66,7 @@ def summary(library: Library, kind: str, path: Path) -> dict[str, Any]:
     if kind in ("photos", "captures"):
         facts |= {"photos": size.photos, "videos": size.videos}
     if kind == "captures":
-        facts["layout"] = layout(path)
+        facts["layout"] = layout_of(path)
         facts["search"] = search_facts(path)
         facts["unfinished"] = is_unfinished(path)
     if kind == "runs":
@@ -76,20 +77,6 @@ def summary(library: Library, kind: str, path: Path) -> dict[str, Any]:
     if kind in ("runs", "scenes"):
         facts["edited"] = (path / "edits.json").is_file()
     return facts
-
-
-def layout(path: Path) -> str | None:
-    """Return the layout of a capture by its files; None if it has no poses that can be found quickly."""
-    if (path / "transforms_train.json").is_file():
-        return "Blender"
-    if (path / "transforms.json").is_file():
-        return "transforms.json"
-    names = (("sparse", "0"), ("sparse",), ("colmap", "sparse", "0"), ())
-    for parts in names:
-        place = path.joinpath(*parts)
-        if any((place / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
-            return "COLMAP"
-    return None
 
 
 def search_facts(path: Path) -> dict[str, Any] | None:
@@ -124,7 +111,7 @@ def _search_facts(file: Path, modified: int, size: int) -> dict[str, Any] | None
 
 def is_unfinished(path: Path) -> bool:
     """Return whether a capture holds only what a search for poses needs to be resumed, and no poses."""
-    return layout(path) is None and (path / "sfm").is_dir()
+    return layout_of(path) is None and (path / "sfm").is_dir()
 
 
 def scene_bytes(file: Path | None) -> int:

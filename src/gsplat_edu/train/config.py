@@ -11,6 +11,7 @@ metadata.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -29,6 +30,7 @@ from gsplat_edu.train.checks import (
     accept_opacity as _opacity,
     accept_positive as _positive,
 )
+from gsplat_edu.train.part import PARTS, PLUGGED_STRATEGIES, default_settings
 from gsplat_edu.train.setting import (
     ALPHA_BACKGROUNDS,
     ASKED,
@@ -36,6 +38,7 @@ from gsplat_edu.train.setting import (
     DEPTH_KINDS,
     LENGTH,
     OUTSIDE_MASKS,
+    OWN_STRATEGIES,
     PHOTOS,
     PURPOSE,
     REGIONS,
@@ -53,7 +56,7 @@ RECIPE_ITERATIONS = 30_000
 SHORT_RUN = 3_000
 """Runs shorter than this do not reset opacities: there is no time to recover."""
 
-STRATEGIES = ("adc", "mcmc", "fast", "none")
+STRATEGIES = (*OWN_STRATEGIES, "none", *PLUGGED_STRATEGIES)
 VIEW_ORDERS = ("shuffled", "random")
 APPEARANCES = ("none", "exposure", "vignetting")
 SKIES = ("none", "shell")
@@ -429,6 +432,7 @@ class TrainConfig:
     adc: AdcConfig = dataclasses.field(default=AdcConfig())
     mcmc: McmcConfig = dataclasses.field(default=McmcConfig())
     fast: FastConfig = dataclasses.field(default=FastConfig())
+    plugged: Mapping[str, Any] = dataclasses.field(default_factory=default_settings, hash=False)
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -444,12 +448,28 @@ class TrainConfig:
 
     def flat(self) -> dict[str, Any]:
         """Return every setting by its flat name, in the order of `SETTINGS`; config.json holds this."""
+        return {setting.name: getattr(self._holder(setting), setting.attribute) for setting in SETTINGS}
+
+    def record(self) -> dict[str, Any]:
+        """Return `flat` for config.json: settings of plug-ins only where they differ from their defaults."""
         return {
-            setting.name: getattr(
-                self if setting.strategy is None else getattr(self, setting.strategy), setting.attribute
-            )
-            for setting in SETTINGS
+            name: value
+            for name, value in self.flat().items()
+            if BY_NAME[name].plugin is None or value != BY_NAME[name].default
         }
+
+    @property
+    def plugins(self) -> tuple[str, ...]:
+        """The plug-ins that the training uses: its strategy, and parts whose settings differ from their defaults."""
+        changed = (BY_NAME[name].plugin for name in self.record())
+        used = (*changed, self.strategy if self.strategy in PLUGGED_STRATEGIES else None)
+        return tuple(dict.fromkeys(name for name in used if name is not None))
+
+    def _holder(self, setting: Setting) -> Any:  # noqa: ANN401
+        """Return the object with a setting."""
+        if setting.plugin is not None:
+            return self.plugged[setting.plugin]
+        return self if setting.strategy is None else getattr(self, setting.strategy)
 
     def changed(self, **changes: Any) -> TrainConfig:  # noqa: ANN401
         """Return a copy with some settings changed, given by their flat names.
@@ -457,17 +477,19 @@ class TrainConfig:
         Raises:
             ArgumentError: a value is out of range, or a setting is unknown.
         """
-        parts: dict[str | None, dict[str, Any]] = {None: {}, "adc": {}, "mcmc": {}, "fast": {}}
+        parts: dict[str | None, dict[str, Any]] = {None: {}}
         for name, value in changes.items():
             one_of("field", name, list(BY_NAME))
-            parts[BY_NAME[name].strategy][BY_NAME[name].attribute] = value
-        return dataclasses.replace(
-            self,
-            adc=dataclasses.replace(self.adc, **parts["adc"]),
-            mcmc=dataclasses.replace(self.mcmc, **parts["mcmc"]),
-            fast=dataclasses.replace(self.fast, **parts["fast"]),
-            **parts[None],
-        )
+            setting = BY_NAME[name]
+            parts.setdefault(setting.plugin or setting.strategy, {})[setting.attribute] = value
+        own = {
+            name: dataclasses.replace(getattr(self, name), **parts.get(name, {})) for name in OWN_STRATEGIES
+        }
+        plugged = {
+            name: dataclasses.replace(settings, **parts.get(name, {}))
+            for name, settings in self.plugged.items()
+        }
+        return dataclasses.replace(self, **own, plugged=plugged, **parts[None])
 
     @property
     def start(self) -> tuple[float, float]:
@@ -489,9 +511,9 @@ class TrainConfig:
         }
 
 
-def _settings(kind: type, strategy: str | None, prefix: str = "") -> list[Setting]:
+def _settings(kind: type, strategy: str | None, prefix: str = "", part: str | None = None) -> list[Setting]:
     return [
-        Setting(f"{prefix}{field.name}", field.name, strategy, field.default, **field.metadata)
+        Setting(f"{prefix}{field.name}", field.name, strategy, part, field.default, **field.metadata)
         for field in fields(kind)
         if field.metadata
     ]
@@ -502,8 +524,10 @@ SETTINGS: tuple[Setting, ...] = (
     *_settings(AdcConfig, "adc"),
     *_settings(McmcConfig, "mcmc", "mcmc_"),
     *_settings(FastConfig, "fast", "fast_"),
+    *(one for name, part in PARTS.items() for one in _settings(part.Settings, None, f"{name}_", name)),
+    *(one for name, kind in PLUGGED_STRATEGIES.items() for one in _settings(kind.Settings, name, f"{name}_")),
 )
-"""All settings of a training."""
+"""All settings of a training, those of plug-ins last."""
 
 BY_NAME = {setting.name: setting for setting in SETTINGS}
 
@@ -515,7 +539,7 @@ SETTABLE = {setting.name: setting for setting in SETTINGS if setting.settable}
 
 ONLY_FOR = {
     strategy: tuple(setting.name for setting in SETTINGS if setting.strategy == strategy)
-    for strategy in ("adc", "mcmc", "fast")
+    for strategy in (*OWN_STRATEGIES, *PLUGGED_STRATEGIES)
 }
 """Settings that only one strategy uses."""
 

@@ -24,6 +24,7 @@ from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.far import Shell
+from gsplat_edu.train.part import PLUGGED_STRATEGIES
 from gsplat_edu.train.poses import Refinement
 from gsplat_edu.train.transient_masks import FeatureRenderer
 from gsplat_edu.train.transients import Transients
@@ -161,7 +162,15 @@ def make_strategy(
         return AdaptiveDensityControl(config, extent, generator, gaussians, shell)
     if config.strategy == "fast":
         return PlannedDensity(config, gaussians, shell)
-    return MCMC(config, generator, shell, add_noise) if config.strategy == "mcmc" else None
+    if config.strategy == "mcmc":
+        return MCMC(config, generator, shell, add_noise)
+    if config.strategy in PLUGGED_STRATEGIES:
+        settings = config.plugged[config.strategy]
+        made: DensityStrategy = PLUGGED_STRATEGIES[config.strategy].make(
+            settings, gaussians, extent, generator
+        )
+        return made
+    return None
 
 
 def make_view_model(

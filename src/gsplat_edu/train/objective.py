@@ -25,6 +25,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.depth import DEPTH, DepthTerm
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
+from gsplat_edu.train.part import PARTS
 from gsplat_edu.train.patches import PATCHES, Neighbourhood, PatchTerm
 from gsplat_edu.train.rendered import NOTHING, Needs, Rendered as Rendered, Turns
 from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm
@@ -157,6 +158,9 @@ def make_objective(
     if has_depth:
         turns = Turns(0, config.depth_every, config.batch)
         terms[DEPTH] = DepthTerm(config.depth_weight, config.points_weight, extent, turns)
+    for name, part in PARTS.items():
+        for own, term in part.terms(config.plugged[name], extent).items():
+            terms[f"{name}.{own}"] = term
     return Objective(terms)
 
 

@@ -27,6 +27,9 @@ REGIONS = ("capture", "none")
 DEPTH_KINDS = ("auto", "z", "ray", "inverse")
 """What the values of the user's depth maps are."""
 
+OWN_STRATEGIES = ("adc", "mcmc", "fast")
+"""Strategies with settings of their own."""
+
 LENGTH, PHOTOS, PURPOSE = "Length and size", "What the photos are like", "What the scene is for"
 """Headings above the questions of a page."""
 
@@ -72,7 +75,8 @@ class Setting:
     Args:
         name: Flat name: the field's name, with the prefix "mcmc_" for `McmcConfig` and "fast_" for `FastConfig`.
         attribute: Its name in its class.
-        strategy: The only strategy that uses it; None for the settings of `TrainConfig` itself.
+        strategy: The only strategy that uses it; None for settings of every strategy.
+        part: The plug-in part whose setting it is; None for the package's own.
         default: Its default for 30,000 iterations.
         help: Its meaning.
         source: Source of the default; "" if it is ours.
@@ -86,6 +90,7 @@ class Setting:
     name: str
     attribute: str
     strategy: str | None
+    part: str | None
     default: Any
     help: str
     source: str
@@ -99,6 +104,11 @@ class Setting:
         """The help text for --help and tables: it starts in lower case, after the strategy that uses the setting."""
         only = f"{self.strategy}: " if self.strategy else ""
         return f"{only}{self.help[0].lower()}{self.help[1:].rstrip('.')}"
+
+    @property
+    def plugin(self) -> str | None:
+        """The plug-in whose setting it is; None for the package's own."""
+        return self.part or (self.strategy if self.strategy not in (None, *OWN_STRATEGIES) else None)
 
     @property
     def names(self) -> tuple[str, ...]:
