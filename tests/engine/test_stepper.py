@@ -237,17 +237,15 @@ def test_a_strategy_that_does_not_follow_a_device_is_named(capture):
 
     run = trainer(capture)
     backend, host = load_backend("webgpu"), run.stepper
-    given = (run.gaussians, backend, host.objective)
-    assert why_not(*given, run.density, host.parts, 1) is None
-    assert why_not(*given, Watcher(), host.parts, 1) == "the density strategy does not follow a device"
     config, start = run.config, run.gaussians
-    assert (
-        why_not(*given, Curious(config, start), host.parts, 1)
-        == "the density strategy does not follow a device"
-    )
-    assert why_not(*given, Renamed(config, start), host.parts, 1) is None
-    team = dataclasses.replace(host.parts, team=Two())
-    assert why_not(*given, run.density, team, 1) == "processes share the step"
+
+    def reason(**parts):
+        return why_not(start, backend, dataclasses.replace(host.parts, **parts), 1)
+
+    assert reason() is None and reason(density=Renamed(config, start)) is None
+    for other in (Watcher(), Curious(config, start)):
+        assert reason(density=other) == "the density strategy does not follow a device"
+    assert reason(team=Two()) == "processes share the step"
 
 
 def test_a_training_that_loses_all_gaussians_goes_on_without_them(capture):

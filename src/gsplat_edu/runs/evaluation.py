@@ -117,17 +117,12 @@ def evaluate_run(
 
     test = score_views(gaussians, test_views, render, judged.background, gallery.add)
     train = score_views(gaussians, train_views, render, judged.background, tell)
-    metrics = {
-        **earlier,
-        **_scores(judged, test, train),
-        "num_gaussians": len(gaussians),
-        **_appearance(config),
-        **(facts or {}),
-    }
+    metrics = {**earlier, **_scores(judged, test, train), "num_gaussians": len(gaussians)}
+    metrics |= _appearance(config) | dict(facts or {})
     masked = masked_pictures(folder, metrics, train_views, gaussians, render, judged.background)
     title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", _notes(judged, config)
-    meshes, further = mesh_entries(folder), plugin_sections(config, log)
-    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, meshes, further)
+    known = mesh_entries(folder), plugin_sections(config, log)
+    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, *known)
     write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated
