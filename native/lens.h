@@ -13,9 +13,7 @@ namespace gsplat {
 namespace GSPLAT_ISA {
 
 constexpr double PI = 3.14159265358979323846;
-constexpr double NEAR_AXIS = 0.04;                  // largest r²/z² at which theta / r is a series
-constexpr int SERIES = 12;                          // last power of it
-constexpr double POLE = 0.0174524064372836;       // cos 89 degrees: least h / p in the Jacobian of the longitude
+constexpr int SERIES = 12;  // last power of the series of theta / r
 
 // atan(√t) / √t for 0 <= t <= NEAR_AXIS, and its first two derivatives.
 GSPLAT_INLINE void arc_series(VD t, VD &value, VD &slope, VD &curve) {

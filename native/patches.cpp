@@ -35,7 +35,6 @@ namespace gsplat {
 
 namespace {
 
-constexpr double NEAREST_POLE = 0.000304586490453;  // squared sine of one degree
 constexpr int MOST_PIXELS = (2 * MOST_RADIUS + 1) * (2 * MOST_RADIUS + 1);
 
 double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -164,7 +163,7 @@ bool see(const Grey &other, const Camera &camera, const double (*points)[3], con
         if (!sight.valid[l]) return false;
         if (camera.wraps()) {  // the longitude's slope is bounded at the poles
             const double x = sight.p[0][l], y = sight.p[1][l], z = sight.p[2][l], h2 = x * x + z * z;
-            if (!(h2 > NEAREST_POLE * (h2 + y * y))) return false;
+            if (!(h2 > POLE * POLE * (h2 + y * y))) return false;
         }
         double along_x, along_y, by_u = 0, by_v = 0;
         if (!sample(other, camera.wraps(), sight.u[l], sight.v[l], &seen[l], &along_x, &along_y)) return false;

@@ -34,10 +34,12 @@ NAMES = (
     "SSIM_C1",
     "SSIM_C2",
     "SRGB_OFFSET",
+    "NEAR_AXIS",
+    "POLE",
 )
 WGSL_NAMES = (
     *("THINNEST", "ALPHA_MIN", "T_STOP", "DET_FLOOR", "SPLAT_LIMIT_F32", "COLOR_LIMIT", "RIM_SLACK"),
-    *("C0", "C1", "C2", "C3", "SH_OFFSET", "SSIM_C1", "SSIM_C2"),
+    *("C0", "C1", "C2", "C3", "SH_OFFSET", "SSIM_C1", "SSIM_C2", "NEAR_AXIS_F32", "POLE"),
 )
 SSIM_TAPS = 6
 """Taps of one half of SSIM's window: the central one and five on one side."""

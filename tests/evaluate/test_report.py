@@ -11,7 +11,8 @@ from PIL import Image
 import gsplat_edu.evaluate.report as report_module
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, summarize
-from gsplat_edu.evaluate.report import SCRIPT, Picture, Report, machine_facts, verdict, write_report
+from gsplat_edu.evaluate.report import SCRIPT, Picture, Report, machine_facts, write_report
+from gsplat_edu.evaluate.verdict import verdict
 from viewer.handles import until
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -169,7 +170,8 @@ def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says)
         k: {"psnr": v, "num_images": 2} for k, v in (("test", test), ("train", train)) if v is not None
     }
     scores = [score("<i>low</i>", 12.5), score("high", 40.0)] if test is not None else []
-    sentence = verdict(metrics, scores)
+    metrics["test_views"] = [{"name": one.name, "psnr": one.psnr} for one in scores]
+    sentence = verdict(metrics)
     assert all(words in sentence for words in says), sentence
     assert sentence.count(". ") == 0 and sentence.endswith(".") and sentence[0].isupper()
     if scores:

@@ -130,3 +130,12 @@ unless told otherwise. Source: ours."""
 
 FAR_BELOW: Final = 0.1
 """A scene that was trained for less than this fraction of its length is not usable: splats have hardly moved."""
+
+NEAR_AXIS: Final = 0.04
+NEAR_AXIS_F32: Final = 0.1
+"""Largest r² / z² at which a fisheye's theta / r is a series, in float64 and in float32: above it, the closed form of
+the second derivative loses at most three digits to cancellation."""
+
+POLE: Final = math.cos(math.radians(89.0))
+"""Smallest distance from the axis of the poles, as a fraction of the distance from the camera, in the Jacobian of an
+equirectangular projection: nearer to a pole, first order would stretch an ellipse around the whole image."""

@@ -15,7 +15,7 @@ from gsplat_edu.base.locks import LOCK, locked
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.doctor.finding import command
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
-from gsplat_edu.evaluate.report import skipped_views
+from gsplat_edu.evaluate.verdict import skipped_views, verdict
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
@@ -106,7 +106,7 @@ def result_lines(result: Evaluation, folder: RunFolder) -> list[str]:
     if skipped := skipped_views(result.metrics):
         how = command("eval", folder.path)
         return [f"--eval-every 0 skipped the scores of {skipped}; to score them: {how}"]
-    return score_lines(result.test, result.train)
+    return [*score_lines(result.test, result.train), verdict(result.metrics)]
 
 
 def score_lines(test: Sequence[ImageScore], train: Sequence[ImageScore]) -> list[str]:

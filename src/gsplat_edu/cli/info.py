@@ -22,7 +22,7 @@ from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.engine import adapters
-from gsplat_edu.evaluate.report import skipped_views
+from gsplat_edu.evaluate.verdict import skipped_views
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_scene, stored_bytes
 from gsplat_edu.io.lod.codec import read_index

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from gsplat_edu.cli.eval import result_lines
 from gsplat_edu.doctor.moving import moved_line
 from gsplat_edu.doctor.remedies import ENOUGH
-from gsplat_edu.evaluate.report import too_short
+from gsplat_edu.evaluate.verdict import too_short
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Metric
 from gsplat_edu.render.api import render

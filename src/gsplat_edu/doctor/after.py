@@ -33,7 +33,7 @@ from gsplat_edu.doctor.finding import (
 from gsplat_edu.doctor.moving import check_moved
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.metrics import SPILLED
-from gsplat_edu.evaluate.report import OVERFITTED
+from gsplat_edu.evaluate.verdict import OVERFITTED
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.train.config import RECIPE_ITERATIONS

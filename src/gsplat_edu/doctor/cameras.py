@@ -14,9 +14,9 @@ from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.dataset import TEST_EVERY
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.doctor.finding import FEWER_PHOTOS, MORE_PHOTOS, NAMED, Finding, Severity, command
+from gsplat_edu.doctor.gap import HOLE, ring_of
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
-from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import FAR_AWAY, SAME_PLACE, far_ratios, settled_eyes, stray_eyes
 from gsplat_edu.train.capacity import advised_side
@@ -79,13 +79,6 @@ largest such distance among 184 cameras of four captures was 0.67, in a capture 
 PAST = math.radians(25.0)
 """A camera with few observed points, or without the common centre in its image, is reported if its axis misses that
 centre by more than this. The largest angle among 173 inward-facing cameras of three captures is 22 degrees."""
-
-HOLE = math.radians(60.0)
-"""Warn when a gap in an orbit is wider than this: surfaces inside it are seen at more than 30 degrees to their normal,
-which stretches them by half."""
-
-HOLE_FACTOR = 3.0
-"""The gap must also exceed this multiple of the median gap: an orbit of six photos has no hole."""
 
 TURN = math.radians(240.0)
 """Cameras that cover more than this angle, two thirds of a turn, are meant as a full orbit. With less, the subject is
@@ -367,15 +360,11 @@ def _alone(geometry: Geometry) -> set[int]:
 
 def check_coverage(survey: Survey) -> list[Finding]:
     """Find gaps in the directions from which cameras see a common subject."""
-    geometry = survey.geometry
-    if geometry.arrangement != INWARD or geometry.centre is None:
+    ring = ring_of(survey.geometry)
+    if ring is None:
         return []
-    azimuths, elevations = _around(geometry, geometry.centre)
-    order = np.argsort(azimuths, kind="stable")
-    gaps = np.diff(np.r_[azimuths[order], azimuths[order[0]] + 2.0 * math.pi])
-    widest = int(np.argmax(gaps))
-    if 2.0 * math.pi - gaps[widest] < TURN:
-        covered = math.degrees(2.0 * math.pi - float(gaps[widest]))
+    if 2.0 * math.pi - ring.widest < TURN:
+        covered = math.degrees(2.0 * math.pi - ring.widest)
         what = f"the cameras cover {covered:.0f} degrees around their subject"
         return [
             Finding(
@@ -386,30 +375,16 @@ def check_coverage(survey: Survey) -> list[Finding]:
             )
         ]
     found = []
-    if gaps[widest] > max(HOLE, HOLE_FACTOR * float(np.median(gaps))):
-        edges = tuple(survey.names[order[k % len(order)]] for k in (widest, widest + 1))
-        what = f"a gap of {math.degrees(gaps[widest]):.0f} degrees without a camera, between {edges[0]} and {edges[1]}"
+    if ring.has_gap(HOLE):
+        edges = [survey.names[end] for end in ring.ends]
+        what = f"a gap of {math.degrees(ring.widest):.0f} degrees without a camera, between {edges[0]} and {edges[1]}"
         advice = (
             f"take photos between the places of {edges[0]} and {edges[1]}: that side of the scene is guessed"
         )
         found.append(Finding("hole", Severity.WARNING, what, advice, changes=(MORE_PHOTOS,)))
-    low, high = np.quantile(elevations, (0.05, 0.95))
+    low, high = np.quantile(ring.elevations, (0.05, 0.95))
     if high - low < ONE_HEIGHT:
         what = f"all cameras are at about the same height, elevations within {math.degrees(high - low):.0f} degrees"
         advice = "add an orbit of photos from higher up: without it the scene has holes from there"
         found.append(Finding("one height", Severity.NOTE, what, advice))
     return found
-
-
-def _around(
-    geometry: Geometry, centre: Float64[np.ndarray, "3"]
-) -> tuple[Float64[np.ndarray, " C"], Float64[np.ndarray, " C"]]:
-    """Return azimuth and elevation of each camera around a point, radians; up is the cameras' common up."""
-    up = common_up(geometry.cameras)
-    offsets = geometry.eyes - centre
-    side = np.cross(up, geometry.cameras[0].R[2])
-    side = np.cross(up, geometry.cameras[0].R[1]) if np.linalg.norm(side) < 1e-3 else side
-    side = side / np.linalg.norm(side)
-    azimuths = np.arctan2(offsets @ np.cross(up, side), offsets @ side)
-    lengths = np.maximum(np.linalg.norm(offsets, axis=1), 1e-300)
-    return azimuths, np.arcsin(np.clip(offsets @ up / lengths, -1.0, 1.0))

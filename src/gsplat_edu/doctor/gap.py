@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from gsplat_edu.doctor.geometry import INWARD, Geometry
 from gsplat_edu.evaluate.paths import common_up
@@ -15,11 +15,86 @@ from gsplat_edu.evaluate.paths import common_up
 LEAST = math.radians(30.0)
 """Narrower arcs are no gap: photos 30 degrees apart still share most of what they show."""
 
+HOLE = math.radians(60.0)
+"""A wider gap is a hole in the scene: surfaces inside it are seen at more than 30 degrees to their normal, which
+stretches them by half."""
+
 FACTOR = 3.0
-"""A gap is also wider than this multiple of the median arc between neighbouring cameras."""
+"""A gap is also wider than this multiple of the median arc between neighbouring cameras: an orbit of six photos has
+none."""
 
 ARC_STEP = math.radians(5.0)
 """Largest angle between two points of the drawn arc."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ring:
+    """The cameras around their common subject, in cylindrical coordinates about the vertical axis through it.
+
+    Args:
+        centre: (3,) the subject, world units.
+        axes: (3, 3) rows: two horizontal axes, and up.
+        azimuths: (C,) radians, -pi to pi.
+        radii: (C,) distances from the axis, world units.
+        heights: (C,) above the subject, world units.
+    """
+
+    centre: Float64[np.ndarray, "3"]
+    axes: Float64[np.ndarray, "3 3"]
+    azimuths: Float64[np.ndarray, " C"]
+    radii: Float64[np.ndarray, " C"]
+    heights: Float64[np.ndarray, " C"]
+
+    def __post_init__(self) -> None:
+        """Order the cameras by azimuth."""
+        order = np.argsort(self.azimuths, kind="stable")
+        turned = self.azimuths[order]
+        object.__setattr__(self, "order", order)
+        object.__setattr__(self, "arcs", np.diff(np.r_[turned, turned[0] + 2.0 * math.pi]))
+
+    order: Int64[np.ndarray, " C"] = field(init=False)
+    """Indices of the cameras by azimuth."""
+    arcs: Float64[np.ndarray, " C"] = field(init=False)
+    """Angles from each camera in this order to the next, radians."""
+
+    @property
+    def elevations(self) -> Float64[np.ndarray, " C"]:
+        """Angles above the horizontal plane through the subject, radians."""
+        return np.asarray(np.arctan2(self.heights, self.radii))
+
+    @property
+    def widest(self) -> float:
+        """The widest arc, radians."""
+        return float(self.arcs.max())
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Indices of the cameras at the ends of the widest arc."""
+        at = int(np.argmax(self.arcs))
+        return int(self.order[at]), int(self.order[(at + 1) % len(self.order)])
+
+    def has_gap(self, least: float) -> bool:
+        """Return whether the widest arc is wider than an angle, radians, and than `FACTOR` times the median arc."""
+        return self.widest > max(least, FACTOR * float(np.median(self.arcs)))
+
+
+def ring_of(geometry: Geometry) -> Ring | None:
+    """Return the cameras around their common subject; None if they do not look at one.
+
+    Args:
+        geometry: The cameras of a capture.
+    """
+    if geometry.arrangement != INWARD or geometry.centre is None:
+        return None
+    up = common_up(geometry.cameras)
+    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    side /= np.linalg.norm(side)
+    across = np.cross(up, side)
+    offsets = geometry.eyes - geometry.centre
+    heights = offsets @ up
+    radii = np.linalg.norm(offsets - heights[:, None] * up, axis=1)
+    azimuths = np.arctan2(offsets @ across, offsets @ side)
+    return Ring(geometry.centre, np.stack((side, across, up)), azimuths, radii, heights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,29 +129,16 @@ def widest_gap(geometry: Geometry) -> Gap | None:
     Returns:
         The gap; None if the cameras do not look at a common subject, or if no arc is wide enough to be a gap.
     """
-    if geometry.arrangement != INWARD or geometry.centre is None:
+    ring = ring_of(geometry)
+    if ring is None or not ring.has_gap(LEAST):
         return None
-    centre, up = geometry.centre, common_up(geometry.cameras)
-    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    side /= np.linalg.norm(side)
-    across = np.cross(up, side)
-    offsets = geometry.eyes - centre
-    azimuths = np.arctan2(offsets @ across, offsets @ side)
-    order = np.argsort(azimuths, kind="stable")
-    arcs = np.diff(np.r_[azimuths[order], azimuths[order[0]] + 2.0 * math.pi])
-    widest = int(np.argmax(arcs))
-    angle = float(arcs[widest])
-    if angle <= max(LEAST, FACTOR * float(np.median(arcs))):
-        return None
-    first, last = int(order[widest]), int(order[(widest + 1) % len(order)])
-    count = 2 * math.ceil(angle / (2.0 * ARC_STEP)) + 1  # odd, so that one point is in the middle
+    first, last = ring.ends
+    count = 2 * math.ceil(ring.widest / (2.0 * ARC_STEP)) + 1  # odd, so that one point is in the middle
     share = np.linspace(0.0, 1.0, count)[:, None]
-    heights = offsets @ up
-    radii = np.linalg.norm(offsets - heights[:, None] * up, axis=1)
-    radius, height = ((1.0 - share) * v[first] + share * v[last] for v in (radii, heights))
-    turn = azimuths[first] + share * angle
-    arc = centre + radius * (np.cos(turn) * side + np.sin(turn) * across) + height * up
-    return Gap(angle, (first, last), arc)
+    radius, height = ((1.0 - share) * v[first] + share * v[last] for v in (ring.radii, ring.heights))
+    turn = ring.azimuths[first] + share * ring.widest
+    arc = ring.centre + np.hstack((radius * np.cos(turn), radius * np.sin(turn), height)) @ ring.axes
+    return Gap(ring.widest, (first, last), arc)
 
 
 def gap_sentence(geometry: Geometry, gap: Gap | None, names: Sequence[str]) -> str:

@@ -16,7 +16,6 @@ const KIND = 6u;             // kind, whether there are coefficients, whether ra
 const AXIS = 7u;             // readout's axis, whether depth is the distance, whether the ellipse has bounds; exposure / sqrt(12)
 
 const PI = 3.14159265;
-const POLE = 0.0174524064;  // cos 89 degrees: least h / |p| in the Jacobian of the longitude
 const POLAR = 1e-12;         // at less than this h² / |p|², rounding leaves no longitude
 const TINY = 1e-18;          // stands for a z of 0
 
@@ -73,10 +72,8 @@ struct Arc {
 // Near the axis, the closed forms cancel: with t = s / z², the relative error of s1 grows as eps / t, and that of s2 as eps / t².
 // Up to t = 0.1, a series takes their place. What it leaves out is largest in the second derivative, 10 x 9 t⁸ / 21 = 4e-8 of 0.33.
 // Right beyond 0.1, the closed form of s1 errs by 31 eps, and that of s s2 by 50 eps of s1 (200,000 random points); both fall from there.
-const NEAR_AXIS = 0.1;
-
 fn arc_of(s: f32, z: f32) -> Arc {
-    let near = z > 0.0 && s < NEAR_AXIS * z * z;
+    let near = z > 0.0 && s < NEAR_AXIS_F32 * z * z;
     let inverse = 1.0 / max(s + z * z, 1e-37);
     var arc: Arc;
     if (near) {

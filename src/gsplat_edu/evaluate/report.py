@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from gsplat_edu.base.constants import FAR_BELOW
 from gsplat_edu.base.content_policy import content_policy, policy_element
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import stored_path
@@ -38,15 +37,10 @@ from gsplat_edu.evaluate.report_parts import (
     section,
     slider_pair,
 )
+from gsplat_edu.evaluate.verdict import FULL_LENGTH, mean_of, skipped_views, verdict
 
 PICTURES = 8
 """Most test views shown in a report."""
-
-SKIPPED = "not_scored"
-"""Key of metrics.json: by "test" and "train", the number of views that an evaluation left out."""
-
-FULL_LENGTH = "full_length"
-"""Key of metrics.json: the iterations that the training would have without a time limit."""
 
 SCORES = (
     ("psnr", "PSNR (dB)"),
@@ -55,13 +49,6 @@ SCORES = (
     ("l1", "L1"),
     ("psnr_fitted", "PSNR, exposure fitted (dB)"),
 )
-
-OVERFITTED = 5.0
-"""Report overfitting from this gap between the PSNR of training and test views, dB. Measured after 2,000 iterations: 2
-dB for a capture of 97 photos, 9 for one of 11, and 12 for one of 50 with random start points."""
-
-GRADES = ((30.0, "very close"), (25.0, "close"), (20.0, "soft or partly wrong"))
-"""Lower limit of the mean test PSNR, dB, and the verdict on the renders; below the last limit, "wrong in places"."""
 
 SHOWN = 0.95
 """Brighten the picture of a difference only as far as this quantile stays below white."""
@@ -230,7 +217,7 @@ def write_report(path: Path, report: Report) -> None:
     cells = _cells(report)
     config = {key: value for key, value in report.config.items() if key != "machine"}
     sections = [
-        f'<p class="verdict">{html.escape(verdict(report.metrics, report.scores))}</p>\n',
+        f'<p class="verdict">{html.escape(verdict(report.metrics))}</p>\n',
         _how_to_score(path, report.metrics),
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
@@ -265,69 +252,6 @@ def _cells(report: Report) -> str:
     return f"<div>{drawing}</div>\n{blocks_table(blocks, report.metrics.get('seams'), report.scores)}"
 
 
-def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> str:
-    """Summarise the metrics in one sentence.
-
-    Args:
-        metrics: As in `Report`.
-        scores: Scores of the test views.
-    """
-    fitted = metrics.get("appearance", "none") != "none"
-    key = "psnr_fitted" if fitted else "psnr"
-    test, train = (_mean(metrics, split, key) for split in ("test", "train"))
-    steps = metrics.get("iterations")
-    after = f"After {steps:,} iterations, " if isinstance(steps, int) else ""
-    if short := too_short(metrics):
-        after = f"{short} {after}"
-    if test is None:
-        if skipped := skipped_views(metrics):
-            return (
-                f"{after or 'The scene was trained; '}nothing was scored: --eval-every 0 skipped {skipped}."
-            )
-        if train is None:
-            return "The scene was not evaluated: no photo was compared with a render."
-        known = f"renders of the training photos reach {train:.1f} dB PSNR"
-        sentence = f"{after}{known}; no photo was held out, so the quality of new views is unknown."
-        return sentence[0].upper() + sentence[1:]
-    grade = next((words for least, words in GRADES if test >= least), "wrong in places")
-    once = " once their exposure is fitted" if fitted else ""
-    parts = [f"{after}renders of the held-out photos reach {test:.1f} dB PSNR{once} ({grade})"]
-    if train is not None:
-        gap = train - test
-        how = f"{abs(gap):.1f} dB {'below' if gap > 0 else 'above'} the training photos"
-        parts.append(f"{how}, so the scene has overfitted to them" if gap >= OVERFITTED else how)
-    if len(scores) > 1 and not fitted:
-        low = worst(scores)
-        parts.append(f"the worst view is {low.name} at {low.psnr:.1f} dB")
-    sentence = "; ".join(parts) + "."
-    return sentence[0].upper() + sentence[1:]
-
-
-def too_short(metrics: Mapping[str, Any]) -> str:
-    """Return a sentence if a time limit ended the training long before the scene is usable; empty otherwise.
-
-    Args:
-        metrics: As in `Report`.
-    """
-    steps, full = metrics.get("iterations"), metrics.get(FULL_LENGTH)
-    if not isinstance(steps, int) or not isinstance(full, int) or steps >= FAR_BELOW * full:
-        return ""
-    return f"The scene is not usable: it was trained for {steps:,} of {full:,} iterations; give it more time."
-
-
-def skipped_views(metrics: Mapping[str, Any]) -> str:
-    """Return how many views of a run were not scored because `--eval-every` was 0; empty if they were scored.
-
-    Args:
-        metrics: As in `Report`.
-    """
-    counts = metrics.get(SKIPPED)
-    if not isinstance(counts, Mapping):
-        return ""
-    test, train = (counts.get(split, 0) for split in ("test", "train"))
-    return f"{test} held-out and {train} training photos"
-
-
 def _how_to_score(report: Path, metrics: Mapping[str, Any]) -> str:
     """Show the command that scores a run which was not scored."""
     if not skipped_views(metrics):
@@ -336,15 +260,9 @@ def _how_to_score(report: Path, metrics: Mapping[str, Any]) -> str:
     return f"<p>To score the photos: <code>{html.escape(command)}</code></p>\n"
 
 
-def _mean(metrics: Mapping[str, Any], split: str, key: str) -> float | None:
-    means = metrics.get(split)
-    value = means.get(key) if isinstance(means, Mapping) else None
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
-
-
 def _with_last(log: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Append the final evaluation, which only the metrics contain, to the log."""
-    test, steps = _mean(metrics, "test", "psnr"), metrics.get("iterations")
+    test, steps = mean_of(metrics, "test", "psnr"), metrics.get("iterations")
     lines = [line for line in log if "psnr" not in line or line.get("iteration") != steps]
     final = [] if test is None or not isinstance(steps, int) else [{"iteration": steps, "psnr": test}]
     return [*lines, *final]

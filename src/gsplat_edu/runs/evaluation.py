@@ -15,7 +15,8 @@ from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.loading_notes import LoadingNote
 from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
-from gsplat_edu.evaluate.report import SKIPPED, Picture, Report, write_report
+from gsplat_edu.evaluate.report import Picture, Report, write_report
+from gsplat_edu.evaluate.verdict import SKIPPED
 from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.runs.meshes import mesh_entries

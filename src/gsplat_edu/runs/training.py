@@ -24,7 +24,8 @@ from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.region import read_region
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.evaluate.report import FULL_LENGTH, machine_facts
+from gsplat_edu.evaluate.report import machine_facts
+from gsplat_edu.evaluate.verdict import FULL_LENGTH
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for

@@ -15,21 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsplat_edu.base.constants import NEAR_AXIS as NEAR_AXIS, POLE as POLE
+
 Numbers = Any
 """A NumPy array or a torch tensor."""
 
 Row = tuple[Numbers, Numbers, Numbers]
 
-NEAR_AXIS = 0.04
-"""Largest r² / z² at which the fisheye's theta / r is a series. Above it, the closed form of the second derivative
-loses at most three digits to cancellation; below it, `SERIES` terms are exact to rounding."""
-
 SERIES = 12
-"""Terms of that series."""
-
-POLE = np.cos(np.radians(89.0))
-"""Smallest distance from the axis of the poles, as a fraction of the distance from the camera, in the Jacobian of an
-equirectangular projection: nearer to a pole, first order would stretch an ellipse around the whole image."""
+"""Terms of the series of a fisheye's theta / r up to `NEAR_AXIS`, exact to rounding."""
 
 
 RADIAL = 9

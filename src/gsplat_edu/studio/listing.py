@@ -14,6 +14,7 @@ from gsplat_edu.base.files import described
 from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.reader import layout_of
+from gsplat_edu.evaluate.verdict import verdict
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.contents import extent_of
@@ -134,6 +135,7 @@ def run_facts(library: Library, path: Path) -> dict[str, Any]:
         "iterations": None,
         "finished": False,
         "psnr": None,
+        "verdict": "",
         "ssim": None,
         "num_gaussians": None,
         "seconds": None,
@@ -157,6 +159,7 @@ def run_facts(library: Library, path: Path) -> dict[str, Any]:
         "iterations": last.get("iteration") if done is None else done,
         "finished": done is not None and (planned is None or done >= planned),
         "psnr": test.get("psnr"),
+        "verdict": "" if done is None else verdict(metrics),
         "ssim": test.get("ssim"),
         "num_gaussians": metrics.get("num_gaussians") or last.get("num_gaussians"),
         "seconds": metrics.get("seconds") or last.get("seconds"),

@@ -14,7 +14,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from gsplat_edu.scene import projection_formulas
+from gsplat_edu.base import constants
 
 PERSPECTIVE, FISHEYE, EQUIRECTANGULAR = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 """`OPTICS` modulo 4; 3 is orthographic."""
@@ -32,10 +32,7 @@ FOCAL, MIDDLE, COEFFICIENTS = tl.constexpr(12), tl.constexpr(14), tl.constexpr(1
 """Places in a lens' row; R and the eye come before. The gradient has the same places."""
 
 PI = tl.constexpr(math.pi)
-POLE = tl.constexpr(float(projection_formulas.POLE))
-
-NEAR_AXIS = tl.constexpr(0.1)
-"""Largest r² / z² at which theta / r is a series. Below it, the closed forms of its derivatives cancel in float32."""
+POLE, NEAR_AXIS = tl.constexpr(constants.POLE), tl.constexpr(constants.NEAR_AXIS_F32)
 
 SERIES = tl.constexpr(16)
 """Last power of the series, even; the first that is left out is 0.1^17."""

@@ -128,12 +128,8 @@ export function judge({ place, store, entry, where }) {
 
   function showViews({ views: found }) {
     views = found;
-    const mean =
-      now.psnr === null
-        ? ""
-        : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
     facts.textContent = found.length
-      ? `${mean} Differences are shown 4 times as strong.`
+      ? `${now.verdict} Differences are shown 4 times as strong.`
       : "There are no held-out views yet. They are rendered when the training ends.";
     show();
   }

@@ -51,7 +51,15 @@ class JobView {
 
 // What is known of a run that has no folder yet.
 function runOf({ subject, created }) {
-  const nothing = { planned: null, iterations: null, psnr: null, ssim: null, num_gaussians: null, seconds: null };
+  const nothing = {
+    planned: null,
+    iterations: null,
+    psnr: null,
+    ssim: null,
+    num_gaussians: null,
+    seconds: null,
+    verdict: "",
+  };
   const entry = { kind: "runs", name: subject.slice(5), entry: subject, path: "", adopted: null, modified: created };
   return { ...entry, ...nothing, files: 0, bytes: 0, finished: false, capture: null, problem: null, edited: false };
 }
