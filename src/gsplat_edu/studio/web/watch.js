@@ -61,12 +61,13 @@ export function watch({ place, store, entry }) {
     count: curve("Splats", whole),
   };
   const next = h("p", { class: "next row" });
+  const verdict = h("p"); // how good the scene is, in words
   place.append(
     h(
       "div",
       { class: "watch" },
       h("div", { class: "left-side" }, scene.element, slider.element, page.element),
-      h("div", { class: "right-side" }, figures, next, job.element),
+      h("div", { class: "right-side" }, figures, verdict, next, job.element),
     ),
     h(
       "section",
@@ -147,6 +148,7 @@ export function watch({ place, store, entry }) {
       else if (now.files) scene.show(page.address(now));
       else scene.show(null, "There is no scene.");
       showFigures(figures, now, view, data);
+      verdict.textContent = active ? "" : now.verdict;
       if (now.finished && !active && !next.children.length) {
         next.append(link("Judge it", `${addressOf(now)}/judge`, { class: "button" }));
       }
