@@ -8,10 +8,17 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.images import decode, decode_mask, image_orientation, image_size, turned, upright_size
 from gsplat_edu.data.orientation import QUARTER_TURNS
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.photos.decoding import (
+    decode,
+    decode_mask,
+    image_orientation,
+    image_size,
+    turned,
+    upright_size,
+)
 from phone_photos import ORIENTATIONS, as_stored, exif_bytes, quarters, save
 
 EVERYTHING = DataSettings(test_every=0)

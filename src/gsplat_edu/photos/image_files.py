@@ -167,15 +167,20 @@ def _opened(file: BinaryIO | BytesIO, source: Path | bytes, formats: Sequence[st
     return image
 
 
-def require_room(path: Path, image: Image.Image) -> None:
+def require_room(path: Path, image: Image.Image, each: int | None = None) -> None:
     """Check that enough memory is free to decode an image, given the size in its header.
+
+    Args:
+        path: The file.
+        image: The image, opened but not decoded.
+        each: Bytes per pixel; None for those that Pillow takes.
 
     Raises:
         NotEnoughMemoryError: too little memory is free.
     """
     require_memory(
         f"{path}: {image.width}x{image.height} px",
-        bytes_per_pixel(image) * image.width * image.height,
+        (each or bytes_per_pixel(image)) * image.width * image.height,
         "close other programs, or make the photo smaller",
     )
 
