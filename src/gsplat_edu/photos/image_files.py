@@ -1,5 +1,8 @@
 """The only module that opens image files: formats of cameras and photo software, within limits of size and memory.
 
+Photos and their masks are then decoded by `gsplat_edu.photos.decoding` only. What is no photo, as a depth map, a mesh's
+texture, an image of SOG or a picture that this program wrote, is decoded where its numbers mean something.
+
 Pillow supports some forty more formats. One of them starts Ghostscript on the file, and others decode data that no
 photo contains.
 """
