@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsplat_edu.blocks.plan import Area, Cell
 from gsplat_edu.blocks.views import SIDE, Renderer, in_any_view
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians

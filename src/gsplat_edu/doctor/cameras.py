@@ -16,7 +16,7 @@ from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.doctor.finding import FEWER_PHOTOS, MORE_PHOTOS, NAMED, Finding, Severity, command
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
-from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import FAR_AWAY, SAME_PLACE, far_ratios, settled_eyes, stray_eyes
 from gsplat_edu.train.capacity import advised_side

@@ -23,7 +23,7 @@ from PIL import Image
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.evidence import judging_backend
 from gsplat_edu.clean.sight import times_seen
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.photos.pixels import area_mean
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.dataset import run_dataset
