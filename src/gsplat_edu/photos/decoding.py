@@ -101,6 +101,16 @@ def image_size(path: Path) -> tuple[int, int]:
         return stored_size(file)
 
 
+def upright_image_size(path: Path) -> tuple[int, int]:
+    """Read width and height of a photo once it is turned by its EXIF orientation, px.
+
+    Raises:
+        DatasetError: as for `image_header`.
+    """
+    with quiet_decoders(), _readable(path) as file:
+        return upright_size(stored_size(file), stored_orientation(file))
+
+
 def image_orientation(path: Path) -> int:
     """Read the EXIF orientation, 1 to 8; 1 if a file has none. Always 1 for HEIC: see `stored_orientation`.
 

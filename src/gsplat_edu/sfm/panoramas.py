@@ -25,9 +25,8 @@ from gsplat_edu.photos.decoding import (
     decode_mask,
     image_header,
     image_orientation,
-    image_size,
     turned,
-    upright_size,
+    upright_image_size,
 )
 from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
 from gsplat_edu.photos.pixels import area_mean
@@ -98,7 +97,7 @@ def are_panoramas(files: Sequence[Path], choice: str, say: Callable[[str], None]
     sizes = dict[Path, tuple[int, int]]()
     for path in files:
         try:
-            sizes[path] = upright_size(image_size(path), image_orientation(path))
+            sizes[path] = upright_image_size(path)
         except DatasetError:
             continue
     others = [path for path, size in sizes.items() if not is_panorama_size(*size)]
@@ -177,7 +176,7 @@ def cut_panoramas(
     found, unreadable, masks = list[Panorama](), list[str](), find_masks(files)
     for path in files:
         try:
-            sizes[path] = upright_size(image_size(path), image_orientation(path))
+            sizes[path] = upright_image_size(path)
         except DatasetError as error:
             unreadable.append(f"{path.name}: {error.reason or error}")
     side = face_side(max((W for W, _ in sizes.values()), default=2), largest)
