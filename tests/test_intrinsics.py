@@ -8,8 +8,8 @@ import pytest
 from gsplat_edu import ArgumentError, Camera
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.lens import Lens
-from gsplat_edu.evaluate.paths import resized
 from gsplat_edu.io.edit import Similarity
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.scene.intrinsics import UNEVEN, Intrinsics
 
 PINHOLE = Intrinsics(40, 30, 50.0, 45.5, 18.25, 16.5)

@@ -20,11 +20,11 @@ from matplotlib.cbook import get_sample_data
 from PIL import Image
 
 from gsplat_edu import Camera, sphere_shell
-from gsplat_edu.data.images import decode
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.engine.passes import Program, manifest
 from gsplat_edu.fit2d.fit import shrunk_photo
 from gsplat_edu.fit2d.splats import random_splats_2d
+from gsplat_edu.photos.decoding import decode
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.gaussian_math import project_cov3d

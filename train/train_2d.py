@@ -22,14 +22,14 @@ from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.printing import say
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.running import run_command
-from gsplat_edu.data.images import decode
 from gsplat_edu.evaluate.figures import save_figure
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.fit2d.fit import Fit2D, Fit2DSettings, Step2D, fit_2d, shrunk_photo
 from gsplat_edu.fit2d.splats import random_splats_2d
 from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.options.values import whole_number_text
-from gsplat_edu.scene.views import Photo
+from gsplat_edu.photos.decoding import decode
+from gsplat_edu.photos.pixels import Photo
 
 LOG_EVERY = 50
 

@@ -28,11 +28,11 @@ import numpy as np
 from matplotlib.cbook import get_sample_data
 
 from gsplat_edu import ALPHA_MAX, ALPHA_MIN, DILATION, Camera, render_gaussians
-from gsplat_edu.data.images import decode
 from gsplat_edu.fit2d.adam import AdamSettings, AdamState, adam_step_2d
 from gsplat_edu.fit2d.fit import Fit2DSettings, fit_2d, psnr_2d, shrunk_photo
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
 from gsplat_edu.fit2d.splats import Splats2D, ellipses_2d, random_splats_2d, render_2d
+from gsplat_edu.photos.decoding import decode
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 SIZE, COUNT, LENGTH, TRIAL = (64, 125, 100, 40) if SHORT else (128, 500, 500, 200)

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, write_path
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
 from gsplat_edu.io.mesh_files import write_mesh
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath, write_path
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.mesh import Mesh

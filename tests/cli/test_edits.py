@@ -9,8 +9,8 @@ import torch
 from gsplat_edu.cli.main import main
 from gsplat_edu.cli.view import _edits_file
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.export import read_back

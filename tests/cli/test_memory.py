@@ -16,10 +16,10 @@ from gsplat_edu.base import headroom
 from gsplat_edu.base.errors import NotEnoughMemoryError
 from gsplat_edu.base.headroom import available_memory, require_memory
 from gsplat_edu.cli.running import run_command
-from gsplat_edu.data.images import decode
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.photos.decoding import decode
 from gsplat_edu.scene.gaussians import Gaussians
 
 CHILD = """
@@ -32,7 +32,7 @@ pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + 640 * 2**20
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 photo, scene, capture, out = sys.argv[1:]
-from gsplat_edu.data.images import decode
+from gsplat_edu.photos.decoding import decode
 from gsplat_edu.cli.running import run_command
 print(run_command("photo", lambda: decode(__import__("pathlib").Path(photo)), False))
 print(main(["render", scene, "--size", "200000", "--frames", "1", "--backend", "cpu", "--out", out]))

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.data import images, reader
+from gsplat_edu.data import reader
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.photos import decoding
 from gsplat_edu.runs import pilot
 from lab.captures.city import City, write_city
 
-COUNTED = ((reader, "read_capture"), (images, "image_header"), (images, "image_size"))
+COUNTED = ((reader, "read_capture"), (decoding, "image_header"), (decoding, "image_size"))
 
 
 def _counting(counts, name, really):

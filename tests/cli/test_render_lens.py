@@ -12,9 +12,9 @@ from PIL import Image
 import gsplat_edu.cli.main as command_line
 from far_run import BLUE, write_far_run
 from gsplat_edu.cli.shot import median_depth
-from gsplat_edu.evaluate.lenses import circle, fisheye, orthographic, panorama
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply
+from gsplat_edu.paths.lenses import circle, fisheye, orthographic, panorama
 from gsplat_edu.render import backends
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings

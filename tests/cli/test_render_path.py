@@ -10,11 +10,11 @@ from PIL import Image
 
 import gsplat_edu.cli.main as command_line
 from far_run import BLUE, ORIGIN, write_far_run
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, write_path
-from gsplat_edu.evaluate.path_curve import PathCurve
-from gsplat_edu.evaluate.paths import orbit_of_scene
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import load_ply, save_ply
+from gsplat_edu.paths.curve import PathCurve
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath, read_path, write_path
+from gsplat_edu.paths.orbits import orbit_of_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
@@ -133,7 +133,7 @@ def test_a_saved_orbit_is_rendered_as_the_orbit(made, cli, tmp_path, capsys):
     for i, orbiting in enumerate(orbit_of_scene(scene.gaussians, 12, 40)):
         # The keyframes are 60 degrees apart. Between them, the curve is off the circle by 3 h⁴ / 128, 3 % of the
         # radius; see
-        # tests/evaluate/test_path_curve.py.
+        # tests/paths/test_curve.py.
         atol = 1e-9 if i % 2 == 0 else 0.03 * np.linalg.norm(orbiting.eye)
         np.testing.assert_allclose(cameras[i].eye, orbiting.eye, atol=atol)
         off = pixels(tmp_path / "path" / f"frame_{i:04d}.png") - picture(

@@ -20,11 +20,11 @@ import pytest
 
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, write_path
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.mesh_files import write_mesh
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath, read_path, write_path
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source

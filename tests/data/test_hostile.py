@@ -16,11 +16,11 @@ from gsplat_edu.base.errors import DatasetError, SceneFormatError
 from gsplat_edu.data import capture
 from gsplat_edu.data.colmap import read_images, read_points
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.images import ImageHeader, decode, decode_mask, image_size
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.io.formats import read_scene
+from gsplat_edu.photos.decoding import ImageHeader, decode, decode_mask, image_size
 from systems import needs_posix
 
 ROOT = Path(__file__).parents[2]
@@ -229,11 +229,11 @@ def test_many_frames_without_a_photo_need_few_system_calls(tmp_path, monkeypatch
 
 def test_many_frames_of_one_photo_read_its_header_once(tmp_path, monkeypatch):
     """Such a photo is one view."""
-    from gsplat_edu.data import images
+    from gsplat_edu.photos import decoding
 
     read = []
     header = ImageHeader((16, 12), "")
-    monkeypatch.setattr(images, "image_header", lambda path: read.append(path) or header)
+    monkeypatch.setattr(decoding, "image_header", lambda path: read.append(path) or header)
     assert len(load_dataset(transforms(tmp_path, ["images/a.png"] * 300), EVERYTHING).train) == 1
     assert len(read) == 1
 

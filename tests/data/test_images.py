@@ -10,8 +10,8 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.images import decode, decode_mask, image_size
 from gsplat_edu.data.writers import write_transforms
+from gsplat_edu.photos.decoding import decode, decode_mask, image_size
 from gsplat_edu.photos.image_files import PIXELS_PER_BYTE
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View

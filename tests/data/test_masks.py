@@ -8,8 +8,8 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.images import decode_mask
 from gsplat_edu.data.masks import MaskFolder
+from gsplat_edu.photos.decoding import decode_mask
 from gsplat_edu.sfm.masks import check_some_used, find_masks
 
 EVERYTHING = DataSettings(test_every=0)

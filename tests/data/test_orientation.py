@@ -8,10 +8,18 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.images import decode, decode_mask, image_orientation, image_size, turned, upright_size
 from gsplat_edu.data.orientation import QUARTER_TURNS
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.photos.decoding import (
+    decode,
+    decode_mask,
+    image_orientation,
+    image_size,
+    turned,
+    upright_image_size,
+    upright_size,
+)
 from phone_photos import ORIENTATIONS, as_stored, exif_bytes, quarters, save
 
 EVERYTHING = DataSettings(test_every=0)
@@ -43,7 +51,7 @@ def test_pixels_are_read_as_stored_and_turned_on_request(tmp_path, name, orienta
     stored = as_stored(quarters(), orientation)
     assert image_orientation(path) == orientation
     assert image_size(path) == stored.shape[1::-1]
-    assert upright_size(image_size(path), orientation) == (64, 48)
+    assert upright_size(image_size(path), orientation) == upright_image_size(path) == (64, 48)
     np.testing.assert_array_equal(decode(path)[0], stored)
     np.testing.assert_array_equal(decode(path, orientation)[0], quarters())
     np.testing.assert_array_equal(turned(stored, orientation), quarters())

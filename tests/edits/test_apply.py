@@ -18,9 +18,9 @@ from gsplat_edu.edits.apply import (
     views_after,
 )
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.edit import IDENTITY, Filter
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at

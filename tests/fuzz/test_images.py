@@ -9,7 +9,7 @@ from PIL import ExifTags, Image, ImageCms, TiffImagePlugin
 import tiers
 from damage import damaged_bytes
 from gsplat_edu.base.errors import SplatError
-from gsplat_edu.data.images import decode, decode_mask, image_header, image_orientation, image_size
+from gsplat_edu.photos.decoding import decode, decode_mask, image_header, image_orientation, image_size
 from gsplat_edu.sfm.photos import copy_photos, taken_at
 
 pytestmark = pytest.mark.fuzz

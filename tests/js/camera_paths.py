@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.scene.camera import look_at
 
 

@@ -15,11 +15,11 @@ from gsplat_edu.base import constants
 from gsplat_edu.edits.apply import apply_operation, moved_together
 from gsplat_edu.edits.cells import EditWork
 from gsplat_edu.edits.membership import Values, members
-from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.sog import codec as sog
 from gsplat_edu.io.sog.files import decode, write_bundle
+from gsplat_edu.paths.curve import PathCurve
 from gsplat_edu.scene.camera import look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.mesh import Mesh

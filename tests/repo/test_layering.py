@@ -1,5 +1,6 @@
-"""The import contracts of pyproject.toml hold, and detect violations."""
+"""The import contracts of pyproject.toml hold, and detect violations; only one room opens and decodes photos."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -62,3 +63,23 @@ def test_a_planted_import_breaks_a_contract(copy, file, line):
 def test_a_new_module_has_to_be_given_a_layer(copy):
     (copy / "src" / "gsplat_edu" / "helpers.py").write_text("")
     assert lint(copy).returncode == 1
+
+
+def test_only_photos_opens_image_files_and_decodes_photos():
+    """Elsewhere, headers are read for facts that only one room wants, and what is decoded is no photo."""
+    allowed = {
+        "sfm/photos.py": "focal length, camera and place in EXIF",
+        "sfm/panoramas.py": "XMP of a panorama",
+        "data/depth_files.py": "depths",
+        "data/depth_folder.py": "confidences of depths",
+        "evaluate/comparison.py": "pictures of a run, which this program wrote",
+        "io/mesh_image.py": "textures",
+        "io/sog/files.py": "numbers of splats",
+    }
+    package = ROOT / "src" / "gsplat_edu"
+    texts = {path.relative_to(package).as_posix(): path.read_text() for path in package.rglob("*.py")}
+    outside = {name: text for name, text in texts.items() if not name.startswith("photos/")}
+    by_themselves = re.compile(r"\bImage\.open\b|\bimread\b|\bimdecode\b|\bHeifImageFile\b")
+    assert by_themselves.search(texts["photos/image_files.py"])
+    assert not [name for name, text in outside.items() if by_themselves.search(text)]
+    assert {name for name, text in outside.items() if "opened_image" in text} == set(allowed)

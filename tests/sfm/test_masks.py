@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.images import decode_mask
+from gsplat_edu.photos.decoding import decode_mask
 from gsplat_edu.sfm.masks import find_masks, unused_folders, upright_masks
 from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct

@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.data.colors import make_profile
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import PhotoFile, load_photo
 from gsplat_edu.data.lens import Lens
+from gsplat_edu.photos.colors import make_profile
 from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from lab.captures.textured_box import box_orbit, photograph_box

@@ -212,6 +212,7 @@ def test_normal_use_leaves_no_errors_in_the_console(visitor, runs):
     tab.get_by_label("Iterations instead of a quality").fill("150")
     tab.get_by_role("button", name="Start training").click()
     tab.get_by_role("link", name="Judge it").wait_for()
+    tab.get_by_text("After 150 iterations, renders of the held-out photos reach").wait_for()
     frame_of(tab)
     tab.get_by_role("link", name="Judge it").click()
     tab.locator(".views li").first.wait_for()

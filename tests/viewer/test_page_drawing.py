@@ -14,9 +14,9 @@ import torch
 from PIL import Image
 
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.evaluate.paths import orbit_of_scene
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.orbits import orbit_of_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.field import within_field
 from gsplat_edu.render.settings import RenderSettings

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from gsplat_edu.evaluate.keyframes import KeyframePath, read_path
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.keyframes import KeyframePath, read_path
 from gsplat_edu.viewer import page
 from js.camera_paths import AROUND, around
 from viewer.handles import until

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at

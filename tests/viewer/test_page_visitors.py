@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.viewer import page
 
 

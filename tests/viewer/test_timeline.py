@@ -9,9 +9,9 @@ import pytest
 
 from gestures import drag, swipe
 from gsplat_edu.edits.apply import views_after
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
-from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.curve import PathCurve
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.scene.camera import look_at
 from gsplat_edu.viewer import page
 from viewer.handles import until

@@ -17,10 +17,11 @@ from torch import Tensor
 
 from gsplat_edu.blocks.plan import Area, Cell
 from gsplat_edu.blocks.views import SIDE, Renderer, in_any_view
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.paths.orbits import resized
+from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.views import Photo, View
+from gsplat_edu.scene.views import View
 
 SHARE = 0.25
 """A pixel counts if at least this share of the light of its Gaussians comes from the cell and its margin."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsplat_edu.blocks.plan import Area, Block, Cell, halved
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import MOST_CHANNELS, RenderOutput
 from gsplat_edu.runs.options import RunOptions

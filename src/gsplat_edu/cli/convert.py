@@ -20,7 +20,6 @@ from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.edits.apply import views_after
 from gsplat_edu.edits.document import read_edits
 from gsplat_edu.edits.operations import Measure
-from gsplat_edu.evaluate.keyframes import read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.io.formats import LOD_META, TILESET
 from gsplat_edu.io.lod.levels import LodOptions
@@ -28,6 +27,7 @@ from gsplat_edu.io.lod.tiles import tile_options
 from gsplat_edu.jobs import emitter
 from gsplat_edu.options.convert import MOVES, photos_asked
 from gsplat_edu.options.values import numbers_text
+from gsplat_edu.paths.keyframes import read_path
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.scene.frame import ORIGIN

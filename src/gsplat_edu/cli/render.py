@@ -24,17 +24,17 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.edits.apply import Views, edited, placed, views_after
 from gsplat_edu.edits.document import Edits, read_edits
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.evaluate.following import path_along
 from gsplat_edu.evaluate.images import VIDEO_SUFFIX, check_output, write_frames
-from gsplat_edu.evaluate.keyframes import FEWEST, Keyframe, KeyframePath, evenly_chosen, read_path, write_path
 from gsplat_edu.evaluate.map_files import write_list, write_maps
-from gsplat_edu.evaluate.path_curve import PathCurve
-from gsplat_edu.evaluate.paths import orbit_of_scene, resized
 from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE, lens_choice
+from gsplat_edu.paths.curve import PathCurve
+from gsplat_edu.paths.following import path_along
+from gsplat_edu.paths.keyframes import FEWEST, Keyframe, KeyframePath, evenly_chosen, read_path, write_path
+from gsplat_edu.paths.orbits import orbit_of_scene, resized
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend, resolve_backend
 from gsplat_edu.render.field import within_field

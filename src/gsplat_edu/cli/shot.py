@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.evaluate.images import VIDEO_SUFFIX
-from gsplat_edu.evaluate.lenses import (
+from gsplat_edu.options.render import FISHEYE_DEGREES, LensChoice, lens_choice
+from gsplat_edu.paths.lenses import (
     LEVEL,
     PANORAMA_SIDES,
     Plan,
@@ -21,7 +22,6 @@ from gsplat_edu.evaluate.lenses import (
     orthographic,
     panorama,
 )
-from gsplat_edu.options.render import FISHEYE_DEGREES, LensChoice, lens_choice
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.frame import ORIGIN

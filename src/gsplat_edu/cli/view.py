@@ -12,10 +12,10 @@ from gsplat_edu.base.files import check_writable
 from gsplat_edu.cli.screen import has_screen, open_in_browser
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.evaluate.keyframes import read_path
 from gsplat_edu.io.formats import LOD_META, SOG_META, file_in
 from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.options.view import BESIDE
+from gsplat_edu.paths.keyframes import read_path
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.server.address import exposure

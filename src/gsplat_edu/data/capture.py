@@ -16,13 +16,14 @@ from jaxtyping import Float64
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable
 from gsplat_edu.base.reading import kind_of
-from gsplat_edu.data.images import UPRIGHT, PhotoFile, PhotoHeaders, upright_size
+from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.native_lens import WIDEST_PANORAMA, is_native, native_intrinsics
 from gsplat_edu.data.notes import Note, UnusablePhotos
 from gsplat_edu.data.panorama import FaceLens, face_rotations
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import FACTOR_BELOW, DataSettings
+from gsplat_edu.photos.decoding import UPRIGHT, PhotoHeaders, upright_size
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.shutter import RollingShutter
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import Capture, Cloud, Frame, UnfitPhotoError, photo_file, whole_panoramas
-from gsplat_edu.data.images import UPRIGHT, ImageStore, PhotoFile, PhotoHeaders
+from gsplat_edu.data.images import ImageStore, PhotoFile
 from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
 from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
 from gsplat_edu.data.loading_notes import (
@@ -46,6 +46,7 @@ from gsplat_edu.data.region_masks import views_of_region
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.visible_cloud import cloud_in_cube, cloud_in_view
+from gsplat_edu.photos.decoding import UPRIGHT, PhotoHeaders
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.region import Region
 from gsplat_edu.scene.rig import scene_extent as scene_extent, settled_eyes, stray_eyes

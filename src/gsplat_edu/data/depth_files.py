@@ -123,7 +123,7 @@ def _plane(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def _image(path: Path) -> Shaped[np.ndarray, "h w"]:
-    """Read a PNG or TIFF with one channel."""
+    """Read a PNG or TIFF with one channel; it is no photo: its values are depths."""
     with opened_image(path, ("PNG", "TIFF")) as file:
         _checked_size(*file.size)
         if file.mode not in ("I;16", "I;16B", "I;16L", "I", "F", "L"):

@@ -35,7 +35,6 @@ from gsplat_edu.data.depth_fit import (
     no_jumps,
 )
 from gsplat_edu.data.depth_folder import GEOMETRIC_MAPS, DepthFile, confidence_of, depth_files, read_map
-from gsplat_edu.data.images import turned, upright_size
 from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.native_lens import native_intrinsics
 from gsplat_edu.data.orientation import oriented
@@ -43,6 +42,7 @@ from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.sparse_depth import sparse_depth, tracked_points
 from gsplat_edu.data.tracks import visible_points
+from gsplat_edu.photos.decoding import turned, upright_size
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH, GivenDepth
 from gsplat_edu.scene.intrinsics import Intrinsics

@@ -30,12 +30,12 @@ from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import PHOTO_FOLDERS, is_file, is_folder
 from gsplat_edu.data.changes import changing
-from gsplat_edu.data.images import BACK, decode_mask, image_orientation, image_size, turned, upright_size
 from gsplat_edu.data.left_out import photo_named, photo_path
 from gsplat_edu.data.mask_shapes import MOST_SHAPES, Shape, checked_shape, covered, shape_document, short_text
 from gsplat_edu.data.masks import MASKS
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.reader import CaptureReader, read_capture
+from gsplat_edu.photos.decoding import BACK, decode_mask, image_orientation, image_size, turned, upright_size
 
 DRAWN = "drawn_masks.json"
 """Name of the file that keeps what was drawn."""

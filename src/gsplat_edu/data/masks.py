@@ -21,7 +21,7 @@ MASK_ENDINGS = (*PHOTO_ENDINGS, ".bmp", ".pgm")
 """Suffixes of masks, in any case."""
 
 LOSSY_ENDINGS = (".jpg", ".jpeg", ".heic", ".heif", ".hif")
-"""Suffixes of masks whose zeros are not exact; `gsplat_edu.data.images.decode_mask` applies a threshold to them."""
+"""Suffixes of masks whose zeros are not exact; `gsplat_edu.photos.decoding.decode_mask` applies a threshold to them."""
 
 MASKS = "masks"
 """Name of the folders that are searched for masks."""

@@ -239,7 +239,7 @@ class UnreadColors:
         """Return the note in a list; empty if no photo has a problem.
 
         Args:
-            problems: Name of each photo and `gsplat_edu.data.images.ImageHeader.problem`.
+            problems: Name of each photo and `gsplat_edu.photos.decoding.ImageHeader.problem`.
         """
         found = [(name, problem) for name, problem in problems if problem]
         return [cls(len(found), len(problems), *found[0])] if found else []

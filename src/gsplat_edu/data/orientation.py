@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import Frame, fits_camera
-from gsplat_edu.data.images import UPRIGHT, PhotoHeaders
+from gsplat_edu.photos.decoding import UPRIGHT, PhotoHeaders
 
 QUARTER_TURNS = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""

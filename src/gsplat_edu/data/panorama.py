@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from gsplat_edu.base.errors import DatasetError, ShapeError
 from gsplat_edu.data.lens import MAX_REMAPPED, Lens
-from gsplat_edu.photos.resizing import area_mean, premultiplied, smaller_mask, unweighted
+from gsplat_edu.photos.pixels import area_mean, premultiplied, smaller_mask, unweighted
 from gsplat_edu.scene.intrinsics import Intrinsics
 
 PITCHES = (33.0, -33.0)

@@ -25,13 +25,13 @@ from gsplat_edu.data.capture import (
     is_folder,
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
-from gsplat_edu.data.images import PhotoHeaders
 from gsplat_edu.data.loading_notes import LoadingNote, MovedOrigin
 from gsplat_edu.data.notes import TwoLayouts
 from gsplat_edu.data.points import finite_cloud, read_points_ply
 from gsplat_edu.data.scale import read_scale
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.data.watch import FileWatch
+from gsplat_edu.photos.decoding import PhotoHeaders
 from gsplat_edu.scene.frame import origin_of
 
 

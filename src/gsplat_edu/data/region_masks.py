@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.region import Region, seen_in
-from gsplat_edu.scene.views import Photo, View
+from gsplat_edu.scene.views import View
 
 AROUND = 4
 """px: this far around the box's place in a photo, pixels count too: what crosses its border needs both sides."""

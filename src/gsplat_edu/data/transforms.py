@@ -38,12 +38,12 @@ from gsplat_edu.data.capture import (
     problem_notes,
 )
 from gsplat_edu.data.colmap import find_model, points_file, read_points
-from gsplat_edu.data.images import image_size
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, RepeatedPhotos
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.shutter_keys import SHUTTER_KEYS, shutter_from_keys
+from gsplat_edu.photos.decoding import image_size
 
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 

@@ -23,9 +23,10 @@ from gsplat_edu.data.native_lens import ARIA, POLYNOMIAL, RATIONAL
 from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.shutter_keys import keys_of_shutter
 from gsplat_edu.data.tracks import UNMEASURED, VisiblePoints, tracks_of, visible_points
+from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.projection import COEFFICIENTS
-from gsplat_edu.scene.views import Photo, View
+from gsplat_edu.scene.views import View
 
 Intrinsic = tuple[str, int, int, tuple[float, ...]]
 """COLMAP's model, width, height and parameters."""

@@ -24,6 +24,7 @@ from gsplat_edu.doctor.geometry import inside
 from gsplat_edu.doctor.photos import BRIGHT, COARSE, DARK, WORK_SIDE
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.io.mesh_glb import linear
+from gsplat_edu.photos.pixels import shrunk
 from gsplat_edu.scene.camera import Camera
 
 EXPOSURE = "exposure"
@@ -209,10 +210,7 @@ def _motion(survey: Survey, i: int, j: int) -> float:
 
 def _signature(thumbnail: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " n"]:
     """Return a small version of a photo normalised to mean 0 and contrast 1, independent of exposure."""
-    h, w = thumbnail.shape[:2]
-    share = min(1.0, DUPLICATE_SIDE / max(h, w))
-    size = max(1, round(w * share)), max(1, round(h * share))
-    small = cv2.resize(thumbnail, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    small = shrunk(thumbnail, DUPLICATE_SIDE).reshape(-1, 3)
     small = small - small.mean(axis=0)
     return np.asarray((small / max(float(small.std()), 1.0)).ravel(), dtype=np.float32)
 

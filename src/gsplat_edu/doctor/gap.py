@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsplat_edu.doctor.geometry import INWARD, Geometry
-from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.paths.orbits import common_up
 
 LEAST = math.radians(30.0)
 """Narrower arcs are no gap: photos 30 degrees apart still share most of what they show."""

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsplat_edu.evaluate.following import point_nearest_most_axes
+from gsplat_edu.paths.following import point_nearest_most_axes
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import scene_extent, settled_eyes
 
@@ -84,7 +84,7 @@ class Geometry:
     def centre(self) -> Float64[np.ndarray, "3"] | None:
         """(3,) the point nearest to most optical axes, if it is in front of most cameras; otherwise None.
 
-        See `gsplat_edu.evaluate.following.point_nearest_most_axes`.
+        See `gsplat_edu.paths.following.point_nearest_most_axes`.
         """
         centre = point_nearest_most_axes(self.cameras)
         return centre if centre is not None and np.mean(self.ahead(centre) > 0) >= MOST else None

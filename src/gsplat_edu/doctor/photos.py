@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from gsplat_edu.data.images import PhotoFile, decode, decode_mask
+from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.data.lens import undistortion
 from gsplat_edu.data.panorama import FaceLens, cut_face, face_side
-from gsplat_edu.scene.views import Photo
+from gsplat_edu.photos.decoding import decode, decode_mask
+from gsplat_edu.photos.pixels import Photo, shrunk
 
 WORK_SIDE = 1024
 """Longest side at which sharpness is measured, px. Blur that is invisible at this size hardly harms a scene, and photos
@@ -91,11 +92,11 @@ def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
     stored = None if source.mask is None else decode_mask(source.mask)
     mask = None if stored is None else _shrunk_mask(stored)
     decoded, alpha = _decoded(source, WORK_SIDE if sharpness else 2 * THUMBNAIL_SIDE)
-    pixels = _shrunk(decoded, WORK_SIDE)
+    pixels = shrunk(decoded, WORK_SIDE)
     counts = _counting(alpha, stored, pixels.shape[:2])
     if face := isinstance(lens, FaceLens):
         pixels, _, counts = cut_face(pixels, None, counts, lens.R, face_side(pixels.shape[1]))
-    small = _shrunk(pixels, THUMBNAIL_SIDE)
+    small = shrunk(pixels, THUMBNAIL_SIDE)
     few = None if counts is None else _nearest(counts, small.shape[:2])
     h, w = small.shape[:2]
     if lens.distorts and not face and min(h, w) > 1:
@@ -187,14 +188,5 @@ def _decoded(
 
 def _shrunk_mask(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
     grey = np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255
-    counts: Bool[np.ndarray, "h w"] = _shrunk(grey, THUMBNAIL_SIDE)[..., 0] >= 128
+    counts: Bool[np.ndarray, "h w"] = shrunk(grey, THUMBNAIL_SIDE)[..., 0] >= 128
     return counts
-
-
-def _shrunk(pixels: UInt8[np.ndarray, "H W 3"], side: int) -> UInt8[np.ndarray, "h w 3"]:
-    H, W = pixels.shape[:2]
-    share = side / max(H, W)
-    if share >= 1.0:
-        return pixels
-    size = max(1, round(W * share)), max(1, round(H * share))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))

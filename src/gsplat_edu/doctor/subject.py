@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.doctor.geometry import Geometry
-from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.region import Region
 
 MIDDLE = 0.5

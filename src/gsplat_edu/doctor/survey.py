@@ -15,7 +15,6 @@ from jaxtyping import Float64
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
 from gsplat_edu.data.depths import DepthReport
-from gsplat_edu.data.images import PhotoHeaders, recorded_exposure
 from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import LeftOutPhotos, Note, UnreadColors
@@ -28,6 +27,7 @@ from gsplat_edu.doctor.finding import Finding
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.photos import PhotoStats, measure_photo, unmeasured
 from gsplat_edu.doctor.support import observed_points
+from gsplat_edu.photos.decoding import PhotoHeaders, recorded_exposure
 from gsplat_edu.scene.camera import Camera
 
 WORKERS = 2
@@ -48,7 +48,7 @@ class Shot:
         camera: The undistorted pinhole camera at the thumbnail's size.
         stats: Its thumbnail and measurements.
         colors: Why its colours are taken as sRGB although its file declares another space; empty if they are converted.
-        exposure: Brightness by its EXIF (`gsplat_edu.data.images.recorded_exposure`), stops; None if it has none.
+        exposure: Brightness by its EXIF (`gsplat_edu.photos.decoding.recorded_exposure`), stops; None if it has none.
     """
 
     name: str

@@ -14,9 +14,9 @@ from gsplat_edu.edits.cells import EditWork
 from gsplat_edu.edits.membership import Members, Values, members
 from gsplat_edu.edits.moves import Moved, move_means, moved_gaussians, similarity_of
 from gsplat_edu.edits.neighbours import within_radius
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.edit import IDENTITY, Similarity
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.scene.camera import WORLD_UP
 from gsplat_edu.scene.frame import ORIGIN, rotation_between
 from gsplat_edu.scene.gaussians import Gaussians

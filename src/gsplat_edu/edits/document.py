@@ -30,7 +30,7 @@ from gsplat_edu.edits.front import Front, parsed_front
 from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.runs import end_of, parsed_runs
 from gsplat_edu.edits.stored import MOST_BYTES
-from gsplat_edu.evaluate.keyframes import Keyframe, check_keyframe, parsed_keyframe, parsed_path
+from gsplat_edu.paths.keyframes import Keyframe, check_keyframe, parsed_keyframe, parsed_path
 from gsplat_edu.scene.camera import ROTATION_TOLERANCE
 from gsplat_edu.scene.frame import UNITS
 

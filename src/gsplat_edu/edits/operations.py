@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from gsplat_edu.edits.front import Front
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 
 Numbers: TypeAlias = tuple[float, ...]
 

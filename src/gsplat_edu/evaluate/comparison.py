@@ -81,7 +81,7 @@ def comparison_size(path: Path) -> tuple[int, int]:
 
 
 def read_comparison(path: Path) -> dict[str, RgbBytes]:
-    """Read a file of `save_comparison`, or of earlier versions, as "photo" and "render".
+    """Read a file of `save_comparison`, or of earlier versions, as "photo" and "render": a PNG of ours, no photo.
 
     Raises:
         OSError, ValueError: the file cannot be read or is not such a picture.

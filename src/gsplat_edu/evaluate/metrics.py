@@ -34,11 +34,11 @@ from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.ops.losses import l1_ssim
 from gsplat_edu.ops.recolor import Backdrop, recolored
-from gsplat_edu.photos.resizing import eroded
+from gsplat_edu.photos.pixels import Photo, eroded
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.views import Photo, View
+from gsplat_edu.scene.views import View
 
 MSE_FLOOR = 1e-10
 """Smallest mean squared error: identical images have 100 dB, a finite number to average, plot and store."""

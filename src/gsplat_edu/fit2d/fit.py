@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
@@ -18,6 +17,7 @@ from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array, in
 from gsplat_edu.fit2d.adam import AdamSettings, AdamState, adam_step_2d
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
 from gsplat_edu.fit2d.splats import Render2D, Splats2D, check_same_size, render_2d
+from gsplat_edu.photos.pixels import shrunk
 
 SQUARED_ERROR_FLOOR = 1e-10
 """Smallest mean squared error: equal images have 100 dB, as in `gsplat_edu.evaluate.metrics`."""
@@ -164,8 +164,4 @@ def shrunk_photo(pixels: UInt8[np.ndarray, "H W 3"], longest: int) -> Float64[np
         ArgumentError: `longest` is not a whole number of at least 1.
     """
     check_shape("pixels", pixels.shape, ("H", "W", 3), {})
-    factor = min(1.0, whole_number("longest", longest, 1) / max(pixels.shape[:2]))
-    height, width = (max(1, round(factor * side)) for side in pixels.shape[:2])
-    if factor < 1.0:
-        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(pixels, dtype=np.float64) / 255.0
+    return np.asarray(shrunk(pixels, whole_number("longest", longest, 1)), dtype=np.float64) / 255.0

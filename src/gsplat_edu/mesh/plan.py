@@ -21,9 +21,9 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError, NotEnoughMemoryError
 from gsplat_edu.base.text import short_number, spelled_bytes, spelled_seconds
-from gsplat_edu.evaluate.paths import resized
 from gsplat_edu.mesh.depths import LEAST_ALPHA, DepthView, Progress, focal, render_depths
 from gsplat_edu.mesh.faces import faces_of
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera

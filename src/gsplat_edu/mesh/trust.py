@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 
 from gsplat_edu.evaluate.intersections import Intersections, self_intersections
-from gsplat_edu.evaluate.paths import resized
 from gsplat_edu.evaluate.surface import Comparison, Counts, SurfaceScores, score_points, visible_points
 from gsplat_edu.evaluate.topology import Topology, topology
 from gsplat_edu.mesh.depths import DepthView, Progress, camera_points
@@ -21,6 +20,7 @@ from gsplat_edu.mesh.extract import MeshResult
 from gsplat_edu.mesh.faces import drawn_in, faces_of
 from gsplat_edu.mesh.raster import Raster, rasterized
 from gsplat_edu.ops.patches import GreyPhoto, Grid, patch_counts
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.mesh import Mesh

@@ -21,10 +21,10 @@ from gsplat_edu.base.validation import check_shape, whole_number
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 from gsplat_edu.ops.lenses import native_camera, native_rays, within_width
 from gsplat_edu.ops.surface import check_maps
+from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.projection_formulas import POLE, Operations
 from gsplat_edu.scene.sight import Optics, sight
-from gsplat_edu.scene.views import Photo
 
 RADIUS = 3
 """A patch has 7 x 7 pixels, as in Chen et al. 2024 (PGSR)."""

@@ -1,1 +1,1 @@
-"""Photos as files and as pixels: opening them within limits, and resizing."""
+"""Everything from an image file to pixels: recognised, decoded, turned, converted to sRGB, downscaled."""

@@ -1,5 +1,8 @@
 """The only module that opens image files: formats of cameras and photo software, within limits of size and memory.
 
+Photos and their masks are then decoded by `gsplat_edu.photos.decoding` only. What is no photo, as a depth map, a mesh's
+texture, an image of SOG or a picture that this program wrote, is decoded where its numbers mean something.
+
 Pillow supports some forty more formats. One of them starts Ghostscript on the file, and others decode data that no
 photo contains.
 """
@@ -167,15 +170,20 @@ def _opened(file: BinaryIO | BytesIO, source: Path | bytes, formats: Sequence[st
     return image
 
 
-def require_room(path: Path, image: Image.Image) -> None:
+def require_room(path: Path, image: Image.Image, each: int | None = None) -> None:
     """Check that enough memory is free to decode an image, given the size in its header.
+
+    Args:
+        path: The file.
+        image: The image, opened but not decoded.
+        each: Bytes per pixel; None for those that Pillow takes.
 
     Raises:
         NotEnoughMemoryError: too little memory is free.
     """
     require_memory(
         f"{path}: {image.width}x{image.height} px",
-        bytes_per_pixel(image) * image.width * image.height,
+        (each or bytes_per_pixel(image)) * image.width * image.height,
         "close other programs, or make the photo smaller",
     )
 

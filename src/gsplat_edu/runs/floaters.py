@@ -28,7 +28,7 @@ from gsplat_edu.clean.judge import Reason
 from gsplat_edu.clean.shape import Shape, judge_shape
 from gsplat_edu.clean.sight import times_seen
 from gsplat_edu.edits.runs import runs_of
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.cleaning import open_subject
 from gsplat_edu.runs.source import Source, open_source

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.evaluate.paths import resized
 from gsplat_edu.io.lod.levels import Node, leaves_of, level_of, with_levels
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend
 from gsplat_edu.runs.dataset import data_settings, run_dataset

@@ -26,12 +26,12 @@ from gsplat_edu.evaluate.mesh_report import (
     replace_mesh_section,
 )
 from gsplat_edu.evaluate.metrics import to_bytes
-from gsplat_edu.evaluate.paths import resized
 from gsplat_edu.mesh.depths import DepthView
 from gsplat_edu.mesh.extract import MeshResult
 from gsplat_edu.mesh.faces import drawn_in
 from gsplat_edu.mesh.raster import Raster, lit, picture, rasterized
 from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust
+from gsplat_edu.paths.orbits import resized
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import NamedCamera
 from gsplat_edu.scene.camera import Camera

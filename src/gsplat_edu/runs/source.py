@@ -13,9 +13,9 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.evaluate.paths import common_up, orbit_of_scene, resized
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.scene import Scene, direction
+from gsplat_edu.paths.orbits import common_up, orbit_of_scene, resized
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.scene.camera import WORLD_UP, Camera

@@ -16,9 +16,10 @@ from gsplat_edu.base.text import as_file_name
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.capture import is_outside
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.data.images import PhotoFile, decode_mask
+from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.evaluate.masked import MaskedPicture
 from gsplat_edu.evaluate.metrics import Renderer, to_bytes
+from gsplat_edu.photos.decoding import decode_mask
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.io.edit import Similarity
+from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import point_nearest_axes
 
@@ -27,7 +27,7 @@ IN_FRONT = 0.9
 def upright(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> Similarity:
     """Find the transform to up (0, -1, 0), with the origin at the cameras' target and the cameras 5 units from it.
 
-    Up is `gsplat_edu.evaluate.paths.common_up`. The first camera looks along +z, except for its tilt. The origin is the
+    Up is `gsplat_edu.paths.orbits.common_up`. The first camera looks along +z, except for its tilt. The origin is the
     point nearest to all optical axes. If these do not meet in front of the cameras, for example in a room photographed
     from its centre, the origin is the mean camera centre, and the median depth of the points becomes 5.
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.photos.decoding import decode_grey
 
 INLIERS = 15
 """Smallest number of matches with one geometry that connects two photos: COLMAP's own bound."""
@@ -164,9 +165,8 @@ def evidence(folder: Path, photos: Sequence[Path], connected: int) -> Evidence:
 def _grey(path: Path) -> Float32[np.ndarray, "H W"] | None:
     """Return the grey values of a photo, 0 to 255; None if it cannot be decoded."""
     try:
-        with opened_image(path) as image:
-            return np.asarray(image.convert("L"), dtype=np.float32)
-    except UNDECODABLE:
+        return decode_grey(path).astype(np.float32)
+    except DatasetError:
         return None
 
 

@@ -13,8 +13,8 @@ from PIL import Image
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.data.capture import PHOTO_FOLDERS, entries, is_file, is_folder
-from gsplat_edu.data.images import UPRIGHT, decode_mask, image_size, turned, upright_size
 from gsplat_edu.data.masks import MASK_ENDINGS, MASKS, MaskFolder, check_none_unused
+from gsplat_edu.photos.decoding import UPRIGHT, decode_mask, image_size, turned, upright_size
 
 MASK_ENDING = ".mask.png"
 """Ending of masks stored beside their photos; case does not matter."""

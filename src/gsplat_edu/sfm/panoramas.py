@@ -13,24 +13,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.data.images import (
+from gsplat_edu.data.masks import MASKS
+from gsplat_edu.data.panorama import FACES, cut_face, face_rotations, face_side, is_panorama_size
+from gsplat_edu.photos.decoding import (
     decode,
     decode_mask,
     image_header,
     image_orientation,
-    image_size,
     turned,
-    upright_size,
+    upright_image_size,
 )
-from gsplat_edu.data.masks import MASKS
-from gsplat_edu.data.panorama import FACES, cut_face, face_rotations, face_side, is_panorama_size
 from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
+from gsplat_edu.photos.pixels import area_mean
 from gsplat_edu.sfm.masks import find_masks
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts, taken_at
 
@@ -98,7 +97,7 @@ def are_panoramas(files: Sequence[Path], choice: str, say: Callable[[str], None]
     sizes = dict[Path, tuple[int, int]]()
     for path in files:
         try:
-            sizes[path] = upright_size(image_size(path), image_orientation(path))
+            sizes[path] = upright_image_size(path)
         except DatasetError:
             continue
     others = [path for path, size in sizes.items() if not is_panorama_size(*size)]
@@ -146,7 +145,7 @@ def _shows_sphere(path: Path) -> bool:
     except DatasetError:
         return False
     width = min(SEAM_WIDTH, image.shape[1])
-    small = cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = area_mean(image, width, width // 2).astype(np.float32)
     band = small[width // 16 : width // 2 - width // 16]  # without the poles, where all columns are alike
     columns = [float(np.abs(band - np.roll(band, shift, axis=1)).mean()) for shift in (1, width // 4)]
     seam = float(np.abs(band[:, 0] - band[:, -1]).mean())
@@ -177,7 +176,7 @@ def cut_panoramas(
     found, unreadable, masks = list[Panorama](), list[str](), find_masks(files)
     for path in files:
         try:
-            sizes[path] = upright_size(image_size(path), image_orientation(path))
+            sizes[path] = upright_image_size(path)
         except DatasetError as error:
             unreadable.append(f"{path.name}: {error.reason or error}")
     side = face_side(max((W for W, _ in sizes.values()), default=2), largest)
@@ -202,7 +201,7 @@ def cut_panoramas(
 
 
 def color_problems(files: Sequence[Path]) -> list[tuple[str, str]]:
-    """Return name and `gsplat_edu.data.images.ImageHeader.problem` of panoramas, whose faces are sRGB."""
+    """Return name and `gsplat_edu.photos.decoding.ImageHeader.problem` of panoramas, whose faces are sRGB."""
     found = []
     for path in files:
         try:

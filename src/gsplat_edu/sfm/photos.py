@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
@@ -19,8 +18,8 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, is_file
-from gsplat_edu.data.colors import conversion_of
-from gsplat_edu.data.images import (
+from gsplat_edu.photos.colors import conversion_of
+from gsplat_edu.photos.decoding import (
     AT_ONCE,
     MIRRORED,
     TURNS,
@@ -30,7 +29,7 @@ from gsplat_edu.data.images import (
     stored_size,
 )
 from gsplat_edu.photos.image_files import HEIF, SPELLED, UNDECODABLE, is_image, opened_image, quiet_decoders
-from gsplat_edu.scene.views import Photo
+from gsplat_edu.photos.pixels import Photo, area_mean
 from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, upright_masks, write_mask
 
 PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))
@@ -80,7 +79,7 @@ class PhotoFacts:
         mask: File of the mask, oriented like the sensor's picture; empty if there is none.
         sensor: EXIF orientation that makes the sensor's picture of the decoded pixels: 2 for a mirrored photo, and for
             HEIC, which is decoded upright, the one that turns it back. Photos of one camera then share a lens.
-        problem: `gsplat_edu.data.images.ImageHeader.problem`.
+        problem: `gsplat_edu.photos.decoding.ImageHeader.problem`.
         taken: When it was taken, from EXIF, as a text that sorts by time; empty if unknown.
         fisheye: Whether EXIF names the lens or camera a fisheye.
     """
@@ -457,9 +456,7 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, remade: tup
         raise DatasetError(f"{path}: its mask {error}") from None
     if counts is not None:
         write_mask(counts, mask_folder(folder) / f"{photo.copy}.png", size)
-    image = np.asarray(Photo(pixels, alpha).over(GRAY))
-    if image.shape[1::-1] != size:
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    image = area_mean(Photo(pixels, alpha).over(GRAY), *size)
     with written_aside(target) as aside:
         Image.fromarray(image).save(aside, format="JPEG", quality=COPY_QUALITY)
 

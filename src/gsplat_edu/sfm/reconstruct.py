@@ -19,9 +19,9 @@ from typing import Any
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import remove_leftovers
-from gsplat_edu.data.images import UPRIGHT
 from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.data.scale import Scale
+from gsplat_edu.photos.decoding import UPRIGHT
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.candidates import Candidates
 from gsplat_edu.sfm.colmap import (

@@ -24,18 +24,11 @@ from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
-from gsplat_edu.data.images import (
-    AT_ONCE,
-    PhotoFile,
-    decode_mask,
-    image_orientation,
-    image_size,
-    load_photo,
-    upright_size,
-)
+from gsplat_edu.data.images import PhotoFile, load_photo
 from gsplat_edu.data.lens import FISHEYE, Lens
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.scale import SCALE_FILE, write_scale
+from gsplat_edu.photos.decoding import AT_ONCE, decode_mask, upright_image_size
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussian_math import quat_to_R
 from gsplat_edu.scene.intrinsics import Intrinsics
@@ -210,7 +203,7 @@ def _panorama_faces(whole: WholePhotos) -> dict[str, _Face]:
     facts = []
     for one in whole.panoramas:
         path = whole.folder / one.name
-        W, H = upright_size(image_size(path), image_orientation(path))
+        W, H = upright_image_size(path)
         facts.append(PhotoFacts(one.name, one.name, W, H, place=one.place))
     return {
         face: _Face(panorama, name, FaceLens.of(panorama.W, panorama.H, number))

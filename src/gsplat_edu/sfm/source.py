@@ -13,8 +13,8 @@ from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import spelled_seconds
 from gsplat_edu.data.capture import entries, is_file, is_folder
-from gsplat_edu.data.images import image_size
 from gsplat_edu.data.reader import layout_of
+from gsplat_edu.photos.decoding import image_size
 from gsplat_edu.sfm.photos import is_photo, is_run, photo_files
 from gsplat_edu.sfm.result import PARTS, published
 from gsplat_edu.sfm.video import is_video

@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import named_in_utf8, written_aside
+from gsplat_edu.photos.pixels import shrunk
 
 VIDEO_ENDINGS = (
     ".mp4",
@@ -194,8 +195,5 @@ def _every(
 
 
 def _grey(frame: np.ndarray, longest: int) -> UInt8[np.ndarray, "h w"]:
-    factor = min(1.0, longest / max(frame.shape[:2]))
-    if factor < 1.0:
-        size = tuple(max(1, round(factor * side)) for side in frame.shape[1::-1])
-        frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+    frame = shrunk(frame, longest)
     return np.asarray(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))

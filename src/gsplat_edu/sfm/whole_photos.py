@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.data.images import UPRIGHT, decode, decode_mask, image_orientation, turned
+from gsplat_edu.photos.decoding import UPRIGHT, decode, decode_mask, image_orientation, turned
 from gsplat_edu.sfm.circle import Circle
 from gsplat_edu.sfm.panoramas import Panorama
 from gsplat_edu.sfm.photos import JPEG_ENDINGS

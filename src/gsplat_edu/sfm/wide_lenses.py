@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
 from gsplat_edu.base.constants import AUTO
-from gsplat_edu.data.images import decode_mask
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.native_lens import projection_of
-from gsplat_edu.photos.image_files import opened_image
+from gsplat_edu.photos.decoding import decode_grey, decode_mask
 from gsplat_edu.sfm.circle import Circle, black_corners, find_circle
 from gsplat_edu.sfm.masks import write_mask
 from gsplat_edu.sfm.options import ASSUMED, is_fisheye, lens_choice
@@ -235,9 +235,8 @@ def _with_circle(
 
 
 def _grey(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"]:
-    with opened_image(path) as file:
-        picture = file.convert("L")
-        return np.asarray(picture if picture.size == size else picture.resize(size))
+    grey = decode_grey(path)
+    return grey if grey.shape[::-1] == size else np.asarray(Image.fromarray(grey).resize(size))
 
 
 def _recognised(group: CameraGroup, circle: Circle | None, model: str, degrees: float | None) -> CameraGroup:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
-from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import settled_eyes
 

@@ -30,7 +30,7 @@ def photo_list(entry: Path) -> list[dict[str, Any]]:
     Raises:
         RefusedError: the list of photos to leave out, or the record of shapes, cannot be read.
     """
-    from gsplat_edu.data.images import image_orientation, image_size, upright_size
+    from gsplat_edu.photos.decoding import upright_image_size
 
     found, out, drawn = [], left_out(entry), masked(entry)
     for name in photo_names(entry):
@@ -42,7 +42,7 @@ def photo_list(entry: Path) -> list[dict[str, Any]]:
         facts: dict[str, Any] = {"name": legible(name), "bytes": size, "problem": None}
         facts |= {"left_out": facts["name"] in out, "masked": facts["name"] in drawn}
         try:
-            facts["W"], facts["H"] = upright_size(image_size(path), image_orientation(path))
+            facts["W"], facts["H"] = upright_image_size(path)
         except DatasetError as error:
             facts |= {"W": None, "H": None, "problem": error.reason}
         found.append(facts)
@@ -157,7 +157,7 @@ def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
         DatasetError: the photo cannot be decoded.
         NotEnoughMemoryError: it needs more memory than is free.
     """
-    from gsplat_edu.data.thumbnails import thumbnail_jpeg
+    from gsplat_edu.photos.decoding import thumbnail_jpeg
 
     target = Path(out)
     if target.is_file():

@@ -189,7 +189,7 @@ def _opened(source: str, applied: str) -> tuple[Any, Any, Any, bool]:
     """
     from dataclasses import replace
 
-    from gsplat_edu.evaluate.paths import resized
+    from gsplat_edu.paths.orbits import resized
     from gsplat_edu.runs.source import open_source
     from gsplat_edu.scene.rig import through_lenses
     from gsplat_edu.viewer.page_start import start_of

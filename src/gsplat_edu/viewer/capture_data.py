@@ -36,7 +36,7 @@ from gsplat_edu.doctor.gap import gap_sentence, widest_gap
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.subject import subject_region
 from gsplat_edu.doctor.support import observed_points
-from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.rig import stand_in
 from gsplat_edu.viewer.capture_matches import matches_of

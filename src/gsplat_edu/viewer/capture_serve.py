@@ -94,7 +94,7 @@ class CaptureServer(PageServer):
             KeyError: the capture has no such photo.
             DatasetError: the photo cannot be decoded.
         """
-        from gsplat_edu.data.thumbnails import thumbnail_jpeg
+        from gsplat_edu.photos.decoding import thumbnail_jpeg
 
         path = self.photos[name]
         with self._decoding:

@@ -13,8 +13,8 @@ from gsplat_edu.base.reading import open_file
 from gsplat_edu.edits.apply import Views, placed_view
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.edits.stored import MOST_BYTES
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.edit import Similarity
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.runs.source import Source
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.viewer.page import Editing, Tour

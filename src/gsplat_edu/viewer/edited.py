@@ -8,8 +8,8 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.edits.apply import Views, edited, moved_together, placed, views_after
 from gsplat_edu.edits.document import Edits
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.io.edit import IDENTITY, Similarity
+from gsplat_edu.paths.keyframes import KeyframePath
 from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer.edit_page import tour_of
 from gsplat_edu.viewer.page import Tour

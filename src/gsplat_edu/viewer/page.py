@@ -26,9 +26,9 @@ from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.base.validation import ArrayLike
-from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.io.scene import Scene, read_extras
+from gsplat_edu.paths.keyframes import KeyframePath
 from gsplat_edu.render.field import BEYOND, LEAST_BEYOND
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.source import NamedCamera, file_settings

@@ -23,7 +23,8 @@ from PIL import Image
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.evidence import judging_backend
 from gsplat_edu.clean.sight import times_seen
-from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.paths.orbits import resized
+from gsplat_edu.photos.pixels import area_mean
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.identity import capture_difference
@@ -197,8 +198,8 @@ def photo_jpeg(view: View, background: Sequence[float]) -> bytes:
     pixels = photo if photo.dtype == np.uint8 else np.rint(255.0 * photo).astype(np.uint8)
     if not view.camera.pinhole:
         pixels = _through_pinhole(pixels, lens.scaled(reduced.camera.W, reduced.camera.H), target)
-    elif pixels.shape[:2] != (target.H, target.W):
-        pixels = cv2.resize(pixels, (target.W, target.H), interpolation=cv2.INTER_AREA)
+    else:
+        pixels = area_mean(pixels, target.W, target.H)
     return _jpeg(pixels, PHOTO_QUALITY)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
-from gsplat_edu.evaluate.paths import common_up, orbit_of_scene
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.paths.orbits import common_up, orbit_of_scene
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.shells import far_shell
 

@@ -247,7 +247,7 @@ def size_of(path: Path, name: str, data: bytes) -> tuple[int, int]:
 
 
 def decode(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
-    """Decode an image after its size has been checked.
+    """Decode an image after its size has been checked; it is no photo: its bytes are numbers of splats.
 
     Raises:
         SceneFormatError: the image is damaged.

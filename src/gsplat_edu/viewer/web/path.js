@@ -1,4 +1,4 @@
-// Smooth camera motion through keyframes: the formulas of gsplat_edu/evaluate/path_curve.py, which explains them.
+// Smooth camera motion through keyframes: the formulas of gsplat_edu/paths/curve.py, which explains them.
 
 import { plus, radians } from "./camera.js";
 

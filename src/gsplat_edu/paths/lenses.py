@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import in_range
-from gsplat_edu.evaluate.paths import weighted_quantile
+from gsplat_edu.paths.orbits import weighted_quantile
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.projection import STEEPEST_FISHEYE, Projection

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.evaluate.lenses import circle, fisheye, floor_plan, orthographic, panorama
+from gsplat_edu.paths.lenses import circle, fisheye, floor_plan, orthographic, panorama
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.planes import distortion_features, facing_normals
 from gsplat_edu.scene.camera import WORLD_UP, Camera

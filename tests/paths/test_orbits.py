@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.evaluate.paths import orbit_of_scene, resized
+from gsplat_edu.paths.orbits import orbit_of_scene, resized
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 

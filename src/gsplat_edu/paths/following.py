@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsplat_edu.base.validation import in_range, whole_number
-from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.camera import Camera, as_camera, look_at
 from gsplat_edu.scene.rig import point_nearest_axes
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import quad
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, parsed_path, read_path, write_path
-from gsplat_edu.evaluate.path_curve import PathCurve
+from gsplat_edu.paths.curve import PathCurve
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath, parsed_path, read_path, write_path
 from gsplat_edu.scene.camera import look_at
 
 EYES = [(0, 0, -4), (0.3, -0.2, -3.8), (2.5, -0.5, -2), (3, 0, 1), (0.5, 0.4, 3.5)]

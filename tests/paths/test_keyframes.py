@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, evenly_chosen, read_path, write_path
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath, evenly_chosen, read_path, write_path
 from gsplat_edu.scene.camera import Camera, look_at
 
 EYES = [(0.0, 0.0, -4.0), (2.5, -0.5, -2.0), (3.0, 0.0, 1.0)]

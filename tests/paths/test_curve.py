@@ -7,8 +7,8 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
-from gsplat_edu.evaluate.path_curve import PathCurve, Travel, _monotone
+from gsplat_edu.paths.curve import PathCurve, Travel, _monotone
+from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.scene.camera import look_at
 
 # Keyframes are unevenly spaced, and the camera also rotates and zooms.

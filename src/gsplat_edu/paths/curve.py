@@ -27,7 +27,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.validation import ArrayLike, float64_array, whole_number
-from gsplat_edu.evaluate.keyframes import ENDS, VIEWS, KeyframePath
+from gsplat_edu.paths.keyframes import ENDS, VIEWS, KeyframePath
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussian_math import quat_to_R_batch
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.evaluate.following import path_along, point_looked_at
+from gsplat_edu.paths.following import path_along, point_looked_at
 from gsplat_edu.scene.camera import Camera, look_at
 
 SUBJECT = np.array([3.0, -20.0, 7.0])
