@@ -9,9 +9,6 @@ from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError
 
-LARGEST_NUMBER = 1e300
-"""No number in a record is as large; a whole number may have more digits than a float can hold."""
-
 
 def as_json(value: object) -> str:
     """Return a value as JSON, at most 40 characters of it."""

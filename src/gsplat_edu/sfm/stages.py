@@ -10,8 +10,8 @@ from typing import Any
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.json_fields import LARGEST_NUMBER
 from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.records import LARGEST_NUMBER
 from gsplat_edu.base.text import names_a_file
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
@@ -14,6 +14,7 @@ from starlette.routing import BaseRoute
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.json_fields import checked_number
+from gsplat_edu.base.records import record_of
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
@@ -112,7 +113,7 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     ]
     if not jobs:
         certain = studio.prober.ask("certain", capture=str(entry))["findings"] if kind == "captures" else []
-        events = [Found(**{key: _frozen(value) for key, value in one.items()}) for one in certain]
+        events = record_of("findings", certain, tuple[Found, ...])
         return {
             "job": None,
             "state": None,
@@ -124,11 +125,6 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
             "again": None,
         }
     return _diagnosis(studio, jobs[-1], kind, entry)
-
-
-def _frozen(value: Any) -> Any:  # noqa: ANN401
-    """Return the value of an event's field that JSON has turned into lists."""
-    return tuple(_frozen(one) for one in value) if isinstance(value, list) else value
 
 
 def _with_photos(
@@ -149,7 +145,7 @@ def _with_photos(
             "masked": [photo in drawn for photo in photos],
             "proposals": proposals(studio, kind, entry, finding),
         }
-        shown.append({**dataclasses.asdict(finding), **facts})
+        shown.append({**asdict(finding), **facts})
     return shown
 
 
@@ -172,7 +168,7 @@ def _diagnosis(studio: Studio, job: Job, kind: str, entry: Path) -> dict[str, An
         "state": job.state.value,
         "line": job.line,
         "findings": findings,
-        **dataclasses.asdict(rest),
+        **asdict(rest),
         "facts": [(name, _with_names(text, entry, capture)) for name, text in rest.facts],
         "stale": stale,
         "again": train_again(studio, entry) if kind == "runs" else None,
