@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -26,9 +26,15 @@ Number = Annotated[float, Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 ONE_LINE = r"^[^\x00-\x1f\x7f]*\Z"
 """Pattern of a text without control characters."""
 
+LINES = r"^(?:[^\x00-\x1f\x7f]|\n)*\Z"
+"""Pattern of a text whose only control characters are line breaks."""
+
 Absent = msgspec.UnsetType
 ABSENT = msgspec.UNSET
 """Value of a field that a record lacks, where null is refused."""
+
+
+Value = TypeVar("Value")
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,6 +67,11 @@ def record_of(where: str, value: object, kind: Any) -> Any:  # noqa: ANN401
     raise ArgumentError(f"{at}{between}{reason}")
 
 
+def present(value: Value | Absent) -> Value | None:
+    """Return the value of a field that may be absent; None if it is."""
+    return None if isinstance(value, Absent) else value
+
+
 def as_json(value: object) -> str:
     """Return a value as JSON, at most 40 characters of it."""
     return shortened(json.dumps(value), 40)
@@ -85,8 +96,11 @@ _SENTENCES: tuple[tuple[str, Callable[[re.Match[str]], str]], ...] = (
         lambda found: f"has to be {_NAMES[found[1]]}, {_AT[found[2]]} {found[3]}",
     ),
     (
-        r"Expected `\w+` of length ([<>]=|) ?(\d+).*",
-        lambda found: f"has to have a length of {_AT[found[1]]} {int(found[2]):,}".replace("  ", " "),
+        r"Expected `(str|array)` of length ([<>]=|) ?(\d+).*",
+        lambda found: (
+            f"has to have {_AT[found[2]]} {int(found[3]):,} ".replace("  ", " ")
+            + ("characters" if found[1] == "str" else "entries")
+        ),
     ),
     (
         r"Expected `(.*?)`(?:, got .*)?",
@@ -100,10 +114,12 @@ _SENTENCES: tuple[tuple[str, Callable[[re.Match[str]], str]], ...] = (
 def _reason(problem: str, value: object, path: str, kind: object) -> str:
     """Return what is wrong, in the words of this program."""
     if problem.startswith("Invalid"):
-        wanted = "has to be one of " + ", ".join(_choices(kind, re.split(r"\W", path)[-1]))
+        wanted = "has to be one of " + ", ".join(map(str, _choices(kind, re.split(r"\W", path)[-1])))
     elif "matching regex" in problem:
         wanted = (
-            "must not hold control characters" if repr(ONE_LINE) in problem else "has to be written otherwise"
+            "must not hold control characters"
+            if repr(ONE_LINE) in problem or repr(LINES) in problem
+            else "has to be written otherwise"
         )
     else:
         found = ((re.fullmatch(pattern, problem), say) for pattern, say in _SENTENCES)
@@ -120,7 +136,7 @@ def _at(value: Any, path: str) -> object:  # noqa: ANN401
     return value
 
 
-def _choices(kind: object, field: str) -> list[str]:
+def _choices(kind: object, field: str) -> list[object]:
     """Return the words that fields of a name may have anywhere in a type."""
     _, parts = msgspec.json.schema_components([kind])
     entries = [part["properties"][field] for part in parts.values() if field in part.get("properties", {})]
