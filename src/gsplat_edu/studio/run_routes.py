@@ -13,8 +13,7 @@ from starlette.routing import BaseRoute
 
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.json_fields import checked_number
-from gsplat_edu.base.records import record_of
+from gsplat_edu.base.records import Number, record_of
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
@@ -97,7 +96,7 @@ def _forecast(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     entry = studio.library.entry("captures", request.path_params["name"])
     text = request.query_params.get("resolution")
     try:
-        resolution = text if text in (None, AUTO) else checked_number("resolution", float(text))
+        resolution = text if text in (None, AUTO) else record_of("resolution", float(text), Number)
     except (ArgumentError, ValueError):
         raise RefusedError(f"resolution: is {str(text)[:20]!r}, but has to be a number or auto") from None
     return {"qualities": studio.prober.ask("forecast", capture=str(entry), resolution=resolution)}
