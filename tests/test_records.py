@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Literal
 
 import pytest
-from msgspec import Meta
+from msgspec import Meta, field
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.records import ABSENT, ONE_LINE, Absent, Number, Record, record_of
@@ -30,6 +30,7 @@ class Drawing(Record, frozen=True):
     count: int = 0
     width: Number | Absent = ABSENT
     limit: Number | None = None
+    scores: dict[str, Number] = field(default_factory=dict)
 
 
 @pytest.mark.parametrize(
@@ -54,6 +55,7 @@ class Drawing(Record, frozen=True):
         ({"count": 1.0}, "in.count: is 1.0, but has to be a whole number"),
         ({"width": None}, "in.width: is null, but has to be a number"),
         ({"limit": "1"}, 'in.limit: is "1", but has to be a number or null'),
+        ({"scores": {"a": "1"}}, 'in.scores: is {"a": "1"}, but each of its values has to be a number'),
         ({"\ud800": 1}, "in: has a name that is not Unicode text"),
     ],
 )  # fmt: skip

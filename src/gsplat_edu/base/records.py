@@ -61,7 +61,7 @@ def record_of(where: str, value: object, kind: Any) -> Any:  # noqa: ANN401
         ours = isinstance(error.__cause__, ArgumentError)
     path = "" if place.startswith("key`") else place.rstrip("`").removeprefix("$")
     reason = problem if ours else _reason(problem, value, path, kind)
-    at = (where + path).removeprefix(".")
+    at = (where + path).removeprefix(".").removesuffix("[...]")
     names_a_field = re.match(r"[\w\[\].]+: ", reason)
     between = "" if not at or reason[0] == "[" else "." if names_a_field else ": "
     raise ArgumentError(f"{at}{between}{reason}")
@@ -86,7 +86,15 @@ _NAMES = {
     "bool": "true or false",
     "array": "a list",
     "object": "an object",
+    "null": "null",
 }
+
+
+def _kinds(text: str) -> list[str]:
+    """Return the names in "int | float | null"; a whole number is a number."""
+    kinds = text.split(" | ")
+    return [kind for kind in kinds if kind != "int" or "float" not in kinds]
+
 
 _SENTENCES: tuple[tuple[str, Callable[[re.Match[str]], str]], ...] = (
     (r"Object missing required field `(.*)`", lambda found: f"lacks {found[1]!r}"),
@@ -104,7 +112,7 @@ _SENTENCES: tuple[tuple[str, Callable[[re.Match[str]], str]], ...] = (
     ),
     (
         r"Expected `(.*?)`(?:, got .*)?",
-        lambda found: "has to be " + " or ".join(_NAMES.get(name, name) for name in found[1].split(" | ")),
+        lambda found: "has to be " + " or ".join(_NAMES[name] for name in _kinds(found[1])),
     ),
     (r"Number out of range", lambda found: "has to be a smaller number"),
 )
@@ -126,7 +134,8 @@ def _reason(problem: str, value: object, path: str, kind: object) -> str:
         wanted = next((say(match) for match, say in found if match), problem)
         if problem.startswith("Object"):
             return wanted
-    return f"is {as_json(_at(value, path))}, but {wanted}"
+    whose = "each of its values " if path.endswith("[...]") else ""
+    return f"is {as_json(_at(value, path))}, but {whose}{wanted}"
 
 
 def _at(value: Any, path: str) -> object:  # noqa: ANN401
