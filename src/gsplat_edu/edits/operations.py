@@ -7,7 +7,7 @@ them; `Upright` and `Scale` take effect on the whole scene when the result is wr
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias, get_args
 
 import numpy as np
 from msgspec import Meta
@@ -50,7 +50,7 @@ Name = Annotated[str, Meta(min_length=1, max_length=LONGEST_NAME, pattern=ONE_LI
 Note = Annotated[str, Meta(max_length=LONGEST_NOTE, pattern=ONE_LINE)]
 How = Literal["replace", "add", "subtract", "intersect"]
 
-REPLACE, ADD, SUBTRACT, INTERSECT = HOW = ("replace", "add", "subtract", "intersect")
+REPLACE, ADD, SUBTRACT, INTERSECT = HOW = get_args(How)
 """How a selection combines with the one before."""
 
 

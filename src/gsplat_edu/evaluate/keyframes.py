@@ -17,7 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeAlias
+from typing import Annotated, Any, Literal, NoReturn, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -48,7 +48,8 @@ LEAST_STEP = 1e-3
 LONGEST = 1e6
 """Seconds: limit of times and durations, 11 days."""
 
-EASES = ENDS, VIEWS = ("ends", "views")
+Ease = Literal["ends", "views"]
+EASES = ENDS, VIEWS = get_args(Ease)
 """Where the camera slows down to a stop: at both ends of the path, or at every keyframe."""
 
 SEGMENT_SECONDS = 2.0
@@ -221,7 +222,7 @@ class PathRecord(Record, frozen=True):
     version: Literal[1]
     loop: bool
     keyframes: tuple[KeyframeRecord, ...]
-    ease: Literal["ends", "views"] | Absent = ABSENT
+    ease: Ease | Absent = ABSENT
     duration: Number | Absent = ABSENT
 
     def __post_init__(self) -> None:
