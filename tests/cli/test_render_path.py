@@ -152,7 +152,7 @@ def without(key):
         (["--path", "gone.json"], "gone.json"),
         (["--path", "."], "is a folder"),
         (["--path", "bad.json"], "bad.json: is not JSON"),
-        (["--path", "less.json"], "less.json: lacks 'keyframes'"),
+        (["--path", "less.json"], "less.json: duration: is [], but has to be a number"),
         (["--path", "few.json"], "few.json: keyframes: has 0, but a path needs at least 2 keyframes"),
         (["--path", "long.json"], "long.json: lasts 1e+06 s, which is 30,000,001 frames; give --frames"),
         (["--path", "p.json", "--orbit"], "--path: cannot be combined with --orbit; give one of them"),

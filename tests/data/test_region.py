@@ -67,9 +67,9 @@ def test_a_box_is_seen_by_the_rays_that_enter_it_ahead_of_the_camera(z, seen):
     ("content", "told"),
     [
         ("", "is not JSON"),
-        ("[1, 2]", "is not an object"),
+        ("[1, 2]", "is [1, 2], but has to be an object"),
         ('{"center": [0, 0, 0], "half": [1, 1, 1]}', "lacks 'rotation'"),
-        ('{"center": [0, 0, 0], "rotation": 3, "half": [1, 1, 1]}', "rotation: has to be three rows"),
+        ('{"center": [0, 0, 0], "rotation": 3, "half": [1, 1, 1]}', "rotation: is 3, but has to be a list"),
         ('{"center": [0, 0, NaN], "rotation": [[1,0,0],[0,1,0],[0,0,1]], "half": [1, 1, 1]}', "center[2]"),
         ('{"center": [0, 0, 0], "rotation": [[1,0,0],[0,1,0],[0,0,1]], "half": [1, -1, 1]}', "half"),
         ('{"center": [0, 0, 0], "rotation": [[1,1,0],[0,1,0],[0,0,1]], "half": [1, 1, 1]}', "rotation"),

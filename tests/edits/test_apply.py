@@ -20,7 +20,7 @@ from gsplat_edu.edits.apply import (
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.io.edit import IDENTITY, Filter
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
+from gsplat_edu.paths.keyframes import Keyframe, KeyframeRecord, PathRecord
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera, look_at
@@ -60,7 +60,7 @@ S, H, D = SELECTED, HIDDEN, DELETED
         ([between(1, 3), ops.Delete(), ALL], [S, D, D, D, S, S]),
         ([between(1, 3), ops.Hide(), ops.Invert(), ops.Delete()], [D, H, H, H, D, D]),
         ([between(1, 3), ops.Hide(), ALL, ops.Show(), ops.Invert()], [0, S, S, S, 0, 0]),
-        ([between(0, 1), ops.Hide(), ops.Crop(ops.Box((2.5, 0.0, 0.0), AXES, (1.6, 1.0, 1.0)))], [D, H, 0, 0, 0, D]),
+        ([between(0, 1), ops.Hide(), ops.Crop((2.5, 0.0, 0.0), AXES, (1.6, 1.0, 1.0))], [D, H, 0, 0, 0, D]),
         ([between(0, 1), ops.Delete(), ops.Show(), between(0, 9, "add")], [D, D, S, S, S, S]),
         ([ops.Delete(), ops.Hide(), ops.Show()], [0] * 6),
     ],
@@ -152,32 +152,37 @@ def test_the_turned_and_scaled_scene_looks_the_same_to_the_turned_view(degree):
 
 
 def view(x):
-    return Keyframe(np.array((float(x), 0.0, 0.0)), np.eye(3), 50.0)
+    return {"position": (float(x), 0.0, 0.0), "rotation": AXES, "fov": 50.0}
 
 
 def test_the_last_operation_of_a_kind_counts():
-    path = KeyframePath((view(0), view(1)), False)
+    path = PathRecord("gsplat_edu path", 1, False, (KeyframeRecord(**view(0)), KeyframeRecord(**view(1))))
     points = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     views = views_after(
         [
-            ops.StartView(view(1), (0.0, 0.0, 0.0)),
-            ops.NamedView("a", view(1)),
-            ops.NamedView("b", view(2)),
+            ops.StartView(**view(1), pivot=(0.0, 0.0, 0.0)),
+            ops.NamedView(name="a", **view(1)),
+            ops.NamedView(name="b", **view(2)),
             ops.Measure(points, "door"),
-            ops.NamedView("a", view(3)),
+            ops.NamedView(name="a", **view(3)),
             ops.RemoveView("none of this name"),
             ops.CameraPath(path),
-            ops.StartView(view(4), (0.0, 1.0, 0.0)),
+            ops.StartView(**view(4), pivot=(0.0, 1.0, 0.0)),
             ops.Measure(points, ""),
         ]
     )
     assert views.start.view.eye[0] == 4 and views.start.pivot == (0.0, 1.0, 0.0)
     assert [(named.name, named.view.eye[0]) for named in views.named] == [("a", 3), ("b", 2)]
-    assert views.path is path and views.move is IDENTITY and not views.upright
+    assert views.path.document() == path.path.document() and views.move is IDENTITY and not views.upright
     assert [measure.note for measure in views.measures] == ["door", ""]
     assert (
         views_after(
-            [ops.CameraPath(path), ops.CameraPath(None), ops.NamedView("a", view(1)), ops.RemoveView("a")]
+            [
+                ops.CameraPath(path),
+                ops.CameraPath(None),
+                ops.NamedView(name="a", **view(1)),
+                ops.RemoveView("a"),
+            ]
         ).named
         == ()
     )
@@ -185,14 +190,17 @@ def test_the_last_operation_of_a_kind_counts():
 
 
 def test_named_views_take_the_order_of_the_last_list():
-    named = [ops.NamedView(name, view(i)) for i, name in enumerate("abcd")]
+    named = [ops.NamedView(name=name, **view(i)) for i, name in enumerate("abcd")]
     order = ops.OrderViews(("d", "none", "b"))
 
     def names(*operations):
         return "".join(one.name for one in views_after(operations).named)
 
     assert names(*named, order) == "dbac", "those without a place follow in their order"
-    assert names(*named, order, ops.NamedView("b", view(9)), ops.NamedView("e", view(5))) == "dbace"
-    assert names(*named, order, ops.RemoveView("d"), ops.NamedView("d", view(5))) == "bacd"
+    assert (
+        names(*named, order, ops.NamedView(name="b", **view(9)), ops.NamedView(name="e", **view(5)))
+        == "dbace"
+    )
+    assert names(*named, order, ops.RemoveView("d"), ops.NamedView(name="d", **view(5))) == "bacd"
     assert names(order, *named) == "abcd", "a view has to exist before it gets a place"
     assert names(*named, order, ops.OrderViews(("c",))) == "cdba"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.records import ABSENT
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.cells import EditWork
 from gsplat_edu.edits.document import parse_edits
@@ -15,7 +16,7 @@ from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.membership import Values, members
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-PICTURE = ops.Picture((0.0, 0.0, 0.0), AXES, 100.0, 100.0, 0.0, 0.0)
+PICTURE = ops.Picture((0.0, 0.0, 0.0), AXES, 100.0, 100.0, 0.0, 0.0, 100, 80)
 """The point (x, y, z) is at depth z and appears at pixel (100 x / z, 100 y / z)."""
 
 
@@ -74,7 +75,7 @@ def test_the_grid_limits_every_shape_of_a_picture(seed):
     ]
     for shape in shapes:
         work, less = EditWork(), EditWork()
-        everything = members(shape(None), values_at(means), less)
+        everything = members(shape(ABSENT), values_at(means), less)
         found = members(shape(front), values_at(means), work)
         np.testing.assert_array_equal(found, everything & held_one_by_one(shape(front), means))
         assert 0 < found.sum() < everything.sum()
@@ -114,7 +115,7 @@ def region_of(by, **more):
 
 @pytest.mark.parametrize("by", SHAPES)
 def test_a_shape_of_a_picture_may_have_a_front(by):
-    assert region_of(by).front is None
+    assert region_of(by).front is ABSENT
     assert region_of(by, front=FRONT).front == Front((1.0, 2.0, 3.0, 4.5), 2, 1, (1.25, None))
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.records import ABSENT
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.cells import MOST_TESTS, EditWork
 from gsplat_edu.edits.document import NEAR
@@ -14,7 +15,7 @@ from gsplat_edu.edits.membership import Values, members
 from gsplat_edu.scene.gaussians import Gaussians
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-FRONT = ops.Picture((0.0, 0.0, -1.0), AXES, 10.0, 20.0, 5.0, 6.0)
+FRONT = ops.Picture((0.0, 0.0, -1.0), AXES, 10.0, 20.0, 5.0, 6.0, 20, 20)
 """The point (x, y, 0) is at depth 1 and appears at pixel (10 x + 5, 20 y + 6)."""
 
 
@@ -43,9 +44,9 @@ def test_a_rectangle_holds_its_border_and_nothing_behind_the_camera():
 
 
 def test_a_turned_picture_sees_along_its_axes():
-    """The camera looks along +x and its right is -z; the rows are right, down, forward."""
+    """The camera looks along +x and its right is -z; the columns are right, down, forward."""
     picture = ops.Picture(
-        (0.0, 0.0, 0.0), ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), 1.0, 1.0, 0.0, 0.0
+        (0.0, 0.0, 0.0), ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)), 1.0, 1.0, 0.0, 0.0, 9, 9
     )
     values = values_at((2, 0, -2), (2, 0, 2), (2, 2, 0), (-2, 0, 0))
     assert held(ops.PictureRectangle(picture, (0.5, -0.5, 1.5, 0.5)), values) == [True, False, False, False]
@@ -87,7 +88,7 @@ def test_a_sphere_and_a_turned_box_hold_their_borders():
     values = values_at((1, 0, 0), (0, 1.0001, 0), (0.6, 0.6, 0.6))
     assert held(ops.Sphere((0.0, 0.0, 0.0), 1.0), values) == [True, False, False]  # 3 * 0.36 = 1.08
     h = float(np.sqrt(0.5))
-    box = ops.Box((0.0, 0.0, 0.0), ((h, h, 0.0), (-h, h, 0.0), (0.0, 0.0, 1.0)), (1.0, 0.1, 0.5))
+    box = ops.Box((0.0, 0.0, 0.0), ((h, -h, 0.0), (h, h, 0.0), (0.0, 0.0, 1.0)), (1.0, 0.1, 0.5))
     corners = values_at(
         (0.7, 0.7, 0.5), (0.72, 0.72, 0), (0.7, -0.7, 0), (0.1, 0.1, 0.51), (-0.7, -0.7, -0.5)
     )
@@ -101,8 +102,8 @@ def test_values_are_compared_raw_with_both_ends_included():
         logits=[-1, 0, 2],
         sh0=[(0, 0, 0), (1, 1, 1), (0, 0, 1.5)],
     )
-    assert held(ops.Opacity(0.0, None), values) == [False, True, True]
-    assert held(ops.Opacity(None, 0.0), values) == [True, True, False]
+    assert held(ops.Opacity(0.0, ABSENT), values) == [False, True, True]
+    assert held(ops.Opacity(ABSENT, 0.0), values) == [True, True, False]
     assert held(ops.Size(-2.0, -1.0), values) == [True, True, False]
     assert held(ops.Color((0.0,) * 3, (1.0,) * 3), values) == [True, True, False]
     assert held(ops.Everything(), values) == [True] * 3
@@ -123,9 +124,9 @@ def test_nan_belongs_to_no_region_and_infinity_is_compared():
     assert held(box, values) == [False, False, False, True]
     for region in (ops.PictureRectangle(FRONT, (-1e6, -1e6, 1e6, 1e6)), ops.Brush(FRONT, 1e6, ((0.0, 0.0),))):
         assert held(region, values)[:2] == [False, False] and held(region, values)[3]
-    assert held(ops.Opacity(-1e6, None), values) == [False, True, False, True]
-    assert held(ops.Opacity(None, 1e6), values) == [False, False, True, True]
-    assert held(ops.Size(None, 1e6), values) == [False, False, True, False]
+    assert held(ops.Opacity(-1e6, ABSENT), values) == [False, True, False, True]
+    assert held(ops.Opacity(ABSENT, 1e6), values) == [False, False, True, True]
+    assert held(ops.Size(ABSENT, 1e6), values) == [False, False, True, False]
     assert held(ops.Color((-1e6,) * 3, (1e6,) * 3), values) == [False, False, False, True]
 
 

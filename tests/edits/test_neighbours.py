@@ -5,12 +5,13 @@ import pytest
 import torch
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.records import ABSENT
 from gsplat_edu.edits import neighbours, operations as ops
 from gsplat_edu.edits.apply import DELETED, HIDDEN, SELECTED, flags_after
 from gsplat_edu.edits.cells import MOST_TESTS, EditWork
 from gsplat_edu.edits.membership import Values
 from gsplat_edu.edits.neighbours import within_radius
-from gsplat_edu.edits.runs import mask_of, parsed_runs, runs_of
+from gsplat_edu.edits.runs import check_runs, mask_of, runs_of
 from gsplat_edu.scene.gaussians import Gaussians
 
 
@@ -91,7 +92,7 @@ S, H, D = SELECTED, HIDDEN, DELETED
         ([near(3, 0.1), ops.Hide(), near(2, 0.1), ops.Grow(1.0), ops.Show()], [0, S, S, 0, 0, 0]),
         ([near(3, 0.1), ops.Hide(), ops.Select("replace", ops.Everything()), ops.Shrink(1.0)], [S, S, S, H, S, S]),
         ([ops.Select("replace", ops.Distance((1.0, 0.0, 0.0), 1.0, 2.0))], [S, 0, S, S, 0, 0]),
-        ([ops.Select("replace", ops.Distance((1.0, 0.0, 0.0), None, 1.0))], [S, S, S, 0, 0, 0]),
+        ([ops.Select("replace", ops.Distance((1.0, 0.0, 0.0), ABSENT, 1.0))], [S, S, S, 0, 0, 0]),
         ([ops.Select("replace", ops.List("here", (1, 2, 5, 1)))], [0, S, S, 0, 0, S]),
         ([near(1, 1.1), ops.Select("intersect", ops.List("here", (1, 2, 5, 1)))], [0, S, S, 0, 0, 0]),
     ],
@@ -128,7 +129,8 @@ def test_runs_and_masks_are_the_same(seed):
     rng = np.random.default_rng(seed)
     for n in (0, 1, 2, 50, 300):
         mask = rng.random(n) < rng.random()
-        runs = parsed_runs("runs", runs_of(mask))
+        runs = tuple(runs_of(mask))
+        check_runs(runs)
         np.testing.assert_array_equal(mask_of(runs, n), mask)
         assert all(count > 0 for count in runs[1::2]) and len(runs) == 2 * len(runs[::2])
 
@@ -140,7 +142,7 @@ def test_distances_hold_their_ends_and_no_nan():
 
     held = [
         members(ops.Distance((0.0,) * 3, *ends), values).tolist()
-        for ends in ((5.0, None), (None, 5.0), (0.0, 1e30))
+        for ends in ((5.0, ABSENT), (ABSENT, 5.0), (0.0, 1e30))
     ]
     assert held == [
         [True, True, False, True, False],

@@ -138,11 +138,11 @@ BAD = {
     "no ease": (lambda d: d.update(ease=None), "ease: is null"),
     "negative": (
         lambda d: d["keyframes"][1].update(hold=-1),
-        r"keyframes\[1\].hold: is -1, but has to be from",
+        r"keyframes\[1\].hold: is -1, but has to be a number, at least",
     ),
     "zero": (
         lambda d: d["keyframes"][1].update(hold=0),
-        r"keyframes\[1\].hold: is 0, but has to be from 0.001",
+        r"keyframes\[1\].hold: is 0, but has to be a number, at least 0.001",
     ),
     "text": (lambda d: d["keyframes"][1].update(hold="2 s"), r"keyframes\[1\].hold: is \"2 s\""),
     "overlap": (

@@ -241,9 +241,9 @@ def test_a_run_in_use_keeps_its_files_and_the_mesh_is_written(run, capsys, monke
     [
         ([], "is not a JSON object"),
         ({"mesh": 3}, "mesh.json: mesh: is not an object"),
-        ({"mesh": {"triangles": "many"}}, "triangles is many, but has to be a whole number"),
-        ({"mesh": {"truth": {"f1": "1"}}}, "has to be an object of numbers"),
-        ({"mesh": {"pictures": [1]}}, "has to be a list of texts"),
+        ({"mesh": {"triangles": "many"}}, 'triangles: is "many", but has to be a whole number'),
+        ({"mesh": {"truth": {"f1": "1"}}}, "each of its values has to be a number or null"),
+        ({"mesh": {"pictures": [1]}}, r"pictures\[0\]: is 1, but has to be text"),
     ],
 )
 def test_a_damaged_record_is_one_line(run, record, said):

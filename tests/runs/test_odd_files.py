@@ -99,7 +99,8 @@ def test_the_message_names_the_field(run):
     before = folder.metrics.read_bytes()
     folder.metrics.write_text('{"test": {"psnr": "high"}}')
     with pytest.raises(
-        CheckpointError, match=r"metrics\.json: test\.psnr is high, but has to be a number; fix or remove"
+        CheckpointError,
+        match=r"metrics\.json: test\.psnr: is .high., but has to be a number or null; fix or remove",
     ):
         folder.read_metrics()
     folder.metrics.write_text('{"iterations": ' + 100_000 * "[" + "}")
@@ -109,7 +110,7 @@ def test_the_message_names_the_field(run):
     log = folder.log_file.read_bytes() if folder.log_file.exists() else b""
     folder.log_file.write_text('{"iteration": 1}\n{"iteration": [2]}\n')
     with pytest.raises(
-        CheckpointError, match=r"log\.jsonl: line 2: iteration is \[2\], but has to be a whole number"
+        CheckpointError, match=r"log\.jsonl: line 2: iteration: is \[2\], but has to be a whole number"
     ):
         folder.log()
     folder.log_file.write_bytes(log)

@@ -48,6 +48,8 @@ def record(library, name, *, events=None, **changes):
         "identity": "",
         "line": "",
         "cancelled": False,
+        "begun_by": "",
+        "begun_at": "",
         **changes,
     }
     (folder / "job.json").write_text(json.dumps(entry))

@@ -13,14 +13,17 @@ The module imports nothing slow.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from gsplat_edu.base.errors import ArgumentError, CheckpointError
-from gsplat_edu.base.json_fields import checked_text, checked_whole, number_within
+from msgspec import Meta
+from msgspec.structs import asdict
+
+from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.reading import open_file, parse_json, read_text
+from gsplat_edu.base.records import ONE_LINE, Record, record_of
 from gsplat_edu.runs.folder import RunFolder, write_json
 
 PLAN = "plan.json"
@@ -35,6 +38,9 @@ LONGEST_TEXT = 1_000
 
 LARGEST_NUMBER = 2**53
 """Largest number in a record; JSON's readers keep whole numbers up to it exactly."""
+
+Whole = Annotated[int, Meta(ge=0, le=LARGEST_NUMBER)]
+Text = Annotated[str, Meta(max_length=LONGEST_TEXT, pattern=ONE_LINE)]
 
 
 @dataclass(frozen=True)
@@ -92,8 +98,8 @@ class BlocksFolder:
         if not path.is_file():
             return None
         try:
-            done = Done.checked(parse_json(read_text(path)))
-        except (ValueError, TypeError, ArgumentError) as error:
+            done: Done = record_of("", parse_json(read_text(path)), Done)
+        except ValueError as error:
             raise CheckpointError(
                 f"{path}: is damaged ({error}); remove it to train the block again"
             ) from None
@@ -104,8 +110,7 @@ class BlocksFolder:
         return done
 
 
-@dataclass(frozen=True)
-class Done:
+class Done(Record, frozen=True):
     """The record of a finished block.
 
     Args:
@@ -121,33 +126,16 @@ class Done:
         version: Version of this package.
     """
 
-    block: int
-    plan: str
-    sha256: str
-    gaussians: int
-    iterations: int
-    seconds: float
-    peak_memory: int
-    host: str
-    instructions: str
-    version: str
-
-    @classmethod
-    def checked(cls, entry: object) -> Done:
-        """Return the record in a JSON object.
-
-        Raises:
-            ArgumentError: a field is of another type or out of range.
-            TypeError: a field is missing or unknown, or the value is no object.
-        """
-        if not isinstance(entry, dict):
-            raise TypeError("is not an object")
-        for name in ("block", "gaussians", "iterations", "peak_memory"):
-            checked_whole(name, entry.get(name), 0, LARGEST_NUMBER)
-        for name in ("plan", "sha256", "host", "instructions", "version"):
-            checked_text(name, entry.get(name), LONGEST_TEXT)
-        number_within("seconds", entry.get("seconds"), 0, LARGEST_NUMBER)
-        return cls(**entry)
+    block: Whole
+    plan: Text
+    sha256: Text
+    gaussians: Whole
+    iterations: Whole
+    seconds: Annotated[float, Meta(ge=0, le=LARGEST_NUMBER)]
+    peak_memory: Whole
+    host: Text
+    instructions: Text
+    version: Text
 
     def write(self, folder: BlocksFolder) -> None:
         """Write the record.
@@ -155,7 +143,7 @@ class Done:
         Raises:
             OSError: the file cannot be written.
         """
-        write_json(folder.record(self.block), dataclasses.asdict(self))
+        write_json(folder.record(self.block), asdict(self))
 
 
 def file_digest(path: Path) -> str:

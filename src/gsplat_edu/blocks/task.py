@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
-from gsplat_edu.base.json_fields import checked_choice
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.reading import stored_path
+from gsplat_edu.base.validation import one_of
 from gsplat_edu.blocks.counted import Counted, counted_views
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
@@ -58,6 +58,7 @@ def block_options(folder: BlocksFolder, plan: BlockPlan, number: int, data: Path
         )
     try:
         train, settings = (_tuples(plan.recipe[name]) for name in ("train", "data"))
+        one_of("backend", plan.recipe["backend"], BACKENDS)
         config = TrainConfig().changed(**train | {"max_gaussians": block.max_gaussians})
         if block.iterations is not None:
             config = stretched(config, block.iterations)
@@ -68,7 +69,7 @@ def block_options(folder: BlocksFolder, plan: BlockPlan, number: int, data: Path
             config=config,
             data_settings=DataSettings(**settings | views),
             scene=folder.start(number),
-            backend=checked_choice("backend", plan.recipe["backend"], BACKENDS),
+            backend=plan.recipe["backend"],
             eval_every=plan.recipe["eval_every"],
             save_every=plan.recipe["save_every"],
             resume=folder.run(number).exists(),

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.json_fields import check_keys, checked_numbers
 from gsplat_edu.base.reading import open_file, parse_json
+from gsplat_edu.base.records import Number, Record, record_of
 from gsplat_edu.data.capture import is_file, is_folder
 from gsplat_edu.scene.region import Region
 
@@ -25,6 +26,15 @@ REGION = "region.json"
 
 MOST_BYTES = 1 << 16
 """Size of the largest file that is read."""
+
+
+Numbers: TypeAlias = tuple[Number, Number, Number]
+
+
+class _Box(Record, frozen=True):
+    center: Numbers
+    rotation: tuple[Numbers, Numbers, Numbers]
+    half: Numbers
 
 
 def read_region(capture: Path) -> Region | None:
@@ -88,15 +98,8 @@ def region_of(found: object) -> Region:
     Raises:
         ArgumentError: it describes no box; the message names the field.
     """
-    if not isinstance(found, dict):
-        raise ArgumentError("is not an object with center, rotation and half")
-    check_keys("", found, ("center", "rotation", "half"))
-    rows = found["rotation"]
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise ArgumentError("rotation: has to be three rows of three numbers")
-    rotation = [checked_numbers(f"rotation[{i}]", row, 3) for i, row in enumerate(rows)]
-    center, half = (checked_numbers(name, found[name], 3) for name in ("center", "half"))
-    return Region(np.array(center), np.array(rotation), np.array(half))
+    box: _Box = record_of("", found, _Box)
+    return Region(np.array(box.center), np.array(box.rotation), np.array(box.half))
 
 
 def document_of(region: Region) -> dict[str, list[float] | list[list[float]]]:

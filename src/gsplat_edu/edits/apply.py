@@ -130,14 +130,14 @@ def views_after(operations: Sequence[ops.Operation]) -> Views:
                 scale = operation
             case ops.StartView():
                 start = operation
-            case ops.NamedView(name):
+            case ops.NamedView(name=name):
                 named[name] = operation
             case ops.RemoveView(name):
                 named.pop(name, None)
             case ops.OrderViews(names):
                 named = {**{name: named[name] for name in names if name in named}, **named}
-            case ops.CameraPath(path):
-                pass
+            case ops.CameraPath(record):
+                path = None if record is None else record.path
     move = IDENTITY
     if upright is not None:
         move = Similarity(upright_rotation(upright), 1.0, np.zeros(3))
@@ -208,8 +208,8 @@ def apply_operation(operation: ops.Operation, values: Values, flags: Flags, work
             flags[flags == SELECTED] = HIDDEN
         case ops.Show():
             flags[flags == HIDDEN] = 0
-        case ops.Crop(box):
-            flags[~members(box, values, work)] = DELETED
+        case ops.Crop(center, rotation, half):
+            flags[~members(ops.Box(center, rotation, half), values, work)] = DELETED
         case ops.Move():
             return move_means(operation, values.means, flags == SELECTED)
     return None

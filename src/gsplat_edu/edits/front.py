@@ -6,25 +6,22 @@ grid of depths. Applying the file only compares numbers, so both sides hold the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.json_fields import (
-    check_keys,
-    checked_list,
-    checked_object,
-    checked_whole,
-    number_within,
-    numbers_within,
-)
+from gsplat_edu.base.records import Record
+from gsplat_edu.paths.keyframes import FARTHEST
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
 
     from gsplat_edu.edits.cells import Column, EditWork
+
+FARTHEST_PIXEL = 1e6
+"""px: coordinates in a picture are at most this."""
 
 MOST_CELLS = 64
 """Cells of the grid along each axis."""
@@ -33,8 +30,11 @@ NARROWEST = 1e-3
 """px: smallest extent of the grid's bounds along each axis, so that cells per px stay finite."""
 
 
-@dataclass(frozen=True)
-class Front:
+Pixel = Annotated[float, Meta(ge=-FARTHEST_PIXEL, le=FARTHEST_PIXEL)]
+Cells = Annotated[int, Meta(ge=1, le=MOST_CELLS)]
+
+
+class Front(Record, frozen=True):
     """The largest camera depth that a selection holds, by the cell of a grid over a part of the picture.
 
     Args:
@@ -44,10 +44,23 @@ class Front:
         deepest: The depths of `rows` times `columns` cells, row by row, world units; None if there is no limit.
     """
 
-    bounds: tuple[float, ...]
-    columns: int
-    rows: int
-    deepest: tuple[float | None, ...]
+    bounds: tuple[Pixel, Pixel, Pixel, Pixel]
+    columns: Cells
+    rows: Cells
+    deepest: Annotated[
+        tuple[Annotated[float, Meta(ge=0.0, le=FARTHEST)] | None, ...], Meta(max_length=MOST_CELLS**2)
+    ]
+
+    def __post_init__(self) -> None:
+        """Check what the values have to be together."""
+        u0, v0, u1, v1 = self.bounds
+        if u1 - u0 < NARROWEST or v1 - v0 < NARROWEST:
+            raise ArgumentError(f"bounds: u1, v1 must exceed u0, v0 by at least {NARROWEST:g}")
+        if len(self.deepest) != self.columns * self.rows:
+            raise ArgumentError(
+                f"deepest: has {len(self.deepest)} depths, but {self.rows} rows of {self.columns} columns are"
+                f" {self.columns * self.rows}"
+            )
 
 
 def in_front(front: Front, u: Column, v: Column, z: Column, work: EditWork) -> Bool[np.ndarray, " N"]:
@@ -75,35 +88,3 @@ def in_front(front: Front, u: Column, v: Column, z: Column, work: EditWork) -> B
 def _cell(values: Column, low: float, high: float, count: int) -> np.ndarray:
     """Return the cell along an axis: floor((value - low) (count / (high - low))), at least 0 and below the count."""
     return np.clip(np.floor((values - low) * (count / (high - low))), 0, count - 1).astype(np.int64)
-
-
-def parsed_front(where: str, value: object, most_pixel: float, most_depth: float) -> Front:
-    """Parse the "front" of a selection.
-
-    Args:
-        where: Its place in the file, for messages.
-        value: The parsed JSON.
-        most_pixel: Largest coordinate of the bounds, px.
-        most_depth: Largest depth, world units.
-
-    Raises:
-        ArgumentError: a value is invalid; the message names the place.
-    """
-    entry = checked_object(where, value)
-    check_keys(f"{where}: ", entry, ("bounds", "columns", "rows", "deepest"))
-    u0, v0, u1, v1 = numbers_within(f"{where}.bounds", entry["bounds"], 4, most_pixel)
-    if u1 - u0 < NARROWEST or v1 - v0 < NARROWEST:
-        raise ArgumentError(f"{where}.bounds: u1, v1 must exceed u0, v0 by at least {NARROWEST:g}")
-    columns, rows = (
-        checked_whole(f"{where}.{key}", entry[key], 1, MOST_CELLS) for key in ("columns", "rows")
-    )
-    cells = checked_list(f"{where}.deepest", entry["deepest"], MOST_CELLS * MOST_CELLS)
-    if len(cells) != columns * rows:
-        raise ArgumentError(
-            f"{where}.deepest: has {len(cells)} depths, but {rows} rows of {columns} columns are {columns * rows}"
-        )
-    deepest = tuple(
-        None if cell is None else number_within(f"{where}.deepest[{i}]", cell, 0.0, most_depth)
-        for i, cell in enumerate(cells)
-    )
-    return Front((u0, v0, u1, v1), columns, rows, deepest)

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta
 
-from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.json_fields import as_json, check_keys, checked_object, checked_whole, numbers_within
+from gsplat_edu.base.records import Record
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.scene.frame import FARTHEST_ORIGIN, Vector
+from gsplat_edu.scene.frame import FARTHEST_ORIGIN
 
 ORDER = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Parameters in the order in which they are hashed."""
 
 MOST_SPLATS = 1 << 32
 
+Coordinate = Annotated[float, Meta(ge=-FARTHEST_ORIGIN, le=FARTHEST_ORIGIN)]
 
-@dataclass(frozen=True)
-class Identity:
+
+class Identity(Record, frozen=True):
     """The facts that identify a scene.
 
     Args:
@@ -29,28 +29,13 @@ class Identity:
         origin: That of the scene.
     """
 
-    count: int
-    sha256: str
-    origin: Vector
+    count: Annotated[int, Meta(ge=0, le=MOST_SPLATS)]
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    origin: tuple[Coordinate, Coordinate, Coordinate]
 
     def document(self) -> dict[str, Any]:
         """Return the entry "scene" of an edits file."""
         return {"count": self.count, "sha256": self.sha256, "origin": list(self.origin)}
-
-    @classmethod
-    def of_document(cls, where: str, value: object) -> Identity:
-        """Return the identity that an edits file states.
-
-        Raises:
-            ArgumentError: a key is missing or unknown, or a value is invalid.
-        """
-        entry = checked_object(where, value)
-        check_keys(f"{where}: ", entry, ("count", "sha256", "origin"))
-        digest = entry["sha256"]
-        if not isinstance(digest, str) or len(digest) != 64 or set(digest) - set("0123456789abcdef"):
-            raise ArgumentError(f"{where}.sha256: is {as_json(digest)}, but has to be 64 hexadecimal digits")
-        x, y, z = numbers_within(f"{where}.origin", entry["origin"], 3, FARTHEST_ORIGIN)
-        return cls(checked_whole(f"{where}.count", entry["count"], 0, MOST_SPLATS), digest, (x, y, z))
 
     def difference(self, other: Identity) -> str | None:
         """Return in a few words how another scene differs from this one; None if it does not."""

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from gsplat_edu.base.records import Absent
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.cells import Cells, Column, EditWork
 from gsplat_edu.edits.document import NEAR
@@ -97,7 +98,7 @@ def _members(region: ops.Region, values: Values, work: EditWork) -> Any:  # noqa
             return _between(_larger(_larger(x, y), z), lowest, highest)
         case ops.Distance(center, lowest, highest):
             x, y, z = (values.means[:, i] - center[i] for i in range(3))
-            squares = [None if end is None else end * end for end in (lowest, highest)]
+            squares = [end if isinstance(end, Absent) else end * end for end in (lowest, highest)]
             return _between((x * x + y * y) + z * z, *squares)
         case ops.List(_, runs):
             return mask_of(runs, len(values.means))
@@ -106,7 +107,7 @@ def _members(region: ops.Region, values: Values, work: EditWork) -> Any:  # noqa
 
 def _drawn(
     picture: ops.Picture,
-    front: Front | None,
+    front: Front | Absent,
     means: Float64[np.ndarray, "N 3"],
     work: EditWork,
     shape: Callable[[Column, Column], Members],
@@ -115,7 +116,7 @@ def _drawn(
     u, v, z = _seen(picture, means)
     at = np.flatnonzero(z > NEAR)
     at = at[shape(u[at], v[at])]
-    if front is not None:
+    if not isinstance(front, Absent):
         at = at[in_front(front, u[at], v[at], z[at], work)]
     result = np.zeros(len(u), dtype=bool)
     result[at] = True
@@ -125,13 +126,13 @@ def _drawn(
 def _seen(picture: ops.Picture, means: Float64[np.ndarray, "N 3"]) -> tuple[Column, Column, Column]:
     """Project centres to (u, v, z): u = (fx x) / z + cx, v = (fy y) / z + cy. A picture sees those with z > NEAR."""
     a, b, c = (means[:, i] - picture.position[i] for i in range(3))
-    x, y, z = ((row[0] * a + row[1] * b) + row[2] * c for row in picture.rotation)
+    x, y, z = ((row[0] * a + row[1] * b) + row[2] * c for row in zip(*picture.rotation, strict=True))
     u = (picture.fx * x) / z + picture.cx
     v = (picture.fy * y) / z + picture.cy
     return u, v, z
 
 
-def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...], work: EditWork) -> Members:
+def _in_polygon(u: Column, v: Column, points: tuple[ops.Pixels, ...], work: EditWork) -> Members:
     """Even-odd rule within the polygon's bounds: count the edges that cross the ray towards larger u."""
     columns, rows = [p[0] for p in points], [p[1] for p in points]
     near = (u >= min(columns)) & (u <= max(columns)) & (v >= min(rows)) & (v <= max(rows))
@@ -152,7 +153,7 @@ def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...], work: Edi
 
 
 def _on_stroke(
-    u: Column, v: Column, radius: float, points: tuple[ops.Numbers, ...], work: EditWork
+    u: Column, v: Column, radius: float, points: tuple[ops.Pixels, ...], work: EditWork
 ) -> Members:
     """Within the radius of a segment, and of the segment's bounds widened by the radius."""
     columns, rows = np.array([p[0] for p in points]), np.array([p[1] for p in points])
@@ -188,17 +189,17 @@ def _in_box(box: ops.Box, means: Float64[np.ndarray, "N 3"]) -> Members:
     """|axis . (mean - centre)| <= half extent along each axis."""
     a, b, c = (means[:, i] - box.center[i] for i in range(3))
     inside = np.ones(len(means), dtype=bool)
-    for axis, half in zip(box.axes, box.half, strict=True):
+    for axis, half in zip(zip(*box.rotation, strict=True), box.half, strict=True):
         along = (axis[0] * a + axis[1] * b) + axis[2] * c
         inside &= (along >= -half) & (along <= half)
     return inside
 
 
-def _between(values: Column, low: float | None, high: float | None) -> Members:
+def _between(values: Column, low: float | Absent, high: float | Absent) -> Members:
     inside: Members = values == values
-    if low is not None:
+    if not isinstance(low, Absent):
         inside &= values >= low
-    if high is not None:
+    if not isinstance(high, Absent):
         inside &= values <= high
     return inside
 

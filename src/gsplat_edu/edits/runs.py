@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.json_fields import as_json, checked_list
 
 MOST_NUMBERS = 4_000_000
 """Numbers of a list, two for each run."""
@@ -15,35 +14,23 @@ MOST_SPLATS = 2**31 - 1
 """Largest index and count."""
 
 
-def parsed_runs(where: str, value: object) -> tuple[int, ...]:
-    """Return checked runs: whole numbers, each run with at least one splat, and a gap before the next one.
-
-    Args:
-        where: The place in the file, for messages.
-        value: The runs, as JSON.
+def check_runs(runs: tuple[int, ...]) -> None:
+    """Check runs: each has at least one splat, and a gap before the next one.
 
     Raises:
         ArgumentError: they are wrong; the message names the place.
     """
-    numbers = checked_list(where, value, MOST_NUMBERS)
-    if len(numbers) % 2:
+    if len(runs) % 2:
         raise ArgumentError(
-            f"{where}: has {len(numbers)} numbers, but has to have a start and a count for each run"
+            f"runs: has {len(runs)} numbers, but has to have a start and a count for each run"
         )
-    for i, number in enumerate(numbers):
-        if type(number) is not int or not i % 2 <= number <= MOST_SPLATS:
-            wanted = "a whole number from " + ("1" if i % 2 else "0") + f" to {MOST_SPLATS:,}"
-            raise ArgumentError(f"{where}[{i}]: is {as_json(number)}, but has to be {wanted}")
-    starts, ends = (
-        numbers[::2],
-        [start + count for start, count in zip(numbers[::2], numbers[1::2], strict=True)],
-    )
-    for i, (end, start) in enumerate(zip(ends, starts[1:], strict=False)):
+    end = -1
+    for i, (start, count) in enumerate(zip(runs[::2], runs[1::2], strict=True)):
+        if count < 1:
+            raise ArgumentError(f"runs[{2 * i + 1}]: is {count}, but has to be at least 1")
         if start <= end:
-            raise ArgumentError(
-                f"{where}[{2 * i + 2}]: is {start}, but the run before ends at {end}; leave a gap"
-            )
-    return tuple(numbers)
+            raise ArgumentError(f"runs[{2 * i}]: is {start}, but the run before ends at {end}; leave a gap")
+        end = start + count
 
 
 def end_of(runs: tuple[int, ...]) -> int:

@@ -31,6 +31,7 @@ from jaxtyping import Bool, Float, Float64, UInt8
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array
+from gsplat_edu.evaluate.verdict import MEASURES as MEASURES
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.ops.losses import l1_ssim
 from gsplat_edu.ops.recolor import Backdrop, recolored
@@ -87,9 +88,6 @@ class ImageScore:
     l1: float
     psnr_fitted: float | None
 
-
-MEASURES = ("psnr", "psnr_8bit", "ssim", "l1", "psnr_fitted")
-"""The scores of an image, by their names in `ImageScore`."""
 
 OnImage = Callable[[View, ImageScore, UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]], None]
 """Called after each scored view with the view, its score, the render and the photo, both rounded to bytes."""

@@ -8,6 +8,9 @@ from typing import Any
 
 from gsplat_edu.base.constants import FAR_BELOW
 
+MEASURES = ("psnr", "psnr_8bit", "ssim", "l1", "psnr_fitted")
+"""The scores of an image and of a split, by their names in metrics.json and in `ImageScore`."""
+
 SKIPPED = "not_scored"
 """Key of metrics.json: by "test" and "train", the number of views that an evaluation left out."""
 

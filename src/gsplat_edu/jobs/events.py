@@ -6,22 +6,27 @@ has `event`, the name of the kind, and `time`, seconds since 1970; the other fie
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
-from gsplat_edu.base.json_fields import LARGEST_NUMBER
+from msgspec import Meta, to_builtins
+
 from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.records import Number, Record, record_of
+from gsplat_edu.base.validation import LARGEST_WHOLE
+
+Whole = Annotated[int, Meta(ge=-LARGEST_WHOLE, le=LARGEST_WHOLE)]
 
 EVENTS = "GSPLAT_EDU_EVENTS"
 """Environment variable that names the file of events."""
 
 
-@dataclass(frozen=True)
-class Started:
+class _Event(Record, frozen=True, tag_field="event", tag=str.lower):
+    """Base of events; `event` is the name of the class in lower case."""
+
+
+class Started(_Event, frozen=True):
     """A process of the job began.
 
     Args:
@@ -29,12 +34,11 @@ class Started:
         identity: `gsplat_edu.jobs.process.identity` of it; empty where the system has none.
     """
 
-    pid: int
+    pid: Whole
     identity: str
 
 
-@dataclass(frozen=True)
-class Stage:
+class Stage(_Event, frozen=True):
     """A part of the work began: photos, features, training, evaluating, ...
 
     Args:
@@ -44,8 +48,7 @@ class Stage:
     name: str
 
 
-@dataclass(frozen=True)
-class Progress:
+class Progress(_Event, frozen=True):
     """How far a stage is.
 
     Args:
@@ -56,13 +59,12 @@ class Progress:
     """
 
     stage: str
-    done: float
-    total: float | None = None
-    seconds_left: float | None = None
+    done: Number
+    total: Number | None = None
+    seconds_left: Number | None = None
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(_Event, frozen=True):
     """A line that the command prints.
 
     Args:
@@ -72,8 +74,7 @@ class Message:
     text: str
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(_Event, frozen=True):
     """A finding of the doctor (`gsplat_edu.doctor.finding.Finding`).
 
     Args:
@@ -95,8 +96,7 @@ class Found:
     options: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True)
-class Diagnosed:
+class Diagnosed(_Event, frozen=True):
     """The rest of the doctor's diagnosis.
 
     Args:
@@ -110,8 +110,7 @@ class Diagnosed:
     advice: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Metric:
+class Metric(_Event, frozen=True):
     """A measured figure.
 
     Args:
@@ -122,13 +121,12 @@ class Metric:
     """
 
     name: str
-    value: float | None
+    value: Number | None
     unit: str = ""
     of: str = ""
 
 
-@dataclass(frozen=True)
-class Failed:
+class Failed(_Event, frozen=True):
     """The command ended with an error.
 
     Args:
@@ -137,11 +135,10 @@ class Failed:
     """
 
     line: str
-    code: int
+    code: Whole
 
 
-@dataclass(frozen=True)
-class Interrupted:
+class Interrupted(_Event, frozen=True):
     """The command ended because the user or the queue interrupted it.
 
     Args:
@@ -151,8 +148,7 @@ class Interrupted:
     line: str
 
 
-@dataclass(frozen=True)
-class Finished:
+class Finished(_Event, frozen=True):
     """The command ended well.
 
     Args:
@@ -162,13 +158,13 @@ class Finished:
     outputs: tuple[str, ...] = ()
 
 
-Event = Started | Stage | Progress | Message | Found | Diagnosed | Metric | Failed | Interrupted | Finished
+Event: TypeAlias = (
+    Started | Stage | Progress | Message | Found | Diagnosed | Metric | Failed | Interrupted | Finished
+)
 
-KINDS: dict[str, type[Event]] = {
-    kind.__name__.lower(): kind
-    for kind in (Started, Stage, Progress, Message, Found, Diagnosed, Metric, Failed, Interrupted, Finished)
-}
-"""The kinds by their names in files."""
+
+class _Time(Record, frozen=True, forbid_unknown_fields=False):
+    time: Number = 0.0
 
 
 def line_of(event: Event, time: float) -> str:
@@ -178,9 +174,8 @@ def line_of(event: Event, time: float) -> str:
         event: The event.
         time: Seconds since 1970.
     """
-    fields = {name: _finite(value) for name, value in dataclasses.asdict(event).items()}
-    entry = {"event": type(event).__name__.lower(), "time": round(time, 3), **fields}
-    return json.dumps(entry, allow_nan=False) + "\n"
+    entry = {"time": round(time, 3), **to_builtins(event)}
+    return json.dumps({name: _finite(value) for name, value in entry.items()}, allow_nan=False) + "\n"
 
 
 def parse_line(line: str | bytes) -> tuple[float, Event]:
@@ -193,44 +188,9 @@ def parse_line(line: str | bytes) -> tuple[float, Event]:
         ValueError: the line is damaged, or of an unknown kind.
     """
     entry = parse_json(line)
-    if not isinstance(entry, dict):
-        raise ValueError("is not an event")
-    kind, time = KINDS.get(str(entry.pop("event", None))), entry.pop("time", 0.0)
-    if kind is None or not _is_number(time):
-        raise ValueError("is not an event")
-    known = {field.name: str(field.type) for field in dataclasses.fields(kind)}
-    for name, value in entry.items():
-        if name not in known or not TYPES[known[name]](value):
-            raise ValueError(f"its field {name[:40]!r} is not known, or has an impossible value")
-    try:
-        return float(time), kind(**{name: _tuple(value) for name, value in entry.items()})
-    except TypeError:
-        raise ValueError("lacks a field") from None
-
-
-def _is_number(value: Any) -> bool:  # noqa: ANN401
-    return type(value) in (int, float) and abs(value) <= LARGEST_NUMBER  # not NaN either
-
-
-def _is_texts(value: Any) -> bool:  # noqa: ANN401
-    return isinstance(value, list) and all(isinstance(text, str) for text in value)
-
-
-TYPES: Mapping[str, Callable[[Any], bool]] = {
-    "int": lambda value: type(value) is int and abs(value) <= LARGEST_NUMBER,
-    "float": _is_number,
-    "float | None": lambda value: value is None or _is_number(value),
-    "str": lambda value: isinstance(value, str),
-    "tuple[str, ...]": _is_texts,
-    "tuple[tuple[str, str], ...]": lambda value: (
-        isinstance(value, list) and all(_is_texts(pair) and len(pair) == 2 for pair in value)
-    ),
-}
-"""Checks of a field's value, by the field's type."""
-
-
-def _tuple(value: Any) -> Any:  # noqa: ANN401
-    return tuple(map(_tuple, value)) if isinstance(value, list) else value
+    time = record_of("", entry, _Time).time
+    event: Event = record_of("", {name: entry[name] for name in entry if name != "time"}, Event)
+    return time, event
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401

@@ -13,15 +13,18 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta, field, structs, to_builtins
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import open_file, parse_json
+from gsplat_edu.base.records import Record, record_of
 from gsplat_edu.base.text import printable, shortened
 
 VERSION = 3
@@ -80,8 +83,12 @@ class Purpose(StrEnum):
     """To start it again; its outputs may exist in part."""
 
 
-@dataclass(frozen=True)
-class Work:
+_Line = Annotated[str, Meta(max_length=LONGEST_LINE)]
+_Time = Annotated[float, Meta(ge=0.0, le=LATEST)]
+_Places = Annotated[tuple[_Line, ...], Meta(max_length=MOST_PLACES)]
+
+
+class Work(Record, frozen=True):
     """What a job does.
 
     A place is a text with slashes. Two places are independent unless they are equal: a file below an entry counts as
@@ -94,10 +101,10 @@ class Work:
         options: Values of the command's options.
     """
 
-    command: str
-    inputs: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
+    command: _Line
+    inputs: _Places = ()
+    outputs: _Places = ()
+    options: dict[str, Any] = field(default_factory=dict)
 
     @property
     def places(self) -> tuple[str, ...]:
@@ -110,20 +117,11 @@ class Work:
 
     def renamed(self, old: str, new: str) -> Work:
         """Return the work after a place got another name; places below it move along."""
-        return replace(
+        return structs.replace(
             self,
             inputs=tuple(_renamed(own, old, new) for own in self.inputs),
             outputs=tuple(_renamed(own, old, new) for own in self.outputs),
         )
-
-    def document(self) -> dict[str, Any]:
-        """Return the work as JSON has it."""
-        return {
-            "command": self.command,
-            "inputs": list(self.inputs),
-            "outputs": list(self.outputs),
-            "options": dict(self.options),
-        }
 
 
 def _renamed(own: str, old: str, new: str) -> str:
@@ -158,6 +156,9 @@ class Rendered:
     argv: tuple[str, ...]
 
 
+NOT_STORED = frozenset({"argv", "waits_for"})
+"""Fields of a job that its record lacks."""
+
 Render = Callable[[Work, Purpose], Rendered]
 """Validates a work and renders its command line; raises ArgumentError if it is not allowed."""
 
@@ -188,16 +189,18 @@ class Job:
     work: Work
     argv: tuple[str, ...]
     state: State
-    created: float
-    started: float | None = None
-    ended: float | None = None
-    attempts: int = 0
-    pid: int | None = None
-    identity: str = ""
-    line: str = ""
+    created: _Time
+    started: _Time | None = None
+    ended: _Time | None = None
+    attempts: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
+    pid: Annotated[int, Meta(ge=2, le=HIGHEST)] | None = (
+        None  # 1 starts the system; 0 is the own process group
+    )
+    identity: _Line = ""
+    line: _Line = ""
     cancelled: bool = False
-    begun_by: str = ""
-    begun_at: str = ""
+    begun_by: _Line = ""
+    begun_at: _Line = ""
     waits_for: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -212,54 +215,8 @@ class Job:
 
     def document(self) -> dict[str, Any]:
         """Return the record as JSON has it: the work, and no command line."""
-        facts = {name: getattr(self, name) for name in (*RECORD_FIELDS, *LATER_FIELDS)}
-        return {"version": VERSION, "id": self.id, "work": self.work.document(), **facts}
-
-
-def _text(value: Any) -> bool:  # noqa: ANN401
-    return isinstance(value, str) and len(value) <= LONGEST_LINE and printable(value) == value
-
-
-def _texts(value: Any) -> bool:  # noqa: ANN401
-    return isinstance(value, list) and len(value) <= MOST_PLACES and all(map(_text, value))
-
-
-def _time(value: Any) -> bool:  # noqa: ANN401
-    return type(value) in (int, float) and 0 <= value <= LATEST
-
-
-def _whole(least: int) -> Callable[[Any], bool]:
-    return lambda value: type(value) is int and least <= value <= HIGHEST
-
-
-def _or_none(check: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: value is None or check(value)
-
-
-RECORD_FIELDS: Mapping[str, Callable[[Any], bool]] = {
-    "state": lambda value: isinstance(value, str) and value in tuple(State),
-    "created": _time,
-    "started": _or_none(_time),
-    "ended": _or_none(_time),
-    "attempts": _whole(0),
-    "pid": _or_none(_whole(2)),  # 1 starts the system, and 0 means the own process group
-    "identity": _text,
-    "line": _text,
-    "cancelled": lambda value: isinstance(value, bool),
-}
-"""Checks of the other fields of a record."""
-
-LATER_FIELDS: Mapping[str, Callable[[Any], bool]] = {"begun_by": _text, "begun_at": _text}
-"""Checks of the fields that earlier records lack; they are empty there."""
-
-
-WORK_FIELDS: Mapping[str, Callable[[Any], bool]] = {
-    "command": _text,
-    "inputs": _texts,
-    "outputs": _texts,
-    "options": lambda value: isinstance(value, dict),
-}
-"""Checks of the fields of a work in a record; `Render` checks what its command allows."""
+        facts = to_builtins(self)
+        return {"version": VERSION, **{name: facts[name] for name in facts if name not in NOT_STORED}}
 
 
 def one_line(text: str) -> str:
@@ -315,29 +272,23 @@ class JobFolder:
             with open_file(self.record) as file:
                 data = file.read(MOST_BYTES + 1)
             entry: Any = parse_json(data) if len(data) <= MOST_BYTES else None
-            if not isinstance(entry, dict) or entry.get("version") != VERSION:
+            if not isinstance(entry, dict) or entry.pop("version", None) != VERSION:
                 raise ValueError("it is no record of this version")
-            entry = dict.fromkeys(LATER_FIELDS, "") | entry
-            if set(entry) != {"version", "id", "work", *RECORD_FIELDS, *LATER_FIELDS}:
+            if set(entry) != {own.name for own in fields(Job)} - NOT_STORED:
                 raise ValueError("it has other fields")
-            if entry["id"] != self.path.name:
+            job: Job = record_of("", entry | {"argv": ()}, Job)
+            if job.id != self.path.name:
                 raise ValueError("it belongs to another job")
-            _check_fields(entry, RECORD_FIELDS)
-            _check_fields(entry, LATER_FIELDS)
-            work = entry["work"]
-            if not isinstance(work, dict) or set(work) != set(WORK_FIELDS):
-                raise ValueError("it has no work")
-            _check_fields(work, WORK_FIELDS)
-            places = {name: tuple(work[name]) for name in ("inputs", "outputs")}
-            shown = render(Work(work["command"], **places, options=work["options"]), Purpose.SHOW)
+            texts = (job.work.command, *job.work.places, job.identity, job.line, job.begun_by, job.begun_at)
+            if any(printable(text) != text for text in texts):
+                raise ValueError("a text has characters that cannot be printed")
+            shown = render(job.work, Purpose.SHOW)
         except OSError as error:
             raise ArgumentError(f"job {self.path.name}: is damaged ({error.strerror}); remove it") from None
         except ValueError as error:
             why = shortened(printable(str(error)))
             raise ArgumentError(f"job {self.path.name}: is damaged ({why}); remove it") from None
-        facts = {name: entry[name] for name in (*RECORD_FIELDS, *LATER_FIELDS)}
-        facts["state"] = State(entry["state"])
-        return Job(self.path.name, shown.work, shown.argv, **facts)
+        return replace(job, work=shown.work, argv=shown.argv)
 
     def _check_files(self) -> None:
         """Check that the folder and its files are no links.
@@ -350,14 +301,3 @@ class JobFolder:
         for path in (self.record, self.events, self.output):
             if path.is_symlink() or (path.exists() and not path.is_file()):
                 raise ValueError(f"{path.name} is a link or no file")
-
-
-def _check_fields(entry: Mapping[str, Any], fields: Mapping[str, Callable[[Any], bool]]) -> None:
-    """Check the values of a record's fields.
-
-    Raises:
-        ValueError: one has an impossible value.
-    """
-    for name, is_allowed in fields.items():
-        if not is_allowed(entry[name]):
-            raise ValueError(f"{name} has an impossible value")

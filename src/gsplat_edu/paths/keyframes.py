@@ -17,22 +17,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Float64
+from msgspec import Meta
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.json_fields import (
-    as_json,
-    check_keys,
-    checked_choice,
-    checked_number,
-    checked_numbers,
-    number_within,
-)
 from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.records import ABSENT, Absent, Number, Record, as_json, present, record_of
 from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.scene.camera import ROTATION_TOLERANCE, Camera
 
@@ -54,11 +48,14 @@ LEAST_STEP = 1e-3
 LONGEST = 1e6
 """Seconds: limit of times and durations, 11 days."""
 
-EASES = ENDS, VIEWS = ("ends", "views")
+Ease = Literal["ends", "views"]
+EASES = ENDS, VIEWS = get_args(Ease)
 """Where the camera slows down to a stop: at both ends of the path, or at every keyframe."""
 
 SEGMENT_SECONDS = 2.0
 """Seconds from one keyframe to the next, on average, if a path states neither times nor a duration."""
+
+Place: TypeAlias = tuple[Number, Number, Number]
 
 NO_SHIFT = (0.0, 0.0, 0.0)
 
@@ -189,6 +186,56 @@ class KeyframePath:
             )
 
 
+class ViewRecord(Record, frozen=True):
+    """A pose and a field of view in a file: the camera's centre, the rotation from camera to world, degrees."""
+
+    position: Place
+    rotation: tuple[Place, Place, Place]
+    fov: Number
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_keyframe(self.view)
+
+    @property
+    def view(self) -> Keyframe:
+        """The keyframe, without a time."""
+        return Keyframe(np.array(self.position), np.array(self.rotation).T, self.fov)
+
+
+class KeyframeRecord(ViewRecord, frozen=True):
+    """A keyframe of a path's file; see `Keyframe`."""
+
+    time: Number | Absent = ABSENT
+    hold: Annotated[float, Meta(ge=LEAST_STEP, le=LONGEST)] | Absent = ABSENT
+
+    @property
+    def keyframe(self) -> Keyframe:
+        """The keyframe."""
+        return replace(self.view, time=present(self.time), hold=present(self.hold) or 0.0)
+
+
+class PathRecord(Record, frozen=True):
+    """The file of a path; see `KeyframePath`."""
+
+    format: Literal["gsplat_edu path"]
+    version: Literal[1]
+    loop: bool
+    keyframes: tuple[KeyframeRecord, ...]
+    ease: Ease | Absent = ABSENT
+    duration: Number | Absent = ABSENT
+
+    def __post_init__(self) -> None:
+        """Check what the values have to be together."""
+        _ = self.path
+
+    @property
+    def path(self) -> KeyframePath:
+        """The path."""
+        keyframes = tuple(record.keyframe for record in self.keyframes)
+        return KeyframePath(keyframes, self.loop, present(self.duration), present(self.ease))
+
+
 def read_path(file: Path, origin: ArrayLike = NO_SHIFT) -> KeyframePath:
     """Read a path.
 
@@ -291,47 +338,8 @@ def parsed_path(found: object) -> KeyframePath:
     """
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise ArgumentError(f'is not a camera path: its "format" has to be "{FORMAT}"')
-    version = found.get("version")
-    if type(version) is not int or version != VERSION:
-        raise ArgumentError(f"version: is {version!r}, but {VERSION} is supported")
-    check_keys("", found, ("format", "version", "loop", "keyframes"), ("ease", "duration"))
-    loop, entries = found["loop"], found["keyframes"]
-    if not isinstance(loop, bool):
-        raise ArgumentError(f"loop: is {as_json(loop)}, but has to be true or false")
-    if not isinstance(entries, list):
-        raise ArgumentError(f"keyframes: is {as_json(entries)}, but has to be a list")
-    keyframes = tuple(parsed_keyframe(f"keyframes[{index}]", entry) for index, entry in enumerate(entries))
-    duration = checked_number("duration", found["duration"]) if "duration" in found else None
-    ease = checked_choice("ease", found["ease"], EASES) if "ease" in found else None
-    return KeyframePath(keyframes, loop, duration, ease)
-
-
-def parsed_keyframe(where: str, entry: object) -> Keyframe:
-    """Return the keyframe that an object of the document describes; its values are checked by `check_keyframe`.
-
-    Args:
-        where: The object's place in its document, for messages.
-        entry: The parsed JSON.
-
-    Raises:
-        ArgumentError: a key is missing or unknown, or a value is of the wrong kind.
-    """
-    if not isinstance(entry, dict):
-        raise ArgumentError(f"{where}: is {as_json(entry)}, but has to be an object")
-    check_keys(f"{where}: ", entry, ("position", "rotation", "fov"), ("time", "hold"))
-    eye = checked_numbers(f"{where}.position", entry["position"], 3)
-    rows = entry["rotation"]
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise ArgumentError(
-            f"{where}.rotation: is {as_json(rows)}, but has to be three rows of three numbers"
-        )
-    rotation = [checked_numbers(f"{where}.rotation[{i}]", row, 3) for i, row in enumerate(rows)]
-    time = checked_number(f"{where}.time", entry["time"]) if "time" in entry else None
-    hold = 0.0
-    if "hold" in entry:
-        hold = number_within(f"{where}.hold", entry["hold"], LEAST_STEP, LONGEST)
-    fov = checked_number(f"{where}.fov", entry["fov"])
-    return Keyframe(np.array(eye), np.array(rotation).T, fov, time, hold)
+    record: PathRecord = record_of("", found, PathRecord)
+    return record.path
 
 
 def _refuse(name: str) -> NoReturn:

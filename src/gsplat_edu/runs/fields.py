@@ -2,139 +2,78 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from gsplat_edu.base.errors import CheckpointError
+import msgspec
+from msgspec import Meta
+
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.records import LARGEST_NUMBER, record_of
 from gsplat_edu.base.validation import LARGEST_WHOLE
+from gsplat_edu.evaluate.verdict import MEASURES
 
-Check = Callable[[object], bool]
-
-
-def _whole(value: object) -> bool:
-    return type(value) is int and abs(value) <= LARGEST_WHOLE
-
-
-def _number(value: object) -> bool:
-    return _whole(value) or (type(value) is float and math.isfinite(value))
+Whole = Annotated[int, Meta(ge=-LARGEST_WHOLE, le=LARGEST_WHOLE)]
+Number = Whole | Annotated[float, Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
+Numbers = dict[str, Number | None]
+Place = tuple[Number, Number, Number]
 
 
-def _text(value: object) -> bool:
-    return isinstance(value, str)
+def _fields(**kinds: Any) -> Any:  # noqa: ANN401
+    """Return the type of an object whose fields have these types; each may be missing or null, and others may exist."""
+    return msgspec.defstruct("Fields", [(name, kind | None, None) for name, kind in kinds.items()])
 
 
-def _texts(value: object) -> bool:
-    return isinstance(value, list) and all(map(_text, value))
+CONFIG = _fields(
+    version=str,
+    backend=str,
+    fingerprint=str,
+    plugins=dict[str, str],
+    origin=Place,
+    scale=_fields(unit=str, source=str, detail=str),
+    data=_fields(path=str),
+    train=_fields(iterations=Whole, strategy=str),
+    render=dict[str, Any],
+)
 
+LOG = _fields(
+    iteration=Whole,
+    num_gaussians=Whole,
+    terms=Numbers,
+    **dict.fromkeys(("loss", "psnr", "ssim", "ms", "seconds"), Number),
+)
 
-def _section(value: object) -> bool:
-    return isinstance(value, dict)
+_SPLIT = _fields(num_images=Whole, **dict.fromkeys(MEASURES, Number))
 
+METRICS = _fields(iterations=Whole, num_gaussians=Whole, seconds=Number, test=_SPLIT, train=_SPLIT)
 
-def _place(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(_number, value))
-
-
-def _numbers(value: object) -> bool:
-    return isinstance(value, dict) and all(number is None or _number(number) for number in value.values())
-
-
-KINDS: Mapping[Check, str] = {
-    _whole: "a whole number",
-    _number: "a number",
-    _text: "text",
-    _texts: "a list of texts",
-    _section: "an object",
-    _numbers: "an object of numbers",
-    _place: "three numbers",
-}
-"""How messages describe the values that each check accepts."""
-
-CONFIG: Mapping[str, Check] = {
-    "version": _text,
-    "backend": _text,
-    "fingerprint": _text,
-    "plugins": _section,
-    "origin": _place,
-    "scale": _section,
-    "scale.unit": _text,
-    "scale.source": _text,
-    "scale.detail": _text,
-    "data": _section,
-    "train": _section,
-    "render": _section,
-    "train.iterations": _whole,
-    "train.strategy": _text,
-    "data.path": _text,
-}
-
-LOG: Mapping[str, Check] = {
-    "iteration": _whole,
-    "num_gaussians": _whole,
-    "terms": _numbers,
-    **dict.fromkeys(("loss", "psnr", "ssim", "ms", "seconds"), _number),
-}
-
-MEASURES = ("psnr", "psnr_8bit", "ssim", "l1", "psnr_fitted")
-"""The scores of a split: those of `gsplat_edu.evaluate.metrics.ImageScore`, which imports torch."""
-
-METRICS: Mapping[str, Check] = {
-    "iterations": _whole,
-    "num_gaussians": _whole,
-    "seconds": _number,
-    **{
-        field: check
-        for split in ("test", "train")
-        for field, check in {
-            split: _section,
-            f"{split}.num_images": _whole,
-            **dict.fromkeys((f"{split}.{score}" for score in MEASURES), _number),
-        }.items()
-    },
-}
-
-
-MESH: Mapping[str, Check] = {
-    "file": _text,
-    "unit": _text,
-    "notes": _texts,
-    "pictures": _texts,
-    "rendered": _texts,
-    "size": _place,
-    "held_out": _numbers,
-    "photos": _numbers,
-    "intersections": _numbers,
-    "truth": _numbers,
-    "left_out": _numbers,
-    **dict.fromkeys(("area", "voxel", "certain", "spread", "outside", "filled", "uncovered"), _number),
+MESH = _fields(
+    file=str,
+    unit=str,
+    size=Place,
+    **dict.fromkeys(("notes", "pictures", "rendered"), list[str]),
+    **dict.fromkeys(("held_out", "photos", "intersections", "truth", "left_out"), Numbers),
+    **dict.fromkeys(("area", "voxel", "certain", "spread", "outside", "filled", "uncovered"), Number),
     **dict.fromkeys(
-        ("iterations", "triangles", "vertices", "convex_parts", "volume_bytes", "few_views"), _whole
+        ("iterations", "triangles", "vertices", "convex_parts", "volume_bytes", "few_views"), Whole
     ),
-    **dict.fromkeys(("parts", "boundary_edges", "holes"), _whole),
-}
+    **dict.fromkeys(("parts", "boundary_edges", "holes"), Whole),
+)
 """The record of a mesh, as `gsplat_edu.runs.meshes.record_of` collects it."""
 
 
-def checked(contents: dict[str, Any], fields: Mapping[str, Check], where: str) -> dict[str, Any]:
+def checked(contents: dict[str, Any], fields: Any, where: str) -> dict[str, Any]:  # noqa: ANN401
     """Check the types of the fields that this program reads, and return the contents.
 
     Args:
         contents: The file's object.
-        fields: `CONFIG`, `LOG`, `METRICS` or `MESH`; a dot separates a section from its field. Fields may be missing or
-            null.
+        fields: `CONFIG`, `LOG`, `METRICS` or `MESH`.
         where: The file, with the line number for log.jsonl.
 
     Raises:
         CheckpointError: a field has the wrong type; the message names it.
     """
-    for name, check in fields.items():
-        section, _, field = name.rpartition(".")
-        values = contents.get(section) if section else contents
-        value = values.get(field) if isinstance(values, dict) else None
-        if value is not None and not check(value):
-            said = str(value)[:40] if not isinstance(value, int) or _whole(value) else "a huge number"
-            raise CheckpointError(
-                f"{where}: {name} is {said}, but has to be {KINDS[check]}; fix or remove the file"
-            )
+    try:
+        record_of("", contents, fields)
+    except ArgumentError as error:
+        raise CheckpointError(f"{where}: {error}; fix or remove the file") from None
     return contents

@@ -3,80 +3,72 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from gsplat_edu.base.errors import DatasetError
+from msgspec import Meta
+
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.json_fields import LARGEST_NUMBER
 from gsplat_edu.base.reading import parse_json, read_text
-from gsplat_edu.base.text import names_a_file
+from gsplat_edu.base.records import Number, Record, record_of
 
+Text = Annotated[str, Meta(pattern=r"^[^\x00\ud800-\udc7f\udd00-\udfff]*\Z")]
+"""A text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)."""
 
-def _text(value: object) -> bool:
-    return isinstance(value, str) and names_a_file(value)
-
-
-def _whole(value: object) -> bool:
-    return type(value) is int and 0 <= value < 2**31
-
-
-def _number(value: object) -> bool:
-    return type(value) in (int, float) and abs(value) < LARGEST_NUMBER  # type: ignore[arg-type]
-
-
-def _texts(value: object) -> bool:
-    return isinstance(value, list) and all(map(_text, value))
-
-
-def _model(value: object) -> bool:
-    return isinstance(value, str) and _MODEL.fullmatch(value) is not None
-
-
-def _panoramas(value: object) -> bool:
-    """Accept objects with a name, the names of faces, and a place; a name of a face is a file beside the others."""
-    return isinstance(value, list) and all(
-        isinstance(one, dict)
-        and _text(one.get("name"))
-        and _texts(one.get("faces"))
-        and one["faces"]
-        and all(_PLAIN.fullmatch(face) for face in one["faces"])
-        and (one.get("place") is None or _place(one["place"]))
-        for one in value
-    )
-
-
-def _place(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(_number, value))
-
-
-_MODEL = re.compile(r"models/\d{1,4}/\d{1,4}")
+Model = Annotated[str, Meta(pattern=r"^models/\d{1,4}/\d{1,4}\Z")]
 """Folder of a model, relative to the work folder."""
 
-_PLAIN = re.compile(r"(?!\.)[^/\\\0]{1,255}")
+FileName = Annotated[str, Meta(pattern=r"^(?!\.)[^/\\\x00\ud800-\udc7f\udd00-\udfff]{1,255}\Z")]
 """Name of a file without a folder."""
 
-Check = Callable[[object], bool]
 
-FACTS: Mapping[str, Mapping[str, Check]] = {
-    "frames": {},
-    "faces": {"panoramas": _panoramas},
-    "photos": {"names": _texts},
-    "features": {"few": _texts},
-    "more features": {},
-    "matches": {"connected": _whole},
-    "mapping": {"folder": _model, "names": _texts, "doubtful": _texts, "unclear": _texts},
-    "capture": {},
+class Facts(Record, frozen=True, forbid_unknown_fields=False):
+    """The facts of a stage that a resumed run uses; `summary` is for the user."""
+
+    summary: Text
+
+
+class _Panorama(Record, frozen=True, forbid_unknown_fields=False):
+    name: Text
+    faces: Annotated[tuple[FileName, ...], Meta(min_length=1)]
+    place: tuple[Number, Number, Number] | None = None
+
+
+class _Faces(Facts, frozen=True):
+    panoramas: tuple[_Panorama, ...]
+
+
+class _Photos(Facts, frozen=True):
+    names: tuple[Text, ...]
+
+
+class _Features(Facts, frozen=True):
+    few: tuple[Text, ...]
+
+
+class _Matches(Facts, frozen=True):
+    connected: Annotated[int, Meta(ge=0, lt=2**31)]
+
+
+class _Mapping(Facts, frozen=True):
+    folder: Model
+    names: tuple[Text, ...]
+    doubtful: tuple[Text, ...]
+    unclear: tuple[Text, ...]
+
+
+FACTS: Mapping[str, type[Facts]] = {
+    "frames": Facts,
+    "faces": _Faces,
+    "photos": _Photos,
+    "features": _Features,
+    "more features": Facts,
+    "matches": _Matches,
+    "mapping": _Mapping,
+    "capture": Facts,
 }
-"""The facts that a resumed run uses, by stage. Each also has "summary", for the user."""
-
-
-def are_facts(name: str, facts: object) -> bool:
-    """Return whether these are facts of a stage; the file may come from somebody else."""
-    checks = {"summary": _text, **FACTS[name]}
-    return isinstance(facts, dict) and all(check(facts.get(field)) for field, check in checks.items())
 
 
 class Stages:
@@ -129,11 +121,13 @@ class Stages:
             return None
         if known["options"] == options:
             facts = known["facts"]
-            if facts is not None and not are_facts(name, facts):
-                raise DatasetError(
-                    f"{self.path}: stages.{name}.facts: is damaged; remove {self.path.parent} and run the same command"
-                    " again"
-                )
+            if facts is not None:
+                try:
+                    record_of(f"stages.{name}.facts", facts, FACTS[name])
+                except ArgumentError as error:
+                    raise DatasetError(
+                        f"{self.path}: {error}; remove {self.path.parent} and run the same command again"
+                    ) from None
             return facts  # type: ignore[no-any-return]
         changed = [key for key in known["options"] | options if known["options"].get(key) != options.get(key)]
         self._say(

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.text import legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
@@ -355,7 +357,7 @@ def command_line(library: Library, work: Work, purpose: Purpose) -> Rendered:
         and "resume" in offered(work.command)
         and (asked.made() / "config.json").is_file()
     ):
-        asked = replace(asked, work=replace(work, options={**work.options, "resume": True}))
+        asked = replace(asked, work=structs.replace(work, options={**work.options, "resume": True}))
     if not (command.makes or command.forms) and work.outputs:
         raise RefusedError(f"outputs: {work.command} writes nothing; leave them out")
     argv = [work.command]

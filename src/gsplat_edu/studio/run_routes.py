@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.json_fields import checked_number
+from gsplat_edu.base.records import Number, record_of
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
@@ -96,7 +96,7 @@ def _forecast(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     entry = studio.library.entry("captures", request.path_params["name"])
     text = request.query_params.get("resolution")
     try:
-        resolution = text if text in (None, AUTO) else checked_number("resolution", float(text))
+        resolution = text if text in (None, AUTO) else record_of("resolution", float(text), Number)
     except (ArgumentError, ValueError):
         raise RefusedError(f"resolution: is {str(text)[:20]!r}, but has to be a number or auto") from None
     return {"qualities": studio.prober.ask("forecast", capture=str(entry), resolution=resolution)}
@@ -112,7 +112,7 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     ]
     if not jobs:
         certain = studio.prober.ask("certain", capture=str(entry))["findings"] if kind == "captures" else []
-        events = [Found(**{key: _frozen(value) for key, value in one.items()}) for one in certain]
+        events = record_of("findings", certain, tuple[Found, ...])
         return {
             "job": None,
             "state": None,
@@ -124,11 +124,6 @@ def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
             "again": None,
         }
     return _diagnosis(studio, jobs[-1], kind, entry)
-
-
-def _frozen(value: Any) -> Any:  # noqa: ANN401
-    """Return the value of an event's field that JSON has turned into lists."""
-    return tuple(_frozen(one) for one in value) if isinstance(value, list) else value
 
 
 def _with_photos(
@@ -149,7 +144,7 @@ def _with_photos(
             "masked": [photo in drawn for photo in photos],
             "proposals": proposals(studio, kind, entry, finding),
         }
-        shown.append({**dataclasses.asdict(finding), **facts})
+        shown.append({**asdict(finding), **facts})
     return shown
 
 
@@ -172,7 +167,7 @@ def _diagnosis(studio: Studio, job: Job, kind: str, entry: Path) -> dict[str, An
         "state": job.state.value,
         "line": job.line,
         "findings": findings,
-        **dataclasses.asdict(rest),
+        **asdict(rest),
         "facts": [(name, _with_names(text, entry, capture)) for name, text in rest.facts],
         "stale": stale,
         "again": train_again(studio, entry) if kind == "runs" else None,

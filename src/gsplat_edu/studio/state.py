@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec import structs
 
 from gsplat_edu.jobs.following import last_stage
 from gsplat_edu.jobs.queue import JobQueue
@@ -78,7 +79,8 @@ class Studio:
             others = self._pending()
             if request.get("to") is None:  # the name is ours, and no reason to do the same work twice
                 work = next(
-                    (job.work for job in others if replace(job.work, outputs=work.outputs) == work), work
+                    (job.work for job in others if structs.replace(job.work, outputs=work.outputs) == work),
+                    work,
                 )
             self._check_first(work, others)
             return self.queue.submit(work, begun_by, begun_at)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import json
 import math
 import secrets
@@ -13,6 +12,8 @@ from collections import deque
 from collections.abc import AsyncIterator
 from time import monotonic
 from typing import Any
+
+from msgspec import to_builtins
 
 from gsplat_edu.base.locks import POLL
 from gsplat_edu.base.text import whole_of
@@ -42,7 +43,7 @@ def job_document(job: Job) -> dict[str, Any]:
         "id": job.id,
         "title": title_of(job.work),
         "subject": subject_of(job.work),
-        "work": job.work.document(),
+        "work": to_builtins(job.work),
         "state": job.state.value,
         "command": job.command,
         "argv": list(job.argv),
@@ -62,10 +63,9 @@ def job_document(job: Job) -> dict[str, Any]:
 def event_document(number: int, time: float, event: Event) -> dict[str, Any]:
     """Return an event of a job as the API shows it."""
     return {
-        "event": type(event).__name__.lower(),
         "number": number,
         "time": time,
-        **dataclasses.asdict(event),
+        **to_builtins(event),
     }
 
 

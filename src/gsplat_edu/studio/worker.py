@@ -305,7 +305,7 @@ def certain(capture: str) -> dict[str, Any]:
     Args:
         capture: Folder of the capture; one whose poses are missing or damaged has no findings yet.
     """
-    from dataclasses import asdict
+    from msgspec.structs import asdict
 
     from gsplat_edu.base.errors import DatasetError
     from gsplat_edu.data.reader import CaptureReader
