@@ -67,6 +67,7 @@ def summary(library: Library, kind: str, path: Path) -> dict[str, Any]:
     if kind in ("photos", "captures"):
         facts |= {"photos": size.photos, "videos": size.videos}
     if kind == "captures":
+        (path / "transforms.json").is_file()  # raises the reason if the system refuses to look at it
         facts["layout"] = layout_of(path)
         facts["search"] = search_facts(path)
         facts["unfinished"] = is_unfinished(path)
