@@ -372,7 +372,7 @@ def test_a_resumed_run_keeps_the_numbers_of_its_config(capture, tmp_path):
     [
         ({"data": {}}, "lacks the section train"),
         ({"train": {}, "data": None}, "lacks the section train or data"),
-        ({"train": {"iterations": "many"}, "data": {}}, "iterations is many"),
+        ({"train": {"iterations": "many"}, "data": {}}, 'train.iterations: is "many"'),
         ({"train": {}, "data": {"resolution": -1.0}}, "resolution: is -1"),
     ],
 )

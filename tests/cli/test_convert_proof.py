@@ -150,7 +150,7 @@ def test_a_capture_that_has_moved_is_given(made, tmp_path, capsys):
     shutil.copytree(folder.path, run.path)
     config = json.loads(run.config.read_text())
     config["data"]["path"] = str(tmp_path / "gone")
-    run.config.write_text(json.dumps(config))
+    run.config.write_text(json.dumps({"format": 1, **config}))
     out = tmp_path / "a.html"
     convert(run.path, out, "--verify", "photos", code=2)
     assert "dataset" in capsys.readouterr().err and not out.exists()

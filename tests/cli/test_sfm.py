@@ -246,7 +246,7 @@ def never(monkeypatch):
 def test_an_existing_run_needs_resume_before_its_capture_is_replaced(tmp_path, capsys):
     save(tmp_path / "photos", box_orbit(3))
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.json").write_text("{}")
+    (tmp_path / "run" / "config.json").write_text('{"format": 1}')
     assert main(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run")]) != 0
     said = capsys.readouterr().err
     assert "already holds a run; add --resume" in said and said.count("\n") == 1
@@ -269,7 +269,7 @@ def test_a_resumed_run_keeps_its_poses(tmp_path):
     found = tmp_path / "run" / "capture"
     (found / "sparse" / "0").mkdir(parents=True)
     (found / "sparse" / "0" / "cameras.bin").write_bytes(b"")
-    (tmp_path / "run" / "config.json").write_text("{}")
+    (tmp_path / "run" / "config.json").write_text('{"format": 1}')
     words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--resume"]
     options = train_options_from(build_parser(["train"]).parse_args(words))
     said = []

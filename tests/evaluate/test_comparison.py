@@ -1,4 +1,4 @@
-"""A photo beside its render, photo first, both with their names; pictures of earlier versions are recognised."""
+"""A photo beside its render, photo first, both with their names."""
 
 import numpy as np
 import pytest
@@ -33,15 +33,7 @@ def test_names_grow_with_the_pictures():
     assert dark.min() < 20 and (dark > 1304).any() and not ((dark > 200) & (dark < 1304)).any()
 
 
-def test_pictures_of_earlier_versions_have_the_render_first(tmp_path):
-    line = np.full((20, 4, 3), 128, np.uint8)
-    Image.fromarray(np.concatenate([RENDER, line, PHOTO], axis=1)).save(tmp_path / "old.png")
-    found = read_comparison(tmp_path / "old.png")
-    np.testing.assert_array_equal(found["photo"], PHOTO)
-    assert comparison_size(tmp_path / "old.png") == (70, 20)
-
-
 def test_other_pictures_are_refused(tmp_path):
-    Image.fromarray(PHOTO[:, :69]).save(tmp_path / "odd.png")
+    Image.fromarray(PHOTO).save(tmp_path / "odd.png")
     with pytest.raises(ValueError, match="is not a photo beside its render"):
         read_comparison(tmp_path / "odd.png")

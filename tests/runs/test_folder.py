@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
+from gsplat_edu.runs.folder import FORMAT, RunFolder, image_file_names, render_settings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
 
@@ -46,6 +46,18 @@ def test_config_and_metrics_are_read_as_written(folder):
     assert folder.read_metrics() == {}
     folder.write_metrics({"test": {"psnr": 0.1 + 0.2}})
     assert folder.read_metrics() == {"test": {"psnr": 0.1 + 0.2}}
+
+
+@pytest.mark.parametrize(("number", "by"), [(None, "no number"), (0, "number 0"), ("1", "no number")])
+def test_a_run_of_another_layout_is_refused(folder, number, by):
+    folder.write_config({"version": "0.1"})
+    written = json.loads(folder.config.read_text())
+    assert written.pop("format") == FORMAT
+    folder.config.write_text(json.dumps(written if number is None else written | {"format": number}))
+    with pytest.raises(
+        CheckpointError, match=rf"config\.json: has {by} for its format.* train the run again"
+    ):
+        folder.read_config()
 
 
 def test_numbers_that_json_lacks_are_refused(folder):

@@ -172,7 +172,6 @@ def test_masks_that_no_run_wrote_are_kept(copied):
     mask = copied.out / "masks" / "mine.png"
     mask.parent.mkdir()
     mask.write_text("mine")
-    (copied.out / "sfm" / "published.json").unlink()  # earlier versions did not write this file
     reconstruct(replace(copied, camera_model="SIMPLE_RADIAL"))
     assert mask.read_text() == "mine" and published(copied.out / "sfm") == ("images", "sparse")
 

@@ -29,7 +29,7 @@ def library(tmp_path):
         (tmp_path / entry).mkdir()
     (tmp_path / "photos" / "a b" / "1.jpg").touch()
     (tmp_path / "photos" / "film" / "x.mp4").touch()
-    (tmp_path / "runs" / "a" / "config.json").write_text("{}")
+    (tmp_path / "runs" / "a" / "config.json").write_text('{"format": 1}')
     (tmp_path / "scenes" / "a" / "toy.spz").touch()
     return made
 
@@ -152,7 +152,7 @@ def test_a_training_resumes_once_its_run_has_begun(library):
     out = library.root / "runs" / "a-run-2"
     out.mkdir()
     assert command_line(library, work, Purpose.CONTINUE).argv == argv
-    (out / "config.json").write_text("{}")
+    (out / "config.json").write_text('{"format": 1}')
     resumed = command_line(library, work, Purpose.CONTINUE)
     assert resumed.argv == (*argv, "--resume")
     assert {command_line(library, resumed.work, purpose) == resumed for purpose in Purpose} == {True}
@@ -389,7 +389,7 @@ def test_a_record_names_no_other_place_than_a_request_could(library, work, purpo
 def test_a_training_and_jobs_that_read_its_run_wait_for_each_other(page, studio):
     (studio.library.root / "captures" / "a").mkdir()
     (studio.library.root / "runs" / "r").mkdir()
-    (studio.library.root / "runs" / "r" / "config.json").write_text("{}")
+    (studio.library.root / "runs" / "r" / "config.json").write_text('{"format": 1}')
     (studio.library.root / "runs" / "same").symlink_to(studio.library.root / "runs" / "r")
     requests = (
         {"command": "clean", "subject": "runs/same"},

@@ -123,7 +123,7 @@ def hostile_folders(library, outside):
         ".studio/trash",
     ):
         (library / name).mkdir(parents=True)
-    (library / "runs" / "inner" / "config.json").write_text("{}")
+    (library / "runs" / "inner" / "config.json").write_text('{"format": 1}')
     (library / "runs" / "inner" / "point_cloud").symlink_to(outside)
     (library / "scenes" / "s" / "s.ply").write_text("ply")
     (library / "scenes" / "s" / "exports").symlink_to(outside / "exports")

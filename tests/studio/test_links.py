@@ -18,7 +18,7 @@ def run(studio):
     """A run without a scene, and its folder."""
     folder = studio.library.root / "runs" / "r"
     (folder / "renders" / "test").mkdir(parents=True)
-    (folder / "config.json").write_text("{}")
+    (folder / "config.json").write_text('{"format": 1}')
     (folder / "metrics.json").write_text(json.dumps({"test_views": [{"name": "a.jpg", "psnr": 20.0}]}))
     return folder
 

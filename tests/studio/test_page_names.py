@@ -64,7 +64,7 @@ def test_what_came_from_a_capture_is_renamed_with_it(visitor, library):
     for name in ("toad", "toad-run-2", "other"):
         (root / "runs" / name).mkdir(parents=True)
         config = {"data": {"path": str(root / "captures" / "toad")}, "train": {"iterations": 10}}
-        (root / "runs" / name / "config.json").write_text(json.dumps(config))
+        (root / "runs" / name / "config.json").write_text(json.dumps({"format": 1, **config}))
     person = visitor()
     tab = person.tab
     go(tab, "captures/toad")

@@ -35,7 +35,7 @@ def add_run(studio, name, capture, iterations=40, planned=40, psnr=20.0):
     folder = studio.library.root / "runs" / name
     folder.mkdir()
     config = {"train": {"iterations": planned}, "data": {"path": str(capture)}}
-    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "config.json").write_text(json.dumps({"format": 1, **config}))
     (folder / "metrics.json").write_text(json.dumps({"iterations": iterations, "test": {"psnr": psnr}}))
     return folder
 

@@ -32,7 +32,7 @@ def trained(studio):
         run = root / "runs" / name
         run.mkdir(parents=True)
         config = {"data": {"path": str(root / "captures" / "toy")}, "train": {"iterations": 10}}
-        (run / "config.json").write_text(json.dumps(config))
+        (run / "config.json").write_text(json.dumps({"format": 1, **config}))
     return studio
 
 

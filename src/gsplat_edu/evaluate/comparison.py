@@ -31,7 +31,7 @@ WIDTH_PER_SCALE = 600
 PANELS, STRIP = "Panels", "Strip"
 """Keywords of the text chunks: names of the pictures from left to right; height of the strip, px."""
 
-ORDER, EARLIER = "photo,render", "render,photo"
+ORDER = "photo,render"
 
 RgbBytes = UInt8[np.ndarray, "H W 3"]
 
@@ -76,29 +76,28 @@ def comparison_size(path: Path) -> tuple[int, int]:
         OSError, ValueError: the file cannot be read or is not such a picture.
     """
     with opened_image(path, ("PNG",)) as file:
-        _, strip = _layout(file)
-        return (file.width - SEPARATOR_WIDTH) // 2, file.height - strip
+        return (file.width - SEPARATOR_WIDTH) // 2, file.height - _strip_height(file)
 
 
 def read_comparison(path: Path) -> dict[str, RgbBytes]:
-    """Read a file of `save_comparison`, or of earlier versions, as "photo" and "render": a PNG of ours, no photo.
+    """Read a file of `save_comparison` as "photo" and "render": a PNG of ours, no photo.
 
     Raises:
         OSError, ValueError: the file cannot be read or is not such a picture.
     """
     with opened_image(path, ("PNG",)) as file:
-        names, strip = _layout(file)
+        strip = _strip_height(file)
         both = np.asarray(file.convert("RGB"))[strip:]
     W = (both.shape[1] - SEPARATOR_WIDTH) // 2
     if W < 1 or both.shape[1] != 2 * W + SEPARATOR_WIDTH:
         raise ValueError("is not a photo beside its render")
     halves = both[:, :W], both[:, W + SEPARATOR_WIDTH :]
-    return {name: np.ascontiguousarray(half) for name, half in zip(names, halves, strict=True)}
+    return {name: np.ascontiguousarray(half) for name, half in zip(ORDER.split(","), halves, strict=True)}
 
 
-def _layout(file: Image.Image) -> tuple[list[str], int]:
-    """Return the names from left to right, and the height of the strip, px."""
-    panels, strip = file.info.get(PANELS, EARLIER), str(file.info.get(STRIP, "0"))
-    if panels not in (ORDER, EARLIER) or not strip.isdecimal() or not 0 <= int(strip[:6]) < file.height:
+def _strip_height(file: Image.Image) -> int:
+    """Return the height of the strip with the names, px; raise a ValueError for another picture."""
+    strip = str(file.info.get(STRIP, ""))
+    if file.info.get(PANELS) != ORDER or not strip.isdecimal() or not 0 <= int(strip[:6]) < file.height:
         raise ValueError("is not a photo beside its render")
-    return panels.split(","), int(strip[:6])
+    return int(strip[:6])

@@ -19,9 +19,6 @@ from gsplat_edu.evaluate.report_parts import bullets, facts_table, folded, jpeg_
 BEGIN, END = "<!-- mesh -->\n", "<!-- end of mesh -->\n"
 """Around the section. Texts of a report are escaped, so that none of them can contain these."""
 
-LAST = "<script>"
-"""In a report without these comments, which an older version wrote, the section goes before the script at its end."""
-
 PANELS = ("photo", "mesh", "views", "agreement")
 """Pictures of a mesh from one camera: what the camera saw, the mesh, and the mesh coloured by two kinds of evidence."""
 
@@ -89,21 +86,17 @@ def replace_mesh_section(path: Path, entries: Sequence[MeshEntry]) -> bool:
         entries: The meshes.
 
     Returns:
-        Whether the file is a report: it has the comments, or the script that ends one.
+        Whether the file is a report: it has the comments.
 
     Raises:
         OSError: the file cannot be read or written. It is unchanged then.
     """
     page = read_text(path)
     start, stop = page.find(BEGIN), page.find(END)
-    if 0 <= start < stop:
-        before, after = page[:start], page[stop + len(END) :]
-    elif (at := page.rfind(LAST)) >= 0:
-        before, after = page[:at], page[at:]
-    else:
+    if not 0 <= start < stop:
         return False
     with written_aside(path) as aside:
-        write_text(aside, before + mesh_section(entries) + after)
+        write_text(aside, page[:start] + mesh_section(entries) + page[stop + len(END) :])
     return True
 
 

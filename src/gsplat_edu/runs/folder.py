@@ -41,6 +41,9 @@ from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.lens_record import lens_entry, with_lens
 from gsplat_edu.scene.views import View
 
+FORMAT = 1
+"""Number of the layout of a run's files; a run of another layout is refused."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RunFolder:
@@ -119,13 +122,19 @@ class RunFolder:
         """Read the settings of the run.
 
         Raises:
-            CheckpointError: the folder contains no run, or the file is damaged.
+            CheckpointError: the folder contains no run, one of another version, or the file is damaged.
         """
         if not self.exists():
             raise CheckpointError(
                 f"{self.path}: is not a run: it has no config.json; give the folder of a run"
             )
-        return checked(_read_object(self.config), CONFIG, str(self.config))
+        config = _read_object(self.config)
+        if (written := config.pop("format", None)) != FORMAT:
+            by = f"number {written}" if type(written) is int else "no number"
+            raise CheckpointError(
+                f"{self.config}: has {by} for its format, and this version reads {FORMAT}; train the run again"
+            )
+        return checked(config, CONFIG, str(self.config))
 
     def check_plugins(self) -> None:
         """Check that the plug-ins that the run was trained with are installed.
@@ -147,7 +156,7 @@ class RunFolder:
             ArgumentError: a value cannot be represented in JSON, for example NaN.
             OSError: the file cannot be written. An existing file is unchanged.
         """
-        write_json(self.config, config)
+        write_json(self.config, {"format": FORMAT, **config})
 
     def read_metrics(self) -> dict[str, Any]:
         """Read the scores; empty if the run has not been evaluated.

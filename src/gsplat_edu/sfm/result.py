@@ -232,21 +232,12 @@ def published(folder: Path) -> tuple[str, ...]:
     """
     path = folder / PUBLISHED
     if not path.is_file():
-        return _published_before(folder / "stages.json")
+        return ()
     try:
         named = parse_json(read_text(path))["parts"]
         return tuple(part for part in PARTS if part in named)
     except (ValueError, KeyError, TypeError):
         raise DatasetError(f"{path}: is damaged; give another folder, or remove the capture") from None
-
-
-def _published_before(stages: Path) -> tuple[str, ...]:
-    """Return the parts of a capture that an earlier version, without published.json, wrote."""
-    try:
-        finished = parse_json(read_text(stages))["stages"]["capture"]["facts"] is not None
-    except (OSError, ValueError, KeyError, TypeError):
-        return ()
-    return ("images", "sparse") if finished else ()
 
 
 def publish(folder: Path, out: Path) -> None:
