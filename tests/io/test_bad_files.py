@@ -96,7 +96,7 @@ def test_names_without_a_format_are_refused(tmp_path):
         with pytest.raises(ArgumentError, match=r"known are \.compressed\.ply, \.ply"):
             format_of(tmp_path / name)
     assert format_of("A.Compressed.PLY").module == "gsplat_edu.io.compressed_ply"
-    assert format_of("folder/meta.json").module == "sog.codec"
+    assert format_of("folder/meta.json").module == "gsplat_edu.io.sog.codec"
 
 
 @every_format
