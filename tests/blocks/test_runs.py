@@ -5,12 +5,13 @@ import resource
 import shutil
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
 
 from block_runs import RECIPE
-from gsplat_edu.blocks.layout import BlocksFolder, Done
+from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import finished_blocks, merged
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.cli.main import main
@@ -229,7 +230,7 @@ def test_changed_or_damaged_files_are_named(serial, tmp_path, capsys):
         file.write(b"x")
     assert main(["merge", str(copy)]) == 2
     assert "block_03" in (error := capsys.readouterr().err) and "was changed after the training" in error
-    Done(**{**vars(done), "plan": "another"}).write(folder)
+    msgspec.structs.replace(done, plan="another").write(folder)
     assert main(["merge", str(copy)]) == 2 and "belongs to another plan" in capsys.readouterr().err
     folder.record(3).write_text("{")
     assert main(["block", str(copy), "3"]) == 2 and "block_03.json: is damaged" in capsys.readouterr().err
