@@ -19,13 +19,11 @@ class Part:
     """What a plug-in adds to each training: settings, terms of the objective, findings, a section of the report.
 
     Its module imports torch only in functions: the command line reads the settings.
-
-    Attributes:
-        Settings: Frozen dataclass whose fields `gsplat_edu.train.strategy_config.number` declares. Their names in
-            options and config.json begin with the plug-in's name.
     """
 
     Settings: ClassVar[type] = NoSettings
+    """Frozen dataclass whose fields `gsplat_edu.train.strategy_config.number` declares; their names in options and
+    config.json begin with the plug-in's name."""
 
     def terms(self, settings: Any, extent: float) -> Mapping[str, Any]:  # noqa: ANN401
         """Return terms of the objective (`gsplat_edu.train.objective.Term`) by name.
@@ -58,13 +56,10 @@ class Part:
 
 
 class Strategy:
-    """A density strategy that a plug-in adds: `--strategy NAME`.
-
-    Attributes:
-        Settings: As for `Part`.
-    """
+    """A density strategy that a plug-in adds: `--strategy NAME`."""
 
     Settings: ClassVar[type] = NoSettings
+    """As for `Part`."""
 
     def make(self, settings: Any, gaussians: Any, extent: float, generator: Any) -> Any:  # noqa: ANN401
         """Return the strategy of a run, a `gsplat_edu.train.density.base.DensityStrategy`.
