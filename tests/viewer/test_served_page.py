@@ -23,9 +23,10 @@ def server(random_gaussians):
 
 
 def test_a_browser_draws_the_page_without_complaint(server, visit):
-    tab = visit(320, 240, url=server.url).ready().tab
-    assert tab.reload().headers["content-security-policy"] == f"{page_parts.policy()}; frame-ancestors 'none'"
-    tab.wait_for_function("window.viewer?.isWhole")
-    picture = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), dtype=float)
+    view = visit(320, 240, url=server.url).ready()
+    answer = view.tab.reload()
+    assert answer.headers["content-security-policy"] == f"{page_parts.policy()}; frame-ancestors 'none'"
+    view.ready()
+    picture = np.asarray(Image.open(io.BytesIO(view.tab.screenshot())).convert("RGB"), dtype=float)
     orange = np.abs(picture - 255.0 * np.array(ORANGE)).max(axis=2) < 3
     assert 0.1 < orange.mean() < 0.95 and picture[~orange].std() > 20
