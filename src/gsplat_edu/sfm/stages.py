@@ -14,14 +14,14 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.records import Number, Record, record_of
 
+# a text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)
 Text = Annotated[str, Meta(pattern=r"^[^\x00\ud800-\udc7f\udd00-\udfff]*\Z")]
-"""A text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)."""
 
+# the folder of a model, relative to the work folder
 Model = Annotated[str, Meta(pattern=r"^models/\d{1,4}/\d{1,4}\Z")]
-"""Folder of a model, relative to the work folder."""
 
+# the name of a file without a folder
 FileName = Annotated[str, Meta(pattern=r"^(?!\.)[^/\\\x00\ud800-\udc7f\udd00-\udfff]{1,255}\Z")]
-"""Name of a file without a folder."""
 
 
 class Facts(Record, frozen=True, forbid_unknown_fields=False):
