@@ -207,12 +207,7 @@ def test_a_new_evaluation_keeps_the_section_and_a_new_mesh_replaces_it(run, eval
     assert set(run.read_meshes()) == {"mesh", "collider"}
 
 
-def test_a_report_of_an_older_version_and_no_report(run, capsys):
-    old = run.report.read_text("utf-8").replace(BEGIN + END, "")
-    run.report.write_text(old, "utf-8")
-    mesh(run)
-    page = run.report.read_text("utf-8")
-    assert page.replace(page[page.index(BEGIN) : page.index(END) + len(END)], "") == old
+def test_without_a_report_eval_adds_the_mesh_to_one(run, capsys):
     run.report.unlink()
     mesh(run)
     assert "mesh.json; eval adds it to a report" in capsys.readouterr().out and not run.report.exists()

@@ -12,6 +12,7 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.jobs import events
 from gsplat_edu.jobs.record import Work
 from gsplat_edu.runs.folder import RunFolder
@@ -135,9 +136,8 @@ def test_held_out_views_are_sorted_and_have_pictures(page, run):
 def test_previews_are_small_and_made_once(page, run, studio):
     (index, view) = next(enumerate(run.read_metrics()["test_views"]))
     (path,) = (run.path / "renders" / "test").glob(f"{view['name'].removesuffix('.png')}*")
-    both = np.zeros((600, 2 * 900 + 4, 3), np.uint8)
-    both[:, :900], both[:, 904:] = (200, 100, 50), (180, 100, 60)
-    Image.fromarray(both).save(path)
+    photo, render = (np.full((600, 900, 3), color, np.uint8) for color in ((180, 100, 60), (200, 100, 50)))
+    save_comparison(path, photo, render)
     wanted = {"render": (200, 100, 50), "photo": (180, 100, 60), "difference": (80, 0, 40)}
     for what, color in wanted.items():
         answer = page.get(f"/api/runs/r/views/{index}/{what}.jpg")
