@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -55,12 +56,13 @@ class Part:
         return ()
 
 
-class Strategy:
+class Strategy(ABC):
     """A density strategy that a plug-in adds: `--strategy NAME`."""
 
     Settings: ClassVar[type] = NoSettings
     """As for `Part`."""
 
+    @abstractmethod
     def make(self, settings: Any, gaussians: Any, extent: float, generator: Any) -> Any:  # noqa: ANN401
         """Return the strategy of a run, a `gsplat_edu.train.density.base.DensityStrategy`.
 
@@ -70,7 +72,6 @@ class Strategy:
             extent: Size of the scene, world units.
             generator: torch.Generator, the source of its draws.
         """
-        raise NotImplementedError
 
 
 PARTS: Mapping[str, Part] = plugins("parts")
