@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from waiting import resize
+
 FOLDER = Path(__file__).parent / "npm"
 """Has the package.json and the lock with axe-core's version."""
 
@@ -48,6 +50,6 @@ def grave_faults_in_all_styles(tab):
     found = []
     for width, height, scheme in STYLES:
         tab.emulate_media(color_scheme=scheme)
-        tab.set_viewport_size({"width": width, "height": height})
+        resize(tab, width, height)
         found += [f"{width} px, {scheme}: {fault}" for fault in grave_faults(tab)]
     return found

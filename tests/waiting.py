@@ -60,6 +60,16 @@ def until_in(tab: Any, frame: Any, expression: str) -> None:
     awaited(tab, lambda: _holds(frame, expression), expression)
 
 
+def resize(tab: Any, width: int, height: int) -> None:
+    """Change the size of a tab's window, CSS px, and wait until its page has that size: what is loaded before then
+    would see the old one."""
+    tab.set_viewport_size({"width": width, "height": height})
+    wanted = [width, height]
+    awaited(
+        tab, lambda: tab.evaluate("[innerWidth, innerHeight]") == wanted, f"a window of {width} x {height}"
+    )
+
+
 def pass_time(tab: Any, milliseconds: int) -> None:
     """Move the clock of a page on, if the test has installed one: every timer in between fires at once, and what the
     page asked its server for has been answered and drawn."""

@@ -58,8 +58,10 @@ def test_exceptions_name_functions_that_exist(limits):
 
 
 def test_no_test_waits_for_a_time():
-    """A state is awaited by `tests/waiting.py`; so does a program or a page's script in a test."""
-    waits = re.compile("|".join((r"\bsleep\(", r"import sleep", "wait_for_timeout", "setTimeout")))
+    """A state is awaited by `tests/waiting.py`; so does a program or a page's script in a test. A window's new size is
+    a state, too."""
+    clocks = (r"\bsleep\(", r"import sleep", "wait_for_timeout", "setTimeout")
+    waits = re.compile("|".join((*clocks, "set_viewport_size")))
     files = [path for kind in ("*.py", "*.js") for path in sorted((ROOT / "tests").rglob(kind))]
     ours = [
         path

@@ -11,7 +11,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from lab.captures.textured_box import box_orbit, photograph_box
 from studio.pages import DROP, encoded, go, png, repeated, train_and_download, visitor_of
-from waiting import until_in
+from waiting import resize, until_in
 
 HOSTILE = "<img src=x onerror=hacked=1>"
 
@@ -20,14 +20,14 @@ def check_that_screens_load_without_shifts(person, address):
     """The screens of a run, opened by their addresses, load without layout shifts."""
     tab = person.tab
     before = tab.viewport_size
-    tab.set_viewport_size({"width": 1440, "height": 900})
+    resize(tab, 1440, 900)
     for screen in ("judge", "judge?view=0", "share"):
         tab.goto("about:blank")
         tab.goto(f"{address}#/runs/box/{screen}")
         tab.locator(".tab h2").first.wait_for()
         tab.wait_for_load_state("networkidle")
         assert person.shift() < 0.02, screen  # a fifth of the bound of the Core Web Vitals
-    tab.set_viewport_size(before)
+    resize(tab, before["width"], before["height"])
 
 
 def check_that_run_and_capture_lead_to_each_other(person):

@@ -9,6 +9,7 @@ from gsplat_edu.data.region import read_region, write_region
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.options.offers import questions
 from studio.pages import go, waiting
+from waiting import resize
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +97,7 @@ def test_the_page_asks_what_the_command_declares(visitor, plain):
 def test_the_box_is_chosen_while_there_is_one(visitor, library, plain):
     folder = library[0].library.root / "captures" / "choices"
     tab = go(visitor().tab, "captures/choices")
-    tab.set_viewport_size({"width": 1200, "height": 900})
+    resize(tab, 1200, 900)
     tab.locator("summary", has_text="More").click()
     box = tab.get_by_label("Learn only what is in the box")
     assert box.is_disabled() and not box.is_checked()

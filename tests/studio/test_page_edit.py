@@ -9,7 +9,7 @@ from gestures import drag, inside
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.formats import read_scene
 from studio.pages import go, visitor_of
-from waiting import awaited, pass_time, until_in
+from waiting import awaited, pass_time, resize, until_in
 
 
 def opened(tab):
@@ -56,10 +56,10 @@ def select_and_delete(tab, frame, corners):
 def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path):
     person, scene = visitor(), wall_entry
     tab = person.tab
-    tab.set_viewport_size({"width": 1000, "height": 620})
+    resize(tab, 1000, 620)
     frame = opened(tab)
     late = visitor_of(person, person.tab.url)
-    late.set_viewport_size({"width": 1000, "height": 620})
+    resize(late, 1000, 620)
     older = opened(late)  # opened before the first tab saves
 
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
@@ -102,7 +102,7 @@ def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     """Although the page has not yet heard from the library that there are any."""
     person, stored = visitor(), wall_entry / "edits.json"
     tab = person.tab
-    tab.set_viewport_size({"width": 1000, "height": 620})
+    resize(tab, 1000, 620)
     stored.unlink(missing_ok=True)
     tab.add_init_script(HELD)
     tab.reload()
@@ -127,7 +127,7 @@ def test_two_saves_at_once_are_no_conflict(visitor, wall_entry):
     """Ctrl S twice, and an edit in between: the second one waits for the first one, and both are stored."""
     person, stored = visitor(), wall_entry / "edits.json"
     tab = person.tab
-    tab.set_viewport_size({"width": 1000, "height": 620})
+    resize(tab, 1000, 620)
     stored.unlink(missing_ok=True)
     frame = opened(tab)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
@@ -157,7 +157,7 @@ def focused(frame):
 def test_the_keyboard_focus_keeps_its_place(visitor, wall_entry, library):
     person = visitor()
     tab = person.tab
-    tab.set_viewport_size({"width": 1000, "height": 620})
+    resize(tab, 1000, 620)
     (wall_entry / "edits.json").unlink(missing_ok=True)
     frame = opened(tab)
     for name, then in (
@@ -199,7 +199,7 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     """They come back unsaved; if others were saved meanwhile, the person chooses."""
     person, stored = visitor(), wall_entry / "edits.json"
     tab = person.tab
-    tab.set_viewport_size({"width": 1000, "height": 620})
+    resize(tab, 1000, 620)
     stored.unlink(missing_ok=True)
     frame = opened(tab)
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
@@ -240,7 +240,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     """Like exports; a box switches to the scene as it was, and edits of another scene are named and left out."""
     person, stored = visitor(), wall_entry / "edits.json"
     tab = person.tab
-    tab.set_viewport_size({"width": 1000, "height": 620})
+    resize(tab, 1000, 620)
     stored.unlink(missing_ok=True)
     go(tab, "")
     card = tab.locator("a.card", has_text="wall").locator("img")
@@ -289,11 +289,11 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
     """The browser's storage has them; the editor of this scene offers them, that of another does not."""
     person, stored = visitor(), wall_entry / "edits.json"
     stored.unlink(missing_ok=True)
-    person.tab.set_viewport_size({"width": 1000, "height": 620})
+    resize(person.tab, 1000, 620)
 
     def closed_with_edits():
         tab = visitor_of(person, person.tab.url)
-        tab.set_viewport_size({"width": 1000, "height": 620})
+        resize(tab, 1000, 620)
         frame = opened(tab)
         select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
         until_in(tab, tab, "localStorage.length === 1")

@@ -20,7 +20,7 @@ from gsplat_edu.jobs.record import Work
 from gsplat_edu.scene.views import View
 from processes import Program
 from studio.pages import COMMAND, examined, go, mask_dialog, waiting
-from waiting import until_in
+from waiting import resize, until_in
 
 W, H = 96, 72
 
@@ -62,7 +62,7 @@ def saved(dialog, said="Saved. "):
 def test_a_rectangle_and_an_outline_are_drawn_undone_saved_and_removed(visitor, capture, size):
     before = {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
     person = visitor()
-    person.tab.set_viewport_size({"width": size[0], "height": size[1]})
+    resize(person.tab, size[0], size[1])
     tab = go(person.tab, f"captures/{capture.name}")
     dialog, box = mask_dialog(tab, "view_001")
     assert "has a mask of its own" in dialog.inner_text()
@@ -123,7 +123,7 @@ def test_the_keyboard_draws_and_escape_gives_up_the_begun_shape_first(visitor, c
 def test_a_brush_paints_beside_the_photo_too_and_a_command_repeats_it(visitor, capture, size):
     before = {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
     person = visitor()
-    person.tab.set_viewport_size({"width": size[0], "height": size[1]})
+    resize(person.tab, size[0], size[1])
     tab = go(person.tab, f"captures/{capture.name}")
     dialog, box = mask_dialog(tab, "view_002")
     tip, slider = dialog.locator(".tip"), dialog.get_by_role("slider", name="radius of the brush")

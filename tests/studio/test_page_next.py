@@ -11,7 +11,7 @@ from PIL import Image
 
 from lab.captures.textured_box import box_orbit, photograph_box
 from studio.pages import DROP, encoded, go
-from waiting import until_in
+from waiting import resize, until_in
 
 NEXT = re.compile("^Next: ")
 
@@ -60,7 +60,7 @@ def check_access(tab, label):
     """On a phone and a wide screen, in both colour schemes: contrasts, sizes of targets, nothing beside the screen."""
     before = tab.viewport_size
     for width, height in SIZES:
-        tab.set_viewport_size({"width": width, "height": height})
+        resize(tab, width, height)
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), (label, width)
         small = (
             f"{CONTROLS}.filter((one) => one.checkVisibility() && one.getBoundingClientRect().height < 24)"
@@ -74,7 +74,7 @@ def check_access(tab, label):
                 name = re.sub(r"\W+", "_", f"{label}_{width}_{scheme}")
                 tab.screenshot(path=str(Path(folder) / f"{time.time():.0f}_{name}.png"))
     tab.emulate_media(color_scheme=None, reduced_motion=None)
-    tab.set_viewport_size(before)
+    resize(tab, before["width"], before["height"])
     ids = "[...document.querySelectorAll('[id]')].map(({ id }) => id)"
     assert tab.evaluate(f"{ids}.length - new Set({ids}).size") == 0
     present = tab.locator(".timeline [aria-current=step]")

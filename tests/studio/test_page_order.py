@@ -16,7 +16,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.region import Region
 from gsplat_edu.studio.commands import title_of
 from studio.pages import capture_frame, go, held_back, mask_dialog, visitor_of, waiting
-from waiting import awaited, settle, until_in
+from waiting import awaited, resize, settle, until_in
 
 REVERSED = """async ([first, second]) => {
   const { Store } = await import("/web/store.js");
@@ -93,7 +93,7 @@ def test_a_late_answer_does_not_take_back_the_box(visitor, capture):
         lambda request: request.method == "GET" and request.frame == person.tab.main_frame,
     )
     tab = go(person.tab, f"captures/{capture.name}")
-    tab.set_viewport_size({"width": 1200, "height": 900})
+    resize(tab, 1200, 900)
     tab.locator("summary", has_text="More").click()
     box = tab.get_by_label("Learn only what is in the box")
     awaited(tab, lambda: held)
@@ -117,7 +117,7 @@ def beside(visitor, library, capture):
     person = visitor()
     tabs = [person.tab, visitor_of(person, library[1])]
     for tab in tabs:
-        tab.set_viewport_size({"width": 1200, "height": 900})  # smaller pages fold their panels
+        resize(tab, 1200, 900)  # smaller pages fold their panels
         tab.goto(f"{library[1]}#/captures/{capture.name}")
         tab.locator(".thumbs li").first.wait_for()
     return [(tab, capture_frame(tab, capture.name)) for tab in tabs]
@@ -138,9 +138,6 @@ def test_another_tab_shows_the_box_and_keeps_what_is_drawn_there(visitor, librar
     there.locator("summary", has_text="More").click()
     box = there.get_by_label("Learn only what is in the box")
     assert box.is_disabled()
-    for one in (first, second):
-        if one.locator("#tools").is_hidden():
-            one.get_by_role("button", name="controls").click()
     first.get_by_role("button", name="draw a box").click()
     first.get_by_role("button", name="save the box").click()
     there.get_by_role("button", name="Change the box").wait_for()
@@ -229,7 +226,7 @@ def test_a_mask_saved_in_another_tab_is_loaded_beneath_what_is_drawn_here(visito
 def test_a_mask_that_was_changed_unheard_is_not_replaced(visitor, capture):
     """The page does not hear of the command line; saving is refused, and the shapes can be loaded."""
     tab = go(visitor().tab, f"captures/{capture.name}")
-    tab.set_viewport_size({"width": 1200, "height": 900})
+    resize(tab, 1200, 900)
     dialog, draw = masking(tab)
     draw((2, 2), (10, 10))
     tab.route("**/api/library", lambda route: None)  # whatever makes the page ask for the library
@@ -254,7 +251,7 @@ def test_a_mask_is_saved_by_this_tab_although_the_library_tells_of_it_first(visi
     person = visitor()
     held = held_back(person.tab, "**/mask")  # questions about a mask name a photo; saving does not
     tab = go(person.tab, f"captures/{capture.name}")
-    tab.set_viewport_size({"width": 1200, "height": 900})
+    resize(tab, 1200, 900)
     dialog, draw = masking(tab)
     draw((2, 2), (10, 10))
     with tab.expect_response(re.compile(r"/mask\?photo=")):  # the page looks at what was saved

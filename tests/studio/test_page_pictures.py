@@ -22,7 +22,7 @@ from gsplat_edu.viewer.live import picture_camera
 from gsplat_edu.viewer.live_folder import LiveFolder, framed
 from studio.conftest import Inline
 from studio.pages import go
-from waiting import awaited, until_in
+from waiting import awaited, resize, until_in
 
 CAMERA = """() => {
   const { R, eye, fx, fy, cx, cy, W, H } = viewer.camera();
@@ -58,7 +58,7 @@ def drawn(tab, frame, as_wanted):
 def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     person = visitor()
     tab = person.tab
-    tab.set_viewport_size({"width": 800, "height": 700})
+    resize(tab, 800, 700)
     assert tab.evaluate("document.createElement('canvas').getContext('webgl2')") is None
     go(tab, "scenes/wall")
     frame = framed_viewer(tab)

@@ -12,7 +12,7 @@ from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.runs.source import open_source
 from processes import Program
 from studio.pages import COMMAND, DROP, encoded, frame_of, go, png
-from waiting import awaited, until_in
+from waiting import awaited, resize, until_in
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_what_the_studio_did_not_answer_is_asked_for_again(visitor, library, run
 def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     person = visitor()
     tab = go(person.tab, "runs/egg")
-    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    resize(tab, size[0], size[1])
     frame = frame_of(tab)
     until_in(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
     tab.get_by_label("View", exact=True).select_option(index=2)
@@ -175,7 +175,7 @@ def test_a_training_has_one_counter_and_one_clock(visitor, runs):
     """All texts of the screen and of the page inside, of one moment."""
     person = visitor()
     tab = go(person.tab, "captures/egg")
-    tab.set_viewport_size({"width": 1440, "height": 900})
+    resize(tab, 1440, 900)
     tab.locator("summary", has_text="More").click()
     tab.get_by_label("Iterations instead of a quality").fill("100000")
     tab.get_by_role("button", name="Start training").click()
@@ -233,7 +233,7 @@ def test_the_report_is_linked(visitor, runs):
 @pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
 def test_nothing_pushes_the_pictures_down(visitor, runs, size):
     tab = go(visitor().tab, "runs/egg")
-    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    resize(tab, size[0], size[1])
     frame_of(tab)
     if size[0] > 960:  # two columns
         live, figures = (
@@ -252,7 +252,7 @@ def test_nothing_pushes_the_pictures_down(visitor, runs, size):
 @pytest.mark.parametrize("size", [(320, 700), (390, 844), (1440, 900)])
 def test_the_text_of_an_upload_stays_in_its_card(visitor, size):
     tab = visitor().tab
-    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    resize(tab, size[0], size[1])
     tab.route("**/files/**", lambda route: None)  # the upload waits
     tab.locator(".drop").wait_for()
     photos = [[f"a-rather-long-folder-name/IMG_{i:04}.png", encoded(png(i, (300, 200)))] for i in range(112)]

@@ -17,6 +17,7 @@ from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 from viewer.pages import Editor, Visit, picture_of, running
+from waiting import resize
 
 
 @pytest.fixture
@@ -53,11 +54,11 @@ def visit(browser, tabs):
         free = None if fresh or url else tabs[repr(sorted(options.items()))]
         if free:
             tab = free.pop()
+            resize(tab, width, height)
         else:
-            context = browser.new_context(**options)
+            context = browser.new_context(viewport={"width": width, "height": height}, **options)
             context.set_offline(not url)
             tab = context.new_page()
-        tab.set_viewport_size({"width": width, "height": height})
         visits.append((kind(tab, url.partition("?")[0] or "file:"), free))
         if url:
             tab.goto(url)

@@ -12,7 +12,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from viewer.handles import until
-from waiting import FRAMES, awaited
+from waiting import FRAMES, awaited, resize
 
 SIZE = (640, 400)
 MIDDLE = (400, 250)  # right of the panel
@@ -222,7 +222,15 @@ def test_the_page_fits_a_phone_and_follows_its_colours(
     page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views)
     seen = visit(390, 844, color_scheme=scheme, has_touch=True).open(tmp_path / "a.html").ready()
     assert not seen.tab.is_visible("#tools"), "the panel is closed at first"
+    resize(seen.tab, 1200, 844)
+    seen.tab.wait_for_selector("#tools")
+    resize(seen.tab, 390, 844)
+    seen.tab.wait_for_selector("#tools", state="hidden")
     seen.tab.click("#fold")
+    resize(seen.tab, 844, 390)
+    resize(seen.tab, 390, 844)
+    seen.tab.evaluate(FRAMES)
+    assert seen.tab.is_visible("#tools"), "the user has opened it"
     ground = seen.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (sum(map(int, ground[4:-1].split(","))) > 384) == (scheme == "light")
     for name in ("cameras", "path"):

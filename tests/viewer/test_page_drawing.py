@@ -24,6 +24,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.projection import Projection
 from gsplat_edu.viewer import page
+from waiting import resize
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
@@ -188,7 +189,7 @@ def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
 
 def test_the_window_may_change_its_size(show, random_gaussians, camera):
     visit = show(random_gaussians(50), [("first", camera)])
-    visit.tab.set_viewport_size({"width": 200, "height": 300})
+    resize(visit.tab, 200, 300)
     visit.tab.wait_for_selector("#canvas[width='200'][height='300']")
     assert (visit.camera().W, visit.camera().H) == (200, 300)
 

@@ -1,6 +1,6 @@
 // Everything around the picture of a capture: the legend, the list of photos, the chosen photo, and the one under the pointer.
 
-import { element } from "./common.js";
+import { element, Fold } from "./common.js";
 import { h, patch, want } from "./patch.js";
 
 export const SMALL = "(max-width: 600px)"; // as in capture.css
@@ -24,18 +24,12 @@ export class CapturePanel {
     element("previous").addEventListener("click", () => actions.step(-1));
     element("next").addEventListener("click", () => actions.step(1));
     element("help-button").addEventListener("click", () => this.help());
-    element("fold").addEventListener("click", () => this.fold(!element("tools").hidden));
     for (const id of ["show-points", "show-path"]) element(id).addEventListener("change", () => actions.repaint());
     element("size").addEventListener("input", ({ target }) => actions.size(2 ** (Number(target.value) / 5)));
     element("size").addEventListener("keydown", (event) => event.stopPropagation()); // arrows move the slider only
-    this.fold(matchMedia(SMALL).matches); // the picture has the room first
+    this.folded = new Fold(SMALL);
     this.fillList();
     this.tell();
-  }
-
-  fold(away) {
-    element("tools").hidden = away;
-    element("fold").setAttribute("aria-expanded", !away);
   }
 
   help() {

@@ -70,7 +70,7 @@ export class RegionTool {
     this.drawing = true;
     this.gizmo.chosen = this.gizmo.hover = null;
     this.viewer.choose(-1);
-    if (matchMedia(SMALL).matches) this.viewer.panel.fold(true);
+    if (matchMedia(SMALL).matches) this.viewer.panel.folded.hide(true);
     this.viewer.view.orbitAround(this.shape.center);
     this.say("");
     this.changed();

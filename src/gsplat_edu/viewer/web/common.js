@@ -30,6 +30,26 @@ export function refill(list, items, elsewhere) {
     ([...list.querySelectorAll("button")].at(-1) ?? elsewhere).focus();
 }
 
+// The controls of a panel, which a button hides and shows. Until somebody presses the button, they are hidden in a window that
+// matches the media query `small`, because the picture has the room first, and shown in any other.
+export class Fold {
+  constructor(small) {
+    const query = matchMedia(small);
+    const follow = () => this.hide(query.matches);
+    query.addEventListener("change", follow);
+    element("fold").addEventListener("click", () => {
+      query.removeEventListener("change", follow);
+      this.hide(!element("tools").hidden);
+    });
+    follow();
+  }
+
+  hide(away) {
+    element("tools").hidden = away;
+    element("fold").setAttribute("aria-expanded", !away);
+  }
+}
+
 // A program of the shaders whose texts the page has under NAME.vert and NAME.frag.
 export function linked(gl, name) {
   const program = gl.createProgram();

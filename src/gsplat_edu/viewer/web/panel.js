@@ -1,6 +1,6 @@
 // Everything around the picture: metadata, buttons, the capture's cameras, messages.
 
-import { element } from "./common.js";
+import { element, Fold } from "./common.js";
 import { h } from "./patch.js";
 
 const POINT_SHOWN = 800; // milliseconds
@@ -15,17 +15,10 @@ export class Panel {
     element("fly").addEventListener("click", () => actions.fly());
     element("reset").addEventListener("click", () => actions.reset());
     element("help-button").addEventListener("click", () => this.help());
-    element("fold").addEventListener("click", () => this.fold(!element("tools").hidden));
-    this.fold(matchMedia(SMALL).matches); // the scene has the room first
+    this.folded = new Fold(SMALL);
     this.fillDegrees(actions);
     this.fillCameras(actions);
     this.atRest();
-  }
-
-  // Hides the controls, or shows them.
-  fold(away) {
-    element("tools").hidden = away;
-    element("fold").setAttribute("aria-expanded", !away);
   }
 
   // How much of the window the closed panel covers at the top, CSS px: on a phone it is as wide as the window.
