@@ -17,8 +17,8 @@ import torch
 
 from gsplat_edu import Camera
 from gsplat_edu.data.synthetic import sphere_cameras
-from gsplat_edu.render import torch_reference
 from gsplat_edu.render.api import render
+from gsplat_edu.render.torch import render as torch_reference
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.initialize import random_ball
 

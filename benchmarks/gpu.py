@@ -205,7 +205,7 @@ def gradient_error(backend: str, count: int) -> float:
 
 def precisions(scale: Scale) -> dict[str, dict[str, float]]:
     """Return, by precision, the time and the largest gradient error relative to the largest gradient."""
-    from gsplat_edu.render.triton import rasterize
+    from gsplat_edu.render.cuda import render as rasterize
 
     found, before = {}, rasterize.PRECISION
     for name in ("ieee", "tf32x3", "tf32"):

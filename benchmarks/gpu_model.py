@@ -27,7 +27,7 @@ from gsplat_edu.engine.model import GPUS, PIXELS, Counters, forecast, step_costs
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend, unavailable
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.webgpu import engine_view
+from gsplat_edu.render.webgpu.render import engine_view
 from gsplat_edu.runs.cleaning import open_subject
 from gsplat_edu.scene.gaussians import Gaussians
 

@@ -20,12 +20,12 @@ import torch
 from gsplat_edu import Camera
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.ops.losses import l1
-from gsplat_edu.render import torch_reference
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.render.torch import render as torch_reference
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.course import EXTENT, course_config

@@ -28,7 +28,7 @@ from gsplat_edu.io.ply import save_ply
 from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.torch_reference import eval_sh_t, render_t
+from gsplat_edu.render.torch.render import eval_sh_t, render_t
 from gsplat_edu.scene.gaussians import Gaussians, cov3d_t, quat_to_R_t
 
 pytestmark = pytest.mark.usefixtures("as_shipped")

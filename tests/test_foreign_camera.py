@@ -6,9 +6,9 @@ import torch
 
 from gsplat_edu import ArgumentError, Camera, CameraLike, ShapeError, project_cov3d, render_gaussians
 from gsplat_edu.render.api import render
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.torch_reference import render_t
+from gsplat_edu.render.torch.render import render_t
 from gsplat_edu.scene.gaussians import Gaussians
 
 pytestmark = pytest.mark.usefixtures("as_shipped")  # otherwise the hook checks annotations first

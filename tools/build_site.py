@@ -86,8 +86,8 @@ PUBLIC = {
         "gsplat_edu.scene.intrinsics.Intrinsics",
         "gsplat_edu.render.settings.RenderSettings",
         "gsplat_edu.render.output.RenderOutput",
-        "gsplat_edu.render.cpu.render_covariances",
-        "gsplat_edu.render.torch_reference.render_t",
+        "gsplat_edu.render.cpu.render.render_covariances",
+        "gsplat_edu.render.torch.render.render_t",
     ),
     "gsplat's interface": "gsplat_edu.compat.gsplat",
     "Captures": (

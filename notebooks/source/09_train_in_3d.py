@@ -41,7 +41,7 @@ from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, C0, DILATION, Z_NEAR
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.data.synthetic import sphere_cameras, sphere_capture
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.render.torch_reference import eval_sh_t
+from gsplat_edu.render.torch.render import eval_sh_t
 from gsplat_edu.train import Start, Views, course, training
 from gsplat_edu.train.initialize import random_ball
 
@@ -354,7 +354,7 @@ print(f"{ITERATIONS} iters -> {milliseconds:.0f} ms/iter at {SIZE} px")
 #
 # `training` puts together what the cells above spelled out: the configuration of this page is
 # `course_config`, the backend is `torch`. Its renderer, its rule for densification and its loop
-# ([render.torch_reference](../src/gsplat_edu/render/torch_reference.py),
+# ([render.torch.render](../src/gsplat_edu/render/torch/render.py),
 # [density.adc](../src/gsplat_edu/train/density/adc.py), [trainer](../src/gsplat_edu/train/trainer.py),
 # [step](../src/gsplat_edu/train/step.py)) serve every other training too, so they are longer. Here they
 # have to give the same numbers, to the last bit of every loss.

@@ -34,7 +34,7 @@ import torch
 from gsplat_edu import _native, render_gaussians, sphere_shell
 from gsplat_edu.base.constants import ALPHA_MIN
 from gsplat_edu.data.synthetic import sphere_cameras
-from gsplat_edu.render.torch_reference import render_t
+from gsplat_edu.render.torch.render import render_t
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -268,7 +268,7 @@ for name, seconds in (
 # executes one program: every variable below holds one number per pixel of the block, a load of one splat
 # is shared by all of them, and the loop is the same loop. There is no
 # `continue`, since pixels of a block cannot go different ways; a weight of zero does the same. The
-# package's own [composite kernel](../src/gsplat_edu/render/triton/composite.py) begins as this one does.
+# package's own [composite kernel](../src/gsplat_edu/render/cuda/composite.py) begins as this one does.
 
 # %%
 source = (LADDER / "naive_triton.py").read_text()

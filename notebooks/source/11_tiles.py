@@ -307,7 +307,7 @@ assert np.abs(relative).max() < 5e-7
 #
 # Every rung draws what the reference renderer draws, given the same rule for extents and for stopping, to
 # within the tolerance that [chapter 10](10_the_naive_kernel.ipynb) derived. The top one is the package's
-# own: [gsplat_edu.render.cpu](../src/gsplat_edu/render/cpu.py) hands tensors to kernels that do what these
+# own: [gsplat_edu.render.cpu](../src/gsplat_edu/render/cpu/render.py) hands tensors to kernels that do what these
 # rungs do. They add what does not fit on a page, such as asking memory for the next splats in the list
 # while the present ones are drawn, or a copy for each instruction set.
 

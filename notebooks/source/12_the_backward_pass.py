@@ -294,7 +294,7 @@ else:
 # %% [markdown]
 # ## The package's
 #
-# [gsplat_edu.render.cpu](../src/gsplat_edu/render/cpu.py) does the same with vectors, adds up the slots and goes on,
+# [The backend cpu](../src/gsplat_edu/render/cpu/render.py) does the same with vectors, adds up the slots and goes on,
 # in one pass over the splats, through conic, covariance and projection to the raw parameters. To torch all of it is
 # one function. In float64 it has to agree with autograd's way through the dense renderer, and it keeps two images
 # where that kept the table above.

@@ -27,6 +27,6 @@ def pool(device) -> Pool:
 @pytest.fixture
 def webgpu(pool, monkeypatch):
     """Let the backend use that device."""
-    from gsplat_edu.render import webgpu
+    from gsplat_edu.render.webgpu import render as webgpu
 
     monkeypatch.setattr(webgpu, "_pool", lambda: pool)

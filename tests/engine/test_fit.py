@@ -17,7 +17,7 @@ from gsplat_edu.engine.frame import draw_frame
 from gsplat_edu.engine.passes import LIMITS
 from gsplat_edu.engine.step import step_program
 from gsplat_edu.io.ply import save_ply
-from gsplat_edu.render import webgpu
+from gsplat_edu.render.webgpu import render as webgpu
 from native_scenes import random
 
 DEFAULT = LIMITS["max-storage-buffer-binding-size"]

@@ -33,7 +33,7 @@ RUN += ("--set", "densify_start=2", "densify_every=3")
 BEGIN = """
 import os, sys, warnings
 from gsplat_edu.runs.training import CaptureRun
-from gsplat_edu.render import webgpu
+from gsplat_edu.render.webgpu import render as webgpu
 save, done = CaptureRun.save, []
 def disturbed(self):
     path = save(self)

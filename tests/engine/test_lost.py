@@ -13,9 +13,9 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.engine import adapters, frame, host
 from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.passes import LIMITS
-from gsplat_edu.render import webgpu, webgpu_resident
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.render.webgpu import render as webgpu, resident as webgpu_resident
 from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe

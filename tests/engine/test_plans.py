@@ -30,8 +30,8 @@ from gsplat_edu.engine.frame import Pool
 from gsplat_edu.engine.passes import LIMITS, WORD
 from gsplat_edu.engine.resident import PHOTO_ROOM
 from gsplat_edu.engine.room import Load, Room, kept_photos, room_of
-from gsplat_edu.render import webgpu as backend_module
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.render.webgpu import render as backend_module
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.scene.given_depth import GivenDepth

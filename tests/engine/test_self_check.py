@@ -6,8 +6,10 @@ from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.engine import host
 from gsplat_edu.engine.frame import Pool
 from gsplat_edu.engine.passes import LIMITS, MODULES
-from gsplat_edu.render import self_check, webgpu
-from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.backends import load_backend, resolve_backend
+from gsplat_edu.render.webgpu import check, render as webgpu
+
+EXACT = load_backend("cpu").rasterize
 
 pytestmark = pytest.mark.usefixtures("webgpu")
 
@@ -15,20 +17,20 @@ pytestmark = pytest.mark.usefixtures("webgpu")
 @pytest.fixture(autouse=True)
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    self_check._adapter_failure.cache_clear()
+    check._failure.cache_clear()
     yield tmp_path / "gsplat_edu/webgpu_passed.json"
-    self_check._adapter_failure.cache_clear()
+    check._failure.cache_clear()
 
 
 def test_correct_kernels_are_checked_once(empty_cache, monkeypatch):
-    assert self_check.webgpu_failure() is None
+    assert check.webgpu_failure(EXACT) is None
     assert webgpu.adapter_name().name in empty_cache.read_text()
-    self_check._adapter_failure.cache_clear()  # as in a new process
-    monkeypatch.setattr(self_check, "shader_error", lambda: "checked again")
-    assert self_check.webgpu_failure() is None
-    self_check._adapter_failure.cache_clear()
-    monkeypatch.setattr(self_check, "_hash_of_kernels", lambda: "of other shaders")
-    assert self_check.webgpu_failure() == "checked again"
+    check._failure.cache_clear()  # as in a new process
+    monkeypatch.setattr(check, "shader_error", lambda exact: "checked again")
+    assert check.webgpu_failure(EXACT) is None
+    check._failure.cache_clear()
+    monkeypatch.setattr(check, "hash_of_kernels", lambda: "of other shaders")
+    assert check.webgpu_failure(EXACT) == "checked again"
 
 
 def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkeypatch):
@@ -91,5 +93,5 @@ def test_a_wrong_step_is_refused(monkeypatch, file, right, wrong, message):
     monkeypatch.setattr(host, "module_source", changed)
     pool = Pool(host.Device(limits=LIMITS))
     monkeypatch.setattr(webgpu, "_pool", lambda: pool)
-    failure = self_check.shader_error()
+    failure = check.shader_error(EXACT)
     assert failure is not None and message in failure

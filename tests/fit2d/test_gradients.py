@@ -8,7 +8,7 @@ from gsplat_edu import Camera, ShapeError
 from gsplat_edu.base.constants import ALPHA_MAX
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
 from gsplat_edu.fit2d.splats import PER_SPLAT, Splats2D, render_2d
-from gsplat_edu.render.torch_reference import render_t
+from gsplat_edu.render.torch.render import render_t
 
 NUDGE = np.finfo(np.float64).eps ** (1 / 3)
 

@@ -19,7 +19,7 @@ from triton.backends import nvidia
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, compile as compiled
 
-from gsplat_edu.render.triton import adam, composite, intersect, loss, project, sight
+from gsplat_edu.render.cuda import adam, composite, intersect, loss, project, sight
 
 INTEGERS = {"n", "width", "height", "tiles_x", "W", "H"}
 KINDS = {

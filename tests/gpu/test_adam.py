@@ -8,7 +8,7 @@ from gsplat_edu.ops import kernels
 pytest.importorskip("triton.language", reason="triton is not installed")
 
 from gsplat_edu.ops.adam import AdamNumbers
-from gsplat_edu.render.triton.adam import adam_triton
+from gsplat_edu.render.cuda.adam import adam_triton
 
 U = 2.0**-24
 """Half a unit in the last place of float32: the largest relative error of one rounding."""

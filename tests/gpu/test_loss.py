@@ -10,8 +10,8 @@ from gsplat_edu.ops.losses import l1_ssim
 # Not `triton`, which is the name of this folder if the wheel is missing.
 pytest.importorskip("triton.language", reason="triton is not installed")
 
-from gsplat_edu.render.triton import loss as module
-from gsplat_edu.render.triton.loss import l1_ssim_triton
+from gsplat_edu.render.cuda import loss as module
+from gsplat_edu.render.cuda.loss import l1_ssim_triton
 
 U = 2.0**-24
 """Half a unit in the last place of float32: the largest relative error of one rounding."""

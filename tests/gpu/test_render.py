@@ -59,7 +59,7 @@ def test_without_a_gpu_auto_uses_the_cpu_and_cuda_is_refused(monkeypatch):
 
 
 def test_a_camera_is_uploaded_once(device):
-    from gsplat_edu.render.triton.rasterize import _camera_rows
+    from gsplat_edu.render.cuda.render import _camera_rows
 
     scene = random(3, (8, 8))
     gaussians = scene.gaussians(torch.float32).to(torch.device(device))

@@ -7,35 +7,38 @@ from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.ops import kernels
-from gsplat_edu.render import backends, self_check
+from gsplat_edu.render import backends
 from gsplat_edu.render.backends import resolve_backend
-from gsplat_edu.render.triton import rasterize
+from gsplat_edu.render.cuda import check, render as rasterize
+from gsplat_edu.render.self_check import check_scene
+
+EXACT = backends.load_backend("torch").rasterize
 
 
 @pytest.fixture(autouse=True)
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    self_check._failure.cache_clear()
+    check._failure.cache_clear()
     backends._warn_once.cache_clear()
     yield tmp_path / "gsplat_edu/cuda_passed.json"
-    self_check._failure.cache_clear()
+    check._failure.cache_clear()
 
 
 def test_correct_kernels_are_checked_once(device, empty_cache, monkeypatch):
-    assert self_check.cuda_failure(torch.device(device)) is None
+    assert check.cuda_failure(EXACT, torch.device(device)) is None
     assert "triton" in empty_cache.read_text()
-    self_check._failure.cache_clear()  # a new process starts like this
-    monkeypatch.setattr(self_check, "kernel_error", lambda device: "checked again")
-    assert self_check.cuda_failure(torch.device(device)) is None
+    check._failure.cache_clear()  # a new process starts like this
+    monkeypatch.setattr(check, "kernel_error", lambda exact, device: "checked again")
+    assert check.cuda_failure(EXACT, torch.device(device)) is None
 
 
 def test_changed_kernels_are_checked_again(device, empty_cache, monkeypatch):
     empty_cache.parent.mkdir()
     for content in ("{", "[" * 100_000, '{"a": 1}', '["another device"]', "[1]"):
         empty_cache.write_text(content)
-        monkeypatch.setattr(self_check, "kernel_error", lambda device: "checked again")
-        self_check._failure.cache_clear()
-        assert self_check.cuda_failure(torch.device(device)) == "checked again"
+        monkeypatch.setattr(check, "kernel_error", lambda exact, device: "checked again")
+        check._failure.cache_clear()
+        assert check.cuda_failure(EXACT, torch.device(device)) == "checked again"
 
 
 def test_a_shifted_image_fails(device, empty_cache, monkeypatch):
@@ -47,7 +50,7 @@ def test_a_shifted_image_fails(device, empty_cache, monkeypatch):
         return row
 
     monkeypatch.setattr(rasterize, "_camera_row", shifted)
-    assert "the image of a test scene is wrong by" in self_check.cuda_failure(torch.device(device))
+    assert "the image of a test scene is wrong by" in check.cuda_failure(EXACT, torch.device(device))
     assert not empty_cache.exists()
 
 
@@ -65,7 +68,7 @@ def test_a_gradient_that_is_one_percent_too_large_fails(device, monkeypatch, nam
         return right(gaussians.map(perturbed), camera, settings, background)
 
     monkeypatch.setattr(rasterize, "render_triton", wrong)
-    assert f"the gradient of {name} is wrong by 0.01" in self_check.cuda_failure(torch.device(device))
+    assert f"the gradient of {name} is wrong by 0.01" in check.cuda_failure(EXACT, torch.device(device))
 
 
 @pytest.mark.skipif(kernels.REASON is None and torch.cuda.is_available(), reason="this machine has a GPU")
@@ -81,7 +84,7 @@ def test_auto_uses_the_cpu_if_the_kernels_do_not_run(monkeypatch, tmp_path, caps
         resolve_backend("cuda")
 
     backends._warn_once.cache_clear()
-    save_ply(tmp_path / "a.ply", self_check.check_scene(torch.float32))
+    save_ply(tmp_path / "a.ply", check_scene(torch.float32))
     out = tmp_path / "frames"
     command = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--out", str(out)]
     assert main(command) == 0

@@ -6,8 +6,8 @@ import torch
 
 from gsplat_edu import Camera
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.render.torch_sight import seen_by
-from gsplat_edu.render.triton.lens import seen_through
+from gsplat_edu.render.cuda.lens import seen_through
+from gsplat_edu.render.torch.sight import seen_by
 from lens_scenes import CLAMPED, LENSES, LIMIT, STEPS, around, beyond, lens_camera
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the interpreter computes with NumPy

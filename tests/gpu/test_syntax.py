@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from gsplat_edu.render import triton
+from gsplat_edu.render import cuda
 
-FILES = sorted(Path(triton.__file__).parent.glob("*.py"))
+FILES = sorted(Path(cuda.__file__).parent.glob("*.py"))
 
 
 def kernels(file):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu import C0, Camera
-from gsplat_edu.render.torch_reference import eval_sh_t, render_t
+from gsplat_edu.render.torch.render import eval_sh_t, render_t
 from gsplat_edu.scene.gaussians import cov3d_t
 from proofs import proves_gradients
 

@@ -15,7 +15,7 @@ from gsplat_edu import ArgumentError, ShapeError
 from gsplat_edu.data.procedural import RADIUS, procedural_capture
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import cov3d_t
 from gsplat_edu.train.config import recipe

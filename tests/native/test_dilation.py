@@ -15,7 +15,7 @@ from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch, render_gaussi
 from gsplat_edu.base.constants import DET_FLOOR, THINNEST
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.api import render
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussian_math import opacity_compensation
 from gsplat_edu.scene.gaussians import Gaussians

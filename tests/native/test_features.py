@@ -13,7 +13,7 @@ import torch
 
 from gsplat_edu import ArgumentError, ShapeError, build_cov3d_batch, quat_to_R_batch, render_gaussians
 from gsplat_edu.render.api import render
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import cov3d_t
 from native_scenes import SCENES, assert_smooth, smooth_scene

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from gsplat_edu.render.api import render
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from native_scenes import BACKGROUND, SCENES, assert_smooth, camera, smooth_scene
 from proofs import proves_gradients

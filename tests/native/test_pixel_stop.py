@@ -7,9 +7,9 @@ import torch
 from gsplat_edu import build_cov3d_batch, quat_to_R_batch
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.api import render
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.torch_reference import _project
+from gsplat_edu.render.torch.render import _project
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_witness import composited
 

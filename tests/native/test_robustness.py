@@ -15,7 +15,7 @@ import torch.utils.checkpoint
 from gsplat_edu import ArgumentError, Camera, _native, orbit_camera
 from gsplat_edu.base.headroom import available_memory
 from gsplat_edu.render.api import render
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from native_scenes import camera, random

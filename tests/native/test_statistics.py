@@ -9,7 +9,7 @@ import torch
 from gsplat_edu import ArgumentError, ShapeError, build_cov3d_batch, quat_to_R_batch, render_gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.torch_reference import eval_sh_t, render_t
+from gsplat_edu.render.torch.render import eval_sh_t, render_t
 from gsplat_edu.scene.gaussians import cov3d_t
 from gsplat_edu.train.optimizer import Adam
 from native_scenes import SCENES, random, smooth_scene

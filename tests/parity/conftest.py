@@ -13,7 +13,7 @@ def backend(request, monkeypatch):
 
         triton_interpreter.speed_up()
     else:
-        from gsplat_edu.render import webgpu
+        from gsplat_edu.render.webgpu import render as webgpu
 
         pool = request.getfixturevalue("pool")
         monkeypatch.setattr(webgpu, "_pool", lambda: pool)

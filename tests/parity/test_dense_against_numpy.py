@@ -14,7 +14,7 @@ from gsplat_edu import (
     sphere_shell,
 )
 from gsplat_edu.data.synthetic import sphere_cameras
-from gsplat_edu.render.torch_reference import eval_sh_t, render_t
+from gsplat_edu.render.torch.render import eval_sh_t, render_t
 from gsplat_edu.scene.gaussians import cov3d_t, quat_to_R_t
 
 

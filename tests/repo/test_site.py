@@ -211,7 +211,7 @@ def test_the_reference_begins_with_the_public_api_and_links_every_name(site):
     )
     assert len(rows) > 30
     assert [row for row in rows if "href=" not in row[0] or len(row[1]) < 10] == []
-    assert "gsplat_edu.render.html" in rest and "gsplat_edu.render.cpu.html" not in rest
+    assert "gsplat_edu.render.html" in rest and "gsplat_edu.render.cpu.render.html" not in rest
 
 
 @pytest.mark.slow

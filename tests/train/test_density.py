@@ -9,7 +9,7 @@ import torch
 
 from gsplat_edu import Camera
 from gsplat_edu.render.api import render
-from gsplat_edu.render.torch_reference import eval_sh_t, render_t
+from gsplat_edu.render.torch.render import eval_sh_t, render_t
 from gsplat_edu.scene.gaussians import Gaussians, cov3d_t
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.adc import AdaptiveDensityControl

@@ -23,7 +23,7 @@ from torch import Tensor
 from gsplat_edu.base.constants import COLOR_LIMIT
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.compat.projection import Lens
-from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera

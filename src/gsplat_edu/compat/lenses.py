@@ -25,7 +25,7 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.compat.checks import Arguments
-from gsplat_edu.render.torch_sight import TORCH
+from gsplat_edu.render.torch.sight import TORCH
 from gsplat_edu.scene.projection import COEFFICIENTS, STEEPEST_FISHEYE, Distortion, Projection
 from gsplat_edu.scene.shutter import LARGEST_TURN, readout_axis
 from gsplat_edu.scene.sight import Optics, Sight, sight

@@ -12,7 +12,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import first_index, flag
 from gsplat_edu.compat.checks import check_projection_options, check_size, expect, real_tensor
 from gsplat_edu.compat.projection import MARGIN, TRIANGLE
-from gsplat_edu.render.torch_sight import TORCH
+from gsplat_edu.render.torch.sight import TORCH
 from gsplat_edu.scene.gaussians import check_tensor, quat_to_R_t
 from gsplat_edu.scene.projection_formulas import OnPlane, fisheye, orthographic
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 
@@ -38,8 +39,8 @@ FEATURES = {
 class Backend:
     """The kernels of one processor.
 
-    `gsplat_edu.render.backends.load_backend` makes those that exist. A new one needs these functions and a name in
-    `BACKENDS`; no other module asks which backend it has.
+    `gsplat_edu.render.backends.load_backend` makes those that exist; each has a room of its name beside this module. No
+    other module asks which backend it has.
 
     Args:
         name: Its name; see `gsplat_edu.render.settings.BACKENDS`.
@@ -82,6 +83,29 @@ class Backend:
             raise ArgumentError(
                 f"{what} needs a backend that {FEATURES[feature]}, which {self.name} does not; use the backend cpu"
             )
+
+
+Host = Callable[[], Backend]
+"""Returns the kernels for tensors on the processor, which other backends use for what they do not do themselves."""
+
+PROCESSOR = torch.device("cpu")
+"""The device of tensors in main memory."""
+
+
+class BackendRoom(Protocol):
+    """What `gsplat_edu.render.NAME.backend` has to say of a backend."""
+
+    def why_unavailable(self, host: Host, device: torch.device | None = None) -> str | None:
+        """Return why the backend cannot run on this machine, and what to do; None if it can."""
+
+    def gpu(self) -> str | None:
+        """Return the name of the GPU on which it runs, and its interface; None on the processor."""
+
+    def device(self) -> torch.device:
+        """Return the device on which it needs its tensors."""
+
+    def make(self, host: Host) -> Backend:
+        """Return the backend, once it is known that it can run."""
 
 
 def check_backend_value(backend: object) -> None:

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import importlib.util
-import os
 import warnings
+from collections.abc import Mapping
 
 import torch
-from torch import Tensor
 
 from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
-from gsplat_edu.engine import adapters
-from gsplat_edu.engine.room import room_of
-from gsplat_edu.ops import kernels
-from gsplat_edu.ops.adam import adam_in_torch, adam_natively
-from gsplat_edu.ops.losses import l1_ssim, l1_ssim_in_torch
-from gsplat_edu.ops.moments import AdamNumbers
-from gsplat_edu.ops.noise import add_noise_in_torch, add_noise_natively
-from gsplat_edu.ops.recolor import recolored_in_torch, recolored_natively
-from gsplat_edu.render.backend import Backend
-from gsplat_edu.render.self_check import cuda_failure, webgpu_failure
+from gsplat_edu.render.backend import Backend, BackendRoom
+from gsplat_edu.render.cpu import backend as cpu
+from gsplat_edu.render.cuda import backend as cuda
 from gsplat_edu.render.settings import BACKENDS as BACKENDS, check_backend
+from gsplat_edu.render.torch import backend as dense
+from gsplat_edu.render.webgpu import backend as webgpu
 
-CUDA_LACKS = frozenset({"stop", "processes", "statistics"})
-"""What the Triton kernels do not offer."""
-
-WEBGPU_LACKS = frozenset({"processes"})
-"""What the WGSL kernels do not offer."""
+ROOMS: Mapping[str, BackendRoom] = {"cpu": cpu, "torch": dense, "cuda": cuda, "webgpu": webgpu}
+"""The room of each backend, by its name in `BACKENDS`."""
 
 
 def resolve_backend(name: str, device: torch.device | None = None) -> str:
@@ -53,7 +42,7 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
     check_backend(name)
     if name == "auto":
         on_gpu = torch.cuda.is_available() if device is None else device.type == "cuda"
-        name = "cuda" if on_gpu and not interpreted() else "cpu"
+        name = "cuda" if on_gpu and not cuda.interpreted() else "cpu"
         if name == "cuda" and device is None and (reason := unavailable("cuda")):
             _warn_once(f"the GPU is not used: {reason}")
             name = "cpu"
@@ -75,46 +64,17 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
         name: The backend.
         device: The GPU for cuda; None means the current one.
     """
-    if name == "cpu":
-        return kernels.REASON
-    if name == "webgpu":
-        return adapters.why_unavailable() or _webgpu_failure()
-    if name == "cuda":
-        if importlib.util.find_spec("triton") is None:
-            return "triton is not installed; pip install triton, or use the backend cpu"
-        if interpreted():
-            return None
-        if not torch.cuda.is_available():
-            return "torch sees no GPU; use the backend cpu (TRITON_INTERPRET=1 runs the kernels, slowly, without one)"
-        if failure := cuda_failure(device if device is not None and device.type == "cuda" else None):
-            return f"its kernels failed their check on this GPU: {failure}; the backend cpu needs no GPU"
-    return None
-
-
-def _webgpu_failure() -> str | None:
-    if failure := webgpu_failure():
-        return f"its kernels failed their check on {adapters.chosen_adapter().name}: {failure}; use the backend cpu"
-    return None
-
-
-def interpreted() -> bool:
-    """Return whether Triton's kernels run in its interpreter, on CPU tensors, for tests without a GPU."""
-    return os.environ.get("TRITON_INTERPRET", "0").lower() in ("1", "true", "on", "yes", "y")
+    return ROOMS[name].why_unavailable(_host, device)
 
 
 def gpu_of(backend: str) -> str | None:
     """Return the name of the GPU on which an available backend runs, and its interface; None on the processor."""
-    if backend == "webgpu":
-        adapter = adapters.chosen_adapter()
-        return f"{adapter.name}, {adapter.interface}{', which computes on the processor' * adapter.software}"
-    if backend == "cuda":
-        return "Triton's interpreter" if interpreted() else f"{torch.cuda.get_device_name()}, CUDA"
-    return None
+    return ROOMS[backend].gpu()
 
 
 def device_of(backend: str) -> torch.device:
     """Return the device on which a backend needs its tensors."""
-    return torch.device("cuda" if backend == "cuda" and torch.cuda.is_available() else "cpu")
+    return ROOMS[backend].device()
 
 
 def load_backend(name: str = "auto", device: torch.device | None = None) -> Backend:
@@ -127,90 +87,10 @@ def load_backend(name: str = "auto", device: torch.device | None = None) -> Back
     Raises:
         BackendUnavailableError: the backend does not exist or cannot run here; the message says why.
     """
-    return _LOADERS[resolve_backend(name, device)]()
+    return ROOMS[resolve_backend(name, device)].make(_host)
 
 
-@functools.cache
-def _cpu() -> Backend:
-    from gsplat_edu.render.cpu import render_cpu  # it needs the native module
-
-    return Backend(
-        "cpu",
-        device_of("cpu"),
-        render_cpu,
-        l1_ssim,
-        adam_natively,
-        add_noise_natively,
-        recolored_natively,
-    )
-
-
-@functools.cache
-def _dense() -> Backend:
-    from gsplat_edu.render.torch_reference import render_dense
-
-    return Backend(
-        "torch",
-        device_of("torch"),
-        render_dense,
-        l1_ssim_in_torch,
-        adam_in_torch,
-        add_noise_in_torch,
-        recolored_in_torch,
-        frozenset({"stop", "processes", "statistics", "forecast"}),
-    )
-
-
-@functools.cache
-def _webgpu() -> Backend:
-    from gsplat_edu.render.webgpu import device, render_webgpu
-    from gsplat_edu.render.webgpu_resident import WebgpuRun
-
-    others = _cpu() if kernels.REASON is None else _dense()  # its tensors are on the CPU
-    return dataclasses.replace(
-        others,
-        name="webgpu",
-        rasterize=render_webgpu,
-        lacks=WEBGPU_LACKS,
-        resident=WebgpuRun,
-        room=lambda: room_of(device()),
-    )
-
-
-@functools.cache
-def _cuda() -> Backend:
-    from gsplat_edu.render.triton.adam import adam_triton
-    from gsplat_edu.render.triton.loss import l1_ssim_triton
-    from gsplat_edu.render.triton.rasterize import render_triton
-
-    if interpreted():  # on tensors of the CPU, where the other kernels are faster
-        return dataclasses.replace(_cpu(), name="cuda", rasterize=render_triton, lacks=CUDA_LACKS)
-
-    def loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        with torch.cuda.device_of(image):  # type: ignore[no-untyped-call]
-            return l1_ssim_triton(image, target, ssim_weight)
-
-    def adam(
-        parameter: Tensor, first: Tensor, second: Tensor, gradient: Tensor, numbers: AdamNumbers
-    ) -> None:
-        if (
-            parameter.dtype != torch.float32
-        ):  # parameters that are not per Gaussian, such as a capture's lenses
-            adam_in_torch(parameter, first, second, gradient, numbers)
-            return
-        with torch.no_grad(), torch.cuda.device_of(parameter):  # type: ignore[no-untyped-call]
-            adam_triton(parameter, first, second, gradient, tuple(numbers))
-
-    return Backend(
-        "cuda",
-        device_of("cuda"),
-        render_triton,
-        loss,
-        adam,
-        add_noise_in_torch,
-        recolored_in_torch,
-        CUDA_LACKS,
-    )
-
-
-_LOADERS = {"cpu": _cpu, "torch": _dense, "cuda": _cuda, "webgpu": _webgpu}
+def _host() -> Backend:
+    """Return the kernels for tensors on the processor: native ones, or torch's where the native module is missing."""
+    room: BackendRoom = cpu if cpu.why_unavailable(_host) is None else dense
+    return room.make(_host)

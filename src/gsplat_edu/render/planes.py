@@ -25,7 +25,7 @@ from torch import Tensor
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
-from gsplat_edu.render.torch_sight import seen_by
+from gsplat_edu.render.torch.sight import seen_by
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
 

@@ -1,4 +1,4 @@
-"""Check the backends cuda and webgpu on a small scene before their first use.
+"""What the checks of cuda and webgpu share: a small scene on which both are checked before their first use.
 
 A GPU, its driver and the installed compiler may differ from everything the kernels were tested on. The first use on a
 device therefore renders and differentiates a scene of 64 Gaussians, and compares both with float64 on the CPU. A
@@ -7,12 +7,10 @@ passed check is stored in the user's cache folder, under the device's name and t
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import os
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +18,11 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.constants import ALPHA_MIN
-from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.engine.passes import FOLDER
-from gsplat_edu.ops import kernels
+from gsplat_edu.render.backend import Rasterize
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.step_check import step_error
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.projection import Distortion, Projection
@@ -47,59 +43,20 @@ GRADIENT_BOUND = 3e-4
 SETTINGS = RenderSettings(background=(0.2, 0.5, 0.9), jacobian_limit=1.3)
 
 
-Render = Callable[[Gaussians, Camera, RenderSettings, Extra], RenderOutput]
-
-
-def cuda_failure(device: torch.device | None = None) -> str | None:
-    """Describe the failure of the kernels of the backend cuda on a device; None if they pass.
-
-    The result is cached for the process; a pass is stored until device, driver or versions change.
-
-    Args:
-        device: A CUDA device, the current one if None or without an index; or the CPU, under Triton's interpreter.
-    """
-    try:
-        if device is None or (device.type == "cuda" and device.index is None):
-            device = torch.device("cuda", torch.cuda.current_device())
-        return _failure(device)
-    except Exception as error:  # compilers and drivers raise anything; the CPU renders instead
-        return _does_not_run(error)
-
-
-def webgpu_failure() -> str | None:
-    """Describe the failure of the kernels of the backend webgpu on the adapter that it uses; None if they pass.
-
-    Cached and stored as for `cuda_failure`.
-    """
-    try:
-        return _adapter_failure()
-    except BackendUnavailableError:
-        raise  # it says what failed
-    except Exception as error:
-        return _does_not_run(error)
-
-
-def _does_not_run(error: Exception) -> str:
+def does_not_run(error: Exception) -> str:
+    """Describe an error that a compiler or a driver raised."""
     first = str(error).strip().splitlines()
     return f"they do not run ({type(error).__name__}: {first[0] if first else 'no message'})"
 
 
-@functools.cache
-def _failure(device: torch.device) -> str | None:
-    return _checked_once("cuda", _identity(device), lambda: kernel_error(device))
+def checked_once(backend: str, identity: str, check: Callable[[], str | None]) -> str | None:
+    """Return what a check finds, without running it if it has passed with this identity before.
 
-
-@functools.cache
-def _adapter_failure() -> str | None:
-    from gsplat_edu.render.webgpu import adapter_name
-
-    name = adapter_name()
-    on = f"{name.name}, {name.interface}, {name.driver}, torch {torch.__version__}, wgpu {version('wgpu')}"
-    return _checked_once("webgpu", f"{on}, kernels {_hash_of_kernels()}", shader_error)
-
-
-def _checked_once(backend: str, identity: str, check: Callable[[], str | None]) -> str | None:
-    """Return what a check finds, without running it if it has passed with this identity before."""
+    Args:
+        backend: The backend's name.
+        identity: Everything that a pass depends on.
+        check: Returns what is wrong; None if nothing is.
+    """
     passed = _passed(backend)
     if identity in passed:
         return None
@@ -109,43 +66,28 @@ def _checked_once(backend: str, identity: str, check: Callable[[], str | None]) 
     return failure
 
 
-def kernel_error(device: torch.device) -> str | None:
-    """Render and differentiate the scene on a device with Triton's kernels, and compare with float64 on the CPU.
+def render_error(render: Rasterize, exact: Rasterize, device: torch.device) -> str | None:
+    """Render and differentiate the scene through three cameras, and compare with float64 on the CPU.
 
     Args:
-        device: As for `cuda_failure`.
+        render: The renderer to check.
+        exact: Renders tensors on the CPU in float64.
+        device: Where the renderer needs its tensors.
 
     Returns:
         The first result that exceeds its bound, and its error; None if none does.
     """
-    from gsplat_edu.render.triton.rasterize import render_triton
-
-    for camera in (CHECK_CAMERA, *CHECK_LENSES):
-        if failure := _error(render_triton, device, camera):
-            return failure
-    return None
+    checks = (_camera_error(render, exact, device, camera) for camera in (CHECK_CAMERA, *CHECK_LENSES))
+    return next((failure for failure in checks if failure), None)
 
 
-def shader_error() -> str | None:
-    """Do the same on the adapter of the backend webgpu, and compare a step of a training that stays there."""
-    from gsplat_edu.render.webgpu import render_webgpu
-    from gsplat_edu.render.webgpu_resident import WebgpuRun
-
-    scene = check_scene(torch.float32)
-    for camera in (CHECK_CAMERA, *CHECK_LENSES):
-        if failure := _error(render_webgpu, torch.device("cpu"), camera):
-            return failure
-    return step_error(
-        WebgpuRun(scene.sh_rest.shape[1]), scene, CHECK_CAMERA, SETTINGS, _exact, GRADIENT_BOUND
-    )
-
-
-def _error(render: Render, device: torch.device, camera: Camera) -> str | None:
+def _camera_error(render: Rasterize, exact: Rasterize, device: torch.device, camera: Camera) -> str | None:
     image, gradients = _differentiated(
-        check_scene(torch.float32).to(device),
-        lambda g, bg: render(g, camera, SETTINGS, Extra(bg)),
+        check_scene(torch.float32).to(device), lambda g, bg: render(g, camera, SETTINGS, Extra(bg))
     )
-    truth, expected = _differentiated(check_scene(torch.float64), lambda g, bg: _exact(g, bg, camera))
+    truth, expected = _differentiated(
+        check_scene(torch.float64), lambda g, bg: exact(g, camera, SETTINGS, Extra(bg))
+    )
     bright = max(1.0, float(truth.abs().max()))
     error = (image - truth).abs()
     worst, mean = float(error.max()) / bright, float(error.mean()) / bright
@@ -198,16 +140,6 @@ def check_scene(dtype: torch.dtype) -> Gaussians:
     ).map(lambda tensor: tensor.to(dtype))
 
 
-def _exact(gaussians: Gaussians, background: Tensor, camera: Camera = CHECK_CAMERA) -> RenderOutput:
-    if kernels.REASON is None:
-        from gsplat_edu.render.cpu import render_cpu
-
-        return render_cpu(gaussians, camera, SETTINGS, Extra(background))
-    from gsplat_edu.render.torch_reference import render_dense
-
-    return render_dense(gaussians, camera, SETTINGS, Extra(background))
-
-
 def _differentiated(
     gaussians: Gaussians, render: Callable[[Gaussians, Tensor], RenderOutput]
 ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -228,31 +160,13 @@ def _differentiated(
     return out.image.detach().double().cpu(), exact
 
 
-def _identity(device: torch.device) -> str:
-    """Identify everything that a pass depends on: device, driver, compiler, torch, and the source of our kernels."""
-    if device.type == "cuda":
-        name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
-        on = f"{name}, {capability}, CUDA {torch.version.cuda}, driver {_driver()}"
-    else:
-        on = "interpreter"
-    return f"{on}, torch {torch.__version__}, triton {version('triton')}, kernels {_hash_of_kernels()}"
-
-
-def _hash_of_kernels() -> str:
+def hash_of_kernels() -> str:
     """Return a hash of the modules and shaders that render."""
     source = hashlib.sha256()
     for folder, pattern in ((Path(__file__).parent, "*.py"), (FOLDER, "*.py"), (FOLDER, "*.wgsl")):
         for path in sorted(folder.rglob(pattern)):
             source.update(path.read_bytes())
     return source.hexdigest()[:16]
-
-
-def _driver() -> str:
-    """Return the NVIDIA driver's version from its kernel module; "unknown" if it gives none."""
-    try:
-        return Path("/sys/module/nvidia/version").read_text().strip()
-    except OSError:
-        return "unknown"
 
 
 def _memory(backend: str) -> Path:

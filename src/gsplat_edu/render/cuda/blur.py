@@ -1,6 +1,6 @@
 """Motion blur in project: what g g' adds to a dilated ellipse and takes from the opacity, and the backward pass.
 
-`gsplat_edu.render.triton.sight` has found g, the blur's standard deviations, px.
+`gsplat_edu.render.cuda.sight` has found g, the blur's standard deviations, px.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from gsplat_edu.render.triton.gaussian import dot3
-from gsplat_edu.render.triton.sight import SEEN
+from gsplat_edu.render.cuda.gaussian import dot3
+from gsplat_edu.render.cuda.sight import SEEN
 
 
 @triton.jit

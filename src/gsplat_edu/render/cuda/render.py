@@ -8,7 +8,7 @@ numbers of pairs and of visible Gaussians, and once per gradient of a camera. Wi
 run on CPU tensors.
 
 Where a lens or a rolling shutter sees the Gaussians is a separate operation before project, whose backward pass takes
-what project_backward returns (`gsplat_edu.render.triton.lens`).
+what project_backward returns (`gsplat_edu.render.cuda.lens`).
 
 Features are composited by the same kernels, in place of colours and depth, four channels per pass.
 """
@@ -28,18 +28,18 @@ from gsplat_edu.base.constants import TILE
 from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.camera_tensors import POSE, CameraTensors, camera_gradients, split_camera
-from gsplat_edu.render.output import Extra, RenderOutput
-from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.triton.composite import composite_backward_kernel, composite_kernel
-from gsplat_edu.render.triton.intersect import count_kernel, emit_kernel
-from gsplat_edu.render.triton.lens import seen_through
-from gsplat_edu.render.triton.project import (
+from gsplat_edu.render.cuda.composite import composite_backward_kernel, composite_kernel
+from gsplat_edu.render.cuda.intersect import count_kernel, emit_kernel
+from gsplat_edu.render.cuda.lens import seen_through
+from gsplat_edu.render.cuda.project import (
     CAMERA_NUMBERS,
     RECORD,
     SLOT,
     project_backward_kernel,
     project_kernel,
 )
+from gsplat_edu.render.output import Extra, RenderOutput
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 

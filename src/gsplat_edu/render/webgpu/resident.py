@@ -16,9 +16,9 @@ from gsplat_edu.engine.room import REPEATED_PHOTOS, kept_photos
 from gsplat_edu.engine.step import NO_SHELL, Noise, PackedPhoto, StepNumbers
 from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import WORD, NoiseNumbers
-from gsplat_edu.render import webgpu
 from gsplat_edu.render.resident import RunRules, RunState, RunSums, RunTarget
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.render.webgpu import render as webgpu
 from gsplat_edu.scene.camera import Camera
 
 _Found = TypeVar("_Found")

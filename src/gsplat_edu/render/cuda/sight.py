@@ -19,7 +19,7 @@ import triton
 import triton.language as tl
 
 from gsplat_edu.render.camera_tensors import LENS_GRADIENT_NUMBERS
-from gsplat_edu.render.triton.lens_formulas import (
+from gsplat_edu.render.cuda.lens_formulas import (
     BLURRED,
     BOUNDED,
     BY_COLUMNS,

@@ -21,7 +21,7 @@ from gsplat_edu.render.camera_tensors import (
     camera_gradients,
     split_camera,
 )
-from gsplat_edu.render.triton.lens_formulas import (
+from gsplat_edu.render.cuda.lens_formulas import (
     BLURRED,
     BOUNDED,
     BY_COLUMNS,
@@ -29,7 +29,7 @@ from gsplat_edu.render.triton.lens_formulas import (
     MOVING,
     RADIAL_FIRST,
 )
-from gsplat_edu.render.triton.sight import LENS_NUMBERS, SEEN, sight_backward_kernel, sight_kernel
+from gsplat_edu.render.cuda.sight import LENS_NUMBERS, SEEN, sight_backward_kernel, sight_kernel
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.projection import COEFFICIENTS
 from gsplat_edu.scene.shutter import MOTION_NUMBERS, readout_axis, readout_pace
@@ -116,7 +116,7 @@ class _Sight(torch.autograd.Function):
 
 
 def _optics(camera: Camera) -> int:
-    """Return the kernels' number of a kind of camera; see `gsplat_edu.render.triton.lens_formulas`."""
+    """Return the kernels' number of a kind of camera; see `gsplat_edu.render.cuda.lens_formulas`."""
     number = NUMBERS[camera.projection.kind]
     number += DISTORTED.value * (camera.coefficients is not None)
     number += RADIAL_FIRST.value * camera.projection.radial_first
@@ -128,7 +128,7 @@ def _optics(camera: Camera) -> int:
 def _lens_row(
     camera: Camera, z_near: float, limit: float | None, device: torch.device, dtype: torch.dtype
 ) -> Tensor:
-    """Return the camera on the device, cached with it; `gsplat_edu.render.triton.sight` has the places."""
+    """Return the camera on the device, cached with it; `gsplat_edu.render.cuda.sight` has the places."""
     rows = _lens_rows.setdefault(camera, {})
     key = (str(device), dtype, z_near, limit)
     if key not in rows:

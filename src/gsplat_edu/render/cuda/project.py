@@ -8,7 +8,7 @@ dx + sy dy)² - (ty dy)²), whose squares cannot cancel for long, thin ellipses.
 Gaussian.
 
 Where a lens or a rolling shutter (LENS: 1, or 2 with an exposure) sees the Gaussians, and g, the kernels of
-`gsplat_edu.render.triton.sight` have worked out before; project_backward returns the gradient of that, in rows of
+`gsplat_edu.render.cuda.sight` have worked out before; project_backward returns the gradient of that, in rows of
 `SEEN`, in place of the means'.
 """
 
@@ -22,8 +22,8 @@ import triton.language as tl
 
 from gsplat_edu.base import constants
 from gsplat_edu.render.camera_tensors import GRADIENT_NUMBERS
-from gsplat_edu.render.triton.blur import blurred, still_gradient, store_blur_gradient
-from gsplat_edu.render.triton.gaussian import (
+from gsplat_edu.render.cuda.blur import blurred, still_gradient, store_blur_gradient
+from gsplat_edu.render.cuda.gaussian import (
     C0,
     DET_FLOOR,
     EYE_AT,
@@ -44,7 +44,7 @@ from gsplat_edu.render.triton.gaussian import (
     store3,
     unit_quaternion,
 )
-from gsplat_edu.render.triton.sight import SEEN
+from gsplat_edu.render.cuda.sight import SEEN
 
 RECORD = tl.constexpr(16)
 """Values per record; twelve are used, sixteen fill a cache line."""

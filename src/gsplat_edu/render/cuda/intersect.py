@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 
 from gsplat_edu.base import constants
-from gsplat_edu.render.triton.project import RECORD
+from gsplat_edu.render.cuda.project import RECORD
 
 TILE = tl.constexpr(constants.TILE)
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(constants.ALPHA_MIN))

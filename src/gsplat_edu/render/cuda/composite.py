@@ -18,8 +18,8 @@ import triton
 import triton.language as tl
 
 from gsplat_edu.base import constants
-from gsplat_edu.render.triton.intersect import seam_shift
-from gsplat_edu.render.triton.project import RECORD, SLOT
+from gsplat_edu.render.cuda.intersect import seam_shift
+from gsplat_edu.render.cuda.project import RECORD, SLOT
 
 TILE = tl.constexpr(constants.TILE)
 PIXELS = tl.constexpr(constants.TILE * constants.TILE)

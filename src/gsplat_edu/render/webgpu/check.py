@@ -1,24 +1,35 @@
-"""Check a backend's training on its device on a small scene: one step and its noise, against float64 on the CPU.
+"""The check of the backend webgpu on an adapter before its first use: renders, and a step of a training there.
 
-The gradients are read from Adam's first moments. Adam and the noise are then repeated from what the device had, so that
-each is compared by itself.
+The gradients of the step are read from Adam's first moments. Adam and the noise are then repeated from what the device
+had, so that each is compared by itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from importlib.metadata import version
 
 import torch
 from torch import Tensor
 
+from gsplat_edu.base.errors import BackendUnavailableError
 from gsplat_edu.ops.adam import adam_in_torch
 from gsplat_edu.ops.losses import l1_ssim_in_torch
 from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.ops.noise import NoiseNumbers, add_noise_in_torch
-from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.backend import PROCESSOR, Rasterize
+from gsplat_edu.render.output import Extra
 from gsplat_edu.render.resident import ResidentRun, RunRules, RunState, RunTarget
-from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.scene.camera import Camera
+from gsplat_edu.render.self_check import (
+    CHECK_CAMERA,
+    GRADIENT_BOUND,
+    SETTINGS,
+    check_scene,
+    checked_once,
+    does_not_run,
+    hash_of_kernels,
+    render_error,
+)
 from gsplat_edu.scene.gaussians import Gaussians
 
 BETAS = 0.9, 0.999
@@ -37,42 +48,68 @@ FAR = 0.3
 """Distance of the photo's values from the image's. Where they are equal, rounding decides the sign of L1's gradient."""
 
 
-def step_error(
-    run: ResidentRun,
-    scene: Gaussians,
-    camera: Camera,
-    settings: RenderSettings,
-    render: Callable[[Gaussians, Tensor], RenderOutput],
-    bound: float,
-) -> str | None:
+def webgpu_failure(exact: Rasterize) -> str | None:
+    """Describe the failure of the kernels of the backend webgpu on the adapter that it uses; None if they pass.
+
+    The result is cached for the process; a pass is stored until adapter, driver or versions change.
+
+    Args:
+        exact: Renders tensors on the CPU in float64.
+    """
+    try:
+        return _failure(exact)
+    except BackendUnavailableError:
+        raise  # it says what failed
+    except Exception as error:
+        return does_not_run(error)
+
+
+@functools.cache
+def _failure(exact: Rasterize) -> str | None:
+    from gsplat_edu.render.webgpu.render import adapter_name
+
+    name = adapter_name()
+    on = f"{name.name}, {name.interface}, {name.driver}, torch {torch.__version__}, wgpu {version('wgpu')}"
+    return checked_once("webgpu", f"{on}, kernels {hash_of_kernels()}", lambda: shader_error(exact))
+
+
+def shader_error(exact: Rasterize) -> str | None:
+    """Compare what the WGSL kernels compute on the adapter with float64 on the CPU; see `kernel_error` of cuda."""
+    from gsplat_edu.render.webgpu.render import render_webgpu
+    from gsplat_edu.render.webgpu.resident import WebgpuRun
+
+    if failure := render_error(render_webgpu, exact, PROCESSOR):
+        return failure
+    scene = check_scene(torch.float32)
+    return step_error(WebgpuRun(scene.sh_rest.shape[1]), scene, exact)
+
+
+def step_error(run: ResidentRun, scene: Gaussians, exact: Rasterize) -> str | None:
     """Take a step on the device, and compare it.
 
     Args:
         run: The device's training; it loses what it had.
         scene: N Gaussians, float32, on the CPU.
-        camera: A camera.
-        settings: Settings.
-        render: Renders Gaussians in float64 over a background, as `settings` say.
-        bound: Largest error of a gradient, relative to the largest entry of its tensor.
+        exact: Renders tensors on the CPU in float64.
 
     Returns:
         The first result that exceeds its bound, and its error; None if none does.
     """
-    photo, loss, gradients, norms = _exact_gradients(scene, settings, render)
+    photo, loss, gradients, norms = _exact_gradients(scene, exact)
     zeros = {name: torch.zeros_like(tensor) for name, tensor in scene.tensors().items()}
     nothing = torch.zeros(len(scene))
     run.load(RunState(scene.tensors(), zeros, zeros, nothing, nothing))
     target = RunTarget(0, photo, None, photo)
-    sums = run.step(camera, settings, target, dict.fromkeys(zeros, NUMBERS), RULES)()
+    sums = run.step(CHECK_CAMERA, SETTINGS, target, dict.fromkeys(zeros, NUMBERS), RULES)()
     after = run.read()
-    if not abs(sums.photo - loss) <= bound * loss:
+    if not abs(sums.photo - loss) <= GRADIENT_BOUND * loss:
         return f"the loss of a test scene is wrong by {abs(sums.photo - loss) / loss:.1g} of itself"
     found = {name: after.first[name].double() / (1 - BETAS[0]) for name in gradients}
     for name, true in (gradients | {"norms": norms}).items():
         off = float(
             ((found | {"norms": after.norm_sums.double()})[name] - true).abs().max() / true.abs().max()
         )
-        if not off <= bound:
+        if not off <= GRADIENT_BOUND:
             return (
                 f"a training's gradient of {name} is wrong by {off:.1g} of its largest entry on a test scene"
             )
@@ -81,13 +118,12 @@ def step_error(
     return _adam_error(scene, after) or _noise_error(run, after)
 
 
-def _exact_gradients(
-    scene: Gaussians, settings: RenderSettings, render: Callable[[Gaussians, Tensor], RenderOutput]
-) -> tuple[Tensor, float, dict[str, Tensor], Tensor]:
+def _exact_gradients(scene: Gaussians, render: Rasterize) -> tuple[Tensor, float, dict[str, Tensor], Tensor]:
     """Return a photo, and in float64 the loss, the gradients of the raw parameters and the norms of all Gaussians."""
     exact = scene.map(lambda tensor: tensor.double()).trainable()
     with torch.enable_grad():
-        output = render(exact, torch.tensor(settings.background, dtype=torch.float64))
+        background = torch.tensor(SETTINGS.background, dtype=torch.float64)
+        output = render(exact, CHECK_CAMERA, SETTINGS, Extra(background))
         image = output.image
         away = torch.where(image.detach() > 0.5, image.detach() - FAR, image.detach() + FAR).clamp(0, 1)
         photo = (255 * away).round().to(torch.uint8)

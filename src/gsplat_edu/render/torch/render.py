@@ -22,7 +22,7 @@ from gsplat_edu.base.validation import first_index, in_range, whole_number
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.torch_sight import Through, directions_through_lens, like, through_lens
+from gsplat_edu.render.torch.sight import Through, directions_through_lens, like, through_lens
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import Gaussians, check_tensor, quat_to_R_t
 from gsplat_edu.scene.sh import basis_terms, num_coefficients

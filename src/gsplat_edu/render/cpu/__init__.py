@@ -1,0 +1,1 @@
+"""The backend cpu: native SIMD kernels, in `native/`."""

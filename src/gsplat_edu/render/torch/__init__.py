@@ -1,0 +1,1 @@
+"""The backend torch: every splat at every pixel, by torch's operations and autograd."""
