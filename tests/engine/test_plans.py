@@ -19,7 +19,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Request, choose
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.cli.main import main
-from gsplat_edu.cli.train import _with_backend
+from gsplat_edu.cli.train import with_backend
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
@@ -282,7 +282,7 @@ def test_auto_decides_by_real_forecasts(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     reader, said = CaptureReader(capture), []
     chosen = dataclasses.replace(options(capture, tmp_path / "run"), backend="cpu")
-    assert _with_backend(chosen, reader, said.append).backend == "cpu"
+    assert with_backend(chosen, reader, said.append).backend == "cpu"
     if all(one.software for one in adapters()):
         assert not said, "without a GPU there is nothing to say"
     prospect = Prospect.of(chosen, reader)
@@ -299,7 +299,7 @@ def test_auto_decides_by_real_forecasts(capture, tmp_path, monkeypatch):
     run.train()
     assert isinstance(run.trainer.stepper, ResidentStepper) and run.trainer.iteration == 30
     resumed = dataclasses.replace(chosen, resume=True)
-    assert _with_backend(resumed, reader, said.append).backend == "webgpu", "it goes on where it began"
+    assert with_backend(resumed, reader, said.append).backend == "webgpu", "it goes on where it began"
 
 
 def test_another_process_lists_the_same_adapters():

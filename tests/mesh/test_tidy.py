@@ -10,8 +10,8 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.mesh import tidy
 from gsplat_edu.mesh.tidy import (
     TidySettings,
-    _turned_over,
     decimated,
+    flipped_faces,
     tidied,
     with_filled_holes,
     with_large_components,
@@ -270,10 +270,10 @@ def test_faces_that_are_turned_over_are_unfolded(monkeypatch):
         0.7 * np.array(vertices[np.argsort(spread)[30]]) / np.linalg.norm(vertices[np.argsort(spread)[30]])
     )
     folded = Mesh(vertices, fine.faces)
-    assert _turned_over(ball, folded).any()
+    assert flipped_faces(ball, folded).any()
     monkeypatch.setattr(tidy, "_simplified", lambda *_: folded)
     mended = decimated(ball, 400)
-    assert not _turned_over(ball, mended).any() and np.array_equal(mended.faces, fine.faces)
+    assert not flipped_faces(ball, mended).any() and np.array_equal(mended.faces, fine.faces)
     assert np.abs(np.linalg.norm(mended.vertices, axis=1) - 0.7).max() < 0.05
 
 

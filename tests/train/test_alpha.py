@@ -38,10 +38,10 @@ def cut_out(width=32, count=16, splats=120, seed=0):
     400 white points lie around it.
     """
     rng = np.random.default_rng(seed)
-    means, cov3ds, colors, opacities = procedural._scene(rng, splats)
+    means, cov3ds, colors, opacities = procedural.egg_splats(rng, splats)
     views = []
     for i in range(count):
-        camera = procedural._camera(i, count, width, round(0.75 * width))
+        camera = procedural.ring_camera(i, count, width, round(0.75 * width))
         image, transmittance = render_gaussians(camera, means, cov3ds, colors, opacities)
         alpha = np.round(255 * (1 - transmittance)).astype(np.uint8)
         straight = image / np.maximum(1 - transmittance, 1e-6)[..., None]

@@ -160,7 +160,7 @@ class PathCurve:
     def _place(self, at: Values) -> Values:
         """Return the distance covered at given times."""
         if len(self._times):
-            return _monotone(self._times, self._places, at, self.loop, self._ease)
+            return monotone_interpolation(self._times, self._places, at, self.loop, self._ease)
         places: Values = self.length * at / self.seconds
         return places
 
@@ -168,7 +168,7 @@ class PathCurve:
         """Return the spline's parameter at given distances from the start."""
         if len(self._nodes) == 1:
             return np.zeros_like(places)
-        parameters: Values = _monotone(self._lengths, self._parameters, places, self.loop)
+        parameters: Values = monotone_interpolation(self._lengths, self._parameters, places, self.loop)
         return parameters
 
     def _measure(self) -> None:
@@ -279,7 +279,7 @@ def _mixed(a: States, b: States, share: Values) -> States:
     return mixed
 
 
-def _monotone(
+def monotone_interpolation(
     x: Float64[np.ndarray, " k"],
     y: Float64[np.ndarray, " k"],
     at: Values,
