@@ -77,19 +77,16 @@ def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkey
     ],
     ids=["lens", "shutter", "seam", "gradient", "value", "adam", "statistics", "noise"],
 )
-def test_a_wrong_step_is_refused(monkeypatch, file, right, wrong, message):
+def test_a_wrong_step_is_refused(file, right, wrong, message):
     """As if a driver had compiled a pass of a step wrongly."""
-    source = host.module_source
 
     def changed(module):
-        text = source(module)
+        text = host.module_source(module)
         if file in MODULES[module]:
             assert right in text
             text = text.replace(right, wrong)
         return text
 
-    monkeypatch.setattr(host, "module_source", changed)
-    pool = Pool(host.Device(limits=LIMITS))
-    monkeypatch.setattr(webgpu, "_pool", lambda: pool)
-    failure = self_check.shader_error()
+    with webgpu.rendering_with(Pool(host.Device(limits=LIMITS, source=changed))):
+        failure = self_check.shader_error()
     assert failure is not None and message in failure
