@@ -4,9 +4,10 @@ import itertools
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
-from dataclasses import replace
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.jobs import queue as queue_module
-from gsplat_edu.jobs.process import carries, identity, is_running
+from gsplat_edu.jobs.process import carries, identity, is_running, send
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import Job, JobFolder, Rendered, State, Work, collision
 from waiting import HERE, until
@@ -69,17 +70,16 @@ def opened(tmp_path):
     made = []
 
     def open_queue(**options):
-        program = (sys.executable, "-S", "-c", PROGRAM)
-        made.append(JobQueue(tmp_path / "jobs", render, program=program, **options))
+        given = {"render": render, "program": (sys.executable, "-S", "-c", PROGRAM)} | options
+        made.append(JobQueue(tmp_path / "jobs", **given))
         return made[-1]
 
     yield open_queue
     for queue in made:
-        queue._closed.set()
-        queue._thread.join()
-        for child in queue._children.values():
-            child.kill()
-            child.wait()
+        for job in queue.jobs():
+            if job.pid is not None:
+                send(job.pid, job.identity, signal.SIGKILL, group=True)
+        queue.close()
 
 
 def reached(queue, name, *states):
@@ -89,8 +89,7 @@ def reached(queue, name, *states):
 
 def abandon(queue):
     """Abandon a queue as kill -9 would: it writes nothing more, and its processes keep running."""
-    queue._closed.set()
-    queue._thread.join()
+    queue.close(interrupt=False)
 
 
 def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_path):
@@ -290,14 +289,13 @@ def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch)
 
 
 def test_jobs_follow_a_renamed_place(opened, tmp_path):
-    queue = opened()
     place, other = tmp_path / "runs" / "a", tmp_path / "runs" / "ab"
     place.mkdir(parents=True)
 
     def in_place(work, purpose):
         return Rendered(work, ("run", str(tmp_path / work.outputs[0]), *work.options["words"]))
 
-    queue._render = in_place
+    queue = opened(render=in_place)
     job = queue.submit(Work("run", ("captures/a",), ("runs/a/x",), {"words": ["fails"]}))
     near = queue.submit(Work("run", ("runs/ab",), ("runs/ab/y",), {"words": []}))
     other.mkdir()
@@ -322,20 +320,31 @@ def test_jobs_follow_a_renamed_place(opened, tmp_path):
     assert (moved / "x.ran").read_text().count("\n") == 2 and not place.exists()
 
 
-def test_work_is_checked_again_before_its_job_is_started_again(opened, tmp_path):
-    queue = opened()
+@pytest.fixture
+def changing():
+    """Rules that a test changes: once `refused` is set, no work is allowed."""
+    refused = threading.Event()
+    return refused, lambda work, purpose: render(
+        asked("run", "refused") if refused.is_set() else work, purpose
+    )
+
+
+def test_work_is_checked_again_before_its_job_is_started_again(opened, changing, tmp_path):
+    refused, rules = changing
+    queue = opened(render=rules)
     job = queue.submit(asked("run", str(tmp_path / "a"), "fails"))
-    failed = reached(queue, job.id, State.FAILED)
-    queue._jobs[job.id] = replace(failed, work=asked("run", "refused"))
+    reached(queue, job.id, State.FAILED)
+    refused.set()
     with pytest.raises(ArgumentError, match="are not allowed"):
         queue.resume(job.id)
     assert queue.get(job.id).state is State.FAILED
 
 
-def test_work_is_checked_when_its_job_starts(opened, tmp_path):
-    queue = opened(at_once=0)
+def test_work_is_checked_when_its_job_starts(opened, changing, tmp_path):
+    refused, rules = changing
+    queue = opened(at_once=0, render=rules)
     job = queue.submit(asked("run", str(tmp_path / "a")))
-    queue._render = lambda work, purpose: render(asked("refused", "refused"), purpose)
+    refused.set()
     queue.at_once = 1
     assert reached(queue, job.id, State.FAILED).line == "words: are not allowed"
     assert queue.get(job.id).attempts == 0 and not (tmp_path / "a.ran").exists()
@@ -396,7 +405,7 @@ def test_a_job_of_a_killed_queue_keeps_its_place_locked(opened, tmp_path):
     late = found.submit(asked("run", str(tmp_path / "b"), reads=["runs/a"]))
     until(lambda: found.get(late.id).waits_for == ((job.id, "runs/a"),))
     (tmp_path / "a").touch()
-    os.waitpid(queue._children[job.id].pid, 0)
+    os.waitpid(queue.get(job.id).pid, 0)
     reached(found, late.id, State.DONE)
 
 

@@ -53,7 +53,7 @@ def test_a_scene_is_judged_on_request_one_at_a_time_until_it_changes(page, studi
 def test_closing_the_studio_ends_the_judgement(page, studio, scenes):
     page.post(scenes[0])
     (running,) = [one for one in studio.proposals._kept.values() if one.running]
-    process = running._process
+    process = running.process
     studio.proposals.close()
     assert process.wait(PATIENCE) < 0
 

@@ -146,7 +146,7 @@ class PathCurve:
         """
         at = float64_array("times", times, ("n",))
         at = np.mod(at, self.seconds) if self.loop else np.clip(at, 0.0, self.seconds)
-        states = self._at(self._parameter(self._place(at)))
+        states = self._at(self._parameter(self.place(at)))
         rotations = np.swapaxes(quat_to_R_batch(states[:, QUAT]), 1, 2)
         return states[:, EYE], rotations, np.degrees(2.0 * np.arctan(np.exp(states[:, ZOOM][:, 0])))
 
@@ -157,8 +157,8 @@ class PathCurve:
         self._times = np.insert(self._times, held + 1, ends)
         self._places = np.insert(self._places, held + 1, self._places[held])
 
-    def _place(self, at: Values) -> Values:
-        """Return the distance covered at given times."""
+    def place(self, at: Values) -> Values:
+        """Return the distance from the start, measured by `travel`, at times from 0 to `seconds`."""
         if len(self._times):
             return monotone_interpolation(self._times, self._places, at, self.loop, self._ease)
         places: Values = self.length * at / self.seconds
