@@ -101,7 +101,7 @@ def test_edits_come_before_filters_and_transforms(run, edits, plain, tmp_path):
 
 
 def facts_of(path):
-    return page._read_facts(path, path.read_bytes())
+    return page.read_facts(path, path.read_bytes())
 
 
 def test_a_page_opens_in_the_start_view_with_named_views_and_the_path(run, edits, tmp_path):

@@ -15,19 +15,19 @@ pytestmark = pytest.mark.usefixtures("webgpu")
 @pytest.fixture(autouse=True)
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    self_check._adapter_failure.cache_clear()
+    self_check.forget_checks()
     yield tmp_path / "gsplat_edu/webgpu_passed.json"
-    self_check._adapter_failure.cache_clear()
+    self_check.forget_checks()
 
 
 def test_correct_kernels_are_checked_once(empty_cache, monkeypatch):
     assert self_check.webgpu_failure() is None
     assert webgpu.adapter_name().name in empty_cache.read_text()
-    self_check._adapter_failure.cache_clear()  # as in a new process
+    self_check.forget_checks()  # as in a new process
     monkeypatch.setattr(self_check, "shader_error", lambda: "checked again")
     assert self_check.webgpu_failure() is None
-    self_check._adapter_failure.cache_clear()
-    monkeypatch.setattr(self_check, "_hash_of_kernels", lambda: "of other shaders")
+    self_check.forget_checks()
+    monkeypatch.setattr(self_check, "hash_of_kernels", lambda: "of other shaders")
     assert self_check.webgpu_failure() == "checked again"
 
 

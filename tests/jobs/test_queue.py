@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.jobs import queue as queue_module
 from gsplat_edu.jobs.process import carries, identity, is_running, send
-from gsplat_edu.jobs.queue import JobQueue
+from gsplat_edu.jobs.queue import MOST_QUEUED, JobQueue
 from gsplat_edu.jobs.record import Job, JobFolder, Rendered, State, Work, collision
 from waiting import HERE, until
 
@@ -251,22 +250,21 @@ def test_closing_interrupts_running_jobs_and_keeps_waiting_ones(opened, tmp_path
     assert again.get(job.id).state is State.INTERRUPTED
 
 
-def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(queue_module, "MOST_QUEUED", 2)
+def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path):
     queue = opened()
     queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     until((tmp_path / "a.ran").exists)
-    kept = [queue.submit(asked("run", str(tmp_path / name))) for name in "bc"]
-    with pytest.raises(ArgumentError, match=r"^jobs: 2 are waiting; cancel some"):
+    kept = [queue.submit(asked("run", str(tmp_path / "b"))) for _ in range(MOST_QUEUED)]
+    with pytest.raises(ArgumentError, match=r"^jobs: 200 are waiting; cancel some"):
         queue.submit(asked("run", "d"))
     with pytest.raises(ArgumentError, match="cancel it first"):
         queue.remove(queue.jobs()[0].id)
     abandon(queue)
     queue.files(kept[0].id).record.write_text("{")
-    shutil.copytree(queue.folder / kept[1].id, queue.folder / "000077")
+    shutil.copytree(queue.folder / kept[1].id, queue.folder / "000777")
     found = opened()
     assert len(found.damaged) == 2 and all(line.count("\n") == 0 for line in found.damaged.values())
-    assert found.submit(asked("run", str(tmp_path / "e"))).id == "000078"  # ids are never reused
+    assert found.submit(asked("run", str(tmp_path / "e"))).id == "000778"  # ids are never reused
 
 
 def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch):

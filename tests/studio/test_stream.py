@@ -47,15 +47,22 @@ def test_a_watcher_resumes_after_the_last_event_it_has():
     assert found[-1][0] == f"{stream.boot}-5"
 
 
-def test_unknown_ids_start_from_the_beginning(monkeypatch):
-    monkeypatch.setattr(stream_module, "KEPT", 3)
-    stream = Stream()
-    for number in range(6):
+def test_unknown_ids_start_from_the_beginning():
+    stream, last = Stream(), stream_module.KEPT + 3
+    for number in range(last):
         stream.publish("job", {"number": number})
     odd = [f"{stream.boot}-{number}" for number in ODD]
-    for last_id in (None, "", "other-3", f"{stream.boot}-x", f"{stream.boot}-99", f"{stream.boot}-2", *odd):
+    for last_id in (
+        None,
+        "",
+        "other-3",
+        f"{stream.boot}-x",
+        f"{stream.boot}-{last + 1}",
+        f"{stream.boot}-2",
+        *odd,
+    ):
         ((found_id, kind, _),) = collected(stream, last_id, 1)
-        assert kind == "reset" and found_id == f"{stream.boot}-6", last_id
+        assert kind == "reset" and found_id == f"{stream.boot}-{last}", last_id
     assert [data["number"] for _, _, data in collected(stream, f"{stream.boot}-3", 3)] == [3, 4, 5]
 
 

@@ -275,7 +275,7 @@ def test_reduced_photos_are_kept_and_equal_those_that_are_not(kinds, background,
         feed = ViewFeed([stored], "shuffled", 0, background)
         feed.use_factor(2.0)
         found = [feed.target(feed.next(), behind) for _ in range(4)]
-        feed._reader.shutdown()
+        feed.close()
         return found
 
     kept = targets()

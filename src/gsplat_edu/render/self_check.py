@@ -79,6 +79,12 @@ def webgpu_failure() -> str | None:
         return _does_not_run(error)
 
 
+def forget_checks() -> None:
+    """Forget the results of this process, such as after a driver was replaced; passes that are stored still count."""
+    _failure.cache_clear()
+    _adapter_failure.cache_clear()
+
+
 def _does_not_run(error: Exception) -> str:
     first = str(error).strip().splitlines()
     return f"they do not run ({type(error).__name__}: {first[0] if first else 'no message'})"
@@ -95,7 +101,7 @@ def _adapter_failure() -> str | None:
 
     name = adapter_name()
     on = f"{name.name}, {name.interface}, {name.driver}, torch {torch.__version__}, wgpu {version('wgpu')}"
-    return _checked_once("webgpu", f"{on}, kernels {_hash_of_kernels()}", shader_error)
+    return _checked_once("webgpu", f"{on}, kernels {hash_of_kernels()}", shader_error)
 
 
 def _checked_once(backend: str, identity: str, check: Callable[[], str | None]) -> str | None:
@@ -235,10 +241,10 @@ def _identity(device: torch.device) -> str:
         on = f"{name}, {capability}, CUDA {torch.version.cuda}, driver {_driver()}"
     else:
         on = "interpreter"
-    return f"{on}, torch {torch.__version__}, triton {version('triton')}, kernels {_hash_of_kernels()}"
+    return f"{on}, torch {torch.__version__}, triton {version('triton')}, kernels {hash_of_kernels()}"
 
 
-def _hash_of_kernels() -> str:
+def hash_of_kernels() -> str:
     """Return a hash of the modules and shaders that render."""
     source = hashlib.sha256()
     for folder, pattern in ((Path(__file__).parent, "*.py"), (FOLDER, "*.py"), (FOLDER, "*.wgsl")):
