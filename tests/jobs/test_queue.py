@@ -127,7 +127,7 @@ def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     waiting = queue.submit(asked("run", str(tmp_path / "b")))
     assert queue.cancel(waiting.id).state is State.CANCELLED
-    until((tmp_path / "a.ran").exists)
+    until(lambda: (tmp_path / "a.ran").exists() and (tmp_path / "a.ran").read_text())
     queue.cancel(job.id)
     ended = reached(queue, job.id, State.CANCELLED)
     assert ended.line == "interrupted after a checkpoint" and ended.resumable
