@@ -82,10 +82,10 @@ STAGES = {
     "sort": "sort",
     "Sort": "sort",
     "moments": "loss",
-    "_add": "loss",
+    "add_kernel": "loss",
     "similarity": "loss",
     "maps": "loss",
-    "gradient_down": "loss",
+    "gradient_kernel": "loss",
     "adam": "Adam",
 }
 """Stage by substring of the kernel's name; the first match wins."""

@@ -41,10 +41,10 @@ def operations(kernel: str, lanes: int) -> int:
         ValueError: the source has a form that this function does not understand.
     """
     file, begin = KERNELS[kernel]
-    return _Counter(lanes).body(_block((NATIVE / file).read_text(encoding="utf-8"), begin))
+    return OperationCounter(lanes).body(_block((NATIVE / file).read_text(encoding="utf-8"), begin))
 
 
-class _Counter:
+class OperationCounter:
     """Counts operations in our C++ for one vector width."""
 
     def __init__(self, lanes: int) -> None:

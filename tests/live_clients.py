@@ -56,10 +56,11 @@ class CountedView(LiveView):
 class Training:
     """A training in its own thread, with its live view."""
 
-    def __init__(self, capture, out, *words):
+    def __init__(self, capture, out, *words, grace=PATIENCE, **waits):
+        """Other programs may keep a client from its next request for seconds, so the view is patient."""
         self.run = made_run(capture, out, *words)
         self.stopped = threading.Event()
-        self.view = CountedView(self.run, port=0)
+        self.view = CountedView(self.run, port=0, grace=grace, **waits)
         self.broadcast = Broadcast(self.run, self.stopped.is_set, [self.view])
         self.failure = None
         self.thread = threading.Thread(target=self._train)
@@ -81,9 +82,9 @@ class Training:
 
 
 @contextmanager
-def training(capture, out, *words, pressed=None):
+def training(capture, out, *words, pressed=None, **waits):
     """Train with a live view until the end of the block; a button may be pressed before the first iteration."""
-    made = Training(capture, out, *words)
+    made = Training(capture, out, *words, **waits)
     with made.view:
         assert pressed is None or Client(made.view.url).control(pressed) == 204
         made.thread.start()

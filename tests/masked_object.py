@@ -41,10 +41,10 @@ def masked_object(width, count, splats=300, seed=0):
     """Photograph the object in the room; masks keep pixels of which the object covers half or more."""
     rng = np.random.default_rng(seed)
     height = round(0.75 * width)
-    means, cov3ds, colors, opacities = procedural._scene(rng, splats)
+    means, cov3ds, colors, opacities = procedural.egg_splats(rng, splats)
     views = []
     for i in range(count):
-        camera = procedural._camera(i, count, width, height)
+        camera = procedural.ring_camera(i, count, width, height)
         image, transmittance = procedural.render_gaussians(camera, means, cov3ds, colors, opacities)
         behind = room(wall_behind(camera)).reshape(height, width, 3)
         pixels = np.round(255 * np.clip(image + transmittance[..., None] * behind, 0, 1)).astype(np.uint8)

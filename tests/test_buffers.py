@@ -82,8 +82,8 @@ def test_a_tensor_outlives_the_block():
 
 def test_buffers_that_outlive_the_block_are_freed_individually(monkeypatch):
     """A tensor that is kept, such as a displayed render, does not keep the memory of others."""
-    made, mapped = [], buffers._mapped
-    monkeypatch.setattr(buffers, "_mapped", lambda nbytes: made.append(mapped(nbytes)) or made[-1])
+    made, mapped = [], buffers.mapped_memory
+    monkeypatch.setattr(buffers, "mapped_memory", lambda nbytes: made.append(mapped(nbytes)) or made[-1])
     with reused_buffers():
         tensors = [reusable_tensor(SHAPE, LIKE) for _ in range(3)]
         waiting = reusable_tensor(SHAPE, LIKE)
@@ -128,7 +128,7 @@ def test_nested_blocks_share_buffers_and_threads_do_not():
 
 def test_the_pool_holds_no_more_than_the_peak_in_use():
     """Two buffers at a time have sizes that never recur, so none can be reused, and unused ones are freed."""
-    pool = buffers._Pool()
+    pool = buffers.BufferPool()
     largest = 0
     for i in range(300):
         size = LARGE + 4096 * ((i * 7919) % 500)
@@ -140,7 +140,7 @@ def test_the_pool_holds_no_more_than_the_peak_in_use():
 
 
 def test_unused_buffers_are_freed_in_time():
-    pool = buffers._Pool()
+    pool = buffers.BufferPool()
     many = [pool.take(LARGE) for _ in range(50)]
     del many
     assert pool.nbytes == 50 * LARGE

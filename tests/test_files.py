@@ -59,7 +59,7 @@ def aside_like(folder):
 
 
 def test_a_folder_that_vanishes_meanwhile_is_passed_over(tmp_path, monkeypatch):
-    left = tmp_path / "z" / f".x.{files._this_machine()}-{2**22 + 1}-0123abcd.ply"
+    left = tmp_path / "z" / f".x.{files.this_machine()}-{2**22 + 1}-0123abcd.ply"
     for folder in ("a/b", "z"):
         (tmp_path / folder).mkdir(parents=True)
     left.touch()
@@ -79,7 +79,7 @@ def test_a_folder_that_vanishes_meanwhile_is_passed_over(tmp_path, monkeypatch):
 
 @needs_posix
 def test_a_link_is_no_leftover(tmp_path):
-    name = f".x.{files._this_machine()}-{2**22 + 1}-0123abcd.ply"
+    name = f".x.{files.this_machine()}-{2**22 + 1}-0123abcd.ply"
     (tmp_path / name).symlink_to(tmp_path / "elsewhere.ply")
     remove_leftovers(tmp_path)
     assert (tmp_path / name).is_symlink()

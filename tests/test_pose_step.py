@@ -11,7 +11,7 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.pose_step import FEWEST, _flow, pose_step
+from gsplat_edu.train.pose_step import FEWEST, image_flow, pose_step
 
 EXTENT = 4.0
 SPREAD = 0.01 * torch.tensor([1.0] * 3 + [EXTENT] * 3, dtype=torch.float64)
@@ -125,7 +125,7 @@ def test_the_flow_is_that_of_finite_differences(scene):
         place = seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         found = (place - pixels.numpy()) / size
         np.testing.assert_allclose(
-            _flow(camera, pixels, z)[:, :, column].numpy(), found, rtol=1e-4, atol=1e-3
+            image_flow(camera, pixels, z)[:, :, column].numpy(), found, rtol=1e-4, atol=1e-3
         )
 
 

@@ -25,7 +25,7 @@ from gsplat_edu.budget.costs import (
     wanted_gaussians,
 )
 from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
-from gsplat_edu.budget.probe import _pairs_at_first, probe, resident_bytes
+from gsplat_edu.budget.probe import pairs_at_first, probe, resident_bytes
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.depths import CAPTURE, POINTS
@@ -212,9 +212,9 @@ def test_depth_is_a_fact_of_views_that_carry_it(capture):
 
 def test_pairs_are_forecast_at_the_photo_size_with_which_the_run_starts():
     fast, plain = recipe(1_000, strategy="fast", max_gaussians=9), PLAIN
-    assert _pairs_at_first(plain, 1e6, 1_000) == math.ceil(1.2e6)
-    assert _pairs_at_first(fast, 1e6, 1_000) == math.ceil(1.2e6 / 16)
-    assert _pairs_at_first(fast, 8_000, 5_000) == 5_000
+    assert pairs_at_first(plain, 1e6, 1_000) == math.ceil(1.2e6)
+    assert pairs_at_first(fast, 1e6, 1_000) == math.ceil(1.2e6 / 16)
+    assert pairs_at_first(fast, 8_000, 5_000) == 5_000
 
 
 def test_the_time_of_a_run_is_the_sum_of_its_parts():

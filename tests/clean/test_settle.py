@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.clean.settle import Doubtful, Judged, _slope, settle
+from gsplat_edu.clean.settle import Doubtful, Judged, logit_gradient, settle
 from gsplat_edu.render.api import render
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -35,7 +35,7 @@ def test_the_gradient_is_that_of_the_error(planted, rings):
     # The gradient of the price has a closed form, which is subtracted here.
     price = 0.3
     factor = 1.0 / (1.0 + np.exp(-logits))
-    found = _slope(
+    found = logit_gradient(
         faint, Doubtful(doubtful, logits, price), logits, Judged(view.camera, view.read(), SETTINGS), CPU, 1.0
     ) - price * factor * (1.0 - factor)
     direction = np.random.default_rng(1).normal(size=len(doubtful))

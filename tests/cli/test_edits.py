@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.cli.view import _edits_file
+from gsplat_edu.cli.view import edits_file
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
 from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
@@ -101,7 +101,7 @@ def test_edits_come_before_filters_and_transforms(run, edits, plain, tmp_path):
 
 
 def facts_of(path):
-    return page._read_facts(path, path.read_bytes())
+    return page.read_facts(path, path.read_bytes())
 
 
 def test_a_page_opens_in_the_start_view_with_named_views_and_the_path(run, edits, tmp_path):
@@ -202,7 +202,7 @@ def test_the_file_of_the_editor_is_beside_the_scene(tmp_path, plain):
         ([plain, "--edit", "x.json"], "x.json"),
     ):
         given = ["view", *map(str, words)]
-        assert str(_edits_file(build_parser(given).parse_args(given))) == str(file)
+        assert str(edits_file(build_parser(given).parse_args(given))) == str(file)
 
 
 def test_sources_that_cannot_be_edited_are_refused_in_one_line(run, plain, tmp_path):

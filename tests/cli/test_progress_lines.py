@@ -13,7 +13,7 @@ from gsplat_edu.cli.terminal import LINE_SECONDS, Bar, clock, stage_bars
 from gsplat_edu.cli.train import progress_bar
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.sfm.colmap import _await_result
+from gsplat_edu.sfm.colmap import await_result
 
 
 class Time:
@@ -135,10 +135,10 @@ def test_progress_is_repeated_while_the_mapper_reports_nothing(monkeypatch):
             answers.put({"result": {"models": []}})
 
     answers.put({"done": 7})
-    assert _await_result(answers, progress) == {"models": []}
+    assert await_result(answers, progress) == {"models": []}
     assert seen == [7, 7, 7, 7, 7]
     answers.put({"ended": True})
-    assert _await_result(answers, progress) is None
+    assert await_result(answers, progress) is None
 
 
 def test_a_training_without_a_terminal_prints_the_time_left(tmp_path, capsys):

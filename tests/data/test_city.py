@@ -1,7 +1,6 @@
 """The cameras, points and photos of the city agree, and a seed determines every byte."""
 
 import hashlib
-import sys
 
 import numpy as np
 import pytest
@@ -52,9 +51,8 @@ def test_several_processes_write_the_same_bytes(written, tmp_path):
         assert len(digests) == 1, file
 
 
-def test_the_command_writes_a_city(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_a_city(tmp_path, capsys):
     words = [
-        "city",
         str(tmp_path / "city"),
         "--photos",
         "3",
@@ -65,8 +63,7 @@ def test_the_command_writes_a_city(tmp_path, monkeypatch, capsys):
         "--seed",
         "3",
     ]
-    monkeypatch.setattr(sys, "argv", words)
-    procedural.main()
+    procedural.main(words)
     assert "3 photos of 16x12 px" in capsys.readouterr().out
     assert len(list((tmp_path / "city" / "images").iterdir())) == 3
 

@@ -189,7 +189,7 @@ def test_thousands_of_elements_and_properties_are_looked_up_in_tables(tmp_path, 
         def __hash__(self):
             return str.__hash__(self)
 
-    lines = ply_table._HeaderLines()
+    lines = ply_table.HeaderLines()
     count = 2000
     for i in range(count):
         assert lines.add(["element", Name(f"e{i}"), "0"]) is None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.cli.doctor import _exposure_beforehand
+from gsplat_edu.cli.doctor import exposure_beforehand
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
@@ -364,7 +364,7 @@ def test_an_unexplained_photo_is_not_also_reported_as_fitted(scene):
 
 def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     gaussians, views = scene
-    findings, why, correction = _exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
+    findings, why, correction = exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
     assert findings == () and "gone" in why and correction == "none"
     said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
     (line,) = [line for line in said if line.startswith("exposure ")]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.records import ABSENT
@@ -57,13 +58,18 @@ def test_the_splats_within_a_radius_are_those_that_all_pairs_give(kind):
     assert some_found > 3
 
 
-def test_pairs_that_are_compared_in_parts_give_the_same(monkeypatch):
-    rng = np.random.default_rng(9)
-    means, some = scattered(rng, 500, "normal"), rng.random(500) < 0.5
-    whole = within_radius(means, some, ~some, 0.1, EditWork())
-    monkeypatch.setattr(neighbours, "AT_ONCE", 7)
-    np.testing.assert_array_equal(within_radius(means, some, ~some, 0.1, EditWork()), whole)
-    assert 0 < whole.sum() < some.sum()
+def test_pairs_that_are_compared_in_parts_give_the_same():
+    """Cells as large as the radius hold more pairs than are compared at once."""
+    n, radius, work = 6000, 0.6, EditWork()
+    means, some = np.random.default_rng(9).uniform(size=(n, 3)), np.arange(n) < n // 2
+    means[: n // 3] *= 0.02  # near the corner that others avoid
+    means[~some] = 0.4 + 0.6 * means[~some]
+    found = within_radius(means, some, ~some, radius, work)
+    nearest = cKDTree(means[~some]).query(means[some])[0]
+    assert np.abs(nearest - radius).min() > 1e-6, "rounding decides nothing"
+    np.testing.assert_array_equal(found[some], nearest <= radius)
+    assert not found[~some].any() and 0 < found.sum() < some.sum()
+    assert MOST_TESTS - work.left > neighbours.AT_ONCE
 
 
 def row(n):
@@ -101,18 +107,15 @@ def test_growing_shrinking_distances_and_lists_give_these_states(operations, fla
     assert flags_after(operations, row(6)).tolist() == flags
 
 
-def test_a_radius_that_takes_too_many_tests_is_refused_before_anything_is_compared(monkeypatch):
-    n = 40_000  # at one place, so each of one half is compared with all of the other
+def test_a_radius_that_takes_too_many_tests_is_refused_before_anything_is_compared():
+    n = 64_000  # at one place, so each of one half is compared with all of the other
     means, half = np.zeros((n, 3)), np.arange(n) % 2 == 0
-    monkeypatch.setattr(neighbours, "_compare", None)
     work = EditWork()
-    with pytest.raises(ArgumentError, match=r"a radius of 0\.5 takes 400,000,000 tests"):
-        monkeypatch.setattr(neighbours, "MOST_PAIRS", 10**8)
+    with pytest.raises(ArgumentError, match=r"a radius of 0\.5 takes 1,024,000,000 tests"):
         within_radius(means, half, ~half, 0.5, work)
     assert MOST_TESTS - work.left == n, "the pairs do not count, because they are not compared"
-    monkeypatch.undo()
     with pytest.raises(ArgumentError, match="take more than"):
-        within_radius(means, half, ~half, 0.5, EditWork(most=n + 1))
+        within_radius(means[:1000], half[:1000], ~half[:1000], 0.5, EditWork(most=1001))
 
 
 def test_a_small_radius_is_cheap_beside_an_outlier():

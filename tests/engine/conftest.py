@@ -25,8 +25,9 @@ def pool(device) -> Pool:
 
 
 @pytest.fixture
-def webgpu(pool, monkeypatch):
+def webgpu(pool):
     """Let the backend use that device."""
-    from gsplat_edu.render.webgpu import render as webgpu
+    from gsplat_edu.render.webgpu.render import rendering_with
 
-    monkeypatch.setattr(webgpu, "_pool", lambda: pool)
+    with rendering_with(pool):
+        yield

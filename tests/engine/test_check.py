@@ -10,9 +10,7 @@ from gsplat_edu.engine import adapters, check
 SMALL = ("--gaussians", "300", "--size", "40x30", "--rounds", "1")
 
 
-@pytest.fixture(autouse=True)
-def adapter(device, monkeypatch):
-    monkeypatch.setattr(check.Device, "default", lambda: device)
+pytestmark = pytest.mark.usefixtures("device")  # skips where there is none
 
 
 def test_the_report(device, tmp_path, capsys):
@@ -67,7 +65,6 @@ def test_bad_input_is_one_line(monkeypatch, capsys):
         check.main(["--size", "large"])
     assert raised.value.code == 2
     assert "--size: is 'large', but has to be WIDTHxHEIGHT" in capsys.readouterr().err
-    monkeypatch.undo()
     monkeypatch.setattr(adapters, "listed_adapters", lambda: ())
     check.Device.default.cache_clear()
     assert check.main(SMALL) == 2

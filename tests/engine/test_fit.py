@@ -17,7 +17,7 @@ from gsplat_edu.engine.frame import draw_frame
 from gsplat_edu.engine.passes import LIMITS
 from gsplat_edu.engine.step import step_program
 from gsplat_edu.io.ply import save_ply
-from gsplat_edu.render.webgpu import render as webgpu
+from gsplat_edu.render.webgpu.render import rendering_with
 from native_scenes import random
 
 DEFAULT = LIMITS["max-storage-buffer-binding-size"]
@@ -92,9 +92,15 @@ def test_an_image_that_is_too_large_is_refused():
         draw_frame(frame.Pool(tight(1 << 18)), scene, plain_view(128, 128))
 
 
-def test_commands_say_it_in_one_line_and_write_nothing(tmp_path, monkeypatch, capsys):
-    pool = frame.Pool(tight(1 << 18))
-    monkeypatch.setattr(webgpu, "_pool", lambda: pool)
+@pytest.fixture
+def narrow():
+    """Let the backend use a device with small buffers."""
+    with rendering_with(frame.Pool(tight(1 << 18))):
+        yield
+
+
+@pytest.mark.usefixtures("narrow")
+def test_commands_say_it_in_one_line_and_write_nothing(tmp_path, capsys):
     save_ply(tmp_path / "a.ply", random(2000, (8, 8)).gaussians(torch.float32))
     command = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--backend", "webgpu"]
     assert main([*command, "--out", str(tmp_path / "frames")]) == 2

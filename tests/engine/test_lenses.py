@@ -8,7 +8,7 @@ import torch
 
 from engine.frames import plain_view
 from gsplat_edu.engine import host, passes
-from gsplat_edu.engine.passes import MODULES, Buffer, Pass, Program, Size
+from gsplat_edu.engine.passes import LIMITS, MODULES, Buffer, Pass, Program, Size
 from gsplat_edu.ops.depth import DepthRule, depth_error
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import COLLECTED
@@ -85,7 +85,8 @@ fn measure(@builtin(workgroup_id) id: vec3<u32>, @builtin(num_workgroups) groups
 """
 
 
-def test_the_arc_tangent_errs_by_three_units(device, monkeypatch):
+@pytest.mark.usefixtures("device")
+def test_the_arc_tangent_errs_by_three_units(monkeypatch):
     """Around every edge between its branches, and at random."""
     rng = np.random.default_rng(0)
     turns = np.concatenate(
@@ -94,9 +95,9 @@ def test_the_arc_tangent_errs_by_three_units(device, monkeypatch):
     points = np.stack([np.sin(turns), np.cos(turns)], axis=1) * rng.uniform(0.01, 100, (len(turns), 1))
     points = points.astype(np.float32)
     monkeypatch.setitem(MODULES, "angles", ("job", "view", "constants", "lens"))
-    source = passes.module_source
-    monkeypatch.setattr(
-        host, "module_source", lambda name: source(name) + (ANGLES if name == "angles" else "")
+    device = host.Device(
+        limits=LIMITS,
+        source=lambda name: passes.module_source(name) + (ANGLES if name == "angles" else ""),
     )
     items = Size("n")
     program = Program(

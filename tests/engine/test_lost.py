@@ -15,7 +15,8 @@ from gsplat_edu.engine.failures import DeviceLostError
 from gsplat_edu.engine.passes import LIMITS
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.render.webgpu import render as webgpu, resident as webgpu_resident
+from gsplat_edu.render.webgpu import resident as webgpu_resident
+from gsplat_edu.render.webgpu.render import rendering_with
 from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
@@ -33,11 +34,10 @@ ITERATIONS = 12
 
 
 @pytest.fixture
-def losable(device, monkeypatch):
+def losable(device):
     """Let the backend use a device of its own."""
-    pool = frame.Pool(host.Device(limits=LIMITS))
-    monkeypatch.setattr(webgpu, "_pool", lambda: pool)
-    return pool
+    with rendering_with(frame.Pool(host.Device(limits=LIMITS))) as pool:
+        yield pool
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_a_training_goes_on_with_the_same_bits(losable, capture, strategy):
 
     def disturb(one, event):
         if event.iteration == 7 and losable.device is first:
-            assert run.stepper._run._done
+            assert run.stepper.device_run.repeatable
             lose(losable)
 
     first = losable.device
@@ -157,7 +157,7 @@ def test_what_is_kept_for_a_repetition_is_bounded(losable, capture, monkeypatch)
         run = trainer(capture, densify_every=1000)
 
         def disturb(one, event, run=run, first=losable.device):
-            kept.append(len(run.stepper._run._done))
+            kept.append(len(run.stepper.device_run.repeatable))
             if event.iteration == 7 and losable.device is first:
                 lose(losable)
 
@@ -165,7 +165,6 @@ def test_what_is_kept_for_a_repetition_is_bounded(losable, capture, monkeypatch)
             assert run.run(callbacks=[disturb]).losses == expected
         assert max(kept) <= 3 and max(kept) > 0
         monkeypatch.undo()
-        monkeypatch.setattr(webgpu, "_pool", lambda: losable)
         assert_same(run, state)
 
 

@@ -40,10 +40,10 @@ def test_bytes_are_of_buffers_that_the_pass_binds(entry):
 def test_no_buffer_moves_more_than_the_host_allocates(device):
     """Except records, which tiles fetch again. The sizes are those of the buffers that exist."""
     scene, view = packed(SMALLER["random"]), view_of(SMALLER["random"])
-    run = measure._Run(device, scene, view)
+    run = measure.StepRun(device, scene, view)
     counters = Counters.of(run.memory, 15, 3, (view.camera.W, view.camera.H))
     assert counters.counts == run.memory.counts and counters.program is run.memory.program
-    sizes = {name: buffer.size for name, buffer in run.memory._buffers.items()}
+    sizes = {name: buffer.size for name, buffer in run.memory.buffers.items()}
     declared = {one.name: WORD * one.size.of(counters.counts) for one in counters.program.buffers}
     assert all(sizes[name] == max(size, 16) for name, size in declared.items()), "16: the smallest buffer"
     for cost in step_costs(counters):
@@ -170,7 +170,7 @@ def test_a_measured_step_and_its_table(device):
 
 def test_another_order_of_sums_is_found(device, monkeypatch):
     """A device whose second run differs in one bit of the state."""
-    states, right = [], measure._Run.state
+    states, right = [], measure.StepRun.state
 
     def state(run):
         found = right(run)
@@ -178,7 +178,7 @@ def test_another_order_of_sums_is_found(device, monkeypatch):
         found["core"][0] += len(states)
         return found
 
-    monkeypatch.setattr(measure._Run, "state", state)
+    monkeypatch.setattr(measure.StepRun, "state", state)
     assert not measure.measure_step(
         device, packed(SMALLER["random"]), view_of(SMALLER["random"]), 1
     ).same_bits
@@ -187,7 +187,7 @@ def test_another_order_of_sums_is_found(device, monkeypatch):
 def test_steps_get_room_for_their_pairs(device):
     """A scene with more than two pairs a Gaussian begins with too little room."""
     scene = SMALLER["hundreds of layers"]
-    run = measure._Run(device, packed(scene), view_of(scene))
+    run = measure.StepRun(device, packed(scene), view_of(scene))
     live = next(run.steps(1))
     assert not live[frame.LIVE - 1] and run.memory.counts["pairs"] >= live[frame.PAIRS] > 0
     assert set(run.state()) == set(STATE)

@@ -19,7 +19,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Request, choose
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.cli.main import main
-from gsplat_edu.cli.train import _with_backend
+from gsplat_edu.cli.train import with_backend
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
@@ -31,7 +31,7 @@ from gsplat_edu.engine.passes import LIMITS, WORD
 from gsplat_edu.engine.resident import PHOTO_ROOM
 from gsplat_edu.engine.room import Load, Room, kept_photos, room_of
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.render.webgpu import render as backend_module
+from gsplat_edu.render.webgpu.render import rendering_with
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.scene.given_depth import GivenDepth
@@ -69,10 +69,10 @@ def test_a_forecast_counts_the_buffers_that_a_training_makes(dataset):
     start = Start(from_points(dataset.points, dataset.colors, config.changed(max_gaussians=100)), extent=1.0)
     run = training(config, dataset, load_backend("webgpu"), start)
     run.run()
-    resident = run.stepper._run.resident
-    run.stepper._load()
-    made = resident._memory._words
-    pairs = resident._most_pairs_each * resident.count / 1.25
+    resident = run.stepper.device_run.resident
+    run.stepper.device_run.load(run.stepper.device_run.read())
+    made = resident.memory.program.words(resident.memory.counts)
+    pairs = resident.most_pairs_each * resident.count / 1.25
     tiles = 4  # 24 x 18 px
     load = Load(resident.count, 3, 24 * 18, tiles, math.floor(pairs))
     assert load.step_words() == made
@@ -100,23 +100,23 @@ def test_the_most_that_fits_fits_and_one_more_does_not(device):
 
 def test_the_trial_times_no_compilation(capture, dataset, monkeypatch):
     """The clock of this test counts the pipelines that are compiled, on a device that has none."""
-    compiled, right = [], host.Device._compiled
+    pool = Pool(host.Device(limits=LIMITS))
+    compiled, right = [], pool.device.device.create_compute_pipeline
 
-    def counted(self, one):
-        compiled.append(one.entry)
-        return right(self, one)
+    def counted(**options):
+        compiled.append(options["compute"]["entry_point"])
+        return right(**options)
 
     class Clock:
         @staticmethod
         def perf_counter():
             return float(len(compiled))
 
-    monkeypatch.setattr(host.Device, "_compiled", counted)
+    monkeypatch.setattr(pool.device.device, "create_compute_pipeline", counted)
     monkeypatch.setattr(trial, "time", Clock)
-    pool = Pool(host.Device(limits=LIMITS))
-    monkeypatch.setattr(backend_module, "_pool", lambda: pool)
     scene, views = from_points(dataset.points, dataset.colors, SMALL), dataset.train[:2]
-    found = trial.run_trial(scene, views, SMALL, 1.0, load_backend("webgpu"))
+    with rendering_with(pool):
+        found = trial.run_trial(scene, views, SMALL, 1.0, load_backend("webgpu"))
     assert compiled and found.seconds == [0.0] * trial.TIMED_STEPS and found.exchange == 0.0
     assert found.pairs > 0 and found.gaussians == len(scene)
 
@@ -177,7 +177,7 @@ def test_photos_keep_to_the_budget_of_the_run(capture, tmp_path):
     chosen = dataclasses.replace(chosen, data_settings=DataSettings(image_memory=5 * 4 * 24 * 18))
     run = CaptureRun(chosen)
     run.train()
-    kept = run.trainer.stepper._run.resident._photos
+    kept = run.trainer.stepper.device_run.resident.photos
     assert sum(sent.kept.nbytes for _, sent in kept.values()) <= 5 * 4 * 24 * 18
     assert len(kept) == 5
 
@@ -282,7 +282,7 @@ def test_auto_decides_by_real_forecasts(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     reader, said = CaptureReader(capture), []
     chosen = dataclasses.replace(options(capture, tmp_path / "run"), backend="cpu")
-    assert _with_backend(chosen, reader, said.append).backend == "cpu"
+    assert with_backend(chosen, reader, said.append).backend == "cpu"
     if all(one.software for one in adapters()):
         assert not said, "without a GPU there is nothing to say"
     prospect = Prospect.of(chosen, reader)
@@ -299,7 +299,7 @@ def test_auto_decides_by_real_forecasts(capture, tmp_path, monkeypatch):
     run.train()
     assert isinstance(run.trainer.stepper, ResidentStepper) and run.trainer.iteration == 30
     resumed = dataclasses.replace(chosen, resume=True)
-    assert _with_backend(resumed, reader, said.append).backend == "webgpu", "it goes on where it began"
+    assert with_backend(resumed, reader, said.append).backend == "webgpu", "it goes on where it began"
 
 
 def test_another_process_lists_the_same_adapters():

@@ -17,18 +17,18 @@ pytestmark = pytest.mark.usefixtures("webgpu")
 @pytest.fixture(autouse=True)
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    check._failure.cache_clear()
+    check.forget_checks()
     yield tmp_path / "gsplat_edu/webgpu_passed.json"
-    check._failure.cache_clear()
+    check.forget_checks()
 
 
 def test_correct_kernels_are_checked_once(empty_cache, monkeypatch):
     assert check.webgpu_failure(EXACT) is None
     assert webgpu.adapter_name().name in empty_cache.read_text()
-    check._failure.cache_clear()  # as in a new process
+    check.forget_checks()  # as in a new process
     monkeypatch.setattr(check, "shader_error", lambda exact: "checked again")
     assert check.webgpu_failure(EXACT) is None
-    check._failure.cache_clear()
+    check.forget_checks()
     monkeypatch.setattr(check, "hash_of_kernels", lambda: "of other shaders")
     assert check.webgpu_failure(EXACT) == "checked again"
 
@@ -79,19 +79,16 @@ def test_a_gradient_that_is_one_percent_too_large_is_refused(empty_cache, monkey
     ],
     ids=["lens", "shutter", "seam", "gradient", "value", "adam", "statistics", "noise"],
 )
-def test_a_wrong_step_is_refused(monkeypatch, file, right, wrong, message):
+def test_a_wrong_step_is_refused(file, right, wrong, message):
     """As if a driver had compiled a pass of a step wrongly."""
-    source = host.module_source
 
     def changed(module):
-        text = source(module)
+        text = host.module_source(module)
         if file in MODULES[module]:
             assert right in text
             text = text.replace(right, wrong)
         return text
 
-    monkeypatch.setattr(host, "module_source", changed)
-    pool = Pool(host.Device(limits=LIMITS))
-    monkeypatch.setattr(webgpu, "_pool", lambda: pool)
-    failure = check.shader_error(EXACT)
+    with webgpu.rendering_with(Pool(host.Device(limits=LIMITS, source=changed))):
+        failure = check.shader_error(EXACT)
     assert failure is not None and message in failure

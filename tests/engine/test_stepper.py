@@ -111,9 +111,9 @@ def test_the_same_bits_again_after_a_resume_and_with_too_little_room(
     load_checkpoint(path, resumed)
     resumed.run()
     monkeypatch.setattr(frame, "FEWEST_PAIRS", 8)
-    crowded.stepper._run.resident._most_pairs_each = 0.0
+    crowded.stepper.device_run.resident.most_pairs_each = 0.0
     losses = crowded.run().losses
-    assert crowded.stepper._run.resident._most_pairs_each > 1.0, (
+    assert crowded.stepper.device_run.resident.most_pairs_each > 1.0, (
         "more pairs were found than there was room for"
     )
     assert len(losses) == 12
@@ -146,16 +146,16 @@ def test_masks_and_random_backgrounds_reach_the_device(capture, alpha):
     expected = runs[1].last
     assert torch.equal(photo, expected[1]) and torch.equal(mask, expected[2])
     assert torch.allclose(image, expected[0], atol=2 / 255)
-    kept = runs[0].stepper._run.resident._photos
+    kept = runs[0].stepper.device_run.resident.photos
     assert len(kept) == (0 if alpha else 6), "photos over random backgrounds are sent for each step"
 
 
 def test_photos_beyond_the_room_are_sent_again_with_the_same_result(capture):
     plain, streamed = (trainer(capture, iterations=14) for _ in range(2))
-    streamed.stepper._run.resident._photo_room = 2 * 4 * 40 * 40
+    streamed.stepper.device_run.resident.photo_room = 2 * 4 * 40 * 40
     plain.run()
     streamed.run()
-    assert len(streamed.stepper._run.resident._photos) == 2
+    assert len(streamed.stepper.device_run.resident.photos) == 2
     assert_same(plain, streamed)
 
 
@@ -178,7 +178,7 @@ def bytes_of_steps(device, side, splats):
     counted, unfinished = [], set()
 
     def count(_, event):
-        unfinished.add(len(run.stepper._run.resident._waiting))
+        unfinished.add(len(run.stepper.device_run.resident.unfinished))
         if event.iteration in (7, 12):
             counted.append((device.sent, device.received))
 
@@ -263,7 +263,7 @@ def test_a_step_that_gets_no_room_ends_the_run_and_saves_nothing(capture, device
     """The host has counted steps that did not happen, so no checkpoint is written from then on."""
     monkeypatch.setattr(frame, "FEWEST_PAIRS", 8)
     run = trainer(capture)
-    run.stepper._run.resident._most_pairs_each = 0.0
+    run.stepper.device_run.resident.most_pairs_each = 0.0
     right = device.check_fits
 
     def tight(program, counts):

@@ -75,7 +75,7 @@ def of_gaussians() -> None:
         stage(intersect.count_kernel, WRAPS=lens > 0, BLOCK=128)
         stage(intersect.emit_kernel, WRAPS=lens > 0, BLOCK=128)
     arrays = dict.fromkeys(("parameter", "m", "v", "gradient"), FLOATS)
-    build(adam._adam, {**arrays, "count": "i32", "numbers": ("fp32",) * 8})
+    build(adam.adam_kernel, {**arrays, "count": "i32", "numbers": ("fp32",) * 8})
 
 
 def of_lenses() -> None:
@@ -96,13 +96,13 @@ def of_pixels() -> None:
 def of_loss() -> None:
     image = {"image": FLOATS, "target": "*u8", "planes": FLOATS}
     sums = {"sums": FLOATS, "size": SIZE}
-    build(loss._moments_across, image | {"size": SIZE, "scale": "fp32"}, warps=16)
-    build(loss._similarity_down, {"planes": FLOATS, "maps": FLOATS, **sums, "each": "fp32"}, warps=16)
-    build(loss._maps_across, {"maps": FLOATS, "planes": FLOATS, "size": SIZE}, warps=16)
+    build(loss.moments_kernel, image | {"size": SIZE, "scale": "fp32"}, warps=16)
+    build(loss.similarity_kernel, {"planes": FLOATS, "maps": FLOATS, **sums, "each": "fp32"}, warps=16)
+    build(loss.maps_kernel, {"maps": FLOATS, "planes": FLOATS, "size": SIZE}, warps=16)
     last = {**image, "gradient": FLOATS, **sums, "numbers": ("fp32", "fp32", "fp32")}
-    build(loss._gradient_down, last, warps=16)
-    build(loss._gradient_down, last, {"planes": None}, warps=16)
-    build(loss._add, {"sums": FLOATS, "count": "i32", "total": FLOATS})
+    build(loss.gradient_kernel, last, warps=16)
+    build(loss.gradient_kernel, last, {"planes": None}, warps=16)
+    build(loss.add_kernel, {"sums": FLOATS, "count": "i32", "total": FLOATS})
 
 
 if __name__ == "__main__":

@@ -166,7 +166,7 @@ def test_results_are_reproducible_and_independent_of_memory_contents(device, wei
 
 
 def test_without_ssim_weight_nothing_is_blurred(device, monkeypatch):
-    for name in ("_moments_across", "_similarity_down", "_maps_across"):
+    for name in ("moments_kernel", "similarity_kernel", "maps_kernel"):
         monkeypatch.setattr(module, name, None)
     image, target = (t.to(device) for t in images((3, 5), "floats"))
     value, gradient = value_and_gradient(l1_ssim_triton, image, target, 0.0)

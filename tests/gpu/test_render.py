@@ -59,17 +59,17 @@ def test_without_a_gpu_auto_uses_the_cpu_and_cuda_is_refused(monkeypatch):
 
 
 def test_a_camera_is_uploaded_once(device):
-    from gsplat_edu.render.cuda.render import _camera_rows
+    from gsplat_edu.render.cuda.render import camera_rows
 
     scene = random(3, (8, 8))
     gaussians = scene.gaussians(torch.float32).to(torch.device(device))
     other = Camera.posed(scene.camera.R, scene.camera.eye, scene.camera.intrinsics)
-    before = len(_camera_rows)
+    before = len(camera_rows)
     rows = []
     for _ in range(2):
         render(gaussians, other, backend="cuda")
-        rows.append(next(iter(_camera_rows[other].values())))
-    assert len(_camera_rows) == before + 1 and rows[0] is rows[1]
+        rows.append(next(iter(camera_rows[other].values())))
+    assert len(camera_rows) == before + 1 and rows[0] is rows[1]
 
 
 def test_features_of_another_dtype_are_refused(device):

@@ -18,16 +18,16 @@ EXACT = backends.load_backend("torch").rasterize
 @pytest.fixture(autouse=True)
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    check._failure.cache_clear()
-    backends._warn_once.cache_clear()
+    check.forget_checks()
+    backends.warn_once.cache_clear()
     yield tmp_path / "gsplat_edu/cuda_passed.json"
-    check._failure.cache_clear()
+    check.forget_checks()
 
 
 def test_correct_kernels_are_checked_once(device, empty_cache, monkeypatch):
     assert check.cuda_failure(EXACT, torch.device(device)) is None
     assert "triton" in empty_cache.read_text()
-    check._failure.cache_clear()  # a new process starts like this
+    check.forget_checks()  # a new process starts like this
     monkeypatch.setattr(check, "kernel_error", lambda exact, device: "checked again")
     assert check.cuda_failure(EXACT, torch.device(device)) is None
 
@@ -37,19 +37,19 @@ def test_changed_kernels_are_checked_again(device, empty_cache, monkeypatch):
     for content in ("{", "[" * 100_000, '{"a": 1}', '["another device"]', "[1]"):
         empty_cache.write_text(content)
         monkeypatch.setattr(check, "kernel_error", lambda exact, device: "checked again")
-        check._failure.cache_clear()
+        check.forget_checks()
         assert check.cuda_failure(EXACT, torch.device(device)) == "checked again"
 
 
 def test_a_shifted_image_fails(device, empty_cache, monkeypatch):
-    right = rasterize._camera_row
+    right = rasterize.camera_row
 
     def shifted(call, device):
         row = right(call, device).clone()
         row[torch.isclose(row, torch.tensor(23.1, device=row.device))] += 0.01
         return row
 
-    monkeypatch.setattr(rasterize, "_camera_row", shifted)
+    monkeypatch.setattr(rasterize, "camera_row", shifted)
     assert "the image of a test scene is wrong by" in check.cuda_failure(EXACT, torch.device(device))
     assert not empty_cache.exists()
 
@@ -83,7 +83,7 @@ def test_auto_uses_the_cpu_if_the_kernels_do_not_run(monkeypatch, tmp_path, caps
     with pytest.raises(BackendUnavailableError, match=r"^backend 'cuda': .*; the backend cpu needs no GPU$"):
         resolve_backend("cuda")
 
-    backends._warn_once.cache_clear()
+    backends.warn_once.cache_clear()
     save_ply(tmp_path / "a.ply", check_scene(torch.float32))
     out = tmp_path / "frames"
     command = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--out", str(out)]

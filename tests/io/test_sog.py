@@ -14,7 +14,7 @@ from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.sog import codec as sog
-from gsplat_edu.io.sog.palette import _picked, codebook, nearest_in_codebook, palette
+from gsplat_edu.io.sog.palette import codebook, nearest_in_codebook, palette, sampled_rows
 from gsplat_edu.io.sog.values import positions_to_steps, quats_to_pixels
 from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
 from gsplat_edu.scene.morton import morton_codes
@@ -252,11 +252,11 @@ def test_the_number_of_picks_is_exact_for_any_chances():
     for _ in range(200):
         chances = 10 ** rng.uniform(-40, 20, 50) * rng.integers(0, 2, 50)
         count = int(rng.integers(1, 50))
-        picked = _picked(chances, count)
+        picked = sampled_rows(chances, count)
         assert picked.sum() == count
         if count * chances.max() >= chances.sum() > 0:
             assert picked[chances.argmax()], "a chance of at least one is always picked"
-    even = _picked(np.ones(100), 20)
+    even = sampled_rows(np.ones(100), 20)
     assert np.diff(np.flatnonzero(even)).tolist() == [5] * 19
 
 

@@ -8,6 +8,7 @@ import pytest
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.jobs.process import send
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import Rendered, State, Work
 from waiting import until
@@ -72,10 +73,8 @@ def test_a_job_cancelled_during_an_import_ends_at_once(tmp_path, interrupts, mod
     program = (sys.executable, "-c", WAITS.format(module=module, mark=str(mark), catches=catches))
     queue = JobQueue(tmp_path / "jobs", render, program=program, patience=NEVER)
     job = queue.submit(Work("doctor", (str(tmp_path / "capture"),), (), {}))
-    child = None
     try:
         until(mark.exists)
-        child = queue._children[job.id]
         queue.cancel(job.id)
         until(lambda: queue.get(job.id).state is not State.RUNNING)
         ended = queue.get(job.id)
@@ -83,8 +82,6 @@ def test_a_job_cancelled_during_an_import_ends_at_once(tmp_path, interrupts, mod
         printed = queue.files(job.id).output.read_text()
         assert "Traceback" not in printed and "cameras" not in printed, "the command did not begin"
     finally:
-        queue._closed.set()
-        queue._thread.join()
-        if child is not None:
-            child.kill()
-            child.wait()
+        if (pid := queue.get(job.id).pid) is not None:
+            send(pid, queue.get(job.id).identity, signal.SIGKILL, group=True)
+        queue.close()

@@ -87,7 +87,7 @@ def test_a_line_without_an_end_is_bounded(tmp_path, monkeypatch):
     follower, found = Follower(path), []
     for _ in range(60):
         found += follower.read()
-        assert len(follower._rest) <= 3000
+        assert len(follower.rest) <= 3000
     assert [(number, event) for number, _, event in found] == [(2, ALL[0])]
     monkeypatch.setattr(following, "MOST_READ", 40_000)
     assert events_after(path) == []

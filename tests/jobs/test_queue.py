@@ -4,18 +4,18 @@ import itertools
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
-from dataclasses import replace
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.jobs import queue as queue_module
-from gsplat_edu.jobs.process import carries, identity, is_running
-from gsplat_edu.jobs.queue import JobQueue
+from gsplat_edu.jobs.process import carries, identity, is_running, send
+from gsplat_edu.jobs.queue import MOST_QUEUED, JobQueue
 from gsplat_edu.jobs.record import Job, JobFolder, Rendered, State, Work, collision
 from waiting import HERE, until
 
@@ -69,17 +69,16 @@ def opened(tmp_path):
     made = []
 
     def open_queue(**options):
-        program = (sys.executable, "-S", "-c", PROGRAM)
-        made.append(JobQueue(tmp_path / "jobs", render, program=program, **options))
+        given = {"render": render, "program": (sys.executable, "-S", "-c", PROGRAM)} | options
+        made.append(JobQueue(tmp_path / "jobs", **given))
         return made[-1]
 
     yield open_queue
     for queue in made:
-        queue._closed.set()
-        queue._thread.join()
-        for child in queue._children.values():
-            child.kill()
-            child.wait()
+        for job in queue.jobs():
+            if job.pid is not None:
+                send(job.pid, job.identity, signal.SIGKILL, group=True)
+        queue.close()
 
 
 def reached(queue, name, *states):
@@ -89,8 +88,7 @@ def reached(queue, name, *states):
 
 def abandon(queue):
     """Abandon a queue as kill -9 would: it writes nothing more, and its processes keep running."""
-    queue._closed.set()
-    queue._thread.join()
+    queue.close(interrupt=False)
 
 
 def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_path):
@@ -129,7 +127,7 @@ def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
     job = queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     waiting = queue.submit(asked("run", str(tmp_path / "b")))
     assert queue.cancel(waiting.id).state is State.CANCELLED
-    until((tmp_path / "a.ran").exists)
+    until(lambda: (tmp_path / "a.ran").exists() and (tmp_path / "a.ran").read_text())
     queue.cancel(job.id)
     ended = reached(queue, job.id, State.CANCELLED)
     assert ended.line == "interrupted after a checkpoint" and ended.resumable
@@ -252,22 +250,21 @@ def test_closing_interrupts_running_jobs_and_keeps_waiting_ones(opened, tmp_path
     assert again.get(job.id).state is State.INTERRUPTED
 
 
-def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(queue_module, "MOST_QUEUED", 2)
+def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path):
     queue = opened()
     queue.submit(asked("run", str(tmp_path / "a"), "waits"))
     until((tmp_path / "a.ran").exists)
-    kept = [queue.submit(asked("run", str(tmp_path / name))) for name in "bc"]
-    with pytest.raises(ArgumentError, match=r"^jobs: 2 are waiting; cancel some"):
+    kept = [queue.submit(asked("run", str(tmp_path / "b"))) for _ in range(MOST_QUEUED)]
+    with pytest.raises(ArgumentError, match=r"^jobs: 200 are waiting; cancel some"):
         queue.submit(asked("run", "d"))
     with pytest.raises(ArgumentError, match="cancel it first"):
         queue.remove(queue.jobs()[0].id)
     abandon(queue)
     queue.files(kept[0].id).record.write_text("{")
-    shutil.copytree(queue.folder / kept[1].id, queue.folder / "000077")
+    shutil.copytree(queue.folder / kept[1].id, queue.folder / "000777")
     found = opened()
     assert len(found.damaged) == 2 and all(line.count("\n") == 0 for line in found.damaged.values())
-    assert found.submit(asked("run", str(tmp_path / "e"))).id == "000078"  # ids are never reused
+    assert found.submit(asked("run", str(tmp_path / "e"))).id == "000778"  # ids are never reused
 
 
 def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch):
@@ -290,14 +287,13 @@ def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch)
 
 
 def test_jobs_follow_a_renamed_place(opened, tmp_path):
-    queue = opened()
     place, other = tmp_path / "runs" / "a", tmp_path / "runs" / "ab"
     place.mkdir(parents=True)
 
     def in_place(work, purpose):
         return Rendered(work, ("run", str(tmp_path / work.outputs[0]), *work.options["words"]))
 
-    queue._render = in_place
+    queue = opened(render=in_place)
     job = queue.submit(Work("run", ("captures/a",), ("runs/a/x",), {"words": ["fails"]}))
     near = queue.submit(Work("run", ("runs/ab",), ("runs/ab/y",), {"words": []}))
     other.mkdir()
@@ -322,20 +318,31 @@ def test_jobs_follow_a_renamed_place(opened, tmp_path):
     assert (moved / "x.ran").read_text().count("\n") == 2 and not place.exists()
 
 
-def test_work_is_checked_again_before_its_job_is_started_again(opened, tmp_path):
-    queue = opened()
+@pytest.fixture
+def changing():
+    """Rules that a test changes: once `refused` is set, no work is allowed."""
+    refused = threading.Event()
+    return refused, lambda work, purpose: render(
+        asked("run", "refused") if refused.is_set() else work, purpose
+    )
+
+
+def test_work_is_checked_again_before_its_job_is_started_again(opened, changing, tmp_path):
+    refused, rules = changing
+    queue = opened(render=rules)
     job = queue.submit(asked("run", str(tmp_path / "a"), "fails"))
-    failed = reached(queue, job.id, State.FAILED)
-    queue._jobs[job.id] = replace(failed, work=asked("run", "refused"))
+    reached(queue, job.id, State.FAILED)
+    refused.set()
     with pytest.raises(ArgumentError, match="are not allowed"):
         queue.resume(job.id)
     assert queue.get(job.id).state is State.FAILED
 
 
-def test_work_is_checked_when_its_job_starts(opened, tmp_path):
-    queue = opened(at_once=0)
+def test_work_is_checked_when_its_job_starts(opened, changing, tmp_path):
+    refused, rules = changing
+    queue = opened(at_once=0, render=rules)
     job = queue.submit(asked("run", str(tmp_path / "a")))
-    queue._render = lambda work, purpose: render(asked("refused", "refused"), purpose)
+    refused.set()
     queue.at_once = 1
     assert reached(queue, job.id, State.FAILED).line == "words: are not allowed"
     assert queue.get(job.id).attempts == 0 and not (tmp_path / "a.ran").exists()
@@ -396,7 +403,7 @@ def test_a_job_of_a_killed_queue_keeps_its_place_locked(opened, tmp_path):
     late = found.submit(asked("run", str(tmp_path / "b"), reads=["runs/a"]))
     until(lambda: found.get(late.id).waits_for == ((job.id, "runs/a"),))
     (tmp_path / "a").touch()
-    os.waitpid(queue._children[job.id].pid, 0)
+    os.waitpid(queue.get(job.id).pid, 0)
     reached(found, late.id, State.DONE)
 
 

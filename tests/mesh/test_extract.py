@@ -13,7 +13,7 @@ from gsplat_edu.base.threads import one_thread
 from gsplat_edu.evaluate.surface import Comparison, score_surface
 from gsplat_edu.evaluate.topology import topology
 from gsplat_edu.mesh.depths import DepthView, checked, neighbours_of, render_depths
-from gsplat_edu.mesh.extract import MeshSettings, _cut, extract_mesh
+from gsplat_edu.mesh.extract import MeshSettings, cut_surface, extract_mesh
 from gsplat_edu.mesh.plan import PIXEL_BYTES, default_voxel
 from gsplat_edu.mesh.tidy import TidySettings
 from gsplat_edu.mesh.trust import seen_by
@@ -208,6 +208,6 @@ def noisy_sphere(deviation):
 def test_noise_does_not_shrink_a_sphere(deviation):
     """With a truncation of two deviations, errors of 1.5 voxels made it smaller by 0.23 voxel on average."""
     voxel = 0.0085
-    cut = _cut(noisy_sphere(deviation * voxel), voxel, MeshSettings(voxel=voxel), lambda *step: None)
+    cut = cut_surface(noisy_sphere(deviation * voxel), voxel, MeshSettings(voxel=voxel), lambda *step: None)
     radii = np.linalg.norm(cut.raw.vertices, axis=1)
     assert abs(radii.mean() - 1.0) < 0.12 * voxel

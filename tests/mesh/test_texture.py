@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.mesh.texture import GUTTER, TextureSettings, TextureView, _texels, laid_out, textured
+from gsplat_edu.mesh.texture import GUTTER, TextureSettings, TextureView, covered_texels, laid_out, textured
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.mesh import Mesh
 
@@ -157,7 +157,7 @@ def test_charts_are_surrounded_by_their_own_colour():
     colors = (0.3 * mesh.vertices + 0.5).astype(np.float32)
     image = textured(Mesh(mesh.vertices, mesh.faces, colors), [], SMALL).texture.image
     height, width = image.shape[:2]
-    _, _, place = _texels(done.texture.uvs, height, width)
+    _, _, place = covered_texels(done.texture.uvs, height, width)
     inside = np.zeros(height * width, dtype=bool)
     inside[place] = True
     inside = inside.reshape(height, width)

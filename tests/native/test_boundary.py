@@ -401,7 +401,7 @@ def test_capsules_of_older_torch_give_the_same_bits(monkeypatch, degree):
     target = torch.randint(0, 256, (24, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     found = []
     for describes in (True, False):
-        monkeypatch.setattr(kernels, "_DESCRIBE_THEMSELVES", describes)
+        monkeypatch.setattr(kernels, "DESCRIBE_THEMSELVES", describes)
         raw = parameters() | {"sh_rest": torch.zeros(N, (degree + 1) ** 2 - 1, 3)}
         gaussians = Gaussians(**raw).trainable()
         optimizer = Adam(gaussians.tensors(), dict.fromkeys(raw, 0.01))

@@ -33,7 +33,7 @@ def test_the_count_is_that_by_hand():
 
 
 def counted(text):
-    return kernel_operations._Counter(8).body(text)
+    return kernel_operations.OperationCounter(8).body(text)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.api import render
 from gsplat_edu.render.cpu.render import render_covariances
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.torch.render import _project
+from gsplat_edu.render.torch.render import project_visible
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_witness import composited
 
@@ -26,7 +26,7 @@ def opaque(random_splats, dtype):
 
 
 def witness(camera, means, cov3ds, colors, opacities, features):
-    screen = _project(means, cov3ds, camera, SETTINGS)
+    screen = project_visible(means, cov3ds, camera, SETTINGS)
     A, m, C = screen.ellipses.unbind(-1)
     conics = torch.stack([A, -A * m, C + A * m * m], dim=-1)
     centers = (screen.means2d + 0.5).expand(camera.H, camera.W, -1, 2)

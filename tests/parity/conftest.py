@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from engine.conftest import device as device, pool as pool
+from engine.conftest import device as device, pool as pool, webgpu as webgpu
 
 
 @pytest.fixture(params=["cuda", "webgpu"])
-def backend(request, monkeypatch):
+def backend(request):
     """A backend that computes in float32, ready to be used on `where(backend)`."""
     if request.param == "cuda":
         pytest.importorskip("triton.language", reason="triton is not installed")
@@ -13,10 +13,7 @@ def backend(request, monkeypatch):
 
         triton_interpreter.speed_up()
     else:
-        from gsplat_edu.render.webgpu import render as webgpu
-
-        pool = request.getfixturevalue("pool")
-        monkeypatch.setattr(webgpu, "_pool", lambda: pool)
+        request.getfixturevalue("webgpu")
     return request.param
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.paths.curve import PathCurve, Travel, _monotone
+from gsplat_edu.paths.curve import PathCurve, Travel, monotone_interpolation
 from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.scene.camera import look_at
 
@@ -214,8 +214,10 @@ def test_the_monotone_cubic_agrees_with_scipys_inside():
     rng = np.random.default_rng(0)
     x, y = np.cumsum(rng.uniform(0.1, 3, 12)), np.cumsum(rng.choice([0.0, 0.3, 2.0, 7.0], 12))
     at = np.linspace(x[1], x[-2], 300)
-    np.testing.assert_allclose(_monotone(x, y, at, False), PchipInterpolator(x, y)(at), rtol=1e-12)
-    everywhere = _monotone(x, y, np.linspace(x[0], x[-1], 2000), False)
+    np.testing.assert_allclose(
+        monotone_interpolation(x, y, at, False), PchipInterpolator(x, y)(at), rtol=1e-12
+    )
+    everywhere = monotone_interpolation(x, y, np.linspace(x[0], x[-1], 2000), False)
     assert np.diff(everywhere).min() >= -1e-12
 
 

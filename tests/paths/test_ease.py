@@ -87,7 +87,7 @@ def test_speed_is_never_negative_and_has_no_jump(ease, loop):
     path = KeyframePath(keyframes(TIMES, HOLDS), loop, 10.0 if loop else None, ease)
     curve = PathCurve(path)
     at = np.linspace(0, curve.seconds - 1e-9, 20001)
-    places = curve._place(at)
+    places = curve.place(at)
     assert np.diff(places).min() >= -1e-12
     rates = np.diff(places) / np.diff(at)
     # the acceleration is bounded: 6 times the mean speed over the time of a segment, the shortest of which has 0.5 s

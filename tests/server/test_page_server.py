@@ -172,10 +172,10 @@ def test_a_request_without_end_is_cut_off(server):
         assert any(is_closed(connection, b"X: " + b"a" * 60_000 + b"\r\n") for _ in range(90))
 
 
-def test_connections_beyond_the_limit_are_closed(server, monkeypatch):
+def test_connections_beyond_the_limit_are_closed(server):
     """Once waiting connections close, the server answers again."""
-    monkeypatch.setattr(serving, "MOST_CONNECTIONS", 3)
-    waiting = [socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE) for _ in range(3)]
+    address = ("127.0.0.1", server.port)
+    waiting = [socket.create_connection(address, timeout=PATIENCE) for _ in range(serving.MOST_CONNECTIONS)]
     try:
         assert ask_raw(server, b"") == b"", "the server has accepted those before"
         with pytest.raises((http.client.BadStatusLine, ConnectionError)):

@@ -108,7 +108,7 @@ def mapped(monkeypatch, tmp_path):
             return {"models": [model(range(count))]}
 
         monkeypatch.setattr(mapping, "call", job)
-        monkeypatch.setattr(mapping, "_usable", lambda out, model: model)
+        monkeypatch.setattr(mapping, "without_implausible_lenses", lambda out, model: model)
         ways = WAYS[: len(counts)]
         try:
             best = mapping.map_photos(

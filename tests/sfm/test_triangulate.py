@@ -23,7 +23,7 @@ from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.scene.views import View
 from gsplat_edu.sfm import colmap
-from gsplat_edu.sfm.colmap import _listen
+from gsplat_edu.sfm.colmap import forward_messages
 from gsplat_edu.sfm.triangulate import LEAST_POINTS, STAGES, triangulate
 from gsplat_edu.train.config import recipe
 from lab.captures.textured_box import BOX_FACES, box_orbit, photograph_box
@@ -107,7 +107,7 @@ def test_a_job_whose_last_line_is_cut_off_has_ended():
     writes = 'import os; os.write(1, b\'{"done": 3}\\n{"result": {"poi\')'
     answers = queue.SimpleQueue()
     with subprocess.Popen([sys.executable, "-c", writes], stdout=subprocess.PIPE) as process:
-        _listen(process, answers)
+        forward_messages(process, answers)
     assert [answers.get(), answers.get()] == [{"done": 3}, {"ended": True}] and answers.empty()
 
 

@@ -50,10 +50,11 @@ def test_a_scene_is_judged_on_request_one_at_a_time_until_it_changes(page, studi
     assert page.get("/api/scenes/none/floaters").status_code == 404
 
 
-def test_closing_the_studio_ends_the_judgement(page, studio, scenes):
-    page.post(scenes[0])
-    (running,) = [one for one in studio.proposals._kept.values() if one.running]
-    process = running._process
+@pytest.mark.usefixtures("scenes")
+def test_closing_the_studio_ends_the_judgement(studio):
+    running = studio.proposals.of("one", studio.library.root / "scenes" / "one" / "one.ply")
+    studio.proposals.start(running)
+    process = running.process
     studio.proposals.close()
     assert process.wait(PATIENCE) < 0
 

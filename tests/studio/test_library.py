@@ -9,7 +9,7 @@ from importlib.resources import files
 import pytest
 
 from gsplat_edu.server.refusal import RefusedError
-from gsplat_edu.studio import contents as contents_module, library as library_module
+from gsplat_edu.studio import contents as contents_module
 from gsplat_edu.studio.library import scene_file
 from gsplat_edu.studio.projects import newest_export
 from photos import blank_png
@@ -348,15 +348,15 @@ def test_what_vanishes_while_it_is_listed_is_left_out(page, studio, jpeg, monkey
 def test_what_is_being_deleted_cannot_be_restored(studio, jpeg, monkeypatch):
     entry(studio, "photos", "a", x__jpg=jpeg)
     number = studio.library.remove("photos", "a")
-    delete, refused = library_module._delete, []
+    delete, refused = shutil.rmtree, []
 
-    def slow(path):
+    def slow(path, **options):
         with pytest.raises(RefusedError, match="trash/"):
             studio.library.restore(number)
         refused.append(number)
-        delete(path)
+        delete(path, **options)
 
-    monkeypatch.setattr(library_module, "_delete", slow)
+    monkeypatch.setattr(shutil, "rmtree", slow)
     studio.library.empty_trash()
     assert refused == [number] and studio.library.trash() == []
     assert list(studio.library.hidden("uploads").iterdir()) == []

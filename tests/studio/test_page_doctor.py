@@ -11,7 +11,7 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.left_out import LEFT_OUT, read_left_out
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.jobs.record import ACTIVE, JobFolder
+from gsplat_edu.jobs.record import ACTIVE, JobFolder, Rendered
 from gsplat_edu.scene.views import View
 from processes import Program
 from studio.pages import COMMAND, examined, go, waiting
@@ -178,7 +178,9 @@ def test_a_training_is_undone_once_and_only_if_a_proposal_began_it(page, studio)
 
     first = start(begun=begun)
     assert (first["begun_by"], first["begun_at"]) == ("Train with a sky", "captures/six")
-    assert JobFolder(studio.queue.folder / first["id"]).read(studio.queue._render).begun_by
+    assert (
+        JobFolder(studio.queue.folder / first["id"]).read(lambda work, purpose: Rendered(work, ())).begun_by
+    )
     page.post(f"/api/jobs/{first['id']}/cancel")
     studio.rename("captures", "six", "seven")
     assert page.get(f"/api/jobs/{first['id']}").json()["begun_at"] == "captures/seven"

@@ -127,7 +127,7 @@ def test_pictures_wait_only_while_a_training_runs(wall_entry):
     camera = camera_at(-4, 20, 20, 20)
     task = {"source": str(wall_entry / "wall.ply"), "camera": camera, "live": False}
     first = painter.paint(lambda: True, **task)
-    painter._free_at += 1e6  # the clock makes the picture seem slow
+    painter.free_at += 1e6  # the clock makes the picture seem slow
     asked = []
 
     def ends_soon():
@@ -136,7 +136,7 @@ def test_pictures_wait_only_while_a_training_runs(wall_entry):
 
     # it waited for the end of the training
     assert painter.paint(ends_soon, **task) == first and len(asked) == 5
-    painter._free_at += 1e6
+    painter.free_at += 1e6
     # no training is slowed down, so pictures do not wait
     assert painter.paint(lambda: False, **task) == first
 

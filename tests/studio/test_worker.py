@@ -11,6 +11,9 @@ from gsplat_edu.studio.worker import answer
 from gsplat_edu.studio.workers import Worker
 from waiting import PATIENCE, until
 
+HANGS = ("sleep", "100")
+"""A worker that never answers."""
+
 
 @pytest.mark.own_process
 def test_a_worker_answers_and_is_replaced():
@@ -18,28 +21,24 @@ def test_a_worker_answers_and_is_replaced():
     for _ in range(2):
         with pytest.raises(RefusedError, match="^KeyError: 'nothing'$"):
             worker.ask("nothing")
-        worker._process.kill()
-        worker._process.wait()
+        worker.process.kill()
+        worker.process.wait()
     worker.close()
 
 
 @pytest.mark.own_process
-def test_a_worker_that_hangs_is_killed(monkeypatch):
-    monkeypatch.setattr(workers, "COMMAND", ("sleep", "100"))
-    monkeypatch.setattr(workers, "PATIENCE", 0.2)
-    worker = Worker()
+def test_a_worker_that_hangs_is_killed():
+    worker = Worker(command=HANGS, patience=0.2)
     with pytest.raises(RefusedError, match="ended or took too long"):
         worker.ask("page")
-    assert worker._process is None
+    assert worker.process is None
 
 
 @pytest.mark.own_process
-def test_the_number_of_waiting_requests_is_limited(monkeypatch):
-    monkeypatch.setattr(workers, "COMMAND", ("sleep", "100"))
-    monkeypatch.setattr(workers, "MOST_WAITING", 1)
-    worker = Worker()
+def test_the_number_of_waiting_requests_is_limited():
+    worker = Worker(waiting=1, command=HANGS)
     thread, said = asking(worker)
-    until(lambda: worker._process is not None)
+    until(lambda: worker.process is not None)
     with pytest.raises(RefusedError, match="too many requests"):
         worker.ask("page")
     worker.close()
@@ -49,7 +48,6 @@ def test_the_number_of_waiting_requests_is_limited(monkeypatch):
 
 @pytest.mark.own_process
 def test_closing_ends_a_process_that_a_request_is_just_starting(monkeypatch):
-    monkeypatch.setattr(workers, "COMMAND", ("sleep", "100"))
     begins, goes_on = threading.Event(), threading.Event()
     start = subprocess.Popen
 
@@ -59,17 +57,17 @@ def test_closing_ends_a_process_that_a_request_is_just_starting(monkeypatch):
         return start(*words, **options)
 
     monkeypatch.setattr(workers.subprocess, "Popen", slow)
-    worker = Worker()
+    worker = Worker(command=HANGS)
     thread, said = asking(worker)
     assert begins.wait(PATIENCE)
     closing = threading.Thread(target=worker.close)
     closing.start()
-    until(lambda: worker._closed)
+    until(lambda: worker.closed)
     goes_on.set()
     for one in (closing, thread):
         one.join(PATIENCE)
         assert not one.is_alive()
-    assert "took too long" in said[0] and worker._process is None
+    assert "took too long" in said[0] and worker.process is None
 
 
 def asking(worker):

@@ -38,10 +38,10 @@ def cut_out(width=32, count=16, splats=120, seed=0):
     400 white points lie around it.
     """
     rng = np.random.default_rng(seed)
-    means, cov3ds, colors, opacities = procedural._scene(rng, splats)
+    means, cov3ds, colors, opacities = procedural.egg_splats(rng, splats)
     views = []
     for i in range(count):
-        camera = procedural._camera(i, count, width, round(0.75 * width))
+        camera = procedural.ring_camera(i, count, width, round(0.75 * width))
         image, transmittance = render_gaussians(camera, means, cov3ds, colors, opacities)
         alpha = np.round(255 * (1 - transmittance)).astype(np.uint8)
         straight = image / np.maximum(1 - transmittance, 1e-6)[..., None]
@@ -140,14 +140,15 @@ def test_colours_differ_between_the_places_of_a_batch_and_between_steps(capture)
     run = trainer(capture, 40, batch=4, strategy="adc")
     colors = []
     for _ in range(2):
-        colors += [view.settings.background for view in run._views(run._draw())]
+        colors += [view.settings.background for view in run.step_views()]
         run.iteration += 4
     assert len(set(colors)) == 8
     assert all(0 <= value <= 1 for color in colors for value in color)
     again = trainer(capture, 40, batch=4, strategy="adc")
     again.iteration = 4
-    assert again._behind_alpha(3) == colors[7]
-    assert trainer(capture, 40, alpha_background="fixed")._behind_alpha(0) == WHITE
+    assert [view.settings.background for view in again.step_views()] == colors[4:]
+    (fixed,) = trainer(capture, 40, alpha_background="fixed").step_views()
+    assert fixed.settings.background == WHITE
 
 
 @pytest.mark.parametrize("layout", ["colmap", "transforms", "blender"])
@@ -165,7 +166,7 @@ def test_every_layout_keeps_the_alpha_unless_a_background_is_given(capture, tmp_
         dataset = load_dataset(tmp_path, DataSettings(background=background))
         assert all((view.read().alpha is None) == (background is not None) for view in dataset.train)
         run = trainer((dataset.train, points, colors), 10)
-        drawn[background] = [view.settings.background for _ in range(3) for view in run._views(run._draw())]
+        drawn[background] = [view.settings.background for _ in range(3) for view in run.step_views()]
     assert set(drawn[WHITE]) == {WHITE}
     assert WHITE not in drawn[None]
     assert load_dataset(tmp_path).train[0].read().alpha is not None

@@ -25,7 +25,6 @@ from gsplat_edu.train.optimizer import Adam, ParameterGroup
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.team import ALONE
 from ranks import together
-from steps import step_views
 
 SCHEDULE = {"densify_start": 3, "densify_every": 10, "sh_every": 20, "random_background": True}
 CONFIGS = {
@@ -40,13 +39,13 @@ def config(name="adc", batch=4, **changes):
     return recipe(ITERATIONS, batch=batch, **{**SCHEDULE, **CONFIGS[name], **changes})
 
 
-def trainer(settings, team=ALONE, splats=900, callbacks=(), **parts):
+def trainer(settings, team=ALONE, splats=900, callbacks=(), stored=lambda view: view, **parts):
     """Make a training of a procedural capture whose 600 Gaussians fill two pages and a part of a third."""
     views, points, colors = procedural_capture(24, 6, splats=splats)
     start = from_points(points, colors, settings)
     return training(
         settings,
-        Views(views),
+        Views([stored(view) for view in views]),
         load_backend("cpu"),
         Start(start, extent=2.0),
         callbacks=callbacks,
@@ -127,7 +126,7 @@ def test_the_gradient_of_a_batch_is_the_mean_over_its_views():
         return training(config, Views(views), load_backend("cpu"), Start(start, extent=1.0), **parts)
 
     single, alone = [], make(note)
-    for view in step_views(alone, 4):
+    for view in alone.step_views():
         terms = alone.stepper.gradients([view], 0)
         single.append(
             {name: tensor.grad for name, tensor in alone.stepper.parameters().items()}
@@ -272,7 +271,7 @@ def test_moments_are_divided_among_ranks():
 def test_views_of_a_batch_do_not_see_each_others_measurements():
     settings = config("adc", appearance="exposure", random_background=False)
     run = trainer(settings)
-    views = step_views(run, 4)
+    views = list(run.step_views())
     rows = run.view_model.parameters()["exposures"]
     before, measure = rows.clone(), run.view_model.measure
 
@@ -287,23 +286,24 @@ def test_views_of_a_batch_do_not_see_each_others_measurements():
     assert all((rows[i] != before[i]).any() == (i in drawn) for i in range(6))
 
 
-def test_after_an_unreadable_photo_all_views_of_the_batch_are_drawn_again(monkeypatch):
-    run = trainer(config())
-    before, read, calls = run.state()[1]["feed"], run._feed._read, []
+def test_after_an_unreadable_photo_all_views_of_the_batch_are_drawn_again():
+    reads = []
 
-    def fails(view):
-        calls.append(view)
-        if len(calls) == 3:
-            raise DatasetError("photo: is gone")
-        return read(view)
+    def stored(view):
+        def read():
+            reads.append(view.name)
+            if len(reads) == 3:
+                raise DatasetError("photo: is gone")
+            return view.read()
 
-    monkeypatch.setattr(run._feed, "_read", fails)
+        return View.stored(view.camera, read, view.name)
+
+    run = trainer(config(), stored=stored)
+    before = run.state()[1]["feed"]
     with pytest.raises(DatasetError):
         run.run()
     assert run.state()[1]["feed"]["generator"] == before["generator"] or before["queue"] == []
     assert run.iteration == 0
-    monkeypatch.undo()
-    run._feed._read = read
     run.run()
     assert bits(run) == trained(config())[1]
 

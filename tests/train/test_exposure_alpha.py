@@ -30,7 +30,7 @@ HELD_OUT = slice(3, None, 6)
 def capture():
     """Views of 64 px with alpha, the same views with random exposures and tints, points, and the random factors."""
     even, points, colors = procedural.procedural_capture(64, 16, splats=300)
-    scene = procedural._scene(np.random.default_rng(0), 300)
+    scene = procedural.egg_splats(np.random.default_rng(0), 300)
     rng = np.random.default_rng(5)
     scales = 2.0 ** rng.uniform(-0.7, 0.7, (16, 1)) * rng.uniform(0.85, 1.15, (16, 3))
     views: tuple[list[View], list[View]] = [], []
@@ -150,7 +150,7 @@ def test_photos_converted_to_the_scenes_exposure_keep_their_alpha(tmp_path):
     from gsplat_edu.runs.exposed import at_exposure_of_scene
 
     photo, output = darker_render(1.6)
-    camera = procedural._camera(0, 4, 40, 30)
+    camera = procedural.ring_camera(0, 4, 40, 30)
     view = View(camera, photo.image, alpha=photo.alpha, name="a")
     write_blender(tmp_path, [view] * 2, [view])
     dataset = load_dataset(tmp_path, DataSettings(background=None))

@@ -146,20 +146,20 @@ def test_gaussians_of_the_highest_score_are_split():
     control = PlannedDensity(config(), gaussians)
     observed(control, [0.0, 1.0, 3.0, 1.0, 2.0])
     everyone = torch.ones(5, dtype=torch.bool)
-    assert control._highest(everyone, 3).tolist() == [False, True, True, False, True], (
+    assert control.highest(everyone, 3).tolist() == [False, True, True, False, True], (
         "the first of equal scores are split"
     )
-    assert int(control._highest(everyone, 9).sum()) == 4, "a Gaussian without a score is never split"
-    assert not control._highest(~everyone, 2).any()
-    assert not control._highest(everyone, -2).any()
+    assert int(control.highest(everyone, 9).sum()) == 4, "a Gaussian without a score is never split"
+    assert not control.highest(~everyone, 2).any()
+    assert not control.highest(everyone, -2).any()
 
 
 def test_a_poisoned_score_is_never_split():
     gaussians = random_ball(4, torch.Generator().manual_seed(0))
     control = PlannedDensity(config(), gaussians)
     observed(control, [np.nan, np.inf, 1.0, 0.0])
-    assert control._highest(torch.ones(4, dtype=torch.bool), 1).tolist() == [False, True, False, False]
-    assert control._highest(torch.ones(4, dtype=torch.bool), 4).tolist() == [False, True, True, False]
+    assert control.highest(torch.ones(4, dtype=torch.bool), 1).tolist() == [False, True, False, False]
+    assert control.highest(torch.ones(4, dtype=torch.bool), 4).tolist() == [False, True, True, False]
 
 
 def test_the_strategy_needs_a_cap():
@@ -275,7 +275,7 @@ def test_reduced_photos_are_kept_and_equal_those_that_are_not(kinds, background,
         feed = ViewFeed([stored], "shuffled", 0, background)
         feed.use_factor(2.0)
         found = [feed.target(feed.next(), behind) for _ in range(4)]
-        feed._reader.shutdown()
+        feed.close()
         return found
 
     kept = targets()

@@ -56,7 +56,7 @@ def draw(feed, background):
 
 def drawn(feed, count, background=WHITE):
     targets = [draw(feed, background) for _ in range(count)]
-    feed._reader.shutdown()  # prefetched photos count as well
+    feed.close()  # prefetched photos count as well
     return targets
 
 

@@ -12,7 +12,7 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.scene.projection import COEFFICIENTS, Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.pose_step import _lens_flow
+from gsplat_edu.train.pose_step import lens_flow
 from gsplat_edu.train.poses import distortion_units, lens_key, refinement_of
 from lens_captures import moving_photo, room_photo
 
@@ -103,7 +103,7 @@ def test_a_step_of_a_pose_works_through_any_lens(kind):
         camera = Camera(R, eye, 15.0, 15.5, 19.0, 10.0, 20, 40).through(Projection(kind, distortion))
     pixels = torch.tensor([[5.0, 5.0], [19.0, 10.0], [30.0, 14.0]], dtype=torch.float64)
     depth = torch.tensor([1.0, 2.0, 1.5], dtype=torch.float64)
-    flow = _lens_flow(camera, pixels, depth).numpy()
+    flow = lens_flow(camera, pixels, depth).numpy()
     columns, rows = pixels.numpy().astype(int).T
     points = camera.eye + depth.numpy()[:, None] * camera.rays()[rows, columns]
     tensors, step = CameraTensors.of(camera), 1e-6

@@ -22,7 +22,6 @@ from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
 from gsplat_edu.train.rendered import Needs
-from steps import step_views
 
 CONFIG = recipe(40, densify_start=2, densify_every=5, grad_threshold=5e-5, sh_degree=0)
 MCMC = recipe(20, strategy="mcmc", max_gaussians=60, sh_degree=0)
@@ -54,7 +53,7 @@ def test_regularisers_match_the_paper(capture):
     """Values and gradients equal those of autograd of weight mean(opacity) + weight mean(scale)."""
     run, seen = trainer(capture, MCMC), []
     run.stepper.parts.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
-    run.stepper.gradients(step_views(run), 0)
+    run.stepper.gradients(list(run.step_views()), 0)
     (rendered,) = seen
     assert isinstance(rendered, Rendered) and rendered.iteration == 0
     with_all = grads(run)
@@ -84,7 +83,7 @@ def test_fast_regularises_the_opacity_of_visible_gaussians_if_they_are_few(captu
     config = recipe(60, strategy="fast", max_gaussians=5 * len(points), sh_degree=0)
     run, seen = trainer((views, more, np.concatenate([colors] * 5)), config), []
     run.stepper.parts.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
-    run.stepper.gradients(step_views(run), 0)
+    run.stepper.gradients(list(run.step_views()), 0)
     (rendered,) = seen
     term, twin = make_objective(config).terms["opacity"], run.gaussians.trainable()
     run.gaussians.logit_opacities.grad = None
@@ -104,7 +103,7 @@ def test_fast_regularises_the_opacity_of_visible_gaussians_if_they_are_few(captu
 def test_fast_regularises_the_opacity_of_all_if_many_are_visible(capture):
     run, seen = trainer(capture, recipe(60, strategy="fast", max_gaussians=100, sh_degree=0)), []
     run.stepper.parts.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
-    run.stepper.gradients(step_views(run), 0)
+    run.stepper.gradients(list(run.step_views()), 0)
     (rendered,) = seen
     output = rendered.output
     few = replace(rendered, output=replace(output, visible=output.visible[:20], radii=output.radii[:20]))
@@ -123,7 +122,7 @@ def _rendered_again(run, rendered):
 
 def test_a_batch_has_the_mean_gradient_of_its_views(capture):
     run = trainer(capture, CONFIG)
-    views = step_views(run, 3)
+    views = [view for _ in range(3) for view in run.step_views()]
     assert len({view.draw.index for view in views}) == 3
     single, losses = [], []
     for view in views:

@@ -82,9 +82,7 @@ def test_a_judgement_can_be_stopped_and_a_lost_server_is_said(opened, served):
 
     def start_and_stand_still():
         start()
-        os.kill(
-            served.proposing._process.pid, signal.SIGSTOP
-        )  # so that it has not ended before it is stopped
+        os.kill(served.proposing.process.pid, signal.SIGSTOP)  # so that it has not ended before it is stopped
 
     served.proposing.start = start_and_stand_still
     shown.do("propose")

@@ -42,12 +42,6 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(autouse=True)
-def patient_view(monkeypatch):
-    """Let a client come back late: other programs may keep it from its next request for seconds."""
-    monkeypatch.setattr(live, "GRACE", PATIENCE)
-
-
 def test_the_first_scene_and_state_describe_the_same_paused_training(capture, tmp_path):
     with training(capture, tmp_path / "run", *ENDLESS) as made:
         client = Client(made.view.url)
@@ -84,17 +78,16 @@ def test_pause_step_and_resume(capture, tmp_path):
         assert client.states(state="paused")["iteration"] == made.iteration > held + 50
 
 
-def test_a_paused_training_continues_when_nobody_watches(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(live, "WAIT", 0.1)
-    with training(capture, tmp_path / "run", *ENDLESS) as made:
+def test_a_paused_training_continues_when_nobody_watches(capture, tmp_path):
+    with training(capture, tmp_path / "run", *ENDLESS, wait=0.1) as made:
         client = Client(made.view.url)
         client.state()
         client.control("pause")
         held = client.states(state="paused")["iteration"]
-        monkeypatch.setattr(live, "GRACE", 0.2)
+        made.view.grace = 0.2
         until(lambda: made.iteration > held + 20, "more iterations")
         client.states(state="training")
-        monkeypatch.setattr(live, "GRACE", PATIENCE)
+        made.view.grace = PATIENCE
         client.control("pause")
         assert client.states(state="paused")["iteration"] > held, "the training can be paused again"
 
@@ -115,8 +108,7 @@ def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
     """The clock jumps by an hour during the pause, which the run's time does not include."""
     clock, ahead = time.perf_counter, []
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + sum(ahead))
-    monkeypatch.setattr(live, "GRACE", 1e9)
-    with training(capture, tmp_path / "run", "--iterations", "60", pressed="step") as made:
+    with training(capture, tmp_path / "run", "--iterations", "60", pressed="step", grace=1e9) as made:
         client = Client(made.view.url)
         client.states(state="paused")
         ahead.append(3600.0)
@@ -131,8 +123,7 @@ def test_nothing_is_packed_unless_a_page_asks(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(
         snapshots, "snapshot_of", lambda trainer: made_of.append(trainer.iteration) or packed(trainer)
     )
-    monkeypatch.setattr(live, "WAIT", 0.1)
-    with training(capture, tmp_path / "run", *ENDLESS) as made:
+    with training(capture, tmp_path / "run", *ENDLESS, wait=0.1) as made:
         client = Client(made.view.url)
         state = client.state()
         until(lambda: made.iteration > state["iteration"] + 50, "more iterations")
@@ -296,9 +287,8 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
         pass
 
 
-def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(live, "WAIT", 0.1)
-    with training(capture, tmp_path / "run", "--iterations", "30") as made:
+def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_path):
+    with training(capture, tmp_path / "run", "--iterations", "30", wait=0.1) as made:
         client = Client(made.view.url)
         client.ask("GET", "/state")
         made.ended()
@@ -309,7 +299,7 @@ def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_
         assert (state["iteration"], state["iterations"], state["seconds_left"]) == (30, 30, None)
         assert client.scene()[0]["iteration"] == 30
         assert staying.is_alive()
-        monkeypatch.setattr(live, "GRACE", 0.3)
+        made.view.grace = 0.3
         staying.join(PATIENCE)
         assert not staying.is_alive() and not made.view.watched
         made.broadcast.stay(lambda: made.view.watched)  # without a browser, the view closes

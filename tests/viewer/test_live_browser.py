@@ -13,7 +13,6 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
-from gsplat_edu.viewer import live
 from gsplat_edu.viewer.live_folder import LiveFolder, header_of
 from live_clients import GROWING, PATIENCE, Client, training, until
 from processes import Program
@@ -70,11 +69,8 @@ class Tab:
         return np.asarray(shown.convert("RGB"), dtype=float)
 
 
-def test_a_page_shows_and_pauses_a_training_and_may_be_closed(
-    capture, tmp_path, browser, picture, monkeypatch
-):
-    monkeypatch.setattr(live, "GRACE", 1.0)
-    with training(capture, tmp_path / "run", "--iterations", "100000") as made:
+def test_a_page_shows_and_pauses_a_training_and_may_be_closed(capture, tmp_path, browser, picture):
+    with training(capture, tmp_path / "run", "--iterations", "100000", grace=1.0) as made:
         with Tab(browser, made.view.url) as tab:
             tab.page.wait_for_selector("#message", state="hidden")
             first = tab.says(r"splats after ([\d,]+) iteration")
@@ -137,7 +133,7 @@ def test_without_webgl2_the_page_shows_our_own_renders(capture, tmp_path, browse
         before = tab.picture()
         drag(tab.page, (400, 250), (520, 230))
         until(lambda: np.abs(tab.picture() - before).mean() > 2, "the scene from another side")
-        assert tab.complaints == [] and made.view._shown == -1, "no snapshot was packed"
+        assert tab.complaints == [] and made.view.newer_scene(-2) == b"", "no snapshot was packed"
 
 
 def output(folder):

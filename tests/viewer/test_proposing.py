@@ -116,7 +116,7 @@ def test_a_judgement_is_stopped_at_once(tmp_path, monkeypatch):
         patch.setattr("gsplat_edu.viewer.proposing.MODULE", "endless")
         patch.setenv("PYTHONPATH", str(tmp_path))
         proposing.start()
-    process = proposing._process
+    process = proposing.process
     proposing.stop()
     assert proposing.state() == {"state": "idle"}
     assert process.wait(PATIENCE) < 0

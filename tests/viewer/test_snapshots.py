@@ -117,7 +117,7 @@ def test_no_files_are_written_after_the_watcher_left(capture, tmp_path):
     with Watched(capture, tmp_path / "run", "--iterations", "100000") as made:
         until(lambda: (made.live.ask(), made.live.scene.exists())[1], "a scene")
         os.utime(made.live.wanted, (0, 0))
-        until(lambda: not made.watcher._wanted, "that the training has noticed it")
+        until(lambda: not made.watcher.watches(), "that the training has noticed it")
         held = made.run.trainer.iteration
         until(lambda: made.run.trainer.iteration > held + 20, "many more iterations")
         before = made.live.state.stat().st_mtime_ns

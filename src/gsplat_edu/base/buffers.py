@@ -41,7 +41,7 @@ M_MMAP_THRESHOLD = -3
 """Number of this parameter in mallopt."""
 
 
-class _Pool:
+class BufferPool:
     """Memory mappings, in use or waiting for reuse.
 
     The pool never holds more bytes than the peak in use within the last two spans of `SPAN` requests.
@@ -65,7 +65,7 @@ class _Pool:
             self._waiting.remove(block)
         else:
             self._shrink(nbytes)
-            block = _mapped(-(-nbytes // mmap.PAGESIZE) * mmap.PAGESIZE)
+            block = mapped_memory(-(-nbytes // mmap.PAGESIZE) * mmap.PAGESIZE)
         self._note(len(block))
         array = np.frombuffer(block, dtype=np.uint8, count=nbytes)
         weakref.finalize(array, self._take_back, block).atexit = False
@@ -112,7 +112,7 @@ class _Pool:
 class _Current(threading.local):
     """The pool of this thread, if it is inside `reused_buffers`."""
 
-    pool: _Pool | None = None
+    pool: BufferPool | None = None
 
 
 _current = _Current()
@@ -129,7 +129,7 @@ def reused_buffers() -> Iterator[None]:
     """
     _limit_heap()
     before = _current.pool
-    pool = _current.pool = before or _Pool()
+    pool = _current.pool = before or BufferPool()
     try:
         yield
     finally:
@@ -153,7 +153,7 @@ def reusable_tensor(shape: Sequence[int], like: Tensor, dtype: torch.dtype | Non
     return torch.from_numpy(pool.take(nbytes)).view(dtype).view(shape)
 
 
-def _mapped(nbytes: int) -> mmap.mmap:
+def mapped_memory(nbytes: int) -> mmap.mmap:
     """Map fresh memory, on Linux in huge pages if the system has them; a forked child gets a copy."""
     if sys.platform == "win32":
         return mmap.mmap(-1, nbytes)

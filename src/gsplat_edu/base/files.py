@@ -31,7 +31,7 @@ def written_aside(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be created or written to. An existing file at `path` stays unchanged.
     """
-    prefix = f".{path.stem}.{_this_machine()}-{os.getpid()}-"  # remove_leftovers asks whether this process still runs
+    prefix = f".{path.stem}.{this_machine()}-{os.getpid()}-"  # remove_leftovers asks whether this process still runs
     aside = path.parent / f"{prefix}{secrets.token_hex(4)}{path.suffix}"
     with named_failure(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -138,7 +138,7 @@ ABANDONED = 24 * 3600.0
 """Seconds without a change after which another machine's temporary file counts as left behind."""
 
 
-def _this_machine() -> str:
+def this_machine() -> str:
     """Return eight characters for the machine, or the container on it, in which process numbers mean the same."""
     try:
         processes = os.readlink("/proc/self/ns/pid")  # noqa: PTH115 - a name, not a path
@@ -166,7 +166,7 @@ def remove_leftovers(folder: Path, *, below: bool = True) -> None:
 
 
 def _is_leftover(path: Path, machine: str, pid: int) -> bool:
-    if machine == _this_machine():
+    if machine == this_machine():
         return not _runs(pid)
     try:
         return time.time() - path.stat().st_mtime > ABANDONED

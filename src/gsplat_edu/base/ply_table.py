@@ -125,7 +125,7 @@ def read_elements(path: Path, file: BinaryIO | BytesIO) -> Header:
         )
     if first.strip() != b"ply":
         raise SceneFormatError(f"{path}: is not a PLY: its first line is not 'ply'; give another file")
-    header = _HeaderLines()
+    header = HeaderLines()
     for number in range(2, HEADER_LIMIT):
         line = file.readline(LINE_LIMIT)
         words = line.decode("ascii", "replace").split()
@@ -145,8 +145,8 @@ def read_elements(path: Path, file: BinaryIO | BytesIO) -> Header:
     return Header(header.format, elements, tuple(header.comments))
 
 
-class _HeaderLines:
-    """Collects the lines of a header; `add` returns an error in the line, or None."""
+class HeaderLines:
+    """Collects the lines of a header."""
 
     def __init__(self) -> None:
         self.format: str | None = None
@@ -155,6 +155,7 @@ class _HeaderLines:
         self.comments: list[tuple[str, ...]] = []
 
     def add(self, words: list[str]) -> str | None:
+        """Take a line of the header, given as its words; return what is wrong with it, or None."""
         match words:
             case [] | ["obj_info", *_]:
                 return None

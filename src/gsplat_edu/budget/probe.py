@@ -112,7 +112,7 @@ def probe(
     if min(min(view.camera.W, view.camera.H) for view in small) >= SMALLEST_HALVED_SIDE:
         trials.append(trial(start, small))
     score, picture = scoring_seconds(grown, photos[:2], config, backend)
-    pairs = _pairs_at_first(config, trials[0].pairs * len(usual) / len(start), len(usual))
+    pairs = pairs_at_first(config, trials[0].pairs * len(usual) / len(start), len(usual))
     del start, usual, grown, small, photos
     return_freed_memory()
     return Measurements(
@@ -138,7 +138,7 @@ def _ready(backend: str) -> tuple[Backend, Room | None]:
     return kernels, None if kernels.room is None else kernels.room()
 
 
-def _pairs_at_first(config: TrainConfig, pairs: float, gaussians: int) -> int:
+def pairs_at_first(config: TrainConfig, pairs: float, gaussians: int) -> int:
     """Return the pairs of the start scene in photos of the size with which the run starts.
 
     The large Gaussians of a random start cover fewer tiles in reduced photos, and have shrunk before training uses the

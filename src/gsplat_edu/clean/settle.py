@@ -102,7 +102,7 @@ def settle(
         index = order.pop()
         photo = views[index].read()
         shown = Judged(views[index].camera, photo, judged_over(photo, settings, index))
-        slope = _slope(gaussians, doubtful, logits, shown, backend, unit)
+        slope = logit_gradient(gaussians, doubtful, logits, shown, backend, unit)
         first += (1.0 - BETAS[0]) * (slope - first)
         second += (1.0 - BETAS[1]) * (np.square(slope) - second)
         rate = RATE if step <= (1.0 - SLOW_PART) * steps else RATE / 3.0
@@ -112,7 +112,7 @@ def settle(
     return logits
 
 
-def _slope(
+def logit_gradient(
     gaussians: Gaussians,
     doubtful: Doubtful,
     logits: Float64[np.ndarray, " D"],

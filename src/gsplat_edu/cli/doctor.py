@@ -159,7 +159,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     extent = scene_extent([view.camera for view in dataset.train])
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
-    before = BeforeTraining() if appearance != "none" else _exposure_beforehand(reader, console)
+    before = BeforeTraining() if appearance != "none" else exposure_beforehand(reader, console)
     trained = Trained(
         folder.path,
         gaussians,
@@ -228,7 +228,7 @@ class BeforeTraining(NamedTuple):
     correction: str = "none"  # what `--appearance auto` chooses
 
 
-def _exposure_beforehand(reader: CaptureReader, console: Console) -> BeforeTraining:
+def exposure_beforehand(reader: CaptureReader, console: Console) -> BeforeTraining:
     """Check the photos' exposure as before training."""
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)

@@ -306,7 +306,7 @@ def _planned(
     time = None if deadline is None else TrialTime(deadline, 0.0 if outlook is None else outlook.shortest)
     options = with_choices(options, reader, left_open(arguments), console, say, time)
     if arguments.backend == AUTO and num_processes() == 1:
-        options = _with_backend(options, reader, say)
+        options = with_backend(options, reader, say)
     with progress_bar(console, "") as bar:
         task = bar.add_task("trials of lengths", total=sum(LENGTHS), visible=False)
 
@@ -328,7 +328,7 @@ def _planned(
     return chosen
 
 
-def _with_backend(
+def with_backend(
     options: RunOptions, reader: CaptureReader, say: Callable[[str], None], allow_software: bool = False
 ) -> RunOptions:
     """Choose the backend, and say so if there is a GPU; a resumed run goes on with its own if that is webgpu."""

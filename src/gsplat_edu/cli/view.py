@@ -108,12 +108,12 @@ def _server(arguments: argparse.Namespace, levels: bool) -> PageServer:
     if arguments.edit is None:
         kind = page_parts.LEVELS if levels else page_parts.PLAIN
         return PageServer(page_parts.policy(kind), arguments.host, arguments.port)
-    file = _edits_file(arguments)
+    file = edits_file(arguments)
     check_writable("--edit", file)
     return EditServer(arguments.host, arguments.port, page_parts.policy(page_parts.EDITOR), file)
 
 
-def _edits_file(arguments: argparse.Namespace) -> Path:
+def edits_file(arguments: argparse.Namespace) -> Path:
     """Return the file that --edit names, or the usual one."""
     if arguments.edit != BESIDE:
         return Path(arguments.edit)

@@ -200,10 +200,10 @@ def _chosen(lens: Lens) -> tuple[Intrinsics, bool]:
         )
     if min(lens.W, lens.H) < 2:
         raise _not_a_pinhole(lens, "the photo covers no rectangle of directions")
-    found = _fitted(lens, _opencv_rectangle(lens) if lens.model in OPENCV else _rectangle(lens, STEEPEST))
+    found = _fitted(lens, opencv_rectangle(lens) if lens.model in OPENCV else ray_rectangle(lens, STEEPEST))
     cropped = lens.wide and (isinstance(found, str) or _angle(found) > MAX_ANGLE)
     if cropped:
-        found = _fitted(lens, _rectangle(lens, CROPPED_ANGLE))
+        found = _fitted(lens, ray_rectangle(lens, CROPPED_ANGLE))
     if isinstance(found, str):
         raise _not_a_pinhole(lens, found)
     if (angle := _angle(found)) > MAX_ANGLE:
@@ -231,7 +231,7 @@ def _angle(pinhole: Intrinsics) -> float:
     return math.atan(max(max(abs(c + 0.5), abs(side - 0.5 - c)) / f for c, f, side in sides))
 
 
-def _opencv_rectangle(lens: Lens) -> Float64[np.ndarray, "3 3"]:
+def opencv_rectangle(lens: Lens) -> Float64[np.ndarray, "3 3"]:
     """Return the intrinsic matrix that stretches the rectangle over the image; NaN if OpenCV finds none."""
     size, coefficients = (lens.W, lens.H), _padded(lens)
     try:
@@ -246,7 +246,7 @@ def _opencv_rectangle(lens: Lens) -> Float64[np.ndarray, "3 3"]:
         return np.full((3, 3), np.nan)
 
 
-def _rectangle(lens: Lens, steepest: float) -> Float64[np.ndarray, "3 3"]:
+def ray_rectangle(lens: Lens, steepest: float) -> Float64[np.ndarray, "3 3"]:
     """Return this matrix for a model that OpenCV does not know; NaN if there is no rectangle.
 
     The rectangle ends at the innermost ray of each edge of the photo, and at an angle of `steepest` to the axis.

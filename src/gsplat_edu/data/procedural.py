@@ -52,10 +52,10 @@ def procedural_capture(
     W, count = whole_number("size", size, 1), whole_number("count", count, 1)
     H = max(1, round(0.75 * W)) if height is None else whole_number("height", height, 1)
     rng = np.random.default_rng(whole_number("seed", seed, 0))
-    means, cov3ds, colors, opacities = _scene(rng, whole_number("splats", splats, 3))
+    means, cov3ds, colors, opacities = egg_splats(rng, whole_number("splats", splats, 3))
     views = []
     for i in range(count):
-        camera = _camera(i, count, W, H)
+        camera = ring_camera(i, count, W, H)
         image, _ = render_gaussians(camera, means, cov3ds, colors, opacities)
         pixels = np.round(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
         views.append(View(camera, pixels, name=f"view_{i:03d}.png"))
@@ -64,7 +64,7 @@ def procedural_capture(
     return views, points, np.clip(colors[start] + 0.05 * rng.normal(size=(len(start), 3)), 0.0, 1.0)
 
 
-def _camera(i: int, count: int, W: int, H: int) -> Camera:
+def ring_camera(i: int, count: int, W: int, H: int) -> Camera:
     """Make camera i of the ring; its elevation oscillates twice per turn, below and above the horizon."""
     azimuth = 2.0 * math.pi * i / count
     elevation = -0.15 + 0.4 * math.sin(2.0 * azimuth + 0.7)
@@ -78,7 +78,7 @@ def _camera(i: int, count: int, W: int, H: int) -> Camera:
     return Camera(look_at(eye, TARGET), eye, focal, focal, (W - 1) / 2, (H - 1) / 2, H, W)
 
 
-def _scene(
+def egg_splats(
     rng: np.random.Generator, count: int
 ) -> tuple[
     Float64[np.ndarray, "n 3"],

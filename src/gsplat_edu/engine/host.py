@@ -232,6 +232,9 @@ class Memory:
         counts: Its counts by name.
         poison: Whether they begin with noise.
         like: Has buffers to use again.
+
+    Attributes:
+        buffers: wgpu's buffers by their names.
     """
 
     def __init__(
@@ -252,22 +255,20 @@ class Memory:
         total = WORD * sum(self._words.values())
         make = device.device.create_buffer
         with one_line(f"{device.name.name} has no {total / 2**20:.0f} MiB for {counts}", device):
-            self._buffers = {} if like is None else like._shared(self._words)
-            for name in self._words.keys() - self._buffers:
-                self._buffers[name] = make(size=WORD * self._words[name], usage=storage)
+            self.buffers = {} if like is None else like._shared(self._words)
+            for name in self._words.keys() - self.buffers:
+                self.buffers[name] = make(size=WORD * self._words[name], usage=storage)
             self._view = make(size=VIEW_BYTES, usage=usage.UNIFORM | usage.COPY_DST)
         if poison:
             noise = np.random.default_rng(0)
             for name, words in self._words.items():
                 self.write(name, noise.integers(0, 2**32, words, dtype=np.uint32))
         self._staging: Any = None
-        self._parts = Parts(device, program, counts, self._buffers, self._view)
+        self._parts = Parts(device, program, counts, self.buffers, self._view)
 
     def _shared(self, words: Mapping[str, int]) -> dict[str, Any]:
         """Return the buffers of these names that have these sizes."""
-        return {
-            name: buffer for name, buffer in self._buffers.items() if words.get(name) == self._words[name]
-        }
+        return {name: buffer for name, buffer in self.buffers.items() if words.get(name) == self._words[name]}
 
     def write(self, name: str, array: np.ndarray) -> None:
         """Write an array of four-byte numbers to the beginning of a buffer.
@@ -281,7 +282,7 @@ class Memory:
             )
         if array.size:
             with one_line(f"{self.device.name.name} does not take {name}", self.device):
-                self.device.device.queue.write_buffer(self._buffers[name], 0, np.ascontiguousarray(array))
+                self.device.device.queue.write_buffer(self.buffers[name], 0, np.ascontiguousarray(array))
             self.device.sent += array.nbytes
 
     def read(self, name: str) -> np.ndarray:
@@ -311,11 +312,11 @@ class Memory:
             began = time.perf_counter()
             encoder = self._begun(view)
             if kept is not None:
-                encoder.copy_buffer_to_buffer(kept.buffer, 0, self._buffers[into], 0, kept.nbytes)
+                encoder.copy_buffer_to_buffer(kept.buffer, 0, self.buffers[into], 0, kept.nbytes)
             encoder, pieces = self._parts.record(encoder, part)
             size = self._bytes_of((read,))
             staging = self.device.staging(size)
-            encoder.copy_buffer_to_buffer(self._buffers[read], 0, staging, 0, WORD * self._words[read])
+            encoder.copy_buffer_to_buffer(self.buffers[read], 0, staging, 0, WORD * self._words[read])
             device, commands = self.device, encoder.finish()
             recorded = time.perf_counter()
             device.device.queue.submit([commands])
@@ -359,7 +360,7 @@ class Memory:
         offset = 0
         staging = self._staging_for(names)
         for name in names:
-            encoder.copy_buffer_to_buffer(self._buffers[name], 0, staging, offset, WORD * self._words[name])
+            encoder.copy_buffer_to_buffer(self.buffers[name], 0, staging, offset, WORD * self._words[name])
             offset += WORD * self._words[name]
         self.device.device.queue.submit([encoder.finish()])
         return self._collected(names, staging)

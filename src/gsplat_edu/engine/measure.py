@@ -79,7 +79,7 @@ class MeasuredStep:
         }
 
 
-class _Run:
+class StepRun:
     """Buffers of a training with room for its pairs."""
 
     def __init__(self, device: Device, scene: Scene, view: DeviceView) -> None:
@@ -154,7 +154,7 @@ def measure_step(device: Device, scene: Scene, view: DeviceView, rounds: int) ->
     Raises:
         BackendUnavailableError: the device fails, or has too little memory.
     """
-    run = _Run(device, scene, view)
+    run = StepRun(device, scene, view)
     states = []
     for _ in range(2):
         run.begin()

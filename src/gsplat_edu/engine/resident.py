@@ -101,7 +101,7 @@ class _Step:
     """A step as it was submitted, to be submitted again if it found no room."""
 
     view: DeviceView
-    photo: _KeptPhoto
+    photo: KeptPhoto
     numbers: StepNumbers
     result: Result
     ticket: Ticket | None = None
@@ -109,7 +109,9 @@ class _Step:
 
 
 @dataclass(frozen=True, eq=False)
-class _KeptPhoto:
+class KeptPhoto:
+    """A photo on the device, and whether its colours are floats."""
+
     kept: Kept
     floats: bool
 
@@ -121,6 +123,12 @@ class Resident:
         device: The device.
         harmonics: K, per Gaussian besides the first.
         photo_room: Bytes of photos to keep there.
+
+    Attributes:
+        most_pairs_each: Most pairs a Gaussian that a step has had, with some to spare; new buffers have room for these.
+        unfinished: Steps whose sums have not arrived, oldest first.
+        photos: By the number of its view, what a photo on the device belongs to, and the photo.
+        photo_room: Bytes that are left for further photos.
     """
 
     def __init__(self, device: Device, harmonics: int, photo_room: int = PHOTO_ROOM) -> None:
@@ -129,10 +137,10 @@ class Resident:
         self._memory: Memory | None = None
         self._pixels, self._tiles, self._pairs = 1, 1, 0
         self._optics = "pinhole"
-        self._most_pairs_each = PAIRS_AT_FIRST
-        self._waiting: deque[_Step] = deque()
-        self._photos: dict[int, tuple[object, _KeptPhoto]] = {}
-        self._photo_room = photo_room
+        self.most_pairs_each = PAIRS_AT_FIRST
+        self.unfinished: deque[_Step] = deque()
+        self.photos: dict[int, tuple[object, KeptPhoto]] = {}
+        self.photo_room = photo_room
         self._last: DeviceView | None = None
         self._failure: BackendUnavailableError | None = None
 
@@ -153,7 +161,7 @@ class Resident:
         like = self._memory if count == self.count else None
         self._memory = self._last = None  # given back before the next one is asked for
         self.count = count
-        self._pairs = pairs_room(count, self._most_pairs_each)
+        self._pairs = pairs_room(count, self.most_pairs_each)
         memory = self._allocate(like)
         for name in STATE:
             memory.write(name, state[name])
@@ -204,7 +212,7 @@ class Resident:
         if self._failure is not None:
             raise self._failure
         self._submit(one)
-        while len(self._waiting) > IN_FLIGHT:
+        while len(self.unfinished) > IN_FLIGHT:
             self.collect()
         return one.result
 
@@ -214,9 +222,9 @@ class Resident:
         Raises:
             BackendUnavailableError: the device fails.
         """
-        if self._waiting:
-            self._waiting[-1].noise = noise
-        self._here.play("noise", noise.packed())
+        if self.unfinished:
+            self.unfinished[-1].noise = noise
+        self.memory.play("noise", noise.packed())
 
     def settle(self) -> None:
         """Wait for all steps.
@@ -226,26 +234,26 @@ class Resident:
         """
         if self._failure is not None:
             raise self._failure
-        while self._waiting:
+        while self.unfinished:
             self.collect()
 
     def collect(self) -> None:
         """Wait for the oldest step whose sums have not arrived, and take them; repeat it if it found no room."""
-        one = self._waiting[0]
+        one = self.unfinished[0]
         live = _words(one)
         if not live[HALT]:
-            self._waiting.popleft()
+            self.unfinished.popleft()
             needed = PAIRS_SPARE * int(live[PAIRS]) / max(self.count, 1)
-            self._most_pairs_each = max(self._most_pairs_each, needed)
+            self.most_pairs_each = max(self.most_pairs_each, needed)
             one.result.arrive(live)
             return
-        again = list(self._waiting)
+        again = list(self.unfinished)
         for other in again[1:]:
             _words(other)
-        self._waiting.clear()
+        self.unfinished.clear()
         self._pairs = rounded_pairs(int(live[PAIRS]))
         try:
-            self._memory = self._allocate(self._here)
+            self._memory = self._allocate(self.memory)
         except BackendUnavailableError as error:
             self._failure = (
                 error  # the host has counted steps that did not happen: nothing may be saved from now on
@@ -254,40 +262,45 @@ class Resident:
         for each in again:
             self._submit(each)
             if each.noise is not None:
-                self._here.play("noise", each.noise.packed())
+                self.memory.play("noise", each.noise.packed())
 
     def _submit(self, one: _Step) -> None:
         self._make_room_for(one.view)
-        memory, pixels = self._here, one.view.camera.H * one.view.camera.W
+        memory, pixels = self.memory, one.view.camera.H * one.view.camera.W
         numbers = one.numbers.packed(pixels, self.count, one.photo.floats)
         block = one.view.packed(self.harmonics, numbers)
         one.ticket = memory.submit("step", block, "live", one.photo.kept, "photo")
         self._last = one.view
-        self._waiting.append(one)
+        self.unfinished.append(one)
 
     @property
-    def _here(self) -> Memory:
+    def memory(self) -> Memory:
+        """The buffers of the Gaussians and of a step.
+
+        Raises:
+            ValueError: nothing is loaded.
+        """
         if self._memory is None:
             raise ValueError("nothing is loaded")
         return self._memory
 
     def _settled(self) -> Memory:
         self.settle()
-        return self._here
+        return self.memory
 
-    def _photo(self, index: int, photo: Callable[[], PackedPhoto], constant: object | None) -> _KeptPhoto:
+    def _photo(self, index: int, photo: Callable[[], PackedPhoto], constant: object | None) -> KeptPhoto:
         """Return a photo on the device, and keep it there if it is constant and there is room."""
-        belongs, known = self._photos.get(index, (None, None))
+        belongs, known = self.photos.get(index, (None, None))
         if known is not None and constant is not None and belongs is constant:
             return known
         if known is not None:
-            self._photo_room += known.kept.nbytes
-            del self._photos[index]
+            self.photo_room += known.kept.nbytes
+            del self.photos[index]
         packed = photo()
-        sent = _KeptPhoto(self.device.keep(packed.words), packed.floats)
-        if constant is not None and sent.kept.nbytes <= self._photo_room:
-            self._photo_room -= sent.kept.nbytes
-            self._photos[index] = constant, sent
+        sent = KeptPhoto(self.device.keep(packed.words), packed.floats)
+        if constant is not None and sent.kept.nbytes <= self.photo_room:
+            self.photo_room -= sent.kept.nbytes
+            self.photos[index] = constant, sent
         return sent
 
     def _make_room_for(self, view: DeviceView) -> None:
@@ -297,7 +310,7 @@ class Resident:
             self.settle()
             self._optics = view.optics
             self._pixels, self._tiles = max(pixels, self._pixels), max(view.tiles, self._tiles)
-            self._memory = self._allocate(self._here)
+            self._memory = self._allocate(self.memory)
 
     def _allocate(self, like: Memory | None) -> Memory:
         """Return buffers, those of another size new, and all others with what is in them."""

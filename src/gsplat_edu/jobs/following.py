@@ -31,12 +31,13 @@ class Follower:
         path: The file; it need not exist yet.
         offset: Bytes that were read.
         number: Lines that were read.
+        rest: Begin of a line whose end is not there yet.
     """
 
     path: Path
     offset: int = 0
     number: int = 0
-    _rest: bytes = field(default=b"", repr=False)
+    rest: bytes = field(default=b"", repr=False)
 
     def read(self) -> list[tuple[int, float, Event]]:
         """Return the number of each new line, counted from 1, its time and its event; damaged lines only count."""
@@ -59,12 +60,12 @@ class Follower:
             return []
         self.offset += len(data)
         first, *others = data.split(b"\n")
-        if len(self._rest) <= LONGEST_LINE:  # otherwise the line is too long; skip to its end
-            self._rest += first
+        if len(self.rest) <= LONGEST_LINE:  # otherwise the line is too long; skip to its end
+            self.rest += first
         if not others:
             return []
-        *lines, rest = self._rest, *others
-        self._rest = rest
+        *lines, rest = self.rest, *others
+        self.rest = rest
         return lines
 
 

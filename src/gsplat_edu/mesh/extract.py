@@ -134,7 +134,7 @@ def extract_mesh(
         )
     rendered = render_depths(gaussians, shown, render_settings, backend, progress)
     wanted = settings.voxel or max(default_voxel(rendered), settings.least_voxel)
-    cut = _cut(rendered, wanted, settings, progress)
+    cut = cut_surface(rendered, wanted, settings, progress)
     if cut.voxel > wanted:
         limits = "the volume fits into the memory"
         if settings.most_faces is not None:
@@ -153,7 +153,7 @@ def extract_mesh(
     return MeshResult(mesh, cut.voxel, cut.truncation, cut.memory, cut.counts, cut.views, tuple(notes))
 
 
-class _Cut(NamedTuple):
+class CutSurface(NamedTuple):
     """The surface of a volume, and what is known of the volume, which is freed."""
 
     raw: Mesh
@@ -164,7 +164,9 @@ class _Cut(NamedTuple):
     counts: DepthCounts
 
 
-def _cut(rendered: Sequence[DepthView], wanted: float, settings: MeshSettings, progress: Progress) -> _Cut:
+def cut_surface(
+    rendered: Sequence[DepthView], wanted: float, settings: MeshSettings, progress: Progress
+) -> CutSurface:
     """Return the surface of the depth maps.
 
     Voxels are enlarged until the volume fits into the memory and its surface has at most `settings.most_faces`
@@ -186,7 +188,7 @@ def _cut(rendered: Sequence[DepthView], wanted: float, settings: MeshSettings, p
         progress("triangles", 1, 1)
         excess = 0.0 if settings.most_faces is None else len(raw.faces) / settings.most_faces
         if excess <= 1.0:
-            return _Cut(raw, volume.voxel, volume.truncation, volume.memory, views, counts)
+            return CutSurface(raw, volume.voxel, volume.truncation, volume.memory, views, counts)
         if fixed:
             raise NotEnoughMemoryError(
                 f"voxel: {voxel:.3g} makes {len(raw.faces):,} triangles, but the memory has room for"

@@ -98,7 +98,7 @@ def textured(mesh: Mesh, views: Iterable[TextureView], settings: TextureSettings
     """
     settings = TextureSettings() if settings is None else settings
     uvs, height, width = laid_out(mesh, settings.size)
-    face, weights, place = _texels(uvs, height, width)
+    face, weights, place = covered_texels(uvs, height, width)
     if not len(face):
         raise ArgumentError(f"size: {settings.size} px are too few for any texel of {len(mesh.faces)} faces")
     points = np.einsum("tk,tkd->td", weights, mesh.corners[face])
@@ -157,7 +157,7 @@ def laid_out(mesh: Mesh, size: int) -> tuple[Float32[np.ndarray, "F 3 2"], int, 
     return coordinates.reshape(-1, 3, 2), int(atlas.height), int(atlas.width)
 
 
-def _texels(
+def covered_texels(
     uvs: Float32[np.ndarray, "F 3 2"], height: int, width: int
 ) -> tuple[Int64[np.ndarray, " T"], Float64[np.ndarray, "T 3"], Int64[np.ndarray, " T"]]:
     """Return for each texel whose centre lies in a face: the face, the weights of its corners, and its place."""

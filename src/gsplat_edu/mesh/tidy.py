@@ -374,7 +374,7 @@ def decimated(mesh: Mesh, faces: int) -> Mesh:
     best, fewest = None, 0
     for aggressiveness in AGGRESSIVENESS:
         candidate = separated(without_spoiled_faces(_simplified(mesh, faces, aggressiveness)))
-        turned = int(_turned_over(mesh, candidate).sum())
+        turned = int(flipped_faces(mesh, candidate).sum())
         if best is None or (turned < fewest and len(candidate.faces) <= faces):
             best, fewest = candidate, turned
         if fewest == 0:
@@ -417,7 +417,7 @@ def _simplified(mesh: Mesh, faces: int, aggressiveness: float) -> Mesh:
     return Mesh(points, triangles[~spoiled[triangles].any(axis=1)])
 
 
-def _turned_over(mesh: Mesh, candidate: Mesh) -> Bool[np.ndarray, " F"]:
+def flipped_faces(mesh: Mesh, candidate: Mesh) -> Bool[np.ndarray, " F"]:
     """Return for each face of a decimated mesh whether it opposes all original faces near its centre."""
     near = min(NEAREST_FACES, len(mesh.faces))
     _, found = cKDTree(mesh.corners.mean(axis=1)).query(candidate.corners.mean(axis=1), k=near)
@@ -427,7 +427,7 @@ def _turned_over(mesh: Mesh, candidate: Mesh) -> Bool[np.ndarray, " F"]:
 
 def _unfolded(mesh: Mesh, candidate: Mesh) -> Mesh:
     """Move the vertices of faces that are turned over to the mean of their neighbours until no face is."""
-    best, turned = candidate, _turned_over(mesh, candidate)
+    best, turned = candidate, flipped_faces(mesh, candidate)
     count = int(turned.sum())
     for _ in range(SMOOTHINGS):
         if not turned.any():
@@ -439,7 +439,7 @@ def _unfolded(mesh: Mesh, candidate: Mesh) -> Mesh:
         means = [np.bincount(start, candidate.vertices[end, axis], len(chosen)) / degree for axis in range(3)]
         moved = np.where(chosen[:, None], np.stack(means, axis=1), candidate.vertices)
         candidate = Mesh(moved, candidate.faces)
-        turned = _turned_over(mesh, candidate)
+        turned = flipped_faces(mesh, candidate)
         if int(turned.sum()) < count:
             best, count = candidate, int(turned.sum())
     return best

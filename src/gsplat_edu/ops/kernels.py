@@ -41,10 +41,11 @@ def native_array(tensor: Tensor) -> object:
     The module is not built against torch. It reads tensors through DLPack's C interface at almost no cost; tensors of
     older torch versions, which lack it, are converted to DLPack capsules.
     """
-    return tensor if _DESCRIBE_THEMSELVES else to_dlpack(tensor)
+    return tensor if DESCRIBE_THEMSELVES else to_dlpack(tensor)
 
 
-_DESCRIBE_THEMSELVES = hasattr(torch.Tensor, "__dlpack_c_exchange_api__")
+DESCRIBE_THEMSELVES = hasattr(torch.Tensor, "__dlpack_c_exchange_api__")
+"""Whether tensors of this version of torch have DLPack's C interface."""
 
 
 def native() -> Any:  # noqa: ANN401

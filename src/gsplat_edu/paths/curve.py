@@ -146,7 +146,7 @@ class PathCurve:
         """
         at = float64_array("times", times, ("n",))
         at = np.mod(at, self.seconds) if self.loop else np.clip(at, 0.0, self.seconds)
-        states = self._at(self._parameter(self._place(at)))
+        states = self._at(self._parameter(self.place(at)))
         rotations = np.swapaxes(quat_to_R_batch(states[:, QUAT]), 1, 2)
         return states[:, EYE], rotations, np.degrees(2.0 * np.arctan(np.exp(states[:, ZOOM][:, 0])))
 
@@ -157,10 +157,10 @@ class PathCurve:
         self._times = np.insert(self._times, held + 1, ends)
         self._places = np.insert(self._places, held + 1, self._places[held])
 
-    def _place(self, at: Values) -> Values:
-        """Return the distance covered at given times."""
+    def place(self, at: Values) -> Values:
+        """Return the distance from the start, measured by `travel`, at times from 0 to `seconds`."""
         if len(self._times):
-            return _monotone(self._times, self._places, at, self.loop, self._ease)
+            return monotone_interpolation(self._times, self._places, at, self.loop, self._ease)
         places: Values = self.length * at / self.seconds
         return places
 
@@ -168,7 +168,7 @@ class PathCurve:
         """Return the spline's parameter at given distances from the start."""
         if len(self._nodes) == 1:
             return np.zeros_like(places)
-        parameters: Values = _monotone(self._lengths, self._parameters, places, self.loop)
+        parameters: Values = monotone_interpolation(self._lengths, self._parameters, places, self.loop)
         return parameters
 
     def _measure(self) -> None:
@@ -279,7 +279,7 @@ def _mixed(a: States, b: States, share: Values) -> States:
     return mixed
 
 
-def _monotone(
+def monotone_interpolation(
     x: Float64[np.ndarray, " k"],
     y: Float64[np.ndarray, " k"],
     at: Values,

@@ -44,7 +44,7 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
         on_gpu = torch.cuda.is_available() if device is None else device.type == "cuda"
         name = "cuda" if on_gpu and not cuda.interpreted() else "cpu"
         if name == "cuda" and device is None and (reason := unavailable("cuda")):
-            _warn_once(f"the GPU is not used: {reason}")
+            warn_once(f"the GPU is not used: {reason}")
             name = "cpu"
     reason = unavailable(name, device)
     if reason:
@@ -53,7 +53,8 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
 
 
 @functools.cache
-def _warn_once(message: str) -> None:
+def warn_once(message: str) -> None:
+    """Warn of what every use of a backend would say, the first time that it is said."""
     warnings.warn(message, BackendWarning, stacklevel=3)
 
 

@@ -58,7 +58,7 @@ def call(
     with log.open("ab") as words:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
     answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    listener = threading.Thread(target=_listen, args=(process, answers), daemon=True)
+    listener = threading.Thread(target=forward_messages, args=(process, answers), daemon=True)
     result: dict[str, Any] | None = None
     assert process.stdin is not None and process.stdout is not None
     try:
@@ -66,7 +66,7 @@ def call(
             process.stdin.write(json.dumps({"job": job, **arguments}).encode() + b"\n")
             process.stdin.flush()  # it stays open: its end tells the process that this one has ended
         listener.start()
-        result = _await_result(answers, progress)
+        result = await_result(answers, progress)
         code = process.wait()
     finally:
         if process.poll() is None:
@@ -86,7 +86,7 @@ def call(
     return result
 
 
-def _await_result(
+def await_result(
     answers: queue.SimpleQueue[dict[str, Any]], progress: Callable[[int], None]
 ) -> dict[str, Any] | None:
     """Forward a job's progress until it ends; return its result, or None if it has none.
@@ -185,7 +185,7 @@ def _unchangeable(database: Path, error: sqlite3.Error) -> DatasetError:
     )
 
 
-def _listen(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[str, Any]]) -> None:
+def forward_messages(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[str, Any]]) -> None:
     """Forward a process's messages, and report its end; the last line of one that was killed may be incomplete."""
     assert process.stdout is not None
     try:

@@ -283,10 +283,10 @@ def _mapped(
         threads=threads,
         seed=COLMAP_SEED,
     )["models"]
-    return [_usable(out, model) for model in found]
+    return [without_implausible_lenses(out, model) for model in found]
 
 
-def _usable(out: Path, model: dict[str, Any]) -> dict[str, Any]:
+def without_implausible_lenses(out: Path, model: dict[str, Any]) -> dict[str, Any]:
     """Leave out photos whose estimated lens is too implausible to undistort them."""
     folder, good = out / model["folder"], dict[int, bool]()
     for number, lens in read_cameras(folder / "cameras.bin").items():

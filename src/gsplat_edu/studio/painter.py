@@ -28,13 +28,18 @@ MOST_WAITING = 4
 
 
 class Painter:
-    """Draws for all pages, one picture after the other."""
+    """Draws for all pages, one picture after the other.
+
+    Attributes:
+        worker: The process that draws.
+        free_at: When the next picture may be drawn beside a training, in seconds of `time.monotonic`.
+    """
 
     def __init__(self) -> None:
         self.worker = Worker(NICE)
         self._room = threading.Semaphore(MOST_WAITING)
         self._one = threading.Lock()
-        self._free_at = 0.0
+        self.free_at = 0.0
         self._closed = False
 
     def paint(self, is_training: Callable[[], bool], **task: Any) -> bytes:  # noqa: ANN401
@@ -53,10 +58,10 @@ class Painter:
             )
         try:
             with self._one:
-                while not self._closed and is_training() and time.monotonic() < self._free_at:
+                while not self._closed and is_training() and time.monotonic() < self.free_at:
                     time.sleep(POLL)
                 made = self.worker.ask("picture", threads=int(is_training()), **task)
-                self._free_at = time.monotonic() + REST * made["seconds"]
+                self.free_at = time.monotonic() + REST * made["seconds"]
         finally:
             self._room.release()
         return base64.b64decode(made["jpeg"])

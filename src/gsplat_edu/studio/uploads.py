@@ -202,7 +202,7 @@ class Uploads:
     async def _stream(self, chunks: AsyncIterator[bytes], length: int | None, part: Path) -> int:
         """Write a body to a file; room for it is reserved first, or as it comes if its length is unknown."""
         size, reserved = 0, length or 0
-        await run_in_threadpool(self._reserve, reserved, begins=True)
+        await run_in_threadpool(self.reserve, reserved, begins=True)
         try:
             with part.open("xb") as file:
                 async for chunk in chunks:
@@ -212,7 +212,7 @@ class Uploads:
                             f"file: has more than {min(self.limits.file, length or size):,} bytes"
                         )
                     if length is None:
-                        await run_in_threadpool(self._reserve, len(chunk))
+                        await run_in_threadpool(self.reserve, len(chunk))
                         reserved += len(chunk)
                     await run_in_threadpool(file.write, chunk)
         finally:
@@ -228,7 +228,7 @@ class Uploads:
         disk = shutil.disk_usage(self.library.root).free - self.limits.spare
         return min(disk, self.limits.library - self.used(fresh=False)) - self._expected
 
-    def _reserve(self, size: int, *, begins: bool = False) -> None:
+    def reserve(self, size: int, *, begins: bool = False) -> None:
         """Reserve room for bytes of an upload.
 
         Raises:

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -21,6 +22,7 @@ MOST_WAITING = 6
 """Requests that wait for a worker; each holds a thread of the server."""
 
 COMMAND = (sys.executable, "-m", "gsplat_edu.studio.worker")
+"""What runs a worker."""
 
 
 class Worker:
@@ -29,14 +31,26 @@ class Worker:
     Args:
         nice: Niceness of the process.
         waiting: Requests that may wait for it; None for `MOST_WAITING`.
+        command: What runs a worker, but for its niceness; it answers lines as `gsplat_edu.studio.worker` does.
+        patience: Seconds after which a worker that does not answer is ended.
+
+    Attributes:
+        process: The process; None before the first request and after one that it did not answer.
+        closed: Whether it was closed, and starts no process any more.
     """
 
-    def __init__(self, nice: int = 0, waiting: int | None = None) -> None:
-        self._command = (*COMMAND, str(nice))
+    def __init__(
+        self,
+        nice: int = 0,
+        waiting: int | None = None,
+        command: Sequence[str] = COMMAND,
+        patience: float = PATIENCE,
+    ) -> None:
+        self._command, self._patience = (*command, str(nice)), patience
         self._lock = threading.Lock()
-        self._closed = False
+        self.closed = False
         self._room = threading.Semaphore(MOST_WAITING if waiting is None else waiting)
-        self._process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | None = None
 
     def ask(self, task: str, **arguments: Any) -> Any:  # noqa: ANN401
         """Run a task (`gsplat_edu.studio.worker.TASKS`) in the worker and return its result.
@@ -68,9 +82,9 @@ class Worker:
 
     def close(self) -> None:
         """End the process and its task."""
-        self._closed = True
+        self.closed = True
         while not self._lock.acquire(timeout=POLL):  # a request waits for an answer, or starts the process
-            if (process := self._process) is not None:
+            if (process := self.process) is not None:
                 process.kill()
         try:
             self._drop()
@@ -79,7 +93,7 @@ class Worker:
 
     def _drop(self) -> None:
         """Forget the process."""
-        process, self._process = self._process, None
+        process, self.process = self.process, None
         if process is None:
             return
         process.kill()
@@ -91,16 +105,16 @@ class Worker:
 
     def _asked(self, line: bytes) -> bytes:
         """Send a request; return the answer, empty if there is none."""
-        if self._closed:
+        if self.closed:
             return b""
-        if self._process is None or self._process.poll() is not None:
+        if self.process is None or self.process.poll() is not None:
             self._drop()
-            self._process = subprocess.Popen(
+            self.process = subprocess.Popen(
                 self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
             )
-        process = self._process
+        process = self.process
         assert process.stdin is not None and process.stdout is not None
-        timer = threading.Timer(PATIENCE, process.kill)
+        timer = threading.Timer(self._patience, process.kill)
         timer.start()
         try:
             process.stdin.write(line)

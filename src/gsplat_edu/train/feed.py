@@ -153,6 +153,10 @@ class ViewFeed:
                 self._ahead = following, self._reader.submit(self._read, after)
         return Draw(index, view, photo, opaque)
 
+    def close(self) -> None:
+        """Finish the photo that is being read, and end the thread that reads ahead; the feed is not used after that."""
+        self._reader.shutdown()
+
     def skip(self) -> None:
         """Draw a view that another process renders; its photo is not read."""
         self._following()

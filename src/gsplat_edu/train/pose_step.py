@@ -92,7 +92,7 @@ def pose_step(
         weights = (
             1.0 / (1.0 + (residual / (2.0 * sigma)).square()) / (PIXELS_PER_OBSERVATION * sigma.square())
         )
-        flow = _flow(camera, pixels, z) if camera.projection.plain else _lens_flow(camera, pixels, z)
+        flow = image_flow(camera, pixels, z) if camera.projection.plain else lens_flow(camera, pixels, z)
         if times is not None:
             columns, rows = pixels.long().unbind(dim=1)
             flow = flow * torch.from_numpy(np.array(times))[rows, columns][:, None, None]
@@ -169,7 +169,7 @@ def _samples(
     return pixels[counts], z[counts], gains * x, gains[:, None] * both / 2.0, gains * x - y
 
 
-def _flow(
+def image_flow(
     camera: Camera, pixels: Float64[Tensor, "n 2"], z: Float64[Tensor, " n"]
 ) -> Float64[Tensor, "n 2 6"]:
     """Return the motion of the image per unit of each component of a twist, px to the right and down."""
@@ -185,7 +185,7 @@ def _flow(
     return torch.cat([turn, shift / z[:, None, None]], dim=2) * focal[:, None]
 
 
-def _lens_flow(
+def lens_flow(
     camera: Camera, pixels: Float64[Tensor, "n 2"], depth: Float64[Tensor, " n"]
 ) -> Float64[Tensor, "n 2 6"]:
     """Return the same for any projection; 0 for pixels without a ray."""

@@ -183,7 +183,7 @@ class ResidentStepper:
         self.photo_room = photo_room
         density = host.parts.density
         assert density is None or isinstance(density, FollowsDevice)
-        self._host, self._run, self._density = host, run, density
+        self._host, self.device_run, self._density = host, run, density
         self.parts, self.places = host.parts, host.places
         self._loaded = False  # whether the device has the run
         self._ahead = False  # whether it has taken steps since the host read it
@@ -207,7 +207,7 @@ class ResidentStepper:
         if self._view is None:
             return None
         if self._image is None:
-            self._image = self._run.image()
+            self._image = self.device_run.image()
         return Shown(self._image, self._view.target, self._view.draw.view.name)
 
     def step(self, views: Iterable[StepView], iteration: int) -> Terms:
@@ -218,7 +218,7 @@ class ResidentStepper:
         optimizer.schedule(iteration)
         constant = view.draw.view if photo is None or photo.alpha is None else None
         target = RunTarget(view.draw.index, view.target.image, view.target.mask, constant)
-        sums = self._run.step(
+        sums = self.device_run.step(
             view.draw.view.camera, view.settings, target, optimizer.advance(), self._rules(iteration)
         )
         self._ahead, self._view, self._image = True, view, None
@@ -258,7 +258,7 @@ class ResidentStepper:
         noise = density.passed(iteration, self._host.optimizer.learning_rates["means"])
         if noise is not None:
             self._load()
-            self._run.add_noise(noise, self._rules(iteration))
+            self.device_run.add_noise(noise, self._rules(iteration))
             self._ahead = True
         return []
 
@@ -280,7 +280,7 @@ class ResidentStepper:
     def _keep_image(self) -> None:
         """Read the last image before the device gives its buffers back."""
         if self._view is not None and self._image is None:
-            self._image = self._run.image()
+            self._image = self.device_run.image()
 
     def _load(self) -> None:
         """Give the device the run of the host, unless it has it."""
@@ -293,14 +293,14 @@ class ResidentStepper:
         )
         gaussians = {name: tensor.detach() for name, tensor in host.gaussians.tensors().items()}
         first, second = host.optimizer.first, host.optimizer.second
-        self._run.load(RunState(gaussians, first, second, norm_sums, times_visible))
+        self.device_run.load(RunState(gaussians, first, second, norm_sums, times_visible))
         self._loaded = True
 
     def _read(self) -> None:
         """Give the host the run of the device, if that is ahead."""
         if not self._ahead:
             return
-        state, host = self._run.read(), self._host
+        state, host = self.device_run.read(), self._host
         host.gaussians = Gaussians(**state.gaussians).trainable()
         host.optimizer.first, host.optimizer.second = dict(state.first), dict(state.second)
         if self._density is not None:

@@ -182,7 +182,7 @@ class Trainer:
         ):
             settings = self._settings(self.config.background)
             self.transients.find(self.gaussians, settings, self.view_model.camera, factor)
-        terms = self.stepper.step(self._views(self._draw()), position)
+        terms = self.stepper.step(self.step_views(), position)
         self.iteration += self.config.batch
         return StepEvent(self.iteration - 1, self.stepper.count, terms, factor)
 
@@ -196,6 +196,14 @@ class Trainer:
         for position in self.tempo.passed(iteration - batch + 1):
             for event in self.stepper.change(position + batch - 1):
                 yield event if event.iteration == iteration else replace(event, iteration=iteration)
+
+    def step_views(self) -> Iterator[StepView]:
+        """Draw the views of the next step that this process renders; yield them with targets and settings.
+
+        Raises:
+            DatasetError: a photo cannot be read; then all views of the step remain due.
+        """
+        return self._views(self._draw())
 
     def _draw(self) -> list[Draw]:
         """Return the views of the next step that this process renders. If a photo cannot be read, all remain due."""

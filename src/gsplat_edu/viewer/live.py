@@ -80,6 +80,8 @@ class LiveView:
         capture: The run; its dataset is loaded.
         host: Address to listen on.
         port: Port; 0 picks a free one.
+        grace: Seconds without a request after which no browser counts as connected.
+        wait: Seconds after which a request for something new is answered without it.
 
     Raises:
         ArgumentError: the address does not belong to this computer, or the port is in use or out of range.
@@ -88,7 +90,16 @@ class LiveView:
         url: The view's address, including the token that grants access.
     """
 
-    def __init__(self, capture: CaptureRun, host: str = LOOPBACK, port: int = PORT) -> None:
+    def __init__(
+        self,
+        capture: CaptureRun,
+        host: str = LOOPBACK,
+        port: int = PORT,
+        *,
+        grace: float = GRACE,
+        wait: float = WAIT,
+    ) -> None:
+        self.grace, self.wait = grace, wait
         self._trainer = capture.trainer
         html = page.live_html(page_facts(capture))
         self._server = _LiveServer(self, page_parts.policy(page_parts.LIVE), host, port)
@@ -121,8 +132,8 @@ class LiveView:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected, or was within the last `GRACE` seconds."""
-        return time.perf_counter() - self._seen_at <= GRACE
+        """Whether a browser is connected, or was within the last `grace` seconds."""
+        return time.perf_counter() - self._seen_at <= self.grace
 
     def watches(self) -> bool:
         """Return whether a browser is connected."""
@@ -130,7 +141,7 @@ class LiveView:
 
     def shown(self) -> int | None:
         """Return the iteration of the newest snapshot; None if no page waits for one."""
-        waiting = time.perf_counter() - self._asked_at <= WAIT
+        waiting = time.perf_counter() - self._asked_at <= self.wait
         return self._shown if waiting else None
 
     def holds(self, iteration: int) -> bool:
@@ -170,13 +181,13 @@ class LiveView:
         self._seen_at = time.perf_counter()
 
     def newer_state(self, version: int) -> dict[str, Any] | None:
-        """Wait for a state of another version; None if there is none within `WAIT` seconds."""
+        """Wait for a state of another version; None if there is none within `wait` seconds."""
         with self._news:
-            is_newer = self._wait(lambda: self._version not in (0, version), WAIT)
+            is_newer = self._wait(lambda: self._version not in (0, version), self.wait)
             return self._state if is_newer else None
 
     def newer_scene(self, iteration: int) -> bytes | None:
-        """Wait for a snapshot of another iteration; None if there is none within `WAIT` seconds.
+        """Wait for a snapshot of another iteration; None if there is none within `wait` seconds.
 
         A page without a snapshot (-1) gets the last one at once and then asks for a newer one.
         """
@@ -186,7 +197,7 @@ class LiveView:
                 return self._snapshot
             before = self._shown
             self._asked_at = time.perf_counter()
-            is_newer = self._wait(lambda: self._shown not in (before, iteration), WAIT)
+            is_newer = self._wait(lambda: self._shown not in (before, iteration), self.wait)
             return self._snapshot if is_newer else None
 
     def control(self, what: object) -> bool:

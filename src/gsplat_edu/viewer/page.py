@@ -231,7 +231,7 @@ def read(path: Path) -> Scene:
     data = read_bytes(path)
     if data.startswith(b"version https://git-lfs"):
         raise SceneFormatError(f"{path}: is a Git LFS pointer, not a page; fetch it with: git lfs pull")
-    facts = _read_facts(path, data)
+    facts = read_facts(path, data)
     count, sh_degree = facts["count"], facts["sh_degree"]
     claimed = page_data.size(count, sh_degree)
     check_expansion(path, claimed, len(data))
@@ -399,7 +399,7 @@ def _camera(camera: Camera) -> dict[str, Any]:
     return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
 
 
-def _read_facts(path: Path, data: bytes) -> dict[str, Any]:
+def read_facts(path: Path, data: bytes) -> dict[str, Any]:
     """Return a page's metadata; the entries that `read` uses are validated."""
     begin = data.find(FACTS_OPEN) + len(FACTS_OPEN)
     end = data.find(CLOSE, begin)

@@ -17,13 +17,17 @@ MODULE = "gsplat_edu.runs.floaters"
 
 
 class Proposing:
-    """A judgement of one scene, in a process of its own. It may be used from any thread."""
+    """A judgement of one scene, in a process of its own. It may be used from any thread.
+
+    Attributes:
+        process: The process while it judges; else None.
+    """
 
     def __init__(self, source: Path) -> None:
         """Take the scene file or run folder; nothing starts yet."""
         self._source = source
         self._lock = threading.Lock()
-        self._process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | None = None
         self._state: dict[str, Any] = {"state": "idle"}
 
     @property
@@ -46,7 +50,7 @@ class Proposing:
             OSError: the process cannot be started.
         """
         with self._lock:
-            if self._process is not None:
+            if self.process is not None:
                 return
             process = subprocess.Popen(
                 (sys.executable, "-m", MODULE, os.fspath(self._source.resolve())),
@@ -54,13 +58,13 @@ class Proposing:
                 stdout=subprocess.PIPE,
                 start_new_session=True,
             )
-            self._process, self._state = process, {"state": "running", "done": 0, "total": 0}
+            self.process, self._state = process, {"state": "running", "done": 0, "total": 0}
         threading.Thread(target=self._follow, args=(process,), daemon=True).start()
 
     def stop(self) -> None:
         """End the judgement, if it is running, and forget its result."""
         with self._lock:
-            process, self._process, self._state = self._process, None, {"state": "idle"}
+            process, self.process, self._state = self.process, None, {"state": "idle"}
         if process is not None:
             process.kill()
 
@@ -86,8 +90,8 @@ class Proposing:
 
     def _set(self, process: subprocess.Popen[bytes], state: dict[str, Any], ended: bool = False) -> None:
         with self._lock:
-            if self._process is not process:
+            if self.process is not process:
                 return  # it was stopped
             self._state = state
             if ended:
-                self._process = None
+                self.process = None

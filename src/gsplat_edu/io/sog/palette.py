@@ -149,7 +149,7 @@ def _clustered(
     middles = _lloyd(vectors[sample], weights[sample], vectors[sample[_spread(len(sample), cells)]])
     cell = _nearest(vectors, middles)
     far = (weights * np.linalg.norm(vectors - middles[cell], axis=1)).astype(np.float64)
-    picked = _picked(far**2, size - cells)
+    picked = sampled_rows(far**2, size - cells)
     ends = np.cumsum(np.bincount(cell, minlength=cells))[:-1]
     entries: list[Float32[np.ndarray, "_ D"]] = []
     labels = np.empty(len(vectors), dtype=np.int64)
@@ -163,7 +163,7 @@ def _clustered(
     return np.concatenate(entries), labels
 
 
-def _picked(chances: Float64[np.ndarray, " N"], count: int) -> Bool[np.ndarray, " N"]:
+def sampled_rows(chances: Float64[np.ndarray, " N"], count: int) -> Bool[np.ndarray, " N"]:
     """Select `count` of the rows in proportion to their chances; rows with an expected count above 1 are always in."""
     chances = np.maximum(chances, 1e-30)
     sure: Bool[np.ndarray, " N"] = np.zeros(len(chances), dtype=bool)

@@ -18,7 +18,7 @@ BLOCK = tl.constexpr(1024)
 
 @triton.jit
 @no_type_check
-def _adam(parameter, m, v, gradient, count, numbers):
+def adam_kernel(parameter, m, v, gradient, count, numbers):
     """Update one block: m = b1 m + n1 g, v = b2 v + n2 g², p -= rate (m c1) / (sqrt(v c2) + eps)."""
     rate, b1, b2, n1, n2, eps, c1, c2 = numbers
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(
@@ -76,5 +76,5 @@ def adam_triton(
         rate, b1, b2, eps, correction1, correction2 = map(float, numbers)
         rounded_once = (rate, b1, b2, 1 - b1, 1 - b2, eps, 1 / correction1, 1 / correction2)
         g = gradient.to(torch.float32).contiguous()
-        _adam[(triton.cdiv(count, BLOCK.value),)](parameter, m, v, g, count, rounded_once)
+        adam_kernel[(triton.cdiv(count, BLOCK.value),)](parameter, m, v, g, count, rounded_once)
         torch.autograd.graph.increment_version(parameter)  # informs autograd of the change

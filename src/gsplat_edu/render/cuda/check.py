@@ -29,6 +29,11 @@ def cuda_failure(exact: Rasterize, device: torch.device | None = None) -> str | 
         return does_not_run(error)
 
 
+def forget_checks() -> None:
+    """Forget the results of this process, such as after a driver was replaced; passes that are stored still count."""
+    _failure.cache_clear()
+
+
 @functools.cache
 def _failure(exact: Rasterize, device: torch.device) -> str | None:
     return checked_once("cuda", _identity(device), lambda: kernel_error(exact, device))

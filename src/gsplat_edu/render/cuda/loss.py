@@ -85,7 +85,7 @@ def _pair(image, target, place, scale, inside):
 
 @triton.jit
 @no_type_check
-def _moments_across(image, target, planes, size, scale):
+def moments_kernel(image, target, planes, size, scale):
     """Blur x, y, x² + y² and xy along the rows, into four planes."""
     height, width = size
     _, column, place, inside = _block(size)
@@ -109,7 +109,7 @@ def _moments_across(image, target, planes, size, scale):
 
 @triton.jit
 @no_type_check
-def _similarity_down(planes, maps, sums, size, each):
+def similarity_kernel(planes, maps, sums, size, each):
     """Blur the moments down the columns; write dS/dmx, dS/dv and dS/dc, and the block's sum of `each` (1 - S)."""
     height, width = size
     row, _, place, inside = _block(size)
@@ -133,7 +133,7 @@ def _similarity_down(planes, maps, sums, size, each):
 
 @triton.jit
 @no_type_check
-def _maps_across(maps, planes, size):
+def maps_kernel(maps, planes, size):
     """Blur the three maps along the rows, into the first three planes."""
     height, width = size
     _, column, place, inside = _block(size)
@@ -145,7 +145,7 @@ def _maps_across(maps, planes, size):
 
 @triton.jit
 @no_type_check
-def _gradient_down(image, target, planes, gradient, sums, size, numbers):
+def gradient_kernel(image, target, planes, gradient, sums, size, numbers):
     """Write the loss's gradient and the block's sum of l1 |x - y|; without planes, the loss is L1 only."""
     height, width = size
     scale, l1, ssim = numbers
@@ -166,7 +166,7 @@ def _gradient_down(image, target, planes, gradient, sums, size, numbers):
 
 @triton.jit
 @no_type_check
-def _add(sums, count, total):
+def add_kernel(sums, count, total):
     """Add all sums in one program: each lane adds its own in order, then the lanes are added."""
     lane = tl.arange(0, LANES)
     partial = tl.zeros([LANES], tl.float32)
@@ -247,10 +247,10 @@ def _loss_and_gradient(x: Tensor, y: Tensor, gradient: Tensor, ssim_weight: floa
     planes = None
     if ssim_weight:
         planes, maps = x.new_empty(4, *x.shape), x.new_empty(3, *x.shape)
-        _moments_across[grid](x, y, planes, size, scale, num_warps=WARPS)
-        _similarity_down[grid](planes, maps, sums[blocks:], size, numbers[2], num_warps=WARPS)
-        _maps_across[grid](maps, planes, size, num_warps=WARPS)
-    _gradient_down[grid](x, y, planes, gradient, sums, size, numbers, num_warps=WARPS)
+        moments_kernel[grid](x, y, planes, size, scale, num_warps=WARPS)
+        similarity_kernel[grid](planes, maps, sums[blocks:], size, numbers[2], num_warps=WARPS)
+        maps_kernel[grid](maps, planes, size, num_warps=WARPS)
+    gradient_kernel[grid](x, y, planes, gradient, sums, size, numbers, num_warps=WARPS)
     total = x.new_empty(())
-    _add[(1,)](sums, sums.numel(), total)
+    add_kernel[(1,)](sums, sums.numel(), total)
     return total

@@ -64,7 +64,7 @@ RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 GROUP = 4
 """Features per pass: composite has room for three colours and a depth."""
 
-_camera_rows: WeakKeyDictionary[Camera, dict[tuple[str, float | None, float], Tensor]] = WeakKeyDictionary()
+camera_rows: WeakKeyDictionary[Camera, dict[tuple[str, float | None, float], Tensor]] = WeakKeyDictionary()
 
 
 @dataclass
@@ -303,7 +303,7 @@ def _project(call: _Call, kept: list[Tensor], seen: Tensor | None) -> Tensor:
     records = kept[0].new_empty(count, RECORD.value)
     if count:
         project_kernel[(-(-count // BLOCK),)](
-            *kept, _camera_row(call, kept[0].device), records if seen is None else seen, records, count,
+            *kept, camera_row(call, kept[0].device), records if seen is None else seen, records, count,
             DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
             DILATION=call.settings.dilation, LENS=call.optics, WRAPS=call.wraps, BLOCK=BLOCK,
         )  # fmt: skip
@@ -332,7 +332,7 @@ def _project_backward(
     camera_sums = kept[0].new_empty(blocks if with_camera else 0, CAMERA_NUMBERS.value)
     if count:
         project_backward_kernel[(blocks,)](
-            *kept, _camera_row(call, slots.device), slots if seen is None else seen, slots, lists.slot_begin,
+            *kept, camera_row(call, slots.device), slots if seen is None else seen, slots, lists.slot_begin,
             lists.pairs_of, *outgoing, norms, camera_sums, count,
             DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
             DILATION=call.settings.dilation, WITH_CAMERA=with_camera, LENS=call.optics, BLOCK=BACKWARD_BLOCK,
@@ -389,13 +389,13 @@ def _grid(camera: Camera) -> tuple[int, int]:
     return tiles_x, tiles_x * -(-camera.H // TILE)
 
 
-def _camera_row(call: _Call, device: torch.device) -> Tensor:
+def camera_row(call: _Call, device: torch.device) -> Tensor:
     """Return the camera on the device: R, eye, f, c, size, bounds of x/z and y/z, near plane, remainder of eye.
 
     They are cached with the camera, so that later renders copy nothing.
     """
     camera, key = call.camera, (str(device), call.settings.jacobian_limit, call.settings.z_near)
-    rows = _camera_rows.setdefault(camera, {})
+    rows = camera_rows.setdefault(camera, {})
     if key not in rows:
         x_bounds, y_bounds = camera.jacobian_bounds(call.settings.jacobian_limit)
         numbers = [

@@ -49,7 +49,7 @@ class _Thresholds(NamedTuple):
     largest: float
 
 
-class _Screen(NamedTuple):
+class Screen(NamedTuple):
     """The visible splats in the image, near to far."""
 
     means2d: Float[Tensor, "M 2"]
@@ -133,7 +133,7 @@ def render_t(
     _check(means, cov3ds, colors, opacities)
     alpha_min, chunk = in_range("alpha_min", alpha_min, 0.0), whole_number("chunk", chunk, 1)
 
-    screen = _project(means, cov3ds, cam)
+    screen = project_visible(means, cov3ds, cam)
     if track_means2d and screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     colors, opacities = colors[screen.visible], _dimmed(opacities, screen)
@@ -165,7 +165,7 @@ def render_dense(
     degree = min(settings.sh_degree, gaussians.sh_degree)
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
     R, scales = quat_to_R_t(gaussians.quats), torch.exp(gaussians.log_scales)
-    screen = _project(gaussians.means, R * scales[:, None, :], camera, settings, factors=(R, scales))
+    screen = project_visible(gaussians.means, R * scales[:, None, :], camera, settings, factors=(R, scales))
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     opacities = _dimmed(gaussians.opacities, screen)
@@ -188,20 +188,20 @@ def render_dense(
     )
 
 
-def _dimmed(opacities: Float[Tensor, " N"], screen: _Screen) -> Float[Tensor, " M"]:
+def _dimmed(opacities: Float[Tensor, " N"], screen: Screen) -> Float[Tensor, " M"]:
     """Return the opacities with which the visible splats are drawn."""
     visible = opacities[screen.visible]
     return visible if screen.factor is None else visible * screen.factor
 
 
 @torch.no_grad()
-def _radii(screen: _Screen, opacities: Float[Tensor, " M"]) -> Float[Tensor, "M 2"]:
+def _radii(screen: Screen, opacities: Float[Tensor, " M"]) -> Float[Tensor, "M 2"]:
     """Return the half extents of the ellipses alpha >= 1/255, px."""
     level = 2.0 * torch.log((opacities / ALPHA_MIN).clamp(min=1.0))
     return torch.sqrt(level[:, None] * screen.variances)
 
 
-def _grad_norms(screen: _Screen, camera: Camera | CameraTensors) -> Float[Tensor, " M"]:
+def _grad_norms(screen: Screen, camera: Camera | CameraTensors) -> Float[Tensor, " M"]:
     """Return the norms of the gradients of the image positions; see `RenderOutput.means2d_grad_norms`."""
     gradient = screen.means2d.grad
     if gradient is None:
@@ -214,7 +214,7 @@ def _grad_norms(screen: _Screen, camera: Camera | CameraTensors) -> Float[Tensor
 
 
 def _composite(
-    screen: _Screen,
+    screen: Screen,
     colors: Float[Tensor, "M C"],
     opacities: Float[Tensor, " M"],
     cam: Camera | CameraTensors,
@@ -244,7 +244,7 @@ def _transmittances(T: Float[Tensor, "H W"], alpha: Float[Tensor, "k H W"]) -> t
 
 @torch.no_grad()
 def _median(
-    screen: _Screen,
+    screen: Screen,
     opacities: Float[Tensor, " M"],
     cam: Camera | CameraTensors,
     thresholds: _Thresholds,
@@ -288,14 +288,14 @@ def _check(
         raise ArgumentError(f"opacities{first_index(outside.numpy(force=True))}: is outside 0 to 1")
 
 
-def _project(
+def project_visible(
     means: Float[Tensor, "N 3"],
     shapes: Float[Tensor, "N 3 3"],
     cam: Camera | CameraTensors,
     settings: RenderSettings | None = None,
     *,
     factors: tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]] | None = None,
-) -> _Screen:
+) -> Screen:
     """Project; `shapes` are covariances, or M = R S if the factors are given, which keeps the digits of thin ones."""
     settings = settings or RenderSettings()
     through = _through_pinhole if cam.pinhole else through_lens
@@ -329,7 +329,7 @@ def _project(
     ellipses = torch.stack([c / det, b / c, 1 / c], dim=-1)
     dims = settings.antialiased or blur is not None
     factor = torch.sqrt(kept_det / det) if dims else None
-    return _Screen(means2d, ellipses, visible, z, torch.stack([a, c], dim=-1), factor)
+    return Screen(means2d, ellipses, visible, z, torch.stack([a, c], dim=-1), factor)
 
 
 def _blur_of_det(

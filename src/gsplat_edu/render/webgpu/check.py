@@ -64,6 +64,11 @@ def webgpu_failure(exact: Rasterize) -> str | None:
         return does_not_run(error)
 
 
+def forget_checks() -> None:
+    """Forget the results of this process, such as after a driver was replaced; passes that are stored still count."""
+    _failure.cache_clear()
+
+
 @functools.cache
 def _failure(exact: Rasterize) -> str | None:
     from gsplat_edu.render.webgpu.render import adapter_name

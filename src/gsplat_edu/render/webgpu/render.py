@@ -9,9 +9,10 @@ one device give the same bits.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -211,8 +212,30 @@ class _Rasterize(torch.autograd.Function):
 
 
 @functools.cache
-def _pool() -> Pool:
+def _default_pool() -> Pool:
     return Pool(Device.default())
+
+
+_chosen: list[Pool] = []
+"""The pools of `rendering_with`, innermost last."""
+
+
+def _pool() -> Pool:
+    return _chosen[-1] if _chosen else _default_pool()
+
+
+@contextlib.contextmanager
+def rendering_with(pool: Pool) -> Iterator[Pool]:
+    """Let this backend use another device in a block, in all threads: another adapter, other limits or other shaders.
+
+    Args:
+        pool: Has the device; frames use its buffers again.
+    """
+    _chosen.append(pool)
+    try:
+        yield pool
+    finally:
+        _chosen.remove(pool)
 
 
 def device() -> Device:

@@ -39,13 +39,17 @@ class WebgpuRun:
 
     Raises:
         BackendUnavailableError: there is no adapter, or it does not start.
+
+    Attributes:
+        resident: What is on the device.
+        repeatable: What was done since the host had the state, to be done again on another device.
     """
 
     def __init__(self, harmonics: int, photo_room: int | None = None) -> None:
         self._photo_room = kept_photos(photo_room)
         self.resident = Resident(webgpu.device(), harmonics, self._photo_room)
         self._start: RunState | None = None
-        self._done: list[Callable[[], None]] = []
+        self.repeatable: list[Callable[[], None]] = []
         self._photos: dict[int, int] = {}
         self._image: Tensor | None = None
         self._losses = 0
@@ -59,7 +63,7 @@ class WebgpuRun:
     def read(self) -> RunState:
         """Wait for all steps, and return the state."""
         found = self._on_a_device(lambda: self.resident.read())  # noqa: PLW0108  it may be another one
-        if self._image is None and self._done:
+        if self._image is None and self.repeatable:
             self._image = self.image()
         gaussians, first, second = (
             _tensors(found[f"core{suffix}"], found[f"rest{suffix}"]) for suffix in ("", "_first", "_second")
@@ -112,7 +116,7 @@ class WebgpuRun:
         self._do(step)
         self._image = None
         self._photos[id(target.image)] = target.image.nbytes
-        if len(self._done) >= MOST_STEPS or sum(self._photos.values()) > REPEATED_PHOTOS:
+        if len(self.repeatable) >= MOST_STEPS or sum(self._photos.values()) > REPEATED_PHOTOS:
             self.read()
         return lambda: self._on_a_device(lambda: _sums(result, numbers, count))
 
@@ -123,12 +127,12 @@ class WebgpuRun:
         self._do(lambda: self.resident.add_noise(noise))
 
     def _begin_from(self, state: RunState) -> None:
-        self._start, self._done, self._photos, self._losses = state, [], {}, 0
+        self._start, self.repeatable, self._photos, self._losses = state, [], {}, 0
 
     def _do(self, action: Callable[[], None]) -> None:
         """Do something that changes the state, and keep it to be done again."""
         self._on_a_device(action)
-        self._done.append(action)
+        self.repeatable.append(action)
 
     def _on_a_device(self, action: Callable[[], _Found]) -> _Found:
         """Return what a function returns; if the device is lost meanwhile, do everything again on a new one."""
@@ -138,13 +142,13 @@ class WebgpuRun:
             try:
                 if lost is not None:
                     self._losses += 1
-                    what = f"{len(self._done)} steps and what followed them are done again"
+                    what = f"{len(self.repeatable)} steps and what followed them are done again"
                     webgpu.replace_device(used, self._losses, what, lost)
                     self.resident = Resident(webgpu.device(), self.resident.harmonics, self._photo_room)
                     lost = None
                     if self._start is not None:
                         self.resident.load(_arrays(self._start))
-                    for done in self._done:
+                    for done in self.repeatable:
                         done()
                 return action()
             except DeviceLostError as error:

@@ -87,7 +87,7 @@ class PlannedDensity:
         planned = int(planned_counts(config, self.start_count, self.cap, np.array([due]))[0])
         room = planned - int(keep.sum()) if growing else 0
         may = keep if self.shell is None else self.shell.within_quota(keep, self._score(), gaussians.means)
-        split = self._highest(may, room)
+        split = self.highest(may, room)
         children = long_axis_children(gaussians.map(lambda tensor: tensor[split]))
         replaced = replace(gaussians, optimizer, keep & ~split, children)
         self._forget(replaced)
@@ -115,7 +115,7 @@ class PlannedDensity:
         due = milestone(iteration, self.config.densify_every, self.config.batch)
         return due if due is not None and due > self.config.densify_start else None
 
-    def _highest(self, keep: Bool[Tensor, " N"], count: int) -> Bool[Tensor, " N"]:
+    def highest(self, keep: Bool[Tensor, " N"], count: int) -> Bool[Tensor, " N"]:
         """Select the `count` Gaussians of the highest positive score, of equal ones the first."""
         score = self._score()
         score = torch.where(keep & (score > 0), score, 0.0)  # NaN is not above 0
