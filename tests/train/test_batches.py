@@ -10,6 +10,7 @@ from gsplat_edu import ArgumentError
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import score_views
+from gsplat_edu.parts.transients.search import Transients
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
@@ -19,7 +20,7 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent, StepEvent
-from gsplat_edu.train.initialize import from_points, make_transients
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import Objective, PhotoTerm
 from gsplat_edu.train.optimizer import Adam, ParameterGroup
 from gsplat_edu.train.schedule import milestone
@@ -198,7 +199,7 @@ def test_the_other_strategies_count_images_too(strategy):
 
 def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_image():
     views, _, _ = procedural_capture(24, 6, splats=30)
-    found = make_transients(config("adc", transients="mask", means_rate_iterations=20), views, render)
+    found = Transients(views, 20, render)
     due = [first for first in range(0, 24, 4) if found.is_due(first, 4)]
     assert due == [0, 4, 8]  # images 2, 4, 7 and 10
     assert [i for i in range(24) if found.is_due(i)] == [2, 4, 7, 10]

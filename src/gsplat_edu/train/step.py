@@ -34,10 +34,10 @@ from gsplat_edu.train.far import Shell, features_before
 from gsplat_edu.train.feed import Draw, Target
 from gsplat_edu.train.objective import Objective, Rendered
 from gsplat_edu.train.optimizer import MOMENTS, Adam, ParameterGroup
-from gsplat_edu.train.rendered import surface_before
+from gsplat_edu.train.part_values import Masker
+from gsplat_edu.train.rendered import without_shell
 from gsplat_edu.train.saved import check_entries, check_tensor_kind
 from gsplat_edu.train.team import ALONE, SharedAdam, Team, places_of, share_results
-from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import Identity, Rows, ViewModel, ViewRender
 
 Reduce = Callable[[Mapping[str, Tensor], int], None]
@@ -64,7 +64,7 @@ class StepParts:
         view_model: Corrects the camera and the image of a view before the loss compares it.
         reduce: Combines the gradients of a step's views before they are applied.
         adam: Updates one tensor by Adam's rule; that of the backend if None.
-        transients: Finds and applies masks of things that move; None for none.
+        maskers: Find masks and apply them, by the names of their parts.
         fused: Takes Adam's step for the Gaussians in the backward pass where that gives the same bits, so that their
             gradients need no memory; see `TensorStepper.fuses`.
         team: The processes that share each step.
@@ -76,7 +76,7 @@ class StepParts:
     view_model: ViewModel = field(default_factory=Identity)
     reduce: Reduce = mean_over_views
     adam: AdamKernel | None = None
-    transients: Transients | None = None
+    maskers: Mapping[str, Masker] = field(default_factory=dict)
     fused: bool = True
     team: Team = ALONE
     shell: Shell | None = None
@@ -379,8 +379,8 @@ class TensorStepper:
         )
         rows = model.measure(index, given, target, iteration)
         image = model.correct(index, given, target, rows)
-        surface = None if shell is None else surface_before(output)
-        return Rendered(self.gaussians, view.draw, output, image, target, iteration, at, surface), rows
+        scene = None if shell is None else without_shell(output)
+        return Rendered(self.gaussians, view.draw, output, image, target, iteration, at, scene), rows
 
     def _store(self, index: int, rows: Rows) -> None:
         """Write what was measured of a view into the view model's tensors."""

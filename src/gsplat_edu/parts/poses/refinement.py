@@ -8,7 +8,7 @@ projection of D onto these columns fixes the gauge: the cameras can move relativ
 and the scene stays in the frame of the capture.
 
 The poses are measured, not learned by gradient descent: whenever a view is drawn, D moves by the step that its render
-and its photo ask for (`gsplat_edu.train.pose_step`), and the next render of the view uses it.
+and its photo ask for (`gsplat_edu.parts.poses.step`), and the next render of the view uses it.
 
 Views with equal intrinsics share a lens, which Adam learns:
 fx' = fx exp(a), fy' = fy exp(b), cx' = cx + c W, cy' = cy + d H, and k' = k + e W / (fx r^n) for coefficients of the
@@ -33,6 +33,7 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
+from gsplat_edu.parts.poses.step import pose_step
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.intrinsics import Intrinsics
@@ -41,7 +42,6 @@ from gsplat_edu.scene.shutter import readout_times
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
-from gsplat_edu.train.pose_step import pose_step
 from gsplat_edu.train.rendered import Needs
 from gsplat_edu.train.view_model import Chain, Identity, Rows, ViewModel, ViewRender
 
