@@ -34,7 +34,7 @@ from gsplat_edu.doctor.remedies import remedies_for
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.options import train as command
 from gsplat_edu.options.parser import OneLineParser
-from gsplat_edu.runs import skies
+from gsplat_edu.parts.sky import start as skies
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians

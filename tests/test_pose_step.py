@@ -6,12 +6,12 @@ import torch
 
 from gsplat_edu.base.errors import ShapeError
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.parts.poses.step import FEWEST, image_flow, pose_step
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.pose_step import FEWEST, image_flow, pose_step
 
 EXTENT = 4.0
 SPREAD = 0.01 * torch.tensor([1.0] * 3 + [EXTENT] * 3, dtype=torch.float64)

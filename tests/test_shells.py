@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from gsplat_edu.parts.sky.find import fibonacci
 from gsplat_edu.scene.shells import far_shell
-from gsplat_edu.sky.find import fibonacci
 
 
 def scene(count=5_000):

@@ -10,13 +10,20 @@ import pytest
 from rich.progress import Task, TaskID
 
 from gsplat_edu.base import text as names
-from gsplat_edu.base.text import as_file_name, decode_file_name, legible, printable, short_number, write_text
+from gsplat_edu.base.text import (
+    as_file_name,
+    decode_file_name,
+    image_file_names,
+    legible,
+    printable,
+    short_number,
+    write_text,
+)
 from gsplat_edu.cli.main import main
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.evaluate.report import Report, write_report
-from gsplat_edu.runs.folder import image_file_names
 
 CHILD = """
 import os, sys

@@ -10,11 +10,11 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.parts.poses.refinement import DISTORTIONS, MOTIONS
+from gsplat_edu.parts.poses.trials import RefineTrials
 from gsplat_edu.runs import pilot
 from gsplat_edu.runs.training import CaptureRun, RunOptions
-from gsplat_edu.runs.trials import RefineTrials
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.poses import DISTORTIONS, MOTIONS
 
 pytestmark = pytest.mark.slow
 

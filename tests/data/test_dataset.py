@@ -18,9 +18,9 @@ from gsplat_edu.data.points import read_points_ply, write_points_ply
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.visible_cloud import cloud_in_view
 from gsplat_edu.data.writers import write_colmap, write_transforms
+from gsplat_edu.parts.sky.find import scene_size
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.views import View
-from gsplat_edu.sky.find import scene_size
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,8 @@ from gsplat_edu import Camera, Gaussians
 from gsplat_edu.ops.depth import DepthRule, depth_error
 from gsplat_edu.ops.patches import GreyPhoto, Grid, patch_error, patch_error_in_torch
 from gsplat_edu.ops.surface import normal_error, normal_error_in_torch
+from gsplat_edu.parts.given_depth.term import DepthTerm
+from gsplat_edu.parts.surface.terms import Turns
 from gsplat_edu.render.api import render
 from gsplat_edu.render.planes import facing_normals
 from gsplat_edu.render.settings import RenderSettings
@@ -22,10 +24,8 @@ from gsplat_edu.scene.camera import look_at
 from gsplat_edu.scene.given_depth import GivenDepth
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.depth import DepthTerm
 from gsplat_edu.train.feed import Draw, Target
 from gsplat_edu.train.rendered import Rendered
-from gsplat_edu.train.surface import Turns
 from native.test_lens_surfaces import MOVING, maps_of, photographed, posed
 
 SIDE, W = 40, 80

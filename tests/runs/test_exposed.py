@@ -11,10 +11,10 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.ops.exposure import falloff
+from gsplat_edu.parts.exposure.photos import at_exposure_of_scene
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.cleaning import open_subject
-from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points

@@ -6,8 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.text import image_file_names
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.folder import FORMAT, RunFolder, image_file_names, render_settings
+from gsplat_edu.runs.folder import FORMAT, RunFolder, render_settings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
 

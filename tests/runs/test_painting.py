@@ -10,9 +10,9 @@ from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.mesh.depths import DepthView
 from gsplat_edu.mesh.faces import faces_of
 from gsplat_edu.mesh.texture import TextureSettings
+from gsplat_edu.parts.transients.files import mask_path
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.painting import painted
-from gsplat_edu.runs.transients import mask_path
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.views import View
@@ -55,7 +55,7 @@ def test_masks_of_a_run_say_what_does_not_paint(taken, tmp_path):
     assert reddest(painted(WALL, dataset, maps, run, SMALL)) > 30, "it looked for nothing that moves"
     counts = np.full((SIZE, SIZE), 255, np.uint8)
     counts[22:42, 22:42] = 0
-    path = mask_path(run, next(view.name for view in dataset.train if view.name.endswith("1.png")))
+    path = mask_path(run.path, next(view.name for view in dataset.train if view.name.endswith("1.png")))
     path.parent.mkdir(parents=True)
     Image.fromarray(counts).save(path)
     assert reddest(painted(WALL, dataset, maps, run, SMALL)) == 0

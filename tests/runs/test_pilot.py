@@ -13,11 +13,11 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.parts.poses.trials import CONTROL
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs import pilot
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.pilot import LEAST_GAIN, refinement_for
-from gsplat_edu.runs.trials import CONTROL
 from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View

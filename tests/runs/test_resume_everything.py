@@ -10,10 +10,10 @@ from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.options import train as command
 from gsplat_edu.options.parser import OneLineParser
+from gsplat_edu.parts.poses.refinement import LENSES, TWISTS
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.events import StepEvent
-from gsplat_edu.train.poses import LENSES, TWISTS
 from lab.captures.outdoors import outdoor_capture
 from passers_by import pasted
 

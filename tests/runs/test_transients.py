@@ -10,13 +10,13 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.parts.transients.files import mask_path, masked_names, write_masks
+from gsplat_edu.parts.transients.search import Transients
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun
-from gsplat_edu.runs.transients import mask_path, masked_names, write_masks
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.transients import Transients
 from passers_by import pasted
 
 
@@ -36,7 +36,7 @@ def run_of(capture, out, resume=False):
 
 def written(run):
     run.finish()
-    masks = {path.name: path.read_bytes() for path in run.folder.transients.iterdir()}
+    masks = {path.name: path.read_bytes() for path in (run.folder.path / "transients").iterdir()}
     return run.folder.latest_scene()[0].read_bytes(), masks
 
 
@@ -59,7 +59,7 @@ def test_a_killed_and_resumed_run_writes_the_same_bytes(capture, tmp_path):
         killed.train(callbacks=[kill])
     resumed = run_of(capture, tmp_path / "killed", resume=True)
     assert resumed.trainer.iteration == 50, "the checkpoint has the masks of the 21st and 41st step"
-    assert any(mask is not None for mask in resumed.trainer.transients.masks)
+    assert any(mask is not None for mask in resumed.trainer.maskers["transients"].masks)
     resumed.train()
     assert written(resumed) == (scene, masks) and masks
 
@@ -71,10 +71,10 @@ def test_masks_have_the_size_of_the_files_and_old_masks_are_removed(capture, tmp
     found.masks[2][:9] = True
     found.too_large[4] = True
     folder = RunFolder(tmp_path / "run")
-    old = folder.transients / "old" / "mask.png"
+    old = folder.path / "transients" / "old" / "mask.png"
     old.parent.mkdir(parents=True)
     Image.new("L", (2, 2)).save(old)
-    sentence, facts = write_masks(folder, dataset, found)
+    sentence, facts = write_masks(folder.path, dataset, found)
     name = dataset.train[2].name
     assert f"masked in 1 of {len(dataset.train)} photos, most of {name} (25.0 %)" in sentence
     assert (
@@ -83,15 +83,15 @@ def test_masks_have_the_size_of_the_files_and_old_masks_are_removed(capture, tmp
     )
     assert facts == {"photos": [{"name": name, "share": 0.25}], "left_alone": [dataset.train[4].name]}
     assert masked_names({"transients": facts}) == [name] and not old.exists()
-    mask = np.asarray(Image.open(folder.transients / f"{name}.png"))
+    mask = np.asarray(Image.open(folder.path / "transients" / f"{name}.png"))
     assert mask.shape == (36, 48) and not mask[:9].any() and (mask[9:] == 255).all()
 
 
 @pytest.mark.parametrize("name", ["../../up.png", "/root/photo.png", "C:\\photo.png"])
 def test_names_cannot_leave_the_folder(tmp_path, name):
     folder = RunFolder(tmp_path / "run")
-    assert mask_path(folder, name).parent == folder.transients
-    assert mask_path(folder, "left/a.jpg") == folder.transients / Path("left/a.jpg.png")
+    assert mask_path(folder.path, name).parent == folder.path / "transients"
+    assert mask_path(folder.path, "left/a.jpg") == folder.path / "transients" / Path("left/a.jpg.png")
 
 
 @pytest.mark.parametrize("metrics", [{}, {"transients": 3}, {"transients": {"photos": [1, "a"]}}])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from doctor.rooms import room
+from gsplat_edu.parts.sky.find import fibonacci, find_sky, scene_size
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.sky.find import fibonacci, find_sky, scene_size
 from lab.captures.outdoors import outdoor_capture, photograph, sky_colors
 
 NO_POINTS = np.zeros((0, 3))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.parts.sky.find import Sky, fibonacci
+from gsplat_edu.parts.sky.shell import FLATNESS, OPACITY, sky_splats
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import quat_to_R_t
-from gsplat_edu.sky.find import Sky, fibonacci
-from gsplat_edu.sky.shell import FLATNESS, OPACITY, sky_splats
 from gsplat_edu.train.far import Shell
 
 CENTRE, RADIUS = np.array([1.0, 2.0, 3.0]), 500.0

@@ -10,6 +10,7 @@ from gsplat_edu import ArgumentError
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import score_views
+from gsplat_edu.parts.transients.search import Transients
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
@@ -19,10 +20,11 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent, StepEvent
-from gsplat_edu.train.initialize import from_points, make_transients
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import Objective, PhotoTerm
 from gsplat_edu.train.optimizer import Adam, ParameterGroup
 from gsplat_edu.train.schedule import milestone
+from gsplat_edu.train.step import mean_over_views
 from gsplat_edu.train.team import ALONE
 from ranks import together
 
@@ -113,19 +115,14 @@ def test_the_gradient_of_a_batch_is_the_mean_over_its_views():
     start = from_points(points, colors, settings).map(torch.Tensor.double)
     objective = Objective({"photo": PhotoTerm(0.2)})
     views = [View(view.camera, view.read().image.astype(np.float32) / 255) for view in views]
-    given = {}
 
-    def note(parameters, count):
-        given.update({name: parameter.grad / count for name, parameter in parameters.items()})
-        for parameter in parameters.values():
-            parameter.grad = None
-
-    def make(reduce):
+    def make():
         config = settings.changed(strategy="none")
-        parts = {"objective": objective, "reduce": reduce}
-        return training(config, Views(views), load_backend("cpu"), Start(start, extent=1.0), **parts)
+        return training(
+            config, Views(views), load_backend("cpu"), Start(start, extent=1.0), objective=objective
+        )
 
-    single, alone = [], make(note)
+    single, alone = [], make()
     for view in alone.step_views():
         terms = alone.stepper.gradients([view], 0)
         single.append(
@@ -134,17 +131,15 @@ def test_the_gradient_of_a_batch_is_the_mean_over_its_views():
         )
         for tensor in alone.stepper.parameters().values():
             tensor.grad = None
-    seen = []
-    batch = make(note)
-    batch.run(lambda: True, [lambda _, event: seen.append(event)])
-    (step,) = seen
-    assert step.iteration == 3 and batch.iteration == 4
-    for name, gradient in given.items():
+    batch = make()
+    loss = batch.stepper.gradients(list(batch.step_views()), 0)["photo"]
+    mean_over_views(batch.stepper.parameters(), 4)
+    for name, tensor in batch.stepper.parameters().items():
         parts = torch.stack([view[name] for view in single])
         bound = 3 * 2.0**-53 * parts.abs().sum(dim=0) / 4
         assert bool((parts.sum(dim=0) != 0).any()) or name == "sh_rest"
-        assert bool(((gradient - parts.sum(dim=0) / 4).abs() <= 2 * bound).all()), name
-    assert step.loss == pytest.approx(float(sum(view["loss"] for view in single)) / 4, rel=1e-12)
+        assert bool(((tensor.grad - parts.sum(dim=0) / 4).abs() <= 2 * bound).all()), name
+    assert float(loss) == pytest.approx(float(sum(view["loss"] for view in single)) / 4, rel=1e-12)
 
 
 def test_adam_follows_the_rule_for_batches():
@@ -197,7 +192,7 @@ def test_the_other_strategies_count_images_too(strategy):
 
 def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_image():
     views, _, _ = procedural_capture(24, 6, splats=30)
-    found = make_transients(config("adc", transients="mask", means_rate_iterations=20), views, render)
+    found = Transients(views, 20, render)
     due = [first for first in range(0, 24, 4) if found.is_due(first, 4)]
     assert due == [0, 4, 8]  # images 2, 4, 7 and 10
     assert [i for i in range(24) if found.is_due(i)] == [2, 4, 7, 10]

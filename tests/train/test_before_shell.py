@@ -13,20 +13,20 @@ import torch
 from gsplat_edu import Camera, build_cov3d_batch, load_backend, quat_to_R_batch, render_gaussians
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.parts.given_depth.term import DepthTerm
+from gsplat_edu.parts.surface.patches import Neighbourhood, PatchTerm
+from gsplat_edu.parts.surface.terms import NormalTerm, Turns
 from gsplat_edu.render.api import render
 from gsplat_edu.render.planes import depth_features
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.given_depth import GivenDepth
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.depth import DepthTerm
 from gsplat_edu.train.far import Shell, features_before
 from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.objective import Objective
-from gsplat_edu.train.patches import Neighbourhood, PatchTerm
-from gsplat_edu.train.rendered import surface_before
+from gsplat_edu.train.rendered import without_shell
 from gsplat_edu.train.step import StepParts, StepView, TensorStepper
-from gsplat_edu.train.surface import NormalTerm, Turns
 from gsplat_edu.train.view_model import Identity
 from lens_scenes import LENSES
 
@@ -71,7 +71,7 @@ def test_depth_before_a_shell_is_that_of_the_scene_alone(backend):
         output = render(
             gaussians, one, features=features, settings=RenderSettings(depth=True), backend=backend
         )
-        found = surface_before(output)
+        found = without_shell(output)
     alone = scene(shell=False)
     z = (alone.means.numpy() - one.eye) @ one.R[2]
     channels = np.stack([z, np.ones(SHEET), np.zeros(SHEET)], axis=1)

@@ -9,6 +9,8 @@ import torch
 from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.synthetic import sphere_capture
+from gsplat_edu.parts.exposure.model import Exposure
+from gsplat_edu.parts.poses.refinement import LENSES, TWISTS, Refinement, refinement_of
 from gsplat_edu.render.backend import FEATURES
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.views import View
@@ -18,10 +20,8 @@ from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
-from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.initialize import random_ball
-from gsplat_edu.train.poses import LENSES, TWISTS, Refinement, refinement_of
 
 CPU = load_backend("cpu")
 
@@ -93,9 +93,9 @@ def test_refine_and_appearance_together(capture):
 
 def test_transients_are_found(capture):
     run = training(recipe(20, strategy="none", transients="mask"), capture, CPU)
-    assert run.transients is not None
+    assert "transients" in run.maskers
     found = []
-    run.transients.find = lambda *arguments: found.append(run.iteration)
+    run.maskers["transients"].find = lambda *arguments: found.append(run.iteration)
     run.run()
     assert found == [2, 4, 7, 10]
     few = Views(capture.train[:3])

@@ -9,13 +9,13 @@ import torch
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.ops.exposure import stops
+from gsplat_edu.parts.exposure.model import NAME
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.exposure import NAME
 from gsplat_edu.train.initialize import from_points
 from test_exposure import photographed
 

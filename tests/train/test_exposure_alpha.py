@@ -8,6 +8,7 @@ from gsplat_edu.data import procedural
 from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views, summarize, transparency_of
 from gsplat_edu.ops.exposure import stops
 from gsplat_edu.ops.recolor import recolored_natively
+from gsplat_edu.parts.exposure.model import Exposure
 from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
@@ -16,7 +17,6 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.view_model import ViewRender
@@ -147,7 +147,7 @@ def test_photos_converted_to_the_scenes_exposure_keep_their_alpha(tmp_path):
     from gsplat_edu.data.dataset import load_dataset
     from gsplat_edu.data.settings import DataSettings
     from gsplat_edu.data.writers import write_blender
-    from gsplat_edu.runs.exposed import at_exposure_of_scene
+    from gsplat_edu.parts.exposure.photos import at_exposure_of_scene
 
     photo, output = darker_render(1.6)
     camera = procedural.ring_camera(0, 4, 40, 30)

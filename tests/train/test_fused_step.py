@@ -10,7 +10,6 @@ import torch
 from gains import Gains
 from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.ops.adam import adam_natively
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.views import View
@@ -185,8 +184,6 @@ def test_gradients_are_stored_if_something_reads_them(capture):
 
     config, strategy = recipe(2, strategy="none"), Watching()
     for parts, changes in (
-        ({"reduce": lambda parameters, count: None}, {}),
-        ({"adam": functools.partial(adam_natively)}, {}),
         ({"objective": Twice({"photo": PhotoTerm(0.2)})}, {}),
         ({}, {"density": strategy}),
     ):

@@ -8,12 +8,12 @@ import torch
 
 import panorama_room
 from gsplat_edu import ArgumentError, Camera, load_backend, look_at, recipe, training
+from gsplat_edu.parts.poses.refinement import distortion_units, lens_key, refinement_of
+from gsplat_edu.parts.poses.step import lens_flow
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.scene.projection import COEFFICIENTS, Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.pose_step import lens_flow
-from gsplat_edu.train.poses import distortion_units, lens_key, refinement_of
 from lens_captures import moving_photo, room_photo
 
 SIDE = 80

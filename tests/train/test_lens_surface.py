@@ -10,10 +10,10 @@ from gsplat_edu import Camera, load_backend, recipe, training
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.parts.surface.patches import neighbours_of
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.scene.projection import Projection
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.patches import neighbours_of
 from lens_captures import FISHEYE, room_cameras, room_depth, write_room
 from panorama_room import rectangles
 

@@ -22,6 +22,7 @@ from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
 from gsplat_edu.train.rendered import Needs
+from gsplat_edu.train.step import mean_over_views
 
 CONFIG = recipe(40, densify_start=2, densify_every=5, grad_threshold=5e-5, sh_degree=0)
 MCMC = recipe(20, strategy="mcmc", max_gaussians=60, sh_degree=0)
@@ -131,30 +132,13 @@ def test_a_batch_has_the_mean_gradient_of_its_views(capture):
         for tensor in run.stepper.parameters().values():
             tensor.grad = None
     terms = run.stepper.gradients(views, 0)
-    run.stepper.parts.reduce(run.stepper.parameters(), 3)
+    mean_over_views(run.stepper.parameters(), 3)
     torch.testing.assert_close(terms["photo"], sum(losses) / 3)
     for name, found in grads(run).items():
         # two sums of three float32 numbers in different orders differ by at most four roundings of the largest
         largest = float(torch.stack([each[name].abs() for each in single]).max())
         expected = sum(each[name] for each in single) / 3
         assert float((found - expected).abs().max()) <= 4 * 2**-24 * largest, name
-
-
-def test_only_gradients_left_by_reduce_are_applied(capture):
-    """If a reduction returns no gradients, as in a process without work, the parameters do not change."""
-    seen = []
-
-    def nothing(parameters, num_views):
-        seen.append((sorted(parameters), num_views))
-        for parameter in parameters.values():
-            parameter.grad = None
-
-    run = trainer(capture, recipe(2, strategy="none", sh_degree=0), {"reduce": nothing})
-    before = run.gaussians.map(torch.clone)
-    run.run()
-    for name, tensor in run.gaussians.tensors().items():
-        assert torch.equal(tensor, before.tensors()[name]), name
-    assert seen == [(sorted(before.tensors()), 1)] * 2
 
 
 def test_terms_are_summed_and_logged_by_name(capture, tmp_path):

@@ -5,14 +5,12 @@ import pytest
 import torch
 
 from gsplat_edu import load_backend, recipe, training
-from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.parts.surface import patches
+from gsplat_edu.parts.surface.patches import NEIGHBOURS, PATCHES, Neighbourhood, neighbours_of
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
-from gsplat_edu.train import patches
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.events import StepEvent
-from gsplat_edu.train.objective import make_objective
-from gsplat_edu.train.patches import NEIGHBOURS, PATCHES, Neighbourhood, neighbours_of
 from gsplat_edu.train.view_model import Identity
 from lab.captures.textured_box import box_orbit, photograph_box
 
@@ -101,7 +99,7 @@ def test_photos_beyond_the_room_are_read_again(box, monkeypatch):
     assert reads == ["0.png", "1.png", "2.png", "1.png", "3.png"], "the photo used longest ago goes"
 
 
-def test_an_objective_without_photos_is_refused():
-    with pytest.raises(ArgumentError, match="around: has to be given"):
-        make_objective(recipe(10, surface=True))
-    assert PATCHES not in make_objective(recipe(10, surface=True, patch_weight=0)).terms
+def test_patches_without_weight_are_no_term():
+    run = training(recipe(10, surface=True, patch_weight=0), Box(), load_backend("cpu"))
+    assert {"normal", "flat"} < set(run.stepper.parts.objective.terms)
+    assert PATCHES not in run.stepper.parts.objective.terms

@@ -8,6 +8,7 @@ import torch
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.alignment import aligned_psnr
+from gsplat_edu.parts.poses.refinement import LENSES, TWISTS, Refinement, gauge
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
@@ -17,7 +18,6 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.poses import LENSES, TWISTS, Refinement, gauge
 
 EXTENT = 4.0
 """Distance of the procedural cameras from the centre, about, world units."""

@@ -12,6 +12,7 @@ from gsplat_edu import load_backend, recipe, training
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.options import train as train_options
+from gsplat_edu.parts.surface.terms import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.views import View
@@ -19,7 +20,6 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.rendered import Rendered
-from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm, Turns
 from lab.captures.textured_box import BOX_FACES, box_orbit, photograph_box
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.parts.transients.masks import RULES, Compared, find_masks, outstanding
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
@@ -12,7 +13,6 @@ from gsplat_edu.scene.sphere_shell import sphere_shell
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.transient_masks import RULES, Compared, find_masks, outstanding
 from passers_by import pasted
 
 HOW = Compared(render, RenderSettings(), lambda index, camera: camera)

@@ -9,6 +9,7 @@ import torch
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import score_views, summarize
+from gsplat_edu.parts.transients.search import LONGEST, MASKS, TOO_LARGE, resized_mask
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.views import View
@@ -17,7 +18,6 @@ from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.transients import LONGEST, MASKS, TOO_LARGE, resized_mask
 from passers_by import pasted
 
 HELD_OUT = slice(3, None, 6)
@@ -71,7 +71,7 @@ def test_a_clean_capture_keeps_every_pixel_and_its_bits(capture):
     plain, masked = (
         trained(capture, capture[0], transients, iterations=120) for transients in ("none", "mask")
     )
-    assert all(mask is None for mask in masked.transients.masks) and plain.transients is None
+    assert all(mask is None for mask in masked.maskers["transients"].masks) and not plain.maskers
     for name, tensor in plain.gaussians.tensors().items():
         assert torch.equal(tensor, masked.gaussians.tensors()[name]), name
 
@@ -90,7 +90,7 @@ def test_a_clean_capture_keeps_every_pixel_and_its_bits(capture):
 def test_masks_are_found_in_every_recipe(capture, changes):
     struck, truth = pasted(capture[0])
     run = trained(capture, struck, "mask", **{"iterations": 200, **changes})
-    found = [mask is not None for mask in run.transients.masks]
+    found = [mask is not None for mask in run.maskers["transients"].masks]
     right = [true.any() for true in truth]
     assert sum(a and b for a, b in zip(found, right, strict=True)) >= 0.6 * sum(right)
 
@@ -145,17 +145,19 @@ def test_given_masks_still_count(capture):
     given[:10] = False
     run = trainer(capture, [View(v.camera, v.image, mask=given, name=v.name) for v in struck], "mask", 200)
     run.run(stop=lambda: run.iteration == 110)
-    index = next(i for i, mask in enumerate(run.transients.masks) if mask is not None and truth[i].any())
+    index = next(
+        i for i, mask in enumerate(run.maskers["transients"].masks) if mask is not None and truth[i].any()
+    )
     photo = torch.from_numpy(struck[index].image)
-    target = run.transients.applied(index, Target(photo, torch.from_numpy(given)))
+    target = run.maskers["transients"].applied(index, Target(photo, torch.from_numpy(given)))
     assert not target.mask[:10].any(), "the given mask is kept"
-    found = resized_mask(run.transients.masks[index], 48, 64)
+    found = resized_mask(run.maskers["transients"].masks[index], 48, 64)
     assert not target.mask.numpy()[found].any() and target.mask.numpy()[given & ~found].all()
-    half = run.transients.applied(index, Target(photo[::2, ::2].contiguous(), None))
+    half = run.maskers["transients"].applied(index, Target(photo[::2, ::2].contiguous(), None))
     assert half.mask.shape == (24, 32) and 0 < (~half.mask).sum() < 24 * 32
-    kept = next(i for i, mask in enumerate(run.transients.masks) if mask is None)
+    kept = next(i for i, mask in enumerate(run.maskers["transients"].masks) if mask is None)
     unchanged = Target(photo, None)
-    assert run.transients.applied(kept, unchanged) is unchanged
+    assert run.maskers["transients"].applied(kept, unchanged) is unchanged
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused_without_changes(capture, tmp_path):

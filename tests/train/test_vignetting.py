@@ -8,10 +8,10 @@ from doctor.rooms import room
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.ops.exposure import falloff
 from gsplat_edu.ops.recolor import recolored_natively
+from gsplat_edu.parts.exposure.model import NAME, VIGNETTING_ERROR, Exposure
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.exposure import NAME, VIGNETTING_ERROR, Exposure
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.view_model import ViewRender
 from test_exposure import photographed

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 _SURROGATES = re.compile("[\ud800-\udfff]")
@@ -204,3 +205,31 @@ def easily_read(count: int) -> int:
     digits = 3 if str(count).startswith("1") else 2
     step = int(10 ** max(len(str(count)) - digits, 0))
     return count // step * step
+
+
+def image_file_names(names: Sequence[str], suffix: str = ".png") -> list[str]:
+    """Turn image names into distinct file names for one folder.
+
+    Every character other than letters, digits, ".", "_" and "-" becomes "_", including path separators. The image's
+    own suffix is removed.
+
+    Args:
+        names: Image names in the capture, for example "left/0001.jpg".
+        suffix: Suffix of the file names.
+
+    Returns:
+        One file name per image: "left_0001.png".
+    """
+    result: list[str] = []
+    taken: set[str] = set()
+    copies: dict[str, int] = {}  # the next number to try, so that equal names do not count up from 2 each
+    for index, name in enumerate(names):
+        base = re.sub(r"\.[A-Za-z]{3,4}$", "", name)
+        stem = re.sub(r"[^\w.-]", "_", base).lstrip(".")[:200] or f"view_{index:04d}"
+        chosen, copy = stem, copies.get(stem.lower(), 2)
+        while chosen.lower() in taken:  # some file systems ignore case
+            chosen, copy = f"{stem}_{copy}", copy + 1
+        taken.add(chosen.lower())
+        copies[stem.lower()] = copy
+        result.append(as_file_name(chosen + suffix))
+    return result

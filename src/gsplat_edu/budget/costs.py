@@ -23,13 +23,13 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.depths import POINTS
 from gsplat_edu.engine.room import PIXEL_BYTES, REPEATED_PHOTOS, Load, Room, kept_photos
 from gsplat_edu.ops.lenses import RAY_ROOM
+from gsplat_edu.parts.surface.patches import PHOTO_ROOM
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
 from gsplat_edu.scene.sh import num_coefficients
 from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
 from gsplat_edu.train.overlap import separate_views
-from gsplat_edu.train.patches import PHOTO_ROOM
 from gsplat_edu.train.schedule import photo_factor, planned_counts
 
 GROWTH = (0.005, 0.08)

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_writable
 from gsplat_edu.base.links import check_links
+from gsplat_edu.base.text import image_file_names
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.shot import PLAN, Shot, check_lens, median_depth, plan_asked_for, through_lens
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
@@ -41,7 +42,7 @@ from gsplat_edu.render.field import within_field
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import MAPS, RenderSettings
 from gsplat_edu.runs.dataset import data_settings
-from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
+from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.source import capture_up, file_settings, open_source
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.gaussians import Gaussians

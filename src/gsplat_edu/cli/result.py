@@ -49,7 +49,7 @@ def tell_result(
 def _tell_odd_photos(capture: CaptureRun, say: Callable[[str], None], *, limited: bool) -> None:
     """Name the photos that show what others do not; with a time limit or without scores, the command that does."""
     trainer, options = capture.trainer, capture.options
-    if trainer.transients is not None or len(capture.dataset.train) < ENOUGH:
+    if trainer.maskers or len(capture.dataset.train) < ENOUGH:
         return
     features = None if limited else functools.partial(render, backend=options.backend)
     line = moved_line(

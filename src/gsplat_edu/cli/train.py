@@ -40,6 +40,7 @@ from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.settings import given
 from gsplat_edu.options.train import AUTO, left_open, options_from
+from gsplat_edu.parts.poses.refinement import NEED_LENSES
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.pilot import refinement_for
 from gsplat_edu.runs.processes import Member, joined
@@ -52,7 +53,6 @@ from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
 from gsplat_edu.train.capacity import advised_side
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
-from gsplat_edu.train.poses import NEED_LENSES
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target

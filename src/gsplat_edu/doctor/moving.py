@@ -8,11 +8,11 @@ from pathlib import Path
 from gsplat_edu.base.text import Told
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.doctor.finding import Finding, Severity, command, counted
+from gsplat_edu.parts.transients.masks import Compared, FeatureRenderer, find_masks
+from gsplat_edu.parts.transients.search import FEWEST, reduced
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.transient_masks import Compared, FeatureRenderer, find_masks
-from gsplat_edu.train.transients import FEWEST, reduced
 
 NOTABLE = 0.01
 """Report a photo only if at least this fraction of it differs."""

@@ -14,7 +14,7 @@ from gsplat_edu.doctor.appearance import correction_of
 from gsplat_edu.doctor.cut_out import outside_masks_of
 from gsplat_edu.doctor.finding import Finding, Remedy, Severity
 from gsplat_edu.doctor.survey import Progress, Survey, prepare
-from gsplat_edu.sky.find import Sky, find_sky
+from gsplat_edu.parts.sky.find import Sky, find_sky
 
 ENOUGH = 12
 """`--transients auto` looks for moving objects from this number of training photos on. In smaller captures, fewer than

@@ -17,12 +17,12 @@ from gsplat_edu.clean.judge import Reason
 from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.evaluate.metrics import SPILLED
 from gsplat_edu.io.formats import FORMATS
+from gsplat_edu.parts.exposure.photos import at_exposure_of_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import appearance_of, run_dataset
-from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
 from gsplat_edu.runs.source import NamedCamera, Source, capture_up, open_source, run_of

@@ -11,18 +11,19 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gsplat_edu.base.links import check_links
+from gsplat_edu.base.text import image_file_names
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.loading_notes import LoadingNote
 from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.evaluate.verdict import SKIPPED
+from gsplat_edu.parts.poses.trials import RefineTrials
+from gsplat_edu.parts.transients.files import masked_pictures
 from gsplat_edu.runs.dataset import appearance_of
-from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.meshes import mesh_entries
 from gsplat_edu.runs.plugged import plugin_sections
-from gsplat_edu.runs.transients import masked_pictures
-from gsplat_edu.runs.trials import RefineTrials
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
@@ -120,7 +121,7 @@ def evaluate_run(
     train = score_views(gaussians, train_views, render, judged.background, tell)
     metrics = {**earlier, **_scores(judged, test, train), "num_gaussians": len(gaussians)}
     metrics |= _appearance(config) | dict(facts or {})
-    masked = masked_pictures(folder, metrics, train_views, gaussians, render, judged.background)
+    masked = masked_pictures(folder.path, metrics, train_views, gaussians, render, judged.background)
     title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", _notes(judged, config)
     known = mesh_entries(folder), plugin_sections(config, log)
     report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, *known)

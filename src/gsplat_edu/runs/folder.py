@@ -32,7 +32,6 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.reading import parse_json, read_text
-from gsplat_edu.base.text import as_file_name
 from gsplat_edu.base.validation import ArrayLike, float64_array, quoted
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.fields import CONFIG, LOG, MESH, METRICS, checked
@@ -89,16 +88,6 @@ class RunFolder:
     def renders(self) -> Path:
         """Folder of pictures."""
         return self.path / "renders"
-
-    @property
-    def refined(self) -> Path:
-        """The capture with refined cameras, if the run refines them."""
-        return self.path / "refined"
-
-    @property
-    def transients(self) -> Path:
-        """Folder of the masks of things that move, if the run finds any."""
-        return self.path / "transients"
 
     @property
     def checkpoints(self) -> Path:
@@ -308,34 +297,6 @@ def render_settings(config: dict[str, Any]) -> RenderSettings:
         return RenderSettings(**values)
     except (ArgumentError, TypeError) as error:
         raise CheckpointError(f"config.json: render: {error}; fix the file") from None
-
-
-def image_file_names(names: Sequence[str], suffix: str = ".png") -> list[str]:
-    """Turn image names into distinct file names for one folder.
-
-    Every character other than letters, digits, ".", "_" and "-" becomes "_", including path separators. The image's
-    own suffix is removed.
-
-    Args:
-        names: Image names in the capture, for example "left/0001.jpg".
-        suffix: Suffix of the file names.
-
-    Returns:
-        One file name per image: "left_0001.png".
-    """
-    result: list[str] = []
-    taken: set[str] = set()
-    copies: dict[str, int] = {}  # the next number to try, so that equal names do not count up from 2 each
-    for index, name in enumerate(names):
-        base = re.sub(r"\.[A-Za-z]{3,4}$", "", name)
-        stem = re.sub(r"[^\w.-]", "_", base).lstrip(".")[:200] or f"view_{index:04d}"
-        chosen, copy = stem, copies.get(stem.lower(), 2)
-        while chosen.lower() in taken:  # some file systems ignore case
-            chosen, copy = f"{stem}_{copy}", copy + 1
-        taken.add(chosen.lower())
-        copies[stem.lower()] = copy
-        result.append(as_file_name(chosen + suffix))
-    return result
 
 
 def write_json(path: Path, value: object) -> None:

@@ -19,13 +19,13 @@ import torch
 
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.io.lod.levels import Node, leaves_of, level_of, with_levels
+from gsplat_edu.parts.exposure.photos import at_exposure_of_scene
+from gsplat_edu.parts.poses.capture import with_camera
 from gsplat_edu.paths.orbits import resized
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend
 from gsplat_edu.runs.dataset import data_settings, run_dataset
-from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.runs.refined import with_camera
 from gsplat_edu.runs.source import Source, run_of
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians

@@ -31,6 +31,7 @@ from gsplat_edu.mesh.extract import MeshResult
 from gsplat_edu.mesh.faces import drawn_in
 from gsplat_edu.mesh.raster import Raster, lit, picture, rasterized
 from gsplat_edu.mesh.trust import FEW_VIEWS, MeshTrust
+from gsplat_edu.parts.surface.patches import neighbours_of
 from gsplat_edu.paths.orbits import resized
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import NamedCamera
@@ -38,7 +39,6 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.rig import scene_extent
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.patches import neighbours_of
 
 KINDS = {"mesh": "Mesh", "collider": "Collider"}
 """The kinds of meshes that a run has a record of, the latest of each, and their titles in the report."""

@@ -10,9 +10,9 @@ from typing import Any
 
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.parts.poses.trials import RefineTrials
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.runs.trials import RefineTrials
 from gsplat_edu.train.config import TrainConfig
 
 

@@ -28,18 +28,18 @@ import numpy as np
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.alignment import aligned_psnr, scored_halves
+from gsplat_edu.parts.poses.capture import with_camera, with_refined_cameras
+from gsplat_edu.parts.poses.refinement import DISTORTIONS, FREE, LEARNED, MOTIONS, refinement_of
+from gsplat_edu.parts.poses.trials import CONTROL, RefineTrials
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.runs.refined import with_camera, with_refined_cameras
-from gsplat_edu.runs.trials import CONTROL, RefineTrials
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.events import Event, StepEvent
-from gsplat_edu.train.poses import DISTORTIONS, FREE, LEARNED, MOTIONS, refinement_of
 from gsplat_edu.train.trainer import Trainer
 
 SIDE = 240

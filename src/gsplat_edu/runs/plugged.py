@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.train.config import BY_NAME, TrainConfig
-from gsplat_edu.train.part import PARTS, Part
+from gsplat_edu.train.part import PLUGGED_PARTS, Part
 
 
 def plugin_sections(
@@ -38,6 +38,6 @@ def _used(config: Mapping[str, Any]) -> Iterator[tuple[str, Part, Any]]:
     used, stored = config.get("plugins", {}), config.get("train", {})
     own = {name: stored[name] for name in stored if name in BY_NAME and BY_NAME[name].part in used}
     settings = TrainConfig().changed(**own).plugged
-    for name, part in PARTS.items():
+    for name, part in PLUGGED_PARTS.items():
         if name in used:
             yield name, part, settings[name]

@@ -27,20 +27,22 @@ from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.evaluate.verdict import FULL_LENGTH
 from gsplat_edu.io.formats import write_scene
+from gsplat_edu.parts.given_depth.capture import check_depth, depth_digest, depth_name, with_run_depth
+from gsplat_edu.parts.poses.capture import aligned_score, with_refined_cameras, write_refined
+from gsplat_edu.parts.poses.refinement import refinement_of
+from gsplat_edu.parts.poses.trials import KEY as TRIALS
+from gsplat_edu.parts.sky.start import shell_around, start_sky, with_room_for
+from gsplat_edu.parts.transients.files import write_masks
+from gsplat_edu.parts.transients.search import Transients, check_enough
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for
-from gsplat_edu.runs.depth import check_depth, depth_digest, depth_name, with_run_depth
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of, with_points_of_first
-from gsplat_edu.runs.refined import aligned_score, with_refined_cameras, write_refined
-from gsplat_edu.runs.skies import shell_around, start_sky, with_room_for
 from gsplat_edu.runs.source import Source, capture_scene, capture_up, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
-from gsplat_edu.runs.transients import write_masks
-from gsplat_edu.runs.trials import KEY as TRIALS
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.checkpoint import (
     list_checkpoints,
@@ -54,11 +56,9 @@ from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.part import packages_of
-from gsplat_edu.train.poses import refinement_of
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.team import ALONE
 from gsplat_edu.train.trainer import Callback, Trainer
-from gsplat_edu.train.transients import check_enough
 
 
 def document(options: RunOptions) -> dict[str, Any]:
@@ -216,7 +216,9 @@ class CaptureRun:
         settings = as_trained(options.data_settings, options.config.appearance)
         reader = reader_for(options.data, reader)
         dataset = Dataset.of(reader, settings, points=options.points)
-        self.dataset = with_run_depth(with_points_of_first(dataset, team), reader, options, say)
+        self.dataset = with_run_depth(
+            with_points_of_first(dataset, team), reader, options.config, options.depth, options.points, say
+        )
         for note in self.dataset.notes:
             say(str(note))
         self._trained = prepare(self.dataset)
@@ -270,7 +272,7 @@ class CaptureRun:
         if folder.exists():
             remove_leftovers(folder.path)
             check_capture(folder, dataset)
-            check_depth(folder, folder.read_config(), depth_digest(dataset))
+            check_depth(folder.path, folder.read_config(), depth_digest(dataset))
             if digest is not None and folder.read_config().get("start") != digest:
                 raise CheckpointError(
                     f"--resume: {folder.path} was not started from {options.scene} as it is now;"
@@ -443,18 +445,21 @@ class CaptureRun:
         facts[FULL_LENGTH] = full_length or self.options.config.iterations
         if clean is not None:
             gaussians, facts["cleaning"] = clean(gaussians, refined or dataset)
-        if trainer.transients is not None:
-            sentence, facts["transients"] = write_masks(self.folder, dataset, trainer.transients)
+        for masker in trainer.maskers.values():
+            assert isinstance(masker, Transients)
+            sentence, facts["transients"] = write_masks(self.folder.path, dataset, masker)
             self._say(sentence)
         path = self.folder.scene(trainer.iteration)
         write_scene(path, capture_scene(gaussians, dataset, self.options.render_settings.antialiased))
         if export is not None:
             facts["exports"] = export(open_source(path))
         if refined is not None:
-            write_refined(self.folder, refined)
-            self._say(f"wrote {self.folder.refined}: the capture with its refined cameras")
+            self._say(
+                f"wrote {write_refined(self.folder.path, refined)}: the capture with its refined cameras"
+            )
             if self.options.scores_at_end:
-                facts |= aligned_score(refined.test, gaussians, self.options, trainer.extent, self._say)
+                config, renderer = self.options.config, self.options.renderer
+                facts |= aligned_score(refined.test, gaussians, config, renderer, trainer.extent, self._say)
         return evaluate_run(
             self.folder,
             ScoredViews(

@@ -14,10 +14,10 @@ from PIL import Image
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import open_file, parse_json
-from gsplat_edu.base.text import whole_of
+from gsplat_edu.base.text import image_file_names, whole_of
 from gsplat_edu.evaluate.comparison import comparison_size, read_comparison
 from gsplat_edu.photos.image_files import UNDECODABLE
-from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.server.refusal import RefusedError, not_found
 from gsplat_edu.studio.pictures import cache_name
 from gsplat_edu.studio.workers import Worker

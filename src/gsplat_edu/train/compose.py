@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -14,7 +13,6 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import of_type, offers, one_of
-from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend, check_backend_value
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.rig import scene_extent
@@ -23,13 +21,14 @@ from gsplat_edu.train.capacity import planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.far import Shell
-from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
-from gsplat_edu.train.objective import make_objective
+from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.objective import Term, make_objective
 from gsplat_edu.train.overlap import separate_views
-from gsplat_edu.train.patches import neighbourhood_for
-from gsplat_edu.train.poses import NEED_LENSES
+from gsplat_edu.train.part import parts as registered_parts
+from gsplat_edu.train.part_values import Masker, Setup
 from gsplat_edu.train.step import StepParts
 from gsplat_edu.train.trainer import Callback, Trainer
+from gsplat_edu.train.view_model import ViewModel, chained
 
 
 @runtime_checkable
@@ -107,7 +106,7 @@ def training(
 
     Raises:
         ArgumentError: there are no views or no points, or the configuration asks for what nothing here can give: mcmc
-            without a cap, a sky without its splats in `start`, masks of things that move with too few views.
+            without a cap, or what a part refuses.
     """
     of_type("config", config, TrainConfig)
     for name in parts:
@@ -116,18 +115,15 @@ def training(
     offers("dataset", dataset, TrainingData)
     config, start = _begin(config, dataset, start)
     cameras = [view.camera for view in dataset.train]
-    _check_lenses(config, dataset.train, backend)
+    _check_lenses(dataset.train, backend)
     extent = scene_extent(cameras) if start.extent is None else start.extent
     gaussians, shell = start.gaussians.to(backend.device), start.shell
-    features = functools.partial(render, backend=backend)
-    view_model = make_view_model(config, cameras, extent, gaussians, backend.recolored)
-    around = neighbourhood_for(config, dataset.train, view_model, extent)
-    has_depth = any(view.depth is not None for view in dataset.train)
+    terms, view_model, maskers = _begun(Setup(config, dataset.train, extent, gaussians, backend, shell))
     made = StepParts(
-        make_objective(config, shell, backend.loss, extent, around, has_depth),
+        make_objective(config, shell, backend.loss, terms),
         make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
         view_model,
-        transients=make_transients(config, dataset.train, features),
+        maskers=maskers,
         shell=shell,
     )
     return Trainer(
@@ -146,11 +142,6 @@ def _begin(config: TrainConfig, dataset: TrainingData, start: Start | None) -> t
     if not dataset.train:
         raise ArgumentError("dataset: has no training views; give at least one")
     config = _with_cap(config, dataset, 0 if start is None else len(start.gaussians))
-    if config.sky != "none" and (start is None or start.shell is None):
-        raise ArgumentError(
-            f"sky: is {config.sky!r}, but start has no shell of splats; gsplat_edu.runs.skies makes it, or set"
-            " sky='none'"
-        )
     if start is None:
         start = Start(sorted_in_space(from_points(dataset.points, dataset.colors, config)))
     return config, start
@@ -166,23 +157,30 @@ def _with_cap(config: TrainConfig, dataset: TrainingData, start: int) -> TrainCo
     return dataclasses.replace(config, max_gaussians=max(planned, start))
 
 
-def _check_lenses(config: TrainConfig, views: Sequence[View], backend: Backend) -> None:
-    """Check that everything the configuration asks for works with the views' lenses.
+def _begun(setup: Setup) -> tuple[dict[str, Term], ViewModel, dict[str, Masker]]:
+    """Let all parts begin, in turn; return their terms, their view models as one, and what masks pixels.
 
     Raises:
-        ArgumentError: a view is no pinhole, and the backend knows pinholes only; or one is orthographic, and a surface
-            is to be learned.
+        ArgumentError: as for `Part.begin`.
     """
-    if config.refine in NEED_LENSES:
-        backend.require("lens", f"refine: {config.refine}")
+    terms, models, maskers = dict[str, Term](), list[ViewModel](), dict[str, Masker]()
+    for name, part in registered_parts().items():
+        settings = setup.config.settings_of(name)
+        begun = part.begin(settings, dataclasses.replace(setup, view_model=chained(models)))
+        if begun is not None:
+            terms |= begun.terms
+            models += [] if begun.view_model is None else [begun.view_model]
+            maskers |= {} if begun.masker is None else {name: begun.masker}
+        terms |= {f"{name}.{own}": term for own, term in part.terms(settings, setup.extent).items()}
+    return terms, chained(models), maskers
+
+
+def _check_lenses(views: Sequence[View], backend: Backend) -> None:
+    """Check that the backend renders the views' lenses.
+
+    Raises:
+        ArgumentError: a view is no pinhole, and the backend knows pinholes only.
+    """
     odd = next((view for view in views if not view.camera.pinhole), None)
-    if odd is None:
-        return
-    backend.require("lens", f"the lens of {odd.name or 'a photo'}")
-    if config.surface and (
-        flat := next((v for v in views if v.camera.projection.kind == "orthographic"), None)
-    ):
-        raise ArgumentError(
-            f"surface: needs rays that meet in the camera, and {flat.name or 'a photo'} is orthographic; "
-            "leave it out, or train without --surface"
-        )
+    if odd is not None:
+        backend.require("lens", f"the lens of {odd.name or 'a photo'}")

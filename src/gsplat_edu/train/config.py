@@ -30,7 +30,7 @@ from gsplat_edu.train.checks import (
     accept_opacity as _opacity,
     accept_positive as _positive,
 )
-from gsplat_edu.train.part import PARTS, PLUGGED_STRATEGIES, default_settings
+from gsplat_edu.train.part import PLUGGED_PARTS, PLUGGED_STRATEGIES, default_settings
 from gsplat_edu.train.setting import (
     ALPHA_BACKGROUNDS,
     ASKED,
@@ -465,6 +465,10 @@ class TrainConfig:
         used = (*changed, self.strategy if self.strategy in PLUGGED_STRATEGIES else None)
         return tuple(dict.fromkeys(name for name in used if name is not None))
 
+    def settings_of(self, part: str) -> Any:  # noqa: ANN401
+        """Return the settings of a part: those of a plug-in, or all, which have those of ours."""
+        return self.plugged.get(part, self)
+
     def _holder(self, setting: Setting) -> Any:  # noqa: ANN401
         """Return the object with a setting."""
         if setting.plugin is not None:
@@ -524,7 +528,11 @@ SETTINGS: tuple[Setting, ...] = (
     *_settings(AdcConfig, "adc"),
     *_settings(McmcConfig, "mcmc", "mcmc_"),
     *_settings(FastConfig, "fast", "fast_"),
-    *(one for name, part in PARTS.items() for one in _settings(part.Settings, None, f"{name}_", name)),
+    *(
+        one
+        for name, part in PLUGGED_PARTS.items()
+        for one in _settings(part.Settings, None, f"{name}_", name)
+    ),
     *(one for name, kind in PLUGGED_STRATEGIES.items() for one in _settings(kind.Settings, name, f"{name}_")),
 )
 """All settings of a training, those of plug-ins last."""

@@ -78,7 +78,7 @@ def features_before(
         normals: (N, 3) `facing_normals`; None to leave them out.
 
     Returns:
-        (N, 2) as of `depth_features`, or (N, 5) with the normals after them; `surface_before` reads the composite.
+        (N, 2) as of `depth_features`, or (N, 5) with the normals after them; `without_shell` reads the composite.
     """
     near = ~shell.holds(gaussians.means)
     depths = depth_features(gaussians, camera, near)

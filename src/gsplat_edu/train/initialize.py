@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -13,22 +12,14 @@ from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, float64_array, whole_number
 from gsplat_edu.ops.noise import NoiseKernel, add_noise_natively
-from gsplat_edu.ops.recolor import RecolorKernel, recolored
-from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
-from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.part import PLUGGED_STRATEGIES
-from gsplat_edu.train.poses import Refinement
-from gsplat_edu.train.transient_masks import FeatureRenderer
-from gsplat_edu.train.transients import Transients
-from gsplat_edu.train.view_model import Chain, Identity, ViewModel
 
 START_SCALE = 0.09
 """Standard deviation of every start Gaussian, world units; a few hundred of them fill the unit ball."""
@@ -171,43 +162,6 @@ def make_strategy(
         )
         return made
     return None
-
-
-def make_view_model(
-    config: TrainConfig,
-    cameras: Sequence[Camera],
-    extent: float,
-    gaussians: Gaussians,
-    recolor: RecolorKernel = recolored,
-) -> ViewModel:
-    """Make the view model of a configuration.
-
-    Args:
-        config: The configuration.
-        cameras: The cameras of the training views, at their full size.
-        extent: Size of the scene, world units.
-        gaussians: The start Gaussians.
-        recolor: Applies corrections of colours; see `Backend.recolored`.
-    """
-    models: list[ViewModel] = []
-    if config.refine != "none":
-        models.append(Refinement(cameras, config, extent))
-    if config.appearance != "none":
-        vignetting = config.appearance == "vignetting"
-        length = config.means_rate_iterations
-        models.append(Exposure(len(cameras), length, gaussians.means, recolor, vignetting))
-    return models[0] if len(models) == 1 else Chain(models) if models else Identity()
-
-
-def make_transients(config: TrainConfig, views: Sequence[View], render: FeatureRenderer) -> Transients | None:
-    """Make the object that masks moving things in the training views; None if the configuration does not ask for it.
-
-    Raises:
-        ArgumentError: there are too few views.
-    """
-    if config.transients == "none":
-        return None
-    return Transients(views, config.means_rate_iterations, render)
 
 
 def random_ball(count: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Gaussians:

@@ -1,7 +1,6 @@
 """The objective of a step: a sum of named terms, each a scalar that autograd can differentiate.
 
-To add a term (depth, normals, a regulariser), add a class here and an entry in `make_objective`; the log, the report
-and the checkpoints need no change.
+Parts of a training (`gsplat_edu.train.part`) add terms; the log, the report and the checkpoints need no change.
 """
 
 from __future__ import annotations
@@ -22,13 +21,9 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.losses import LossKernel, photo_loss
 from gsplat_edu.train.config import TrainConfig
-from gsplat_edu.train.depth import DEPTH, DepthTerm
 from gsplat_edu.train.events import PHOTO as PHOTO
 from gsplat_edu.train.far import Shell
-from gsplat_edu.train.part import PARTS
-from gsplat_edu.train.patches import PATCHES, Neighbourhood, PatchTerm
-from gsplat_edu.train.rendered import NOTHING, Needs, Rendered as Rendered, Turns
-from gsplat_edu.train.surface import FLAT, NORMAL, FlatTerm, NormalTerm
+from gsplat_edu.train.rendered import NOTHING, Needs, Rendered as Rendered
 
 FEW_VISIBLE = 0.25
 """Regularise only the visible Gaussians if they are fewer than this fraction of all. Views of one subject show at least
@@ -108,17 +103,12 @@ def make_objective(
     config: TrainConfig,
     shell: Shell | None = None,
     loss: LossKernel | None = None,
-    extent: float = 1.0,
-    around: Neighbourhood | None = None,
-    has_depth: bool = False,
+    others: Mapping[str, Term] | None = None,
 ) -> Objective:
-    """Make the objective of a configuration: the photo term and the regularisers of its strategy.
+    """Make the objective of a configuration: the photo term, the regularisers of its strategy, and the parts' terms.
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
-    if nothing is outside of masks + weight_e sum_outside(alpha) / (H W);
-    for a surface + weight_n mean a (a - N . m) + weight_f mean(smallest scale) / extent
-    + weight_c mean min(1 - ncc, most)
-    with given depth + weight_d mean rho(z / z* - 1), or for points + weight_p extent mean |1/z - 1/z*|
+    if nothing is outside of masks + weight_e sum_outside(alpha) / (H W)
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
     rate if all its gradients agree, however small they are. If each view shows a twentieth of the scene, invisible
@@ -128,12 +118,7 @@ def make_objective(
         config: The configuration.
         shell: Where far splats lie, whose scale is not regularised; None if there are none.
         loss: Compares images and photos; see `photo_loss`.
-        extent: Size of the scene, world units.
-        around: The photos whose patches a surface compares with their neighbours'.
-        has_depth: Whether views have depth (`View.depth`).
-
-    Raises:
-        ArgumentError: the configuration compares patches, but there are no photos to compare.
+        others: The terms of parts by name.
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
@@ -145,23 +130,7 @@ def make_objective(
         terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, FEW_VISIBLE)
     if config.outside_masks == "empty":
         terms["outside"] = EmptyOutside(OUTSIDE_WEIGHT)
-    if config.surface:
-        turns = Turns(config.surface_start, config.surface_every, config.batch)
-        terms[NORMAL] = NormalTerm(config.normal_weight, turns)
-        terms[FLAT] = FlatTerm(config.flat_weight, extent, turns, shell)
-        if config.patch_weight > 0:
-            if around is None:
-                raise ArgumentError(
-                    "around: has to be given, because patch_weight compares photos; or set it to 0"
-                )
-            terms[PATCHES] = PatchTerm(config.patch_weight, turns, around, config.seed)
-    if has_depth:
-        turns = Turns(0, config.depth_every, config.batch)
-        terms[DEPTH] = DepthTerm(config.depth_weight, config.points_weight, extent, turns)
-    for name, part in PARTS.items():
-        for own, term in part.terms(config.plugged[name], extent).items():
-            terms[f"{name}.{own}"] = term
-    return Objective(terms)
+    return Objective(terms | dict(others or {}))
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,19 @@
-"""Parts and strategies of a training that plug-ins add; see docs/PLUGINS.md."""
+"""Parts of a training: what one is, and the registry of all. Plug-ins add parts and strategies; see docs/PLUGINS.md.
+
+Whoever composes a training or a run loops over `parts()` and names none.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, ClassVar
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.plugins import package_of, plugins
 
 
@@ -17,9 +23,10 @@ class NoSettings:
 
 
 class Part:
-    """What a plug-in adds to each training: settings, terms of the objective, findings, a section of the report.
+    """What a training can have besides Gaussians, photos and a strategy. Each method by default does nothing.
 
-    Its module imports torch only in functions: the command line reads the settings.
+    The module of a plug-in imports torch only in functions: the command line reads the settings. `settings` are the
+    run's `Settings`; those of our own parts are fields of `TrainConfig`, which they get whole.
     """
 
     Settings: ClassVar[type] = NoSettings
@@ -55,6 +62,18 @@ class Part:
         """
         return ()
 
+    def begin(self, settings: Any, setup: Any) -> Any:  # noqa: ANN401
+        """Return what the part does in the steps, a `gsplat_edu.train.part_values.Begun`; None for nothing.
+
+        Args:
+            settings: The run's `Settings`.
+            setup: The training, a `gsplat_edu.train.part_values.Setup`.
+
+        Raises:
+            ArgumentError: the settings do not fit the training.
+        """
+        return None
+
 
 class Strategy(ABC):
     """A density strategy that a plug-in adds: `--strategy NAME`."""
@@ -74,17 +93,43 @@ class Strategy(ABC):
         """
 
 
-PARTS: Mapping[str, Part] = plugins("parts")
+OWN_PARTS = {
+    "sky": "gsplat_edu.parts.sky.part:SKY",
+    "poses": "gsplat_edu.parts.poses.part:POSES",
+    "exposure": "gsplat_edu.parts.exposure.part:EXPOSURE",
+    "transients": "gsplat_edu.parts.transients.part:TRANSIENTS",
+    "surface": "gsplat_edu.parts.surface.part:SURFACE",
+    "given_depth": "gsplat_edu.parts.given_depth.part:GIVEN_DEPTH",
+}
+"""Entry points of our own parts, in the order in which they act: poses move a camera before its image is corrected."""
+
+PLUGGED_PARTS: Mapping[str, Part] = plugins("parts")
 PLUGGED_STRATEGIES: Mapping[str, Strategy] = plugins("strategies")
+
+
+@functools.cache
+def parts() -> Mapping[str, Part]:
+    """Return all parts by name: ours, then those of plug-ins. Ours import torch.
+
+    Raises:
+        ArgumentError: a plug-in has the name of one of ours.
+    """
+    if taken := sorted(set(OWN_PARTS) & set(PLUGGED_PARTS)):
+        raise ArgumentError(
+            f"plug-in {taken[0]} of {package_of('parts', taken[0])}: has the name of a part of gsplat_edu;"
+            " remove the package, or rename the entry point"
+        )
+    own = {name: EntryPoint(name, value, "gsplat_edu.parts").load() for name, value in OWN_PARTS.items()}
+    return own | dict(PLUGGED_PARTS)
 
 
 def default_settings() -> dict[str, Any]:
     """Return the settings of every plug-in that has some, by its name."""
-    parts: dict[str, type] = {name: part.Settings for name, part in PARTS.items()}
-    parts |= {name: strategy.Settings for name, strategy in PLUGGED_STRATEGIES.items()}
-    return {name: settings() for name, settings in parts.items()}
+    kinds: dict[str, type] = {name: part.Settings for name, part in PLUGGED_PARTS.items()}
+    kinds |= {name: strategy.Settings for name, strategy in PLUGGED_STRATEGIES.items()}
+    return {name: settings() for name, settings in kinds.items()}
 
 
 def packages_of(names: Sequence[str]) -> dict[str, str]:
     """Return the packages of plug-ins by their names, for config.json."""
-    return {name: package_of("parts" if name in PARTS else "strategies", name) for name in names}
+    return {name: package_of("parts" if name in PLUGGED_PARTS else "strategies", name) for name in names}

@@ -118,7 +118,7 @@ class Rendered:
         return self.before_shell or Surface(output.depth, output.alpha, output.features)
 
 
-def surface_before(output: RenderOutput) -> Surface:
+def without_shell(output: RenderOutput) -> Surface:
     """Return what lies before a shell, from a render of `gsplat_edu.train.far.features_before`."""
     assert output.features is not None, "the stepper gives them"
     depth, alpha, normals = output.features[..., 0], output.features[..., 1], output.features[..., 2:]

@@ -31,7 +31,6 @@ from gsplat_edu.train.step import (
     StepView,
     TensorStepper,
     Terms,
-    mean_over_views,
 )
 from gsplat_edu.train.view_model import Identity
 
@@ -92,8 +91,7 @@ def why_not(
         "processes share the step": parts.team.size > 1,
         "the view model corrects images or cameras (appearance, refine)": type(parts.view_model)
         is not Identity,
-        "masks of moving things are found (transients)": parts.transients is not None,
-        "reduce or adam is another function": parts.reduce is not mean_over_views or parts.adam is not None,
+        "masks of moving things are found (transients)": bool(parts.maskers),
         "gradients are to be stored (fused=False)": not parts.fused,
         f"the Gaussians are {gaussians.means.dtype}": gaussians.means.dtype != torch.float32,
         "the density strategy does not follow a device": not _follows(parts.density),

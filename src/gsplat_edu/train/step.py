@@ -10,7 +10,7 @@ Chapter: 09_train_in_3d.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -19,7 +19,6 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
-from gsplat_edu.ops.adam import AdamKernel
 from gsplat_edu.ops.moments import AdamInBackward
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
@@ -34,15 +33,11 @@ from gsplat_edu.train.far import Shell, features_before
 from gsplat_edu.train.feed import Draw, Target
 from gsplat_edu.train.objective import Objective, Rendered
 from gsplat_edu.train.optimizer import MOMENTS, Adam, ParameterGroup
-from gsplat_edu.train.rendered import surface_before
+from gsplat_edu.train.part_values import Masker
+from gsplat_edu.train.rendered import without_shell
 from gsplat_edu.train.saved import check_entries, check_tensor_kind
 from gsplat_edu.train.team import ALONE, SharedAdam, Team, places_of, share_results
-from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import Identity, Rows, ViewModel, ViewRender
-
-Reduce = Callable[[Mapping[str, Tensor], int], None]
-"""Called with all parameters and the number of views: turns the sum over the views in each `grad` into the gradient to
-apply. Processes that share a step call it with the rows that each of them moves."""
 
 
 @one_thread()
@@ -62,9 +57,7 @@ class StepParts:
         objective: The objective to minimise.
         density: Clones, splits, prunes or moves Gaussians after a step; None keeps them.
         view_model: Corrects the camera and the image of a view before the loss compares it.
-        reduce: Combines the gradients of a step's views before they are applied.
-        adam: Updates one tensor by Adam's rule; that of the backend if None.
-        transients: Finds and applies masks of things that move; None for none.
+        maskers: Find masks and apply them, by the names of their parts.
         fused: Takes Adam's step for the Gaussians in the backward pass where that gives the same bits, so that their
             gradients need no memory; see `TensorStepper.fuses`.
         team: The processes that share each step.
@@ -74,9 +67,7 @@ class StepParts:
     objective: Objective
     density: DensityStrategy | None = None
     view_model: ViewModel = field(default_factory=Identity)
-    reduce: Reduce = mean_over_views
-    adam: AdamKernel | None = None
-    transients: Transients | None = None
+    maskers: Mapping[str, Masker] = field(default_factory=dict)
     fused: bool = True
     team: Team = ALONE
     shell: Shell | None = None
@@ -240,14 +231,11 @@ class TensorStepper:
     def fuses(self) -> bool:
         """Whether the Gaussians may be moved in the backward pass of a single view, with the same bits.
 
-        False if something needs their gradients: another `reduce` or `adam`, a subclass of `Objective` (it may pass
-        backward more than once), or a density strategy without a true attribute `observes_renders_only`. A render
-        without `RenderOutput.defer` stores its gradients in any case, and so does a batch: its views are rendered from
-        the same Gaussians.
+        False if something needs their gradients: a subclass of `Objective` (it may pass backward more than once), or a
+        density strategy without a true attribute `observes_renders_only`. A render without `RenderOutput.defer` stores
+        its gradients in any case, and so does a batch: its views are rendered from the same Gaussians.
         """
-        parts = self.parts
-        plain = parts.reduce is mean_over_views and parts.adam is None and type(parts.objective) is Objective
-        return parts.fused and plain and self._reads_output_only
+        return self.parts.fused and type(self.parts.objective) is Objective and self._reads_output_only
 
     @property
     def _reads_output_only(self) -> bool:
@@ -255,7 +243,7 @@ class TensorStepper:
         return density is None or getattr(density, "observes_renders_only", False)
 
     def _make_optimizer(self, parameters: Mapping[str, Tensor]) -> Adam:
-        kernel, team = self.parts.adam or self._backend.adam, self.parts.team
+        kernel, team = self._backend.adam, self.parts.team
         if team.size > 1:
             return SharedAdam(parameters, self._groups, kernel, team)
         return Adam(parameters, self._groups, kernel)
@@ -272,7 +260,7 @@ class TensorStepper:
             (view,) = views
             return self._single_step(view, iteration)
         terms = self.gradients(list(views), iteration)
-        self.parts.reduce(self.parameters(), self._batch)
+        mean_over_views(self.parameters(), self._batch)
         self.apply(iteration)
         return terms
 
@@ -285,7 +273,6 @@ class TensorStepper:
         self._store(view.draw.index, rows)
         if in_backward is None:
             self._observe(rendered)
-            self.parts.reduce(self.parameters(), 1)
             self.apply(iteration)
         else:
             self.apply(iteration, in_backward)
@@ -349,7 +336,7 @@ class TensorStepper:
         rows = optimizer.own(self.parameters())
         for name, gradient in optimizer.summed(list(batch.learned), sums, count).items():
             rows[name].grad = gradient
-        self.parts.reduce(rows, count)
+        mean_over_views(rows, count)
         optimizer.schedule(iteration, count)
         optimizer.step(rows)
         optimizer.spread(self.gaussians.tensors())
@@ -379,8 +366,8 @@ class TensorStepper:
         )
         rows = model.measure(index, given, target, iteration)
         image = model.correct(index, given, target, rows)
-        surface = None if shell is None else surface_before(output)
-        return Rendered(self.gaussians, view.draw, output, image, target, iteration, at, surface), rows
+        scene = None if shell is None else without_shell(output)
+        return Rendered(self.gaussians, view.draw, output, image, target, iteration, at, scene), rows
 
     def _store(self, index: int, rows: Rows) -> None:
         """Write what was measured of a view into the view model's tensors."""

@@ -6,7 +6,7 @@ Chapter: 09_train_in_3d.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,19 +26,20 @@ from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Change, Event, Losses, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
 from gsplat_edu.train.optimizer import MOMENTS
+from gsplat_edu.train.part import parts as registered_parts
+from gsplat_edu.train.part_values import Masker
 from gsplat_edu.train.resident import make_stepper
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
 from gsplat_edu.train.step import StepParts as StepParts, StepView
 from gsplat_edu.train.tempo import Tempo
-from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import ViewModel
 
 Callback = Callable[["Trainer", Event], None]
 """Called after every step and every change of the Gaussians, with the trainer and the event."""
 
-PARTS = ("gaussians", "view_model", *MOMENTS, "density", "transients")
-"""Groups of a checkpoint's tensors: the first word of their names."""
+GROUPS = ("gaussians", "view_model", *MOMENTS, "density")
+"""Groups of a checkpoint's tensors, the first word of their names; others are named after parts."""
 
 BACKGROUND_STREAM = 1
 """Second word of the random backgrounds' seed, so that they are independent of the view order."""
@@ -123,9 +124,9 @@ class Trainer:
         return self.stepper.parts.view_model
 
     @property
-    def transients(self) -> Transients | None:
-        """The masks of things that move, if the run finds any."""
-        return self.stepper.parts.transients
+    def maskers(self) -> Mapping[str, Masker]:
+        """What finds masks during the run, by the names of parts."""
+        return self.stepper.parts.maskers
 
     @property
     def tempo(self) -> Tempo:
@@ -177,11 +178,10 @@ class Trainer:
         position = self.position
         factor = photo_factor(self.config, position)
         self._feed.use_factor(factor)
-        if self.transients is not None and any(
-            self.transients.is_due(passed, self.config.batch) for passed in self.tempo.passed(self.iteration)
-        ):
-            settings = self._settings(self.config.background)
-            self.transients.find(self.gaussians, settings, self.view_model.camera, factor)
+        for masker in self.maskers.values():
+            if any(masker.is_due(passed, self.config.batch) for passed in self.tempo.passed(self.iteration)):
+                settings = self._settings(self.config.background)
+                masker.find(self.gaussians, settings, self.view_model.camera, factor)
         terms = self.stepper.step(self.step_views(), position)
         self.iteration += self.config.batch
         return StepEvent(self.iteration - 1, self.stepper.count, terms, factor)
@@ -234,8 +234,8 @@ class Trainer:
             if draw.opaque is not None and not self.config.random_background:
                 background = self._behind_alpha(place)
             target = self._feed.target(draw, background)
-            if self.transients is not None:
-                target = self.transients.applied(draw.index, target)
+            for masker in self.maskers.values():
+                target = masker.applied(draw.index, target)
             yield StepView(draw, target, self._settings(background))
 
     def _behind_alpha(self, place: int) -> tuple[float, float, float]:
@@ -274,8 +274,7 @@ class Trainer:
         }
         if self.density is not None:
             parts["density"], numbers["density"] = self.density.state()
-        if self.transients is not None:
-            parts["transients"] = self.transients.state()
+        parts |= {name: dict(masker.state()) for name, masker in self.maskers.items()}
         flat = {
             f"{part}.{name}": t.detach() for part, tensors in parts.items() for name, t in tensors.items()
         }
@@ -289,7 +288,7 @@ class Trainer:
         Raises:
             ArgumentError: the state does not fit this trainer, which stays unchanged; the message names the entry.
         """
-        parts: dict[str, dict[str, Tensor]] = {part: {} for part in PARTS}
+        parts: dict[str, dict[str, Tensor]] = {part: {} for part in (*GROUPS, *registered_parts())}
         for key, tensor in tensors.items():
             part, _, name = key.partition(".")
             if part not in parts:
@@ -310,11 +309,11 @@ class Trainer:
             raise ArgumentError(
                 f"gaussians: there are {count}; their number has to be from 1 to {cap or 'any'}"
             )
-        transients = self.transients
-        if transients is not None:
-            transients.check_state(parts["transients"])
-        elif parts["transients"]:
-            raise ArgumentError("transients: are present, but this run has none")
+        for name in registered_parts():
+            if name in self.maskers:
+                self.maskers[name].check_state(parts[name])
+            elif parts[name]:
+                raise ArgumentError(f"{name}: are present, but this run has none")
         if self.density is not None:  # the last check that can fail
             if not isinstance(given["density"], dict):
                 raise ArgumentError("density: has to be an object")
@@ -328,8 +327,8 @@ class Trainer:
             raise ArgumentError("density: is present, but this run has no density control")
         self.stepper.take_over(loaded)
         self.iteration = iteration
-        if transients is not None:
-            transients.load_state(parts["transients"])
+        for name, masker in self.maskers.items():
+            masker.load_state(parts[name])
         self._feed.load_state(given["feed"])
         self._backgrounds.bit_generator.state = given["backgrounds"]
 

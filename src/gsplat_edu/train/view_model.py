@@ -172,3 +172,8 @@ class Chain:
         for model in self.models:
             render = render._replace(image=model.correct(index, render, target, rows))
         return render.image
+
+
+def chained(models: Sequence[ViewModel]) -> ViewModel:
+    """Return one view model that applies some in turn."""
+    return models[0] if len(models) == 1 else Chain(models) if models else Identity()

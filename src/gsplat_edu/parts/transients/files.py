@@ -12,25 +12,27 @@ from jaxtyping import Bool
 from PIL import Image
 
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.text import as_file_name
+from gsplat_edu.base.text import as_file_name, image_file_names
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.capture import is_outside
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.evaluate.masked import MaskedPicture
 from gsplat_edu.evaluate.metrics import Renderer, to_bytes
+from gsplat_edu.parts.transients.masks import LARGEST_SHARE
+from gsplat_edu.parts.transients.search import Transients, resized_mask
 from gsplat_edu.photos.decoding import decode_mask
-from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.transient_masks import LARGEST_SHARE
-from gsplat_edu.train.transients import Transients, resized_mask
+
+FOLDER = "transients"
+"""Name of the folder of masks in the run's."""
 
 PICTURES = 6
 """Most masked photos shown in a report."""
 
 
-def write_masks(folder: RunFolder, dataset: Dataset, found: Transients) -> tuple[str, dict[str, Any]]:
+def write_masks(run: Path, dataset: Dataset, found: Transients) -> tuple[str, dict[str, Any]]:
     """Write RUN/transients/NAME.png, zero for pixels that do not count, for every photo with a masked part.
 
     Pixels that the capture's own masks exclude are zero too. A mask has the size of its photo's file, as masks of
@@ -38,7 +40,7 @@ def write_masks(folder: RunFolder, dataset: Dataset, found: Transients) -> tuple
     from an earlier completion of the run are removed.
 
     Args:
-        folder: The run's folder.
+        run: The run's folder.
         dataset: The capture.
         found: The masks of its training views.
 
@@ -53,10 +55,10 @@ def write_masks(folder: RunFolder, dataset: Dataset, found: Transients) -> tuple
     for view, mask in zip(dataset.train, found.masks, strict=True):
         if mask is not None:
             shares[view.name] = float(mask.mean())
-            path = mask_path(folder, view.name)
+            path = mask_path(run, view.name)
             _write(path, _counting(view, mask), sources.get(view.name))
             written.add(path)
-    for path in folder.transients.rglob("*.png"):
+    for path in (run / FOLDER).rglob("*.png"):
         if path not in written:
             path.unlink()
     largest_first = sorted(shares, key=lambda name: (-shares[name], name))
@@ -65,17 +67,17 @@ def write_masks(folder: RunFolder, dataset: Dataset, found: Transients) -> tuple
         "photos": [{"name": name, "share": round(shares[name], 4)} for name in largest_first],
         "left_alone": alone,
     }
-    return _sentence(folder, facts, len(dataset.train)), facts
+    return _sentence(run, facts, len(dataset.train)), facts
 
 
-def mask_path(folder: RunFolder, name: str) -> Path:
+def mask_path(run: Path, name: str) -> Path:
     """Return the file of a view's mask."""
-    safe = image_file_names([name])[0] if is_outside(folder.transients, name) else f"{name}.png"
-    return folder.transients / as_file_name(safe)
+    safe = image_file_names([name])[0] if is_outside(run / FOLDER, name) else f"{name}.png"
+    return run / FOLDER / as_file_name(safe)
 
 
 def masked_pictures(
-    folder: RunFolder,
+    run: Path,
     metrics: Mapping[str, Any],
     views: Sequence[View],
     gaussians: Gaussians,
@@ -85,7 +87,7 @@ def masked_pictures(
     """Make the pictures of the photos with the largest masked parts.
 
     Args:
-        folder: The run's folder.
+        run: The run's folder.
         metrics: The contents of metrics.json.
         views: The training views.
         gaussians: The scene.
@@ -98,7 +100,7 @@ def masked_pictures(
     by_name = {view.name: view for view in views}
     pictures = []
     for name in masked_names(metrics)[:PICTURES]:
-        view, path = by_name.get(name), mask_path(folder, name)
+        view, path = by_name.get(name), mask_path(run, name)
         if view is None or not path.is_file():
             continue
         counts = resized_mask(decode_mask(path), view.camera.H, view.camera.W)
@@ -117,11 +119,11 @@ def masked_names(metrics: Mapping[str, Any]) -> list[str]:
     return [str(entry.get("name")) for entry in entries if isinstance(entry, Mapping)]
 
 
-def _sentence(folder: RunFolder, facts: Mapping[str, Any], total: int) -> str:
+def _sentence(run: Path, facts: Mapping[str, Any], total: int) -> str:
     photos, alone = facts["photos"], facts["left_alone"]
     if photos:
         most = f"most of {photos[0]['name']} ({100 * photos[0]['share']:.1f} %)"
-        said = f"things that moved are masked in {len(photos)} of {total} photos, {most}: {folder.transients}"
+        said = f"things that moved are masked in {len(photos)} of {total} photos, {most}: {run / FOLDER}"
     else:
         said = f"nothing moved: none of {total} photos shows what the others do not"
     if alone:

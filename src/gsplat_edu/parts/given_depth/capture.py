@@ -11,29 +11,34 @@ from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.depths import CAPTURE, POINTS, DepthSource, with_depth
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.train.config import TrainConfig
 
 
 def with_run_depth(
-    dataset: Dataset, reader: CaptureReader, options: RunOptions, say: Callable[[str], None]
+    dataset: Dataset,
+    reader: CaptureReader,
+    config: TrainConfig,
+    depth: Path | None,
+    points: Path | None,
+    say: Callable[[str], None],
 ) -> Dataset:
     """Give the training views the depth that a run's options name, and say what was found.
 
     Args:
         dataset: The dataset of the run.
         reader: Its capture.
-        options: The options.
+        config: Kind and unit of the depth.
+        depth: The depth, as in `RunOptions`.
+        points: The run's file of start points, if it has one.
         say: Receives sentences for the user.
 
     Raises:
         DatasetError: the depth cannot be used.
     """
-    if options.depth is None:
+    if depth is None:
         return dataset
-    config = options.config
-    source = DepthSource(options.depth, config.depth_kind, config.depth_unit)
-    dataset, report = with_depth(dataset, reader, source, options.points)
+    source = DepthSource(depth, config.depth_kind, config.depth_unit)
+    dataset, report = with_depth(dataset, reader, source, points)
     for sentence in report.lines():
         say(sentence)
     return dataset
@@ -57,7 +62,7 @@ def depth_digest(dataset: Dataset) -> str | None:
     return digest.hexdigest() if found else None
 
 
-def check_depth(folder: RunFolder, stored: dict[str, Any], digest: str | None) -> None:
+def check_depth(run: Path, stored: dict[str, Any], digest: str | None) -> None:
     """Compare the depth of a resumed run with that it was started with.
 
     Raises:
@@ -66,5 +71,5 @@ def check_depth(folder: RunFolder, stored: dict[str, Any], digest: str | None) -
     if stored.get("depth") != digest:
         was = "without depth" if stored.get("depth") is None else "with other depth"
         raise CheckpointError(
-            f"--resume: {folder.path} was started {was}; give the same --depth with the same files, or another --out"
+            f"--resume: {run} was started {was}; give the same --depth with the same files, or another --out"
         )

@@ -8,10 +8,10 @@ import numpy as np
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.parts.sky.find import SIDE, find_sky, scene_size
+from gsplat_edu.parts.sky.shell import MOST, sky_splats
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.rig import settled_eyes
-from gsplat_edu.sky.find import SIDE, find_sky, scene_size
-from gsplat_edu.sky.shell import MOST, sky_splats
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.far import Shell
 

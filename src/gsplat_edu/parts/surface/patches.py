@@ -15,7 +15,6 @@ from gsplat_edu.ops.patches import GreyPhoto, Grid, patch_error
 from gsplat_edu.render.camera_tensors import split_camera
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.rendered import Needs, Rendered, Turns
 from gsplat_edu.train.view_model import ViewModel
 
@@ -120,13 +119,6 @@ class Neighbourhood:
         while self._bytes > PHOTO_ROOM and len(self._kept) > 1:
             self._bytes -= self._kept.popitem(last=False)[1].nbytes
         return GreyPhoto(camera, found.pixels, found.counts)
-
-
-def neighbourhood_for(
-    config: TrainConfig, views: Sequence[View], model: ViewModel, extent: float
-) -> Neighbourhood | None:
-    """Return the photos that a configuration compares in patches; None if it compares none."""
-    return Neighbourhood(views, model, extent) if config.surface and config.patch_weight > 0 else None
 
 
 class PatchTerm:

@@ -1,6 +1,6 @@
 """Masks of things that move, found several times while the scene is trained.
 
-`gsplat_edu.train.transient_masks` says how. Masked pixels do not count in the loss, as those that the capture's own
+`gsplat_edu.parts.transients.masks` says how. Masked pixels do not count in the loss, as those that the capture's own
 masks exclude. Masks are found anew each time: where other views have explained a pixel by then, it counts again.
 """
 
@@ -15,6 +15,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.parts.transients.masks import Compared, FeatureRenderer, find_masks
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
@@ -22,7 +23,6 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.saved import check_entries, check_tensor_kind
-from gsplat_edu.train.transient_masks import Compared, FeatureRenderer, find_masks
 
 WHEN = (0.1, 0.2, 0.35, 0.5)
 """Shares of the run after which masks are found: early, before the scene shows passers-by as floaters, and until most

@@ -8,7 +8,7 @@ projection of D onto these columns fixes the gauge: the cameras can move relativ
 and the scene stays in the frame of the capture.
 
 The poses are measured, not learned by gradient descent: whenever a view is drawn, D moves by the step that its render
-and its photo ask for (`gsplat_edu.train.pose_step`), and the next render of the view uses it.
+and its photo ask for (`gsplat_edu.parts.poses.step`), and the next render of the view uses it.
 
 Views with equal intrinsics share a lens, which Adam learns:
 fx' = fx exp(a), fy' = fy exp(b), cx' = cx + c W, cy' = cy + d H, and k' = k + e W / (fx r^n) for coefficients of the
@@ -33,34 +33,37 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
+from gsplat_edu.parts.poses.step import pose_step
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.scene.projection import COEFFICIENTS
 from gsplat_edu.scene.shutter import readout_times
-from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.config import REFINEMENTS, TrainConfig
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
-from gsplat_edu.train.pose_step import pose_step
 from gsplat_edu.train.rendered import Needs
 from gsplat_edu.train.view_model import Chain, Identity, Rows, ViewModel, ViewRender
 
 TWISTS, LENSES, DISTORTIONS, MOTIONS = "twists", "lenses", "distortions", "motions"
 """Names of the parameters."""
 
-LEARNED = {
+WORDS = {
     "poses": (TWISTS,),
     "intrinsics": (LENSES,),
     "both": (TWISTS, LENSES),
     "lens": (LENSES, DISTORTIONS),
     "shutter": (MOTIONS,),
-    "poses+lens": (TWISTS, LENSES, DISTORTIONS),
-    "poses+shutter": (TWISTS, MOTIONS),
-    "both+shutter": (TWISTS, LENSES, MOTIONS),
-    "lens+shutter": (LENSES, DISTORTIONS, MOTIONS),
     "all": (TWISTS, LENSES, DISTORTIONS, MOTIONS),
 }
-"""The parameters that each value of the setting `refine` learns."""
+"""The parameters that each word of the setting `refine` learns."""
+
+LEARNED = {
+    value: tuple(name for word in value.split("+") for name in WORDS[word])
+    for value in REFINEMENTS
+    if value != "none"
+}
+"""The parameters that each value of the setting `refine` learns: words joined by +."""
 
 NEED_LENSES = tuple(name for name, learned in LEARNED.items() if {DISTORTIONS, MOTIONS} & set(learned))
 """Values of `refine` that make every camera one that is not a pinhole at rest."""

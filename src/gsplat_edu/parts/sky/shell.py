@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
 from gsplat_edu.base.constants import C0, SH_OFFSET
+from gsplat_edu.parts.sky.find import CELLS, Sky, fibonacci
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.sky.find import CELLS, Sky, fibonacci
 from gsplat_edu.train.far import Shell
 
 MOST = 3_000

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
-from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.evaluate.alignment import TensorRenderer, aligned_psnr, mean_aligned_psnr
+from gsplat_edu.parts.poses.refinement import Refinement
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.poses import Refinement
+from gsplat_edu.train.config import TrainConfig
+
+FOLDER = "refined"
+"""Name of the folder in the run's."""
 
 
 def with_refined_cameras(refinement: Refinement, dataset: Dataset) -> Dataset:
@@ -33,8 +35,8 @@ def with_camera(view: View, camera: Camera) -> View:
     return View.stored(camera, view.read, view.name)
 
 
-def write_refined(folder: RunFolder, dataset: Dataset) -> None:
-    """Write RUN/refined: the photos as they were trained on, as PNG, with the refined cameras in COLMAP's layout.
+def write_refined(run: Path, dataset: Dataset) -> Path:
+    """Write and return RUN/refined: photos as trained on, as PNG, with the refined cameras in COLMAP's layout.
 
     Raises:
         OSError: a file cannot be written.
@@ -44,7 +46,9 @@ def write_refined(folder: RunFolder, dataset: Dataset) -> None:
         for part in (dataset.train, dataset.test)
         for view, name in zip(part, png_names(part), strict=True)
     ]
-    write_colmap(folder.refined, every, dataset.points + dataset.origin, dataset.colors)
+    folder = run / FOLDER
+    write_colmap(folder, every, dataset.points + dataset.origin, dataset.colors)
+    return folder
 
 
 def in_capture_frame(camera: Camera, dataset: Dataset) -> Camera:
@@ -63,7 +67,8 @@ def png_names(views: Sequence[View]) -> list[str]:
 def aligned_score(
     views: Sequence[View],
     gaussians: Gaussians,
-    options: RunOptions,
+    config: TrainConfig,
+    renderer: TensorRenderer,
     extent: float,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
@@ -72,14 +77,13 @@ def aligned_score(
     Args:
         views: The held-out views.
         gaussians: The scene.
-        options: Options of the run.
+        config: The run's configuration.
+        renderer: Renders a scene with the run's settings.
         extent: Size of the scene, world units.
         say: Receives a sentence with the score.
     """
-    colors, background = options.config.appearance != "none", options.config.background
-    scores = [
-        aligned_psnr(gaussians, view, options.renderer, background, extent, colors=colors) for view in views
-    ]
+    colors, background = config.appearance != "none", config.background
+    scores = [aligned_psnr(gaussians, view, renderer, background, extent, colors=colors) for view in views]
     mean = mean_aligned_psnr(scores)
     if mean is None:
         return {}

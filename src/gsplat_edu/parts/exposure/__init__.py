@@ -1,0 +1,1 @@
+"""Exposure, white balance and vignetting of each photo."""

@@ -1,0 +1,1 @@
+"""Poses, lenses and rolling shutters of the cameras, refined with the scene."""

@@ -1,0 +1,1 @@
+"""What makes Gaussians learn a surface, for meshes."""

@@ -1,0 +1,1 @@
+"""Masks of things that move."""
