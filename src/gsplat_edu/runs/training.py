@@ -446,9 +446,9 @@ class CaptureRun:
         if clean is not None:
             gaussians, facts["cleaning"] = clean(gaussians, refined or dataset)
         for masker in trainer.maskers.values():
-            assert isinstance(masker, Transients)
-            sentence, facts["transients"] = write_masks(self.folder.path, dataset, masker)
-            self._say(sentence)
+            if isinstance(masker, Transients):  # and not of a plug-in
+                sentence, facts["transients"] = write_masks(self.folder.path, dataset, masker)
+                self._say(sentence)
         path = self.folder.scene(trainer.iteration)
         write_scene(path, capture_scene(gaussians, dataset, self.options.render_settings.antialiased))
         if export is not None:

@@ -1,6 +1,6 @@
 """Parts of a training: what one is, and the registry of all. Plug-ins add parts and strategies; see docs/PLUGINS.md.
 
-Whoever composes a training or a run loops over `parts()` and names none.
+What composes a training and takes its steps loops over `parts()` and names none; `gsplat_edu.runs` still names ours.
 """
 
 from __future__ import annotations
