@@ -330,7 +330,7 @@ def test_the_time_before_the_plan_counts(capture, tmp_path):
 
 def test_a_limit_that_cannot_be_kept_is_refused_before_any_trial(capture, tmp_path, monkeypatch, capsys):
     """Nothing can be done in a millisecond, which has passed before the command reads its options."""
-    monkeypatch.setattr(train, "refinement_for", lambda *words: pytest.fail("trials were made"))
+    monkeypatch.setattr(train, "chosen_by_pilots", lambda *words: pytest.fail("trials were made"))
     monkeypatch.setattr(train, "remedies_for", lambda *words: pytest.fail("all photos were read"))
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--refine", "auto", "--time-limit"]
     assert main([*words, "0.001s"]) == 2

@@ -1,4 +1,4 @@
-"""What puts trainings together loops over parts: its source names none."""
+"""What puts trainings together, runs, reports and commands them loops over parts: its source names none."""
 
 import re
 from pathlib import Path
@@ -7,14 +7,41 @@ import pytest
 
 from gsplat_edu.train.part import OWN_PARTS
 
+IMPORTERS = {
+    "budget/costs.py",
+    "doctor/moving.py",
+    "doctor/remedies.py",
+    "runs/cleaning.py",
+    "runs/lod_refinement.py",
+    "runs/meshes.py",
+    "runs/painting.py",
+    "runs/pilot.py",
+}
+"""Modules that use what a part offers beside its hooks, for example how a sky is found; no other may."""
+
 SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
 
 
 @pytest.mark.parametrize(
-    "module", ["train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"]
+    "module",
+    [
+        *("train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"),
+        *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py"),
+        "evaluate/report.py",
+    ],
 )
 def test_the_source_names_no_part(module):
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", (SOURCE / module).read_text()).lower().replace(" ", "_")
     assert len(OWN_PARTS) >= 6
     named = [name for name in OWN_PARTS if re.search(rf"(?<![a-z]){name}(?![a-z])", text)]
     assert not named
+
+
+def test_no_other_module_imports_a_part():
+    rooms = "|".join(OWN_PARTS)
+    found = {
+        str(path.relative_to(SOURCE))
+        for path in SOURCE.rglob("*.py")
+        if re.search(rf"^\s*(from|import) gsplat_edu\.parts\.({rooms})\b", path.read_text(), re.MULTILINE)
+    }
+    assert {path for path in found if not path.startswith("parts/")} == IMPORTERS

@@ -17,7 +17,7 @@ from gsplat_edu.parts.poses.trials import CONTROL
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs import pilot
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.runs.pilot import LEAST_GAIN, refinement_for
+from gsplat_edu.runs.pilot import LEAST_GAIN, chosen_by_pilots
 from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View
@@ -67,7 +67,7 @@ def write_moving_room(folder, pixels):
 def chosen_for(folder, tmp_path, lens):
     """Return the choice for a capture, and how many pilots were trained."""
     steps = []
-    chosen = refinement_for(options(folder, tmp_path, lens=lens), CaptureReader(folder), steps.append)
+    chosen = chosen_by_pilots(options(folder, tmp_path, lens=lens), CaptureReader(folder), steps.append)
     assert len(steps) % pilot.PILOT_STEPS == 0
     return *chosen, len(steps) // pilot.PILOT_STEPS
 
@@ -115,7 +115,7 @@ def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
     write_colmap(tmp_path / "capture", views, points, colors)
     steps = []
     reader = CaptureReader(tmp_path / "capture")
-    chosen, reason, trials = refinement_for(options(reader.path, tmp_path), reader, steps.append)
+    chosen, reason, trials = chosen_by_pilots(options(reader.path, tmp_path), reader, steps.append)
     assert len(steps) == len(trials.posed) * 250 and steps[0] == 3 * 250
     assert (chosen != "none") == wrong, reason
     assert "dB with none" in reason and "dB with both" in reason
@@ -139,20 +139,22 @@ def test_pilots_end_early_if_they_would_take_too_much_of_a_time_limit(tmp_path, 
     write_colmap(tmp_path / "capture", *procedural_capture(32, 8, splats=60))
     reader, steps = CaptureReader(tmp_path / "capture"), []
     time = TrialTime(Deadline(1_000.0, lambda: float(len(steps))))
-    found = refinement_for(options(reader.path, tmp_path), reader, steps.append, asked, time.is_over)
-    assert (found.refine, found.trials) == (asked or "none", None)
+    found = chosen_by_pilots(options(reader.path, tmp_path), reader, steps.append, asked, time.is_over)
+    assert (found.value, found.trials) == (asked or "none", None)
     assert "more than a quarter of the time that is left" in found.reason
     assert 0 < len(steps) < 50, "the pace tells long before 250 s"
     late = TrialTime(Deadline(1_000.0, lambda: 1_001.0))
     steps.clear()
-    assert refinement_for(options(reader.path, tmp_path), reader, steps.append, asked, late.is_over) == found
+    assert (
+        chosen_by_pilots(options(reader.path, tmp_path), reader, steps.append, asked, late.is_over) == found
+    )
     assert not steps
 
 
 def test_without_held_out_photos_nothing_is_refined(tmp_path):
     write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=60))
     reader = CaptureReader(tmp_path / "capture")
-    assert refinement_for(options(reader.path, tmp_path, test_every=0), reader) == (
+    assert chosen_by_pilots(options(reader.path, tmp_path, test_every=0), reader) == (
         "none",
         "no photos are held out to judge by",
         None,

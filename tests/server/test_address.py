@@ -5,11 +5,11 @@ import pytest
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.server.address import (
     bound_socket,
-    exposure,
     free_port,
     is_loopback,
     names_this_computer,
     url_of,
+    warning_for,
 )
 
 NAMES = ("--host", "--port")
@@ -77,9 +77,9 @@ def test_a_free_port_is_free():
 
 def test_only_addresses_beyond_this_computer_give_a_warning():
     for host in ("127.0.0.1", "127.3.2.1", "localhost", "::1"):
-        assert is_loopback(host) and exposure(host, "sees it") is None
+        assert is_loopback(host) and warning_for(host, "sees it") is None
     for host in ("0.0.0.0", "::", "192.168.0.7", "example.org"):
-        said = exposure(host, "sees it")
+        said = warning_for(host, "sees it")
         assert said.startswith(f"warning: listening on {host}: anyone who can reach") and "\n" not in said
 
 

@@ -57,9 +57,9 @@ def block_options(folder: BlocksFolder, plan: BlockPlan, number: int, data: Path
             f"{folder.plan}: capture: is not a path of this computer; name the capture with --data PATH"
         )
     try:
-        train, settings = (_tuples(plan.recipe[name]) for name in ("train", "data"))
+        settings = _tuples(plan.recipe["data"])
         one_of("backend", plan.recipe["backend"], BACKENDS)
-        config = TrainConfig().changed(**train | {"max_gaussians": block.max_gaussians})
+        config = TrainConfig.of_record(plan.recipe["train"] | {"max_gaussians": block.max_gaussians})
         if block.iterations is not None:
             config = stretched(config, block.iterations)
         views = {"train_views": block.train, "test_views": block.test}

@@ -34,7 +34,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.runs.plugged import plugin_findings
+from gsplat_edu.runs.parts import findings
 from gsplat_edu.train.config import DEFAULT_STRATEGY, TrainConfig, recipe
 from gsplat_edu.train.length import DEFAULT_QUALITY, planned_iterations
 
@@ -177,7 +177,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         strategy=_strategy(section),
         corrected=appearance != "none",
         moved=moved,
-        plugged=plugin_findings(config, folder.path),
+        plugged=findings(config, folder.path),
     )
     views = view_lines(trained) if arguments.all_views else ()
     return examine_run(trained), [*views, *_gpu_lines(backend)]

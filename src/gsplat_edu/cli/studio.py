@@ -9,7 +9,7 @@ from dataclasses import replace
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.printing import say
 from gsplat_edu.cli.screen import has_screen, open_in_browser
-from gsplat_edu.server.address import exposure
+from gsplat_edu.server.address import warning_for
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> None:
         limits = replace(limits, file=arguments.max_upload)
     if arguments.max_library is not None:
         limits = replace(limits, library=arguments.max_library)
-    if warning := exposure(arguments.host, "can run trainings and read and write your files", token=True):
+    if warning := warning_for(arguments.host, "can run trainings and read and write your files", token=True):
         say(warning)
 
     def opened(url: str) -> None:

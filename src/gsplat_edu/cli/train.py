@@ -34,20 +34,19 @@ from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.finding import Remedy
-from gsplat_edu.doctor.remedies import CHOICES, remedies_for, transients_for
+from gsplat_edu.doctor.remedies import BY_COUNT, CHOICES, remedies_for
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.settings import given
 from gsplat_edu.options.train import AUTO, left_open, options_from
-from gsplat_edu.parts.poses.refinement import NEED_LENSES
 from gsplat_edu.runs.cleaning import cleaner
-from gsplat_edu.runs.pilot import refinement_for
+from gsplat_edu.runs.pilot import NEED_TRIALS, TRIED, chosen_by_pilots
 from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
-from gsplat_edu.server.address import PORT, exposure, free_port
+from gsplat_edu.server.address import PORT, free_port, warning_for
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
 from gsplat_edu.train.capacity import advised_side
@@ -216,7 +215,7 @@ def _view(
 
     view = closing.enter_context(LiveView(capture, host, port))
     say(f"live view: {view.url}")
-    if warning := exposure(host, "sees the training and can pause it", token=True):
+    if warning := warning_for(host, "sees the training and can pause it", token=True):
         say(warning)
     return view
 
@@ -386,22 +385,22 @@ def with_choices(
             )
         for name, remedy in remedies.items():
             options = take(options, name, remedy)
-    if "transients" in names:
+    if by_count := [name for name in names if name in BY_COUNT]:
         count = len(Dataset.of(reader, options.data_settings, points=options.points).train)
-        options = take(options, "transients", transients_for(count))
-    asked = "" if "refine" in names else options.config.refine
-    if "refine" in names or (asked in NEED_LENSES and not (options.resume and options.folder.exists())):
+        for name in by_count:
+            options = take(options, name, BY_COUNT[name](count))
+    asked = "" if TRIED in names else getattr(options.config, TRIED)
+    if TRIED in names or (asked in NEED_TRIALS and not (options.resume and options.folder.exists())):
         with progress_bar(console, "") as bar:
             task = bar.add_task("short trainings", total=None)
-            chosen = refinement_for(
+            chosen = chosen_by_pilots(
                 options,
                 reader,
                 lambda total: bar.update(task, advance=1, total=total),
                 asked,
                 *(() if time is None else (time.is_over,)),
             )
-        options = replace(options, trials=chosen.trials)
-        options = take(options, "refine", Remedy(chosen.refine, chosen.reason))
+        options = take(replace(options, trials=chosen.record), TRIED, Remedy(chosen.value, chosen.reason))
     return options
 
 

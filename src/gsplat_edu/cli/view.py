@@ -18,7 +18,7 @@ from gsplat_edu.options.view import BESIDE
 from gsplat_edu.paths.keyframes import read_path
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
-from gsplat_edu.server.address import exposure
+from gsplat_edu.server.address import warning_for
 from gsplat_edu.server.page_server import PageServer
 from gsplat_edu.viewer import export, page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
@@ -90,7 +90,7 @@ def _serve(
     server: PageServer, console: Terminal, arguments: argparse.Namespace, does: str, token: bool
 ) -> None:
     """Print the address of a server's page, open it, and answer until Ctrl-C."""
-    if warning := exposure(arguments.host, does, token=token):
+    if warning := warning_for(arguments.host, does, token=token):
         console.print(warning, soft_wrap=True)
 
     def opened() -> None:

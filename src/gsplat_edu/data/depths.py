@@ -154,6 +154,11 @@ class Depths:
     report: DepthReport
 
 
+def depth_name(path: Path) -> str:
+    """Return how config.json names the source of depth: the folder's full path, or the word."""
+    return str(path if path in (POINTS, CAPTURE) else path.resolve())
+
+
 def with_depth(
     dataset: Dataset, reader: CaptureReader, source: DepthSource, points: Path | None = None
 ) -> tuple[Dataset, DepthReport]:

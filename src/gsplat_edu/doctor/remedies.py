@@ -72,6 +72,9 @@ def sky_of(survey: Survey) -> Remedy:
 CHOICES = {"appearance": correction_of, "sky": sky_of, "outside_masks": outside_masks_of}
 """Functions that choose a setting for a surveyed capture, by the setting's name."""
 
+BY_COUNT = {"transients": transients_for}
+"""Functions that choose a setting for a number of training photos."""
+
 
 def check_sky(survey: Survey) -> list[Finding]:
     """Report a sky, which needs far splats."""

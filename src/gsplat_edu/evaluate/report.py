@@ -25,10 +25,10 @@ from gsplat_edu.base.text import write_text
 from gsplat_edu.evaluate.block_figures import blocks_table, cells_figure
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.images import small_jpeg
-from gsplat_edu.evaluate.masked import MaskedPicture, masked_figures
 from gsplat_edu.evaluate.mesh_report import MeshEntry, mesh_section
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.evaluate.report_parts import (
+    Section,
     bullets,
     facts_table,
     folded,
@@ -47,7 +47,7 @@ SCORES = (
     ("psnr_8bit", "PSNR, 8-bit (dB)"),
     ("ssim", "SSIM"),
     ("l1", "L1"),
-    ("psnr_fitted", "PSNR, exposure fitted (dB)"),
+    ("psnr_fitted", "PSNR, colours fitted (dB)"),
 )
 
 SHOWN = 0.95
@@ -175,10 +175,9 @@ class Report:
         config: The run's configuration.
         scores: Scores of the test views.
         pictures: Pictures of test views. At most 8 are shown, the best and the worst among them.
-        masked: Pictures of photos with parts that were masked as moving.
         notes: Notes for the reader, one sentence each.
         meshes: What is known of the meshes of the scene.
-        further: Headings and sentences of further sections.
+        sections: The sections of the training's parts.
         machine: Facts about the machine; by default, this one.
     """
 
@@ -188,10 +187,9 @@ class Report:
     config: Mapping[str, Any] = field(default_factory=dict)
     scores: Sequence[ImageScore] = ()
     pictures: Sequence[Picture] = ()
-    masked: Sequence[MaskedPicture] = ()
     notes: Sequence[str] = ()
     meshes: Sequence[MeshEntry] = ()
-    further: Sequence[tuple[str, Sequence[str]]] = ()
+    sections: Sequence[Section] = ()
     machine: Mapping[str, str] = field(default_factory=machine_facts)
 
 
@@ -224,10 +222,9 @@ def write_report(path: Path, report: Report) -> None:
         section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
         section("Blocks", cells),
         _views(report.scores, report.pictures, skipped_views(report.metrics)),
-        section("Masked things that moved", masked_figures(report.masked)),
+        *(section(part.heading, f"{bullets(part.sentences)}{part.figures}") for part in report.sections),
         mesh_section(report.meshes),
         _exports(report.metrics.get("exports")),
-        *(section(heading, bullets(sentences)) for heading, sentences in report.further),
         section("Notes", bullets(report.notes)),
         section("Configuration", folded("all settings of this run", facts_table(_flat(config)))),
         *_machines(report),

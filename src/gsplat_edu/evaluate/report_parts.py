@@ -5,6 +5,22 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a report.
+
+    Args:
+        heading: Its heading.
+        sentences: Text, as a list.
+        figures: HTML of its pictures, made by functions of `gsplat_edu.evaluate`.
+    """
+
+    heading: str
+    sentences: Sequence[str] = ()
+    figures: str = ""
 
 
 def section(title: str, body: str) -> str:

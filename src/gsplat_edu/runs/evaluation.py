@@ -18,12 +18,11 @@ from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.evaluate.verdict import SKIPPED
-from gsplat_edu.parts.poses.trials import RefineTrials
-from gsplat_edu.parts.transients.files import masked_pictures
+from gsplat_edu.parts.run_values import Reported
 from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.meshes import mesh_entries
-from gsplat_edu.runs.plugged import plugin_sections
+from gsplat_edu.runs.parts import sections
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
@@ -121,10 +120,10 @@ def evaluate_run(
     train = score_views(gaussians, train_views, render, judged.background, tell)
     metrics = {**earlier, **_scores(judged, test, train), "num_gaussians": len(gaussians)}
     metrics |= _appearance(config) | dict(facts or {})
-    masked = masked_pictures(folder.path, metrics, train_views, gaussians, render, judged.background)
-    title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", _notes(judged, config)
-    known = mesh_entries(folder), plugin_sections(config, log)
-    report = Report(title, metrics, log, config, test, gallery.pictures, masked, notes, *known)
+    title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", [*map(str, judged.notes)]
+    run = Reported(folder.path, config, metrics, log, train_views, gaussians, render, judged.background)
+    known = mesh_entries(folder), sections(run)
+    report = Report(title, metrics, log, config, test, gallery.pictures, notes, *known)
     write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated
@@ -137,13 +136,6 @@ def _scores(judged: ScoredViews, test: list[ImageScore], train: list[ImageScore]
         return {SKIPPED: {"test": len(judged.test), "train": len(judged.train)}}
     views = [dataclasses.asdict(score) for score in test]
     return {"test": summarize(test), "train": summarize(train), "test_views": views}
-
-
-def _notes(judged: ScoredViews, config: Mapping[str, Any]) -> list[str]:
-    """Return the notes of the report: those of the capture, and which refinements were tried."""
-    trials = RefineTrials.of(config)
-    tried = [trials.note(config.get("train"))] if trials else []
-    return [*map(str, judged.notes), *tried]
 
 
 def _appearance(config: Mapping[str, Any]) -> dict[str, Any]:

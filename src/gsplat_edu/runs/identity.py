@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -21,6 +22,9 @@ SAME = ("train", "render", "data")
 
 MAY_DIFFER = {"data": ("path", "points", "scene", "depth", "image_memory"), "train": ("iterations",)}
 """Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
+
+DIGESTS = "digests"
+"""Key of config.json: digests of what parts of the training added to the views, by part."""
 
 MOVED = 1e-9
 """Tolerance of camera coordinates, relative and absolute: subtracting an origin and adding it back rounds."""
@@ -146,6 +150,27 @@ def check_capture(folder: RunFolder, dataset: Dataset) -> None:
             f"--resume: {folder.path} was started with another capture: {found}; "
             "resume with the original capture, or give another --out"
         )
+
+
+def check_digests(folder: RunFolder, digests: Mapping[str, str]) -> None:
+    """Compare what parts of a resumed training add to the views with what they added when the run was started.
+
+    Args:
+        folder: The run's folder.
+        digests: By part.
+
+    Raises:
+        CheckpointError: they differ.
+    """
+    stored = folder.read_config().get(DIGESTS, {})
+    for name in {**digests, **stored}:
+        if stored.get(name) != digests.get(name):
+            what = name.replace("_", " ")
+            was = f"with other {what}" if name in stored else f"without {what}"
+            raise CheckpointError(
+                f"--resume: {folder.path} was started {was}; give the same options with the same files, or another"
+                " --out"
+            )
 
 
 def _comparable(config: dict[str, Any]) -> bool:

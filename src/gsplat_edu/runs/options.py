@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.parts.poses.trials import RefineTrials
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.train.config import TrainConfig
@@ -33,7 +32,7 @@ class RunOptions:
             at any time.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
         resume: Continue from the last checkpoint of the folder.
-        trials: Scores by which `config.refine` was chosen, for config.json; None if no short trainings were judged.
+        trials: Scores of the short trainings that chose settings, for config.json, by their key there.
 
     Raises:
         ArgumentError: a number is out of range.
@@ -50,7 +49,7 @@ class RunOptions:
     eval_every: int = 1_000
     save_every: int = 500
     resume: bool = False
-    trials: RefineTrials | None = None
+    trials: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the ranges."""

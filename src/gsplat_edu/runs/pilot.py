@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,8 +29,8 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.alignment import aligned_psnr, scored_halves
 from gsplat_edu.parts.poses.capture import with_camera, with_refined_cameras
-from gsplat_edu.parts.poses.refinement import DISTORTIONS, FREE, LEARNED, MOTIONS, refinement_of
-from gsplat_edu.parts.poses.trials import CONTROL, RefineTrials
+from gsplat_edu.parts.poses.refinement import DISTORTIONS, FREE, LEARNED, MOTIONS, NEED_LENSES, refinement_of
+from gsplat_edu.parts.poses.trials import CONTROL, KEY, RefineTrials
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.options import RunOptions
@@ -92,15 +92,27 @@ class OutOfTimeError(Exception):
     """The time for pilots is over."""
 
 
+TRIED = "refine"
+"""The setting that pilots choose."""
+
+NEED_TRIALS = NEED_LENSES
+"""Values of the setting that are judged by pilots also where the user gave them."""
+
+
 class Chosen(NamedTuple):
     """What a run refines, why, and the scores that say so."""
 
-    refine: str
+    value: str
     reason: str  # a clause
     trials: RefineTrials | None  # None if no training was judged
 
+    @property
+    def record(self) -> dict[str, Any]:
+        """The scores for config.json, by their key there."""
+        return {} if self.trials is None else {KEY: self.trials.json()}
 
-def refinement_for(
+
+def chosen_by_pilots(
     options: RunOptions,
     reader: CaptureReader,
     progress: Callable[[int], None] = lambda total: None,

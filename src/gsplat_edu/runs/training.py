@@ -20,6 +20,7 @@ from gsplat_edu.base.files import check_folder, remove_leftovers
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.depths import depth_name
 from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.region import read_region
@@ -27,17 +28,18 @@ from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.evaluate.verdict import FULL_LENGTH
 from gsplat_edu.io.formats import write_scene
-from gsplat_edu.parts.given_depth.capture import check_depth, depth_digest, depth_name, with_run_depth
-from gsplat_edu.parts.poses.capture import aligned_score, with_refined_cameras, write_refined
-from gsplat_edu.parts.poses.refinement import refinement_of
-from gsplat_edu.parts.poses.trials import KEY as TRIALS
-from gsplat_edu.parts.sky.start import shell_around, start_sky, with_room_for
-from gsplat_edu.parts.transients.files import write_masks
-from gsplat_edu.parts.transients.search import Transients, check_enough
+from gsplat_edu.parts.run_values import Captured, Finished
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
-from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
+from gsplat_edu.runs.identity import (
+    DIGESTS,
+    check_capture,
+    check_digests,
+    check_options,
+    fingerprint,
+    photo_digests,
+)
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of, with_points_of_first
@@ -55,7 +57,7 @@ from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.part import packages_of
+from gsplat_edu.train.part import packages_of, parts
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.team import ALONE
 from gsplat_edu.train.trainer import Callback, Trainer
@@ -80,7 +82,7 @@ def document(options: RunOptions) -> dict[str, Any]:
         "render": dataclasses.asdict(options.render_settings),
         "backend": options.backend,
         "machine": machine_facts(),
-        **({} if options.trials is None else {TRIALS: options.trials.json()}),
+        **options.trials,
     }
 
 
@@ -215,33 +217,47 @@ class CaptureRun:
         self._began: float | None = None  # during training: when the count of seconds started
         settings = as_trained(options.data_settings, options.config.appearance)
         reader = reader_for(options.data, reader)
-        dataset = Dataset.of(reader, settings, points=options.points)
-        self.dataset = with_run_depth(
-            with_points_of_first(dataset, team), reader, options.config, options.depth, options.points, say
-        )
+        capture = self._captured(reader, Dataset.of(reader, settings, points=options.points))
+        self.dataset = capture.dataset
         for note in self.dataset.notes:
             say(str(note))
         self._trained = prepare(self.dataset)
         self.dataset.preload(progress)
-        if options.config.transients != "none":
-            check_enough(len(self.dataset.train))
-        # a scene to start from may have a sky; a resumed run need not say --from again
-        from_scene = team.shared(self._leads and self._is_from_scene())
-        self._shell = shell_around(self.dataset) if from_scene else None
-        gaussians = self._begin()
+        start, digest = self._start(capture)
+        gaussians = start.gaussians
+        if self._leads:
+            self._write_or_compare(digest)
         self._log = LogWriter(self.folder.log_file)
-        self.trainer = self._trainer(gaussians)
+        self.trainer = self._trainer(start)
         if self._leads:
             self._take_up()
             self._extend()
         if isinstance(team, Processes):
             self._share_start(team, gaussians)
 
+    def _captured(self, reader: CaptureReader, dataset: Dataset) -> Captured:
+        """Return the capture with what the parts of the training add to its views."""
+        options = self.options
+        # a resumed run need not say --from again
+        from_scene = self._team.shared(self._leads and self._is_from_scene())
+        is_new = not self.folder.exists()
+        dataset = with_points_of_first(dataset, self._team)
+        capture = Captured(dataset, reader, options.points, options.depth, from_scene, is_new, self._say)
+        for name, part in parts().items():
+            changed = part.captured(options.config.settings_of(name), capture)
+            capture = dataclasses.replace(capture, dataset=changed)
+        return capture
+
+    def _digests(self) -> dict[str, str]:
+        """Return digests of what parts added to the views, by part."""
+        digests = {name: part.digest(self.dataset) for name, part in parts().items()}
+        return {name: digest for name, digest in digests.items() if digest is not None}
+
     def _share_start(self, team: Processes, gaussians: Gaussians) -> None:
         """Check that all processes start from equal data, and load the first one's checkpoint in all."""
         views = [(view.name, view.camera.W, view.camera.H) for view in self.dataset.train]
         start = {"photos": fingerprint(self.dataset), "views": digest_of(repr(views).encode())}
-        start |= {"depth": depth_digest(self.dataset) or "none"}
+        start |= {name: self._digests().get(name, "none") for name in parts()}
         check_alike(team, "start alike", start | {"Gaussians": scene_digest(gaussians)})
         checkpoints = list_checkpoints(self.folder.checkpoints) if self._leads else []
         state = team.shared_state(read_checkpoint(checkpoints[-1]) if checkpoints else None)
@@ -263,17 +279,19 @@ class CaptureRun:
                 f"{folder.path}: was started on the backend {before}; {options.backend} rounds differently"
             )
 
-    def _begin(self) -> Gaussians:
-        """Make the start Gaussians; write the run's settings, or compare them with the stored ones."""
+    def _write_or_compare(self, scene: str | None) -> None:
+        """Write the settings of a new run, or compare those of a resumed one with the stored ones.
+
+        Args:
+            scene: Digest of the scene that the run starts from; None without one.
+        """
         options, dataset, folder = self.options, self.dataset, self.folder
-        gaussians, digest = self._start_cloud()
-        if not self._leads:
-            return sorted_in_space(gaussians)
+        digests = self._digests()
         if folder.exists():
             remove_leftovers(folder.path)
             check_capture(folder, dataset)
-            check_depth(folder.path, folder.read_config(), depth_digest(dataset))
-            if digest is not None and folder.read_config().get("start") != digest:
+            check_digests(folder, digests)
+            if scene is not None and folder.read_config().get("start") != scene:
                 raise CheckpointError(
                     f"--resume: {folder.path} was not started from {options.scene} as it is now;"
                     " resume with the original scene, or give another --out"
@@ -284,41 +302,41 @@ class CaptureRun:
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
             facts |= {"up": list(capture_up(dataset))}
             facts |= {} if dataset.scale is None else {"scale": dataset.scale.json()}
-            facts |= {} if (depth := depth_digest(dataset)) is None else {"depth": depth}
-            folder.write_config(document(options) | facts | ({"start": digest} if digest else {}))
-        return sorted_in_space(gaussians)
+            facts |= {DIGESTS: digests} if digests else {}
+            folder.write_config(document(options) | facts | ({"start": scene} if scene else {}))
 
-    def _trainer(self, gaussians: Gaussians) -> Trainer:
+    def _trainer(self, start: Start) -> Trainer:
         options = self.options
         return training(
             options.config,
             self._trained,
             dataclasses.replace(load_backend(options.backend), photo_room=options.data_settings.image_memory),
-            Start(gaussians, self._shell),
+            start,
             callbacks=[self._record],
             team=self._team,
         )
 
-    def _start_cloud(self) -> tuple[Gaussians, str | None]:
+    def _start(self, capture: Captured) -> tuple[Start, str | None]:
         """Make the start Gaussians, and their digest if they come from a scene."""
-        options, dataset = self.options, self.dataset
+        options, config = self.options, self.options.config
+        each = (part.start(config.settings_of(name), capture) for name, part in parts().items())
+        added = [one for one in each if one is not None]
+        shell = next((one.shell for one in added if one.shell is not None), None)
         if options.scene is not None:
-            gaussians, notes = scene_start(options.scene, options.config, dataset.origin)
+            gaussians, notes = scene_start(options.scene, config, capture.dataset.origin)
             for note in notes:
                 self._say(note)
-            return gaussians, scene_digest(gaussians)
-        config, sky = options.config, None
-        if config.sky != "none":
-            sky, self._shell = start_sky(dataset, config)
-            config = with_room_for(len(sky), config)
-            if not self.folder.exists():
-                self._say(f"{len(sky)} splats of the sky lie {self._shell.radius:.3g} world units away")
-        gaussians = from_points(dataset.points, dataset.colors, config)
-        if len(gaussians) < len(dataset.points) and not self.folder.exists():
+            return Start(sorted_in_space(gaussians), shell), scene_digest(gaussians)
+        further = [one.gaussians for one in added if one.gaussians is not None]
+        if config.max_gaussians is not None and further:
+            config = config.changed(max_gaussians=config.max_gaussians - sum(map(len, further)))
+        points, colors = capture.dataset.points, capture.dataset.colors
+        gaussians = from_points(points, colors, config)
+        if len(gaussians) < len(points) and capture.is_new:
             self._say(
-                f"the capture has {len(dataset.points):,} start points; {len(gaussians):,} of them are used (the cap)"
+                f"the capture has {len(points):,} start points; {len(gaussians):,} of them are used (the cap)"
             )
-        return gaussians if sky is None else Gaussians.concatenated([gaussians, sky]), None
+        return Start(sorted_in_space(Gaussians.concatenated([gaussians, *further])), shell), None
 
     def _extend(self) -> None:
         """Record in config.json that the run was extended, before the first additional iteration."""
@@ -435,37 +453,39 @@ class CaptureRun:
             clean: Called with the scene and the capture first; metrics.json gets its record as "cleaning".
             full_length: Iterations that the run would have without a time limit; None for those of its configuration.
         """
-        trainer, dataset = self.trainer, self.dataset
-        refinement = refinement_of(trainer.view_model)
-        refined = None if refinement is None else with_refined_cameras(refinement, dataset)
+        trainer, dataset, config = self.trainer, self.dataset, self.options.config
+        learned = dataset
+        for part in parts().values():
+            learned = part.learned(trainer, learned)
         gaussians = trainer.gaussians.map(lambda tensor: tensor[trainer.gaussians.finite_rows()])
         if lost := len(trainer.gaussians) - len(gaussians):
             self._say(f"{lost} Gaussians are NaN or infinite and are left out of the scene")
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
-        facts[FULL_LENGTH] = full_length or self.options.config.iterations
+        facts[FULL_LENGTH] = full_length or config.iterations
         if clean is not None:
-            gaussians, facts["cleaning"] = clean(gaussians, refined or dataset)
-        for masker in trainer.maskers.values():
-            if isinstance(masker, Transients):  # and not of a plug-in
-                sentence, facts["transients"] = write_masks(self.folder.path, dataset, masker)
-                self._say(sentence)
+            gaussians, facts["cleaning"] = clean(gaussians, learned)
         path = self.folder.scene(trainer.iteration)
         write_scene(path, capture_scene(gaussians, dataset, self.options.render_settings.antialiased))
         if export is not None:
             facts["exports"] = export(open_source(path))
-        if refined is not None:
-            self._say(
-                f"wrote {write_refined(self.folder.path, refined)}: the capture with its refined cameras"
-            )
-            if self.options.scores_at_end:
-                config, renderer = self.options.config, self.options.renderer
-                facts |= aligned_score(refined.test, gaussians, config, renderer, trainer.extent, self._say)
+        run = Finished(
+            self.folder.path,
+            trainer,
+            dataset,
+            learned,
+            gaussians,
+            self.options.renderer,
+            self.options.scores_at_end,
+            self._say,
+        )
+        for name, part in parts().items():
+            facts |= part.finish(config.settings_of(name), run)
         return evaluate_run(
             self.folder,
             ScoredViews(
                 dataset.test,
-                (refined or dataset).train,
-                self.options.config.background,
+                learned.train,
+                config.background,
                 dataset.notes,
                 skipped=not self.options.scores_at_end,
             ),

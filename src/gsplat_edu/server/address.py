@@ -131,7 +131,7 @@ def url_of(host: str, port: int) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def exposure(host: str, what: str, token: bool = False) -> str | None:
+def warning_for(host: str, what: str, token: bool = False) -> str | None:
     """Return a warning if other computers can reach a server; None if only this one can.
 
     Args:

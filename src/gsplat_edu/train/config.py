@@ -458,6 +458,17 @@ class TrainConfig:
             if BY_NAME[name].plugin is None or value != BY_NAME[name].default
         }
 
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> TrainConfig:
+        """Return the configuration that `record` returned and JSON kept, which has lists for tuples.
+
+        Raises:
+            ArgumentError: a value is out of range, or a setting is unknown.
+            TypeError: a value has the wrong type.
+        """
+        values = {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+        return cls().changed(**values)
+
     @property
     def plugins(self) -> tuple[str, ...]:
         """The plug-ins that the training uses: its strategy, and parts whose settings differ from their defaults."""

@@ -1,6 +1,6 @@
 """Parts of a training: what one is, and the registry of all. Plug-ins add parts and strategies; see docs/PLUGINS.md.
 
-What composes a training and takes its steps loops over `parts()` and names none; `gsplat_edu.runs` still names ours.
+What composes a training, takes its steps, runs it on a capture and reports it loops over `parts()` and names none.
 """
 
 from __future__ import annotations
@@ -53,14 +53,46 @@ class Part:
         """
         return ()
 
-    def section(self, settings: Any, log: Sequence[Mapping[str, Any]]) -> Sequence[str]:  # noqa: ANN401
-        """Return the sentences of the plug-in's section in the report.
+    def section(self, settings: Any, run: Any) -> Any:  # noqa: ANN401
+        """Return the part's section in the report, a `gsplat_edu.evaluate.report_parts.Section`; None for none.
 
         Args:
             settings: The run's `Settings`.
-            log: The entries of the run's log.
+            run: The run, a `gsplat_edu.parts.run_values.Reported`.
         """
-        return ()
+        return None
+
+    def captured(self, settings: Any, capture: Any) -> Any:  # noqa: ANN401
+        """Return the dataset that a run trains on: that of the capture, perhaps with more.
+
+        Args:
+            settings: The run's `Settings`.
+            capture: The capture before its photos are read, a `gsplat_edu.parts.run_values.Captured`.
+
+        Raises:
+            ArgumentError: the settings do not fit the capture.
+            DatasetError: a file that the part needs cannot be used.
+        """
+        return capture.dataset
+
+    def digest(self, dataset: Any) -> str | None:  # noqa: ANN401
+        """Return a digest of what `captured` added to the dataset; None for nothing.
+
+        A resumed run and the processes that share one are refused if theirs differ.
+        """
+        return None
+
+    def start(self, settings: Any, capture: Any) -> Any:  # noqa: ANN401
+        """Return what the part adds to the start, a `gsplat_edu.parts.run_values.Added`; None for nothing.
+
+        Args:
+            settings: The run's `Settings`.
+            capture: The capture, a `gsplat_edu.parts.run_values.Captured`.
+
+        Raises:
+            ArgumentError: the settings do not fit the capture.
+        """
+        return None
 
     def begin(self, settings: Any, setup: Any) -> Any:  # noqa: ANN401
         """Return what the part does in the steps, a `gsplat_edu.train.part_values.Begun`; None for nothing.
@@ -73,6 +105,24 @@ class Part:
             ArgumentError: the settings do not fit the training.
         """
         return None
+
+    def learned(self, trainer: Any, dataset: Any) -> Any:  # noqa: ANN401
+        """Return a dataset with what the part learned of it, for example its cameras.
+
+        Args:
+            trainer: The training, a `gsplat_edu.train.trainer.Trainer`.
+            dataset: The dataset, with what the parts before learned.
+        """
+        return dataset
+
+    def finish(self, settings: Any, run: Any) -> Mapping[str, Any]:  # noqa: ANN401
+        """Write what the part has to write into a run's folder; return entries of metrics.json.
+
+        Args:
+            settings: The run's `Settings`.
+            run: The run, a `gsplat_edu.parts.run_values.Finished`.
+        """
+        return {}
 
 
 class Strategy(ABC):

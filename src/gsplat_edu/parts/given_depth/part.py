@@ -1,8 +1,13 @@
-"""The part that learns from depth that views have (`View.depth`)."""
+"""The part that learns from depth that views have (`View.depth`): the user's maps, or points of the capture."""
 
 from __future__ import annotations
 
+import hashlib
+
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.depths import DepthSource, with_depth
 from gsplat_edu.parts.given_depth.term import DEPTH, DepthTerm
+from gsplat_edu.parts.run_values import Captured
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
 from gsplat_edu.train.part_values import Begun, Setup
@@ -11,6 +16,32 @@ from gsplat_edu.train.rendered import Turns
 
 class GivenDepthPart(Part):
     """Pulls the rendered depth to the given one."""
+
+    def captured(self, settings: TrainConfig, capture: Captured) -> Dataset:
+        """Give the training views the depth that the run's options name, and say what was found.
+
+        Raises:
+            DatasetError: the depth cannot be used.
+        """
+        if capture.depth is None:
+            return capture.dataset
+        source = DepthSource(capture.depth, settings.depth_kind, settings.depth_unit)
+        dataset, report = with_depth(capture.dataset, capture.reader, source, capture.points)
+        for sentence in report.lines():
+            capture.say(sentence)
+        return dataset
+
+    def digest(self, dataset: Dataset) -> str | None:
+        """Return a digest of the depth of all training views; None if they have none."""
+        digest, found = hashlib.sha256(), False
+        for view in dataset.train:
+            if view.depth is None:
+                continue
+            given, found = view.depth(), True
+            digest.update(f"{view.name} {len(given)} {given.sparse}".encode())
+            for array in (given.rays, given.depths, given.weights):
+                digest.update(array.tobytes())
+        return digest.hexdigest() if found else None
 
     def begin(self, settings: TrainConfig, setup: Setup) -> Begun | None:
         """Return the term that compares depths, if views have some.

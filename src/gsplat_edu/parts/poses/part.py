@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from gsplat_edu.parts.poses.refinement import NEED_LENSES, Refinement
+from collections.abc import Mapping
+from typing import Any
+
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.evaluate.report_parts import Section
+from gsplat_edu.parts.poses.capture import aligned_score, with_refined_cameras, write_refined
+from gsplat_edu.parts.poses.refinement import NEED_LENSES, Refinement, refinement_of
+from gsplat_edu.parts.poses.trials import RefineTrials
+from gsplat_edu.parts.run_values import Finished, Reported
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
 from gsplat_edu.train.part_values import Begun, Setup
+from gsplat_edu.train.trainer import Trainer
 
 
 class PosesPart(Part):
@@ -23,6 +32,31 @@ class PosesPart(Part):
             setup.backend.require("lens", f"refine: {settings.refine}")
         cameras = [view.camera for view in setup.views]
         return Begun(view_model=Refinement(cameras, settings, setup.extent))
+
+    def learned(self, trainer: Trainer, dataset: Dataset) -> Dataset:
+        """Return the capture with its refined cameras."""
+        refinement = refinement_of(trainer.view_model)
+        return dataset if refinement is None else with_refined_cameras(refinement, dataset)
+
+    def finish(self, settings: TrainConfig, run: Finished) -> Mapping[str, Any]:
+        """Write the capture with its refined cameras; return the score of held-out views at aligned poses.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+            OSError: a file cannot be written.
+        """
+        if refinement_of(run.trainer.view_model) is None:
+            return {}
+        run.say(f"wrote {write_refined(run.path, run.learned)}: the capture with its refined cameras")
+        if not run.is_scored:
+            return {}
+        extent = run.trainer.extent
+        return aligned_score(run.learned.test, run.gaussians, settings, run.renderer, extent, run.say)
+
+    def section(self, settings: TrainConfig, run: Reported) -> Section | None:
+        """Return which refinements were tried; None if none were."""
+        trials = RefineTrials.of(run.config)
+        return None if trials is None else Section("Refined cameras", [trials.note(settings.refine)])
 
 
 POSES = PosesPart()

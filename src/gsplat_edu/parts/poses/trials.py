@@ -53,13 +53,8 @@ class RefineTrials:
         without = next((name for name in (f"none{CONTROL}", "none") if name in scores), None)
         return None if without is None or self.asked not in scores else scores[self.asked] - scores[without]
 
-    def note(self, settings: object) -> str:
-        """Return a sentence for the run's report.
-
-        Args:
-            settings: The section "train" of config.json.
-        """
-        refine = settings.get("refine") if isinstance(settings, Mapping) else None
+    def note(self, refine: str) -> str:
+        """Return a sentence for the report of a run that refines this."""
         return f"refine {refine}: {self}"
 
     def __str__(self) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.parts.run_values import Added, Captured
+from gsplat_edu.parts.sky.start import shell_around, start_sky
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
 from gsplat_edu.train.part_values import Setup
@@ -10,6 +12,23 @@ from gsplat_edu.train.part_values import Setup
 
 class SkyPart(Part):
     """Starts a run with a shell of splats far behind the scene."""
+
+    def start(self, settings: TrainConfig, capture: Captured) -> Added | None:
+        """Return the splats of the sky and the shell where they lie.
+
+        A scene to start from may have a sky, so a run that starts from one has a shell.
+
+        Raises:
+            ArgumentError: no photo shows a sky.
+        """
+        if capture.starts_from_scene:
+            return Added(shell=shell_around(capture.dataset))
+        if settings.sky == "none":
+            return None
+        splats, shell = start_sky(capture.dataset, settings)
+        if capture.is_new:
+            capture.say(f"{len(splats)} splats of the sky lie {shell.radius:.3g} world units away")
+        return Added(splats, shell)
 
     def begin(self, settings: TrainConfig, setup: Setup) -> None:
         """Check that the start has the shell, which `gsplat_edu.parts.sky.start` makes of a capture.

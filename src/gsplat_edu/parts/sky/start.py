@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from gsplat_edu.base.errors import ArgumentError
@@ -74,14 +72,3 @@ def start_sky(dataset: Dataset, config: TrainConfig) -> tuple[Gaussians, Shell]:
         )
     shell = shell_around(dataset)
     return sky_splats(sky, shell, config.sh_degree, most), shell
-
-
-def with_room_for(count: int, config: TrainConfig) -> TrainConfig:
-    """Return the configuration with a cap that is lower by a number of Gaussians.
-
-    Args:
-        count: The number.
-        config: The configuration; it may have no cap.
-    """
-    cap = config.max_gaussians
-    return config if cap is None else dataclasses.replace(config, max_gaussians=cap - count)

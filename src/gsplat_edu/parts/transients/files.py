@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,15 @@ from PIL import Image
 
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.text import as_file_name, image_file_names
-from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.capture import is_outside
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.evaluate.masked import MaskedPicture
-from gsplat_edu.evaluate.metrics import Renderer, to_bytes
+from gsplat_edu.evaluate.metrics import to_bytes
+from gsplat_edu.parts.run_values import Reported
 from gsplat_edu.parts.transients.masks import LARGEST_SHARE
 from gsplat_edu.parts.transients.search import Transients, resized_mask
 from gsplat_edu.photos.decoding import decode_mask
-from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
 FOLDER = "transients"
@@ -76,37 +75,22 @@ def mask_path(run: Path, name: str) -> Path:
     return run / FOLDER / as_file_name(safe)
 
 
-def masked_pictures(
-    run: Path,
-    metrics: Mapping[str, Any],
-    views: Sequence[View],
-    gaussians: Gaussians,
-    render: Renderer,
-    background: ArrayLike,
-) -> list[MaskedPicture]:
+def masked_pictures(run: Reported) -> list[MaskedPicture]:
     """Make the pictures of the photos with the largest masked parts.
-
-    Args:
-        run: The run's folder.
-        metrics: The contents of metrics.json.
-        views: The training views.
-        gaussians: The scene.
-        render: Renders Gaussians from a camera, over `background`.
-        background: (3,) colour behind photos that are not opaque.
 
     Raises:
         DatasetError: a photo or a mask cannot be read.
     """
-    by_name = {view.name: view for view in views}
+    by_name = {view.name: view for view in run.views}
     pictures = []
-    for name in masked_names(metrics)[:PICTURES]:
-        view, path = by_name.get(name), mask_path(run, name)
+    for name in masked_names(run.metrics)[:PICTURES]:
+        view, path = by_name.get(name), mask_path(run.path, name)
         if view is None or not path.is_file():
             continue
         counts = resized_mask(decode_mask(path), view.camera.H, view.camera.W)
         with torch.no_grad():
-            image = render(gaussians, view.camera).image
-        photo = np.asarray(to_bytes(view.read().over(background)))
+            image = run.renderer(run.gaussians, view.camera).image
+        photo = np.asarray(to_bytes(view.read().over(run.background)))
         pictures.append(MaskedPicture.of(name, photo, ~counts, to_bytes(image)))
     return pictures
 

@@ -1,0 +1,104 @@
+"""What a run hands to the parts of its training, and what they give back; `gsplat_edu.train.part.Part` says when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.base.validation import ArrayLike
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.evaluate.alignment import TensorRenderer
+from gsplat_edu.evaluate.metrics import Renderer
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
+from gsplat_edu.train.far import Shell
+from gsplat_edu.train.trainer import Trainer
+
+
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """The capture of a run, before the training.
+
+    Args:
+        dataset: The capture, with what the parts before gave it.
+        reader: It has read the capture.
+        points: The run's file of start points; None if it has none.
+        depth: Where the run's depth comes from, as in `gsplat_edu.runs.options.RunOptions`.
+        starts_from_scene: Whether the run starts from a scene, which may have far splats, instead of points.
+        is_new: Whether the run begins now; false if it is resumed.
+        say: Receives sentences for the user.
+    """
+
+    dataset: Dataset
+    reader: CaptureReader
+    points: Path | None
+    depth: Path | None
+    starts_from_scene: bool
+    is_new: bool
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Added:
+    """What a part adds to the start of a training.
+
+    Args:
+        gaussians: Start Gaussians beside those of the points; None for none. The cap leaves room for them.
+        shell: Where far splats lie; None if there are none.
+    """
+
+    gaussians: Gaussians | None = None
+    shell: Shell | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A run whose training is over and whose scene is written.
+
+    Args:
+        path: The run's folder.
+        trainer: The training.
+        dataset: The capture.
+        learned: The capture as the parts' `learned` returned it.
+        gaussians: The scene.
+        renderer: Renders Gaussians from a camera with the run's settings.
+        is_scored: Whether the views are scored.
+        say: Receives sentences for the user.
+    """
+
+    path: Path
+    trainer: Trainer
+    dataset: Dataset
+    learned: Dataset
+    gaussians: Gaussians
+    renderer: TensorRenderer
+    is_scored: bool
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Reported:
+    """A run for whose report the parts write sections.
+
+    Args:
+        path: The run's folder.
+        config: The contents of config.json.
+        metrics: The contents of metrics.json.
+        log: The entries of the log.
+        views: The training views that were scored.
+        gaussians: The scene.
+        renderer: Renders Gaussians from a camera, over `background`.
+        background: (3,) colour behind photos that are not opaque.
+    """
+
+    path: Path
+    config: Mapping[str, Any]
+    metrics: Mapping[str, Any]
+    log: Sequence[Mapping[str, Any]]
+    views: Sequence[View]
+    gaussians: Gaussians
+    renderer: Renderer
+    background: ArrayLike

@@ -1,0 +1,52 @@
+"""What the parts of a training say of a run: sections of the report and findings of the doctor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.evaluate.report_parts import Section
+from gsplat_edu.parts.run_values import Reported
+from gsplat_edu.train.config import BY_NAME, TrainConfig
+from gsplat_edu.train.part import PLUGGED_PARTS, Part, parts
+
+
+def sections(run: Reported) -> list[Section]:
+    """Return the sections that parts add to the report of a run.
+
+    Raises:
+        CheckpointError: config.json has a setting that is out of range.
+        DatasetError: a photo cannot be read.
+    """
+    found = (part.section(settings, run) for part, settings in _used(run.config))
+    return [section for section in found if section is not None]
+
+
+def findings(config: Mapping[str, Any], run: Path) -> list[tuple[str, str]]:
+    """Return what parts find in a run: sentences, each with what to do about it.
+
+    Args:
+        config: The run's config.json.
+        run: Its folder.
+
+    Raises:
+        CheckpointError: config.json has a setting that is out of range.
+    """
+    return [said for part, settings in _used(config) for said in part.findings(settings, run)]
+
+
+def _used(config: Mapping[str, Any]) -> Iterator[tuple[Part, Any]]:
+    """Yield our parts, and those plug-ins that a run used and that are installed, with their settings in the run."""
+    plugins, stored = config.get("plugins", {}), config.get("train", {})
+    own = {
+        name: stored[name] for name in stored if name in BY_NAME and BY_NAME[name].plugin in (None, *plugins)
+    }
+    try:
+        settings = TrainConfig.of_record(own)
+    except (ArgumentError, TypeError) as error:
+        raise CheckpointError(f"config.json: train: {error}; fix the file") from None
+    for name, part in parts().items():
+        if name not in PLUGGED_PARTS or name in plugins:
+            yield part, settings.settings_of(name)
