@@ -32,7 +32,6 @@ import numpy as np
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import finished_blocks, merged
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.seams import pooled_psnr, strip_masks, strip_width
@@ -44,6 +43,7 @@ from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source

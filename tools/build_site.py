@@ -94,7 +94,7 @@ PUBLIC = {
         "gsplat_edu.data.dataset.load_dataset",
         "gsplat_edu.data.dataset.scene_extent",
         "gsplat_edu.scene.views.View",
-        "gsplat_edu.photos.pixels.Photo",
+        "gsplat_edu.scene.photo.Photo",
     ),
     "Training": (
         "gsplat_edu.train.config.recipe",

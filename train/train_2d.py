@@ -29,7 +29,7 @@ from gsplat_edu.fit2d.splats import random_splats_2d
 from gsplat_edu.options.parser import OneLineParser
 from gsplat_edu.options.values import whole_number_text
 from gsplat_edu.photos.decoding import decode
-from gsplat_edu.photos.pixels import Photo
+from gsplat_edu.scene.photo import Photo
 
 LOG_EVERY = 50
 

@@ -12,10 +12,10 @@ from block_runs import RECIPE
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.locks import LOCK
 from gsplat_edu.blocks.cluster import ClusterOptions, exposed, run_on_cluster
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.status import statuses
 from gsplat_edu.cli.main import main
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 from processes import Program
 from tiers import SEED
 from waiting import PATIENCE, until

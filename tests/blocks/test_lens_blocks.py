@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from block_runs import RECIPE
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.io.ply import load_ply
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.scene.projection import Projection
 from lab.captures.lens_captures import lens_capture

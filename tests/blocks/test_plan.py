@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gsplat_edu.base.errors import CheckpointError
-from gsplat_edu.blocks.layout import PLAN, BlocksFolder, Done
 from gsplat_edu.blocks.plan import Block, BlockPlan, Cell, automatic_count, halved, measured_area
+from gsplat_edu.runs.blocks_folder import PLAN, BlocksFolder, Done
 from gsplat_edu.scene.camera import Camera, look_at
 
 

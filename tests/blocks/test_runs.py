@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from block_runs import RECIPE
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import finished_blocks, merged
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.ply import load_ply
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.train.length import planned_iterations
 from systems import needs_posix

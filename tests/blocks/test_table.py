@@ -6,9 +6,9 @@ import shutil
 import pytest
 from rich.console import Console
 
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.cli.block_table import BlockTable
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 
 pytestmark = pytest.mark.slow
 

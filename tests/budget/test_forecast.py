@@ -22,7 +22,6 @@ from gsplat_edu.budget.costs import (
     photo_copies,
     pixel_share,
     term_factors,
-    wanted_gaussians,
 )
 from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import pairs_at_first, probe, resident_bytes
@@ -34,6 +33,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.ops.lenses import RAY_ROOM
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.given_depth import GivenDepth
+from gsplat_edu.train.capacity import wanted_gaussians
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC

@@ -18,7 +18,6 @@ from gsplat_edu.budget.costs import (
     Measurements,
     Speed,
     photo_copies,
-    wanted_gaussians,
 )
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.plan import Limits, Request, choose, look_ahead, plan
@@ -35,7 +34,7 @@ from gsplat_edu.options.train import options_from
 from gsplat_edu.options.values import bytes_text, seconds_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
-from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS
+from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS, wanted_gaussians
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import random_ball
 

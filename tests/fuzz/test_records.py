@@ -15,7 +15,6 @@ import tiers
 from blocks.test_plan import flight, under
 from damage import damaged_json
 from gsplat_edu.base.errors import SplatError
-from gsplat_edu.blocks.layout import BlocksFolder, Done
 from gsplat_edu.blocks.plan import Block, BlockPlan, Cell, measured_area
 from gsplat_edu.blocks.split import recipe_of
 from gsplat_edu.blocks.task import block_options
@@ -23,6 +22,7 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.jobs.events import Progress, line_of, parse_line
 from gsplat_edu.jobs.record import Job, JobFolder, State, Work
+from gsplat_edu.runs.blocks_folder import BlocksFolder, Done
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.studio.commands import command_line

@@ -16,8 +16,8 @@ from gsplat_edu.ops.patches import (
     patch_error,
     patch_error_in_torch,
 )
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.photo import Photo
 
 NORMAL = np.array([0.2, 0.1, -0.97]) / np.linalg.norm([0.2, 0.1, -0.97])
 """The plane NORMAL . x = 0 through the origin, which cameras at z < 0 see from its front."""

@@ -119,7 +119,7 @@ def test_the_architecture_shows_the_layers_of_the_contract():
             if contract["type"] == "layers"
         )
     text = (ROOT / "ARCHITECTURE.md").read_text()
-    block = text[text.index("```\n__main__\n") + 4 :].split("\n```")[0]
+    block = text[text.index("```\ncli ") + 4 :].split("\n```")[0]
     assert [re.split(r"\s{2,}", line)[0] for line in block.splitlines()] == layers
 
 

@@ -9,11 +9,11 @@ from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views
 from gsplat_edu.ops.exposure import stops
 from gsplat_edu.ops.recolor import recolored_natively
 from gsplat_edu.parts.exposure.model import Exposure
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe

@@ -9,11 +9,11 @@ import torch
 
 from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians, cov3d_t
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.rig import orbit_camera
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint

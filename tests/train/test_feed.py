@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.photos.pixels import AT_ONCE, Photo
+from gsplat_edu.scene.photo import AT_ONCE, Photo
 from gsplat_edu.scene.rig import orbit_camera
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.feed import ViewFeed

@@ -8,11 +8,11 @@ import torch
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training

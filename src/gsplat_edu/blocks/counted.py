@@ -18,9 +18,9 @@ from torch import Tensor
 from gsplat_edu.blocks.plan import Area, Cell
 from gsplat_edu.blocks.views import SIDE, Renderer, in_any_view
 from gsplat_edu.paths.orbits import resized
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.views import View
 
 SHARE = 0.25

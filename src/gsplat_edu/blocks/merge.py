@@ -13,7 +13,6 @@ import torch
 
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.links import check_links
-from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
 from gsplat_edu.blocks.seams import pooled_psnr, strip_masks, strip_width
@@ -22,6 +21,7 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.render.api import render
+from gsplat_edu.runs.blocks_folder import BlocksFolder, Done, file_digest
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
 from gsplat_edu.runs.identity import fingerprint

@@ -20,8 +20,8 @@ from jaxtyping import Bool, Float, Float64
 
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.reading import parse_json, read_text
-from gsplat_edu.blocks.layout import MOST_BLOCKS, PLAN
 from gsplat_edu.paths.orbits import common_up
+from gsplat_edu.runs.blocks_folder import MOST_BLOCKS, PLAN
 from gsplat_edu.runs.folder import write_json
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import settled_eyes

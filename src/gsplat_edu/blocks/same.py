@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsplat_edu.base.errors import CheckpointError, DatasetError
-from gsplat_edu.blocks.layout import BlocksFolder, file_digest
 from gsplat_edu.blocks.plan import Block, BlockPlan
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.runs.blocks_folder import BlocksFolder, file_digest
 from gsplat_edu.runs.identity import photo_digests, views_difference
 
 

@@ -12,10 +12,10 @@ from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.blocks.plan import Area, Cell
 from gsplat_edu.evaluate.metrics import MSE_FLOOR, Renderer, over_backgrounds
 from gsplat_edu.ops.depth import LEAST_ALPHA
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import View
 

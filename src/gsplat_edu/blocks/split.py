@@ -14,19 +14,19 @@ import torch
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.blocks.counted import Counted
-from gsplat_edu.blocks.layout import PLAN, BlocksFolder, file_digest
 from gsplat_edu.blocks.plan import Block, BlockPlan, automatic_count, measured_area
 from gsplat_edu.blocks.same import write_views
 from gsplat_edu.blocks.views import LEAST_VIEWS, assigned, feature_renderer, seen_shares
-from gsplat_edu.budget.costs import wanted_gaussians
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.runs.blocks_folder import PLAN, BlocksFolder, file_digest
 from gsplat_edu.runs.dataset import reader_for
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.start import scene_file, scene_start
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.train.capacity import wanted_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.length import planned_iterations
 from gsplat_edu.train.overlap import separate_views

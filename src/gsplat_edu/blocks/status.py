@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gsplat_edu.base.reading import open_file, parse_json
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 
 TAIL = 4096
 """Number of bytes at the end of a log that are searched for its last whole line."""

@@ -17,7 +17,6 @@ from gsplat_edu.base.locks import locked
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.blocks.counted import Counted, counted_views
-from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
 from gsplat_edu.blocks.views import feature_renderer
@@ -27,6 +26,7 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.ops.kernels import REASON, native
 from gsplat_edu.render.settings import BACKENDS
+from gsplat_edu.runs.blocks_folder import BlocksFolder, Done, file_digest
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.config import TrainConfig, stretched

@@ -26,20 +26,11 @@ from gsplat_edu.ops.lenses import RAY_ROOM
 from gsplat_edu.parts.surface.patches import PHOTO_ROOM
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
 from gsplat_edu.scene.sh import num_coefficients
-from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
+from gsplat_edu.train.capacity import added_gaussians, wanted_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
 from gsplat_edu.train.overlap import separate_views
 from gsplat_edu.train.schedule import photo_factor, planned_counts
-
-GROWTH = (0.005, 0.08)
-"""adc: Gaussians added per densification, for each pixel of a photo and for each start point. The model gives 5,700 for
-snowmiku97 and 3,000 at half size; whole trainings added 3,100 (3,000 iterations), 4,100 (7,000), 5,500 (7,000, not
-rescaled) and 3,900 (1,200, half size). For fox it gives 5,000; 3,500 were added. Scenes with much fine detail need
-several times as many."""
-
-FEW_POINTS = 30_000
-"""Start points beyond this number do not increase the growth."""
 
 COPIES = 8
 """Peak memory of a Gaussian as a multiple of its parameters: parameters, gradients, two moments, the copies that
@@ -229,8 +220,8 @@ class Measurements:
 def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np.ndarray, " iterations"]:
     """Estimate the number of Gaussians at every iteration.
 
-    adc adds the same number at each densification (see `GROWTH`), mcmc grows by a factor, fast linearly to its cap; a
-    cap limits all of them.
+    adc adds the same number at each densification (`added_gaussians`), mcmc grows by a factor, fast linearly to its
+    cap; a cap limits all of them.
 
     Args:
         config: The run.
@@ -243,7 +234,7 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
         return planned_counts(config, int(counts[0]), cap, np.arange(config.iterations))
     stop = {"adc": config.adc.densify_stop, "mcmc": config.mcmc.stop}.get(config.strategy, 0)
     every = config.densify_every
-    first, added = (config.densify_start // every + 1) * every, _added(points, pixels)
+    first, added = (config.densify_start // every + 1) * every, added_gaussians(points, pixels)
     for moment in range(first, min(stop, config.iterations), every):
         now = int(counts[moment])
         grown = now + added if config.strategy == "adc" else int(config.mcmc.growth * now)
@@ -325,24 +316,6 @@ def photo_copies(config: TrainConfig, facts: Facts) -> int:
     return kept + max(copies - int(PER_PIXEL * facts.largest) // 2, 0)
 
 
-def wanted_gaussians(
-    config: TrainConfig, points: int, pixels: float, views: int = PLANNED_VIEWS, separate: float = 1.0
-) -> int:
-    """Estimate how many Gaussians the images need: the plan of fast, or the growth of adc within the given iterations.
-
-    Args:
-        config: The run; its cap is ignored.
-        points: Number of start points.
-        pixels: Pixels of a view.
-        views: Number of training views.
-        separate: As for `gsplat_edu.train.capacity.planned_gaussians`.
-    """
-    if config.strategy == "fast":
-        return planned_gaussians(pixels, views, separate)
-    window = min(config.adc.densify_stop, config.iterations) - config.densify_start
-    return points + _added(points, pixels) * max(window // config.densify_every, 0)
-
-
 def _lens_pixels(dataset: Dataset) -> float:
     """Return `Facts.lens_pixels` of a capture."""
     lenses = {view.camera.intrinsics for view in dataset.train if not view.camera.pinhole}
@@ -353,10 +326,6 @@ def _depth_of(dataset: Dataset) -> str:
     """Return what gives the depth that the training views carry, by the first one that has some."""
     read = next((view.depth for view in dataset.train if view.depth is not None), None)
     return "" if read is None else "points" if read().sparse else "maps"
-
-
-def _added(points: int, pixels: float) -> int:
-    return round(GROWTH[0] * pixels + GROWTH[1] * min(points, FEW_POINTS))
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,13 @@ from torch import Tensor
 
 from gsplat_edu.clean.sight import largest_weights
 from gsplat_edu.evaluate.metrics import BEHIND_ALPHA
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.views import View
 
 MOST_OPAQUE = 0.985

@@ -20,12 +20,12 @@ import torch
 from jaxtyping import Float64, Int64
 
 from gsplat_edu.clean.evidence import MOST_OPAQUE, judged_over, residual_of
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.views import View
 
 RATE = 0.25

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.task import train_block
 from gsplat_edu.cli.block_table import BlockTable
 from gsplat_edu.cli.process import interruptible
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.status import BlockStatus, statuses
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 
 SHOWN = 40
 """Largest number of rows; finished blocks are left out first, then waiting ones."""

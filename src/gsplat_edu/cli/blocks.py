@@ -15,7 +15,6 @@ from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.blocks.cluster import AGAIN, ClusterOptions, run_on_cluster
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import merge_blocks
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.split import SplitOptions, check_recipe, coarse_scene, split_capture
@@ -41,6 +40,7 @@ from gsplat_edu.options.block_parts import parts_of_blocks
 from gsplat_edu.options.blocks import LEAST_VIEWS, SPLIT, block_count
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.train import OPEN, left_open, options_from
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun, is_finished
 from gsplat_edu.viewer.export import check_target

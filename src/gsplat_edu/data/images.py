@@ -19,7 +19,7 @@ from gsplat_edu.data.panorama import FaceLens, cut_face
 from gsplat_edu.data.watch import FileWatch
 from gsplat_edu.photos.decoding import AT_ONCE, UPRIGHT, decode, decode_mask
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
-from gsplat_edu.photos.pixels import Photo
+from gsplat_edu.scene.photo import Photo
 
 Plane = Bool[np.ndarray, "H W"] | None
 

@@ -20,8 +20,8 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from gsplat_edu.base.errors import DatasetError, ShapeError
 from gsplat_edu.data.lens import MAX_REMAPPED, Lens
-from gsplat_edu.photos.pixels import area_mean, premultiplied, smaller_mask, unweighted
 from gsplat_edu.scene.intrinsics import Intrinsics
+from gsplat_edu.scene.photo import area_mean, premultiplied, smaller_mask, unweighted
 
 PITCHES = (33.0, -33.0)
 """Pitch of the two rings of faces, degrees; positive looks up. A face of 90 degrees reaches from 12 degrees across the

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.region import Region, seen_in
 from gsplat_edu.scene.views import View
 

@@ -23,8 +23,8 @@ from gsplat_edu.data.native_lens import ARIA, POLYNOMIAL, RATIONAL
 from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.shutter_keys import keys_of_shutter
 from gsplat_edu.data.tracks import UNMEASURED, VisiblePoints, tracks_of, visible_points
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.projection import COEFFICIENTS
 from gsplat_edu.scene.views import View
 

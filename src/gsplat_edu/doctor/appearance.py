@@ -24,8 +24,8 @@ from gsplat_edu.doctor.geometry import inside
 from gsplat_edu.doctor.photos import BRIGHT, COARSE, DARK, WORK_SIDE
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.io.mesh_glb import linear
-from gsplat_edu.photos.pixels import shrunk
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.photo import shrunk
 
 EXPOSURE = "exposure"
 """Name of findings about brightness, before and after training."""

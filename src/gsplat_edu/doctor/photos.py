@@ -13,7 +13,7 @@ from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.data.lens import undistortion
 from gsplat_edu.data.panorama import FaceLens, cut_face, face_side
 from gsplat_edu.photos.decoding import decode, decode_mask
-from gsplat_edu.photos.pixels import Photo, shrunk
+from gsplat_edu.scene.photo import Photo, shrunk
 
 WORK_SIDE = 1024
 """Longest side at which sharpness is measured, px. Blur that is invisible at this size hardly harms a scene, and photos

@@ -35,10 +35,10 @@ from gsplat_edu.evaluate.verdict import MEASURES as MEASURES
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.ops.losses import l1_ssim
 from gsplat_edu.ops.recolor import Backdrop, recolored
-from gsplat_edu.photos.pixels import Photo, eroded
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import Photo, eroded
 from gsplat_edu.scene.views import View
 
 MSE_FLOOR = 1e-10

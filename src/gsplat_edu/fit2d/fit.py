@@ -17,7 +17,7 @@ from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array, in
 from gsplat_edu.fit2d.adam import AdamSettings, AdamState, adam_step_2d
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
 from gsplat_edu.fit2d.splats import Render2D, Splats2D, check_same_size, render_2d
-from gsplat_edu.photos.pixels import shrunk
+from gsplat_edu.scene.photo import shrunk
 
 SQUARED_ERROR_FLOOR = 1e-10
 """Smallest mean squared error: equal images have 100 dB, as in `gsplat_edu.evaluate.metrics`."""

@@ -21,8 +21,8 @@ from gsplat_edu.base.validation import check_shape, whole_number
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 from gsplat_edu.ops.lenses import native_camera, native_rays, within_width
 from gsplat_edu.ops.surface import check_maps
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.projection_formulas import POLE, Operations
 from gsplat_edu.scene.sight import Optics, sight
 

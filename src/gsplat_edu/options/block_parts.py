@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.data.settings import FACTOR_BELOW
 from gsplat_edu.options.blocks import COARSE_FACTOR, COARSE_SHARE
 from gsplat_edu.options.length import length_of, strategy_of
 from gsplat_edu.options.train import FOR_POINTS
+from gsplat_edu.runs.blocks_folder import BlocksFolder
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.strategy_config import FastConfig

@@ -8,8 +8,8 @@ from pathlib import Path
 from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import whole_number
-from gsplat_edu.blocks.layout import MOST_BLOCKS, PLAN
 from gsplat_edu.options.values import whole_number_text
+from gsplat_edu.runs.blocks_folder import MOST_BLOCKS, PLAN
 
 LEAST_VIEWS = 50
 """Default of --min-views."""

@@ -27,7 +27,7 @@ from gsplat_edu.photos.image_files import (
     quiet_decoders,
     require_room,
 )
-from gsplat_edu.photos.pixels import Photo, shrunk
+from gsplat_edu.scene.photo import Photo, shrunk
 
 AT_ONCE = 64_000_000
 """Pixels to decode at once; decoding takes about 10 bytes per pixel, and 25 more if alpha is resampled."""

@@ -16,9 +16,9 @@ from gsplat_edu.mesh.texture import TextureSettings, TextureView, textured
 from gsplat_edu.parts.transients.files import mask_path
 from gsplat_edu.parts.transients.search import resized_mask
 from gsplat_edu.photos.decoding import decode_mask
-from gsplat_edu.photos.pixels import Photo, area_mean
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.mesh import Mesh
+from gsplat_edu.scene.photo import Photo, area_mean
 from gsplat_edu.scene.views import View
 
 HALF_OPAQUE = 128

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from gsplat_edu.base.validation import ArrayLike, check_shape
-from gsplat_edu.photos.pixels import Photo, Pixels
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.given_depth import GivenDepth
+from gsplat_edu.scene.photo import Photo, Pixels
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -29,7 +29,7 @@ from gsplat_edu.photos.decoding import (
     upright_image_size,
 )
 from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
-from gsplat_edu.photos.pixels import area_mean
+from gsplat_edu.scene.photo import area_mean
 from gsplat_edu.sfm.masks import find_masks
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts, taken_at
 

@@ -29,7 +29,7 @@ from gsplat_edu.photos.decoding import (
     stored_size,
 )
 from gsplat_edu.photos.image_files import HEIF, SPELLED, UNDECODABLE, is_image, opened_image, quiet_decoders
-from gsplat_edu.photos.pixels import Photo, area_mean
+from gsplat_edu.scene.photo import Photo, area_mean
 from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, upright_masks, write_mask
 
 PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import named_in_utf8, written_aside
-from gsplat_edu.photos.pixels import shrunk
+from gsplat_edu.scene.photo import shrunk
 
 VIDEO_ENDINGS = (
     ".mp4",

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.photos.pixels import Photo, eroded
+from gsplat_edu.scene.photo import Photo, eroded
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 

@@ -24,12 +24,12 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.evidence import judging_backend
 from gsplat_edu.clean.sight import times_seen
 from gsplat_edu.paths.orbits import resized
-from gsplat_edu.photos.pixels import area_mean
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.identity import capture_difference
 from gsplat_edu.runs.source import Source, run_of
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.photo import area_mean
 from gsplat_edu.scene.rig import stand_in
 from gsplat_edu.scene.views import View
 

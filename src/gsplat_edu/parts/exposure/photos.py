@@ -14,10 +14,10 @@ from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.ops.recolor import recolored
-from gsplat_edu.photos.pixels import Photo
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import Photo
 from gsplat_edu.scene.views import View
 
 Render = Callable[[Gaussians, Camera], RenderOutput]
