@@ -136,7 +136,7 @@ def test_keys_move_along_the_cameras_axes_while_they_are_held_and_show_help(tour
 
     tour.tab.wait_for_selector("#rate:empty", state="attached")
     text = tour.tab.inner_text("#panel")
-    assert "reflections" in text and "harmonics" not in text and "rest" not in text
+    assert "Shine" in text and "harmonics" not in text and "rest" not in text
     assert tour.tab.locator("#degree option").all_inner_texts() == ["off", "1 of 3", "2 of 3", "full"]
 
 

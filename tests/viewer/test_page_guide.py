@@ -80,7 +80,7 @@ def becomes(seen, x, y, color):
 def test_the_tour_goes_by_keys(shown):
     seen, (first, _, last) = shown(), cameras()
     tab = seen.tab
-    assert tab.inner_text("#tour") == "guided tour (2)" and not tab.is_visible("#guide")
+    assert tab.inner_text("#tour") == "Guided tour (2)" and not tab.is_visible("#guide")
     tab.keyboard.press("t")
     arrives(seen, first)
     assert tab.inner_text("#guide h2") == "1. Door"
@@ -252,7 +252,8 @@ def test_the_poster_is_shown_until_the_first_picture_and_without_scripts(visit, 
     held.open(path)
     assert is_color(color_at(held, 320, 100), RED), "the page has not drawn yet"
     drawn = visit(*SIZE, fresh=True).open(path).ready()
-    assert drawn.tab.locator("#poster").count() == 0 and not is_color(color_at(drawn, 320, 100), RED)
+    drawn.tab.wait_for_selector("#poster", state="detached")
+    assert not is_color(color_at(drawn, 320, 100), RED)
 
 
 def test_axe_finds_nothing_serious_in_a_page_with_a_tour_and_photos(shown):

@@ -25,9 +25,9 @@ def shared(visit, tmp_path, random_gaussians, three_views):
 def test_visitors_see_named_views_and_no_file_names(shared, three_views):
     seen, path = shared
     assert b"IMG_" not in path.read_bytes()
-    assert seen.tab.inner_text("#views summary") == "views (1)"
+    assert seen.tab.inner_text("#views summary") == "Views (1)"
     assert seen.tab.locator("#views button").all_inner_texts() == ["The <front> door"]
-    assert seen.tab.inner_text("#cameras summary") == "photos (3)"
+    assert seen.tab.inner_text("#cameras summary") == "Photos (3)"
     seen.tab.click("#cameras summary")
     assert seen.tab.locator("#cameras button").all_inner_texts() == ["photo 1", "photo 2 held out", "photo 3"]
     seen.tab.get_by_role("button", name="The <front> door").click()

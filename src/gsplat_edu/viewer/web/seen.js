@@ -67,6 +67,5 @@ export class Seen {
 
 // Shows a button of the panel, and its line in the help.
 export function offer(button) {
-  for (const hidden of [button, element("proof"), ...document.querySelectorAll(`#help [data-for=${button.id}]`)])
-    hidden.hidden = false;
+  for (const hidden of [button, ...document.querySelectorAll(`#help [data-for=${button.id}]`)]) hidden.hidden = false;
 }
