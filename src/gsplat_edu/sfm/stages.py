@@ -49,7 +49,7 @@ class _Features(Facts, frozen=True):
 
 
 class _Matches(Facts, frozen=True):
-    connected: Annotated[int, Meta(ge=0, lt=2**31)]
+    connected: Annotated[int, Meta(ge=0, le=2**31 - 1)]
 
 
 class _Mapping(Facts, frozen=True):
