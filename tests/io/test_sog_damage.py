@@ -233,8 +233,8 @@ def test_file_names_outside_the_folder_are_refused(tmp_path, contents, name):
     [
         (b"", "is not JSON"),
         (b"\xff\xfe\x00", "is not JSON"),
-        (b'{"count": NaN}', "is not JSON (NaN is not a JSON number)"),
-        (b'{"count": -Infinity}', "is not JSON (-Infinity is not a JSON number)"),
+        (b'{"count": NaN}', "is not JSON (NaN is not valid JSON)"),
+        (b'{"count": -Infinity}', "is not JSON (-Infinity is not valid JSON)"),
         (b'{"a":' * 200_000, "is not JSON (nested too deeply)"),
         (b"9" * 5000, "is not JSON"),
         (b"[]", "has no object"),

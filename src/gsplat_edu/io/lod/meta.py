@@ -147,7 +147,7 @@ def from_json(path: Path, data: bytes) -> LodMeta:
             f"{path}: has {len(data):,} bytes, too many for the index of a scene; check its name"
         )
     try:
-        document = parse_json(data, _no_number)
+        document = parse_json(data, strict=True)
     except ValueError as error:
         reason = str(error).splitlines()[0][:80]
         raise SceneFormatError(f"{path}: is not JSON ({reason}); get the file again") from None
@@ -178,10 +178,6 @@ def from_json(path: Path, data: bytes) -> LodMeta:
 
 def _refuse(path: Path, what: str) -> NoReturn:
     raise SceneFormatError(f"{path}: {what}; it is damaged, get it again")
-
-
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a JSON number")
 
 
 def _whole(path: Path, value: object, key: str, low: int, high: int) -> int:

@@ -166,7 +166,7 @@ def from_json(path: Path, data: bytes) -> Meta:
         SceneFormatError: not a meta.json of version 2, or with impossible values.
     """
     try:
-        document = parse_json(data, _no_number)
+        document = parse_json(data, strict=True)
     except ValueError as error:
         reason = str(error).splitlines()[0][:80]
         raise SceneFormatError(f"{path}: its metadata is not JSON ({reason}); get the file again") from None
@@ -222,10 +222,6 @@ def _checked(path: Path, document: dict[str, object]) -> Meta:
 
 def _refuse(path: Path, what: str) -> NoReturn:
     raise SceneFormatError(f"{path}: its metadata has {what}; it is damaged, get the file again")
-
-
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a JSON number")
 
 
 def _at(document: object, key: str) -> object:
