@@ -7,6 +7,7 @@ fields is checked in `__post_init__`, which raises an ArgumentError, as "corners
 from __future__ import annotations
 
 import json
+import math
 import re
 from typing import Annotated, Any, TypeVar
 
@@ -69,6 +70,15 @@ def record_of(where: str, value: object, kind: Any) -> Any:  # noqa: ANN401
 def present(value: Value | Absent) -> Value | None:
     """Return the value of a field that may be absent; None if it is."""
     return None if isinstance(value, Absent) else value
+
+
+def without_nan(value: Any) -> Any:  # noqa: ANN401
+    """Replace NaN and infinities by None, recursively: JSON cannot represent them."""
+    if isinstance(value, dict):
+        return {key: without_nan(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def as_json(value: object) -> str:
