@@ -23,10 +23,10 @@ LARGEST_NUMBER = 1e300
 Number = Annotated[float, Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 """A finite number."""
 
-ONE_LINE = r"^[^\x00-\x1f\x7f]*\Z"
-"""Pattern of a text without control characters."""
+ONE_LINE = r"^[^\x00-\x1f\x7f]*\Z(?#free of control characters)"
+"""Pattern of a text without control characters; the comment at its end says in messages what a text has to be."""
 
-LINES = r"^(?:[^\x00-\x1f\x7f]|\n)*\Z"
+LINES = r"^(?:[^\x00-\x1f\x7f]|\n)*\Z(?#free of control characters)"
 """Pattern of a text whose only control characters are line breaks."""
 
 Absent = msgspec.UnsetType
@@ -161,12 +161,11 @@ def _bounds(value: Any, kind: Any) -> str:  # noqa: ANN401
     if isinstance(kind, inspect.TupleType):
         return f"has to have {len(kind.item_types)} entries"
     if isinstance(kind, inspect.StrType) and kind.pattern and not re.search(kind.pattern, value):
-        plain = kind.pattern in (ONE_LINE, LINES)
-        return "must not hold control characters" if plain else "has to be written otherwise"
+        return f"has to be {kind.pattern.rpartition('(?#')[2].removesuffix(')')}"
     what = "characters" if isinstance(kind, inspect.StrType) else "entries"
     return f"has to have {_ends(kind.min_length, kind.max_length)} {what}"
 
 
 def _ends(low: float | None, high: float | None) -> str:
-    ends = (("at least", low), ("at most", high))
-    return " and ".join(f"{word} {end:,.12g}" for word, end in ends if end is not None)
+    ends = (("", low),) if low == high else (("at least ", low), ("at most ", high))
+    return " and ".join(f"{word}{end:,.12g}" for word, end in ends if end is not None)
