@@ -20,8 +20,9 @@ from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.evaluate.masked import MaskedPicture
 from gsplat_edu.evaluate.metrics import Renderer, to_bytes
 from gsplat_edu.parts.transients.masks import LARGEST_SHARE
-from gsplat_edu.parts.transients.search import Transients, resized_mask
+from gsplat_edu.parts.transients.search import Transients
 from gsplat_edu.photos.decoding import decode_mask
+from gsplat_edu.photos.pixels import resized_mask
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 

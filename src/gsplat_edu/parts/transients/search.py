@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.parts.transients.masks import Compared, FeatureRenderer, find_masks
+from gsplat_edu.photos.pixels import resized_mask
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
@@ -149,13 +150,6 @@ def check_enough(count: int) -> None:
             f"transients: {count} training photos are too few to tell what moved; give at least {FEWEST}, or"
             " none"
         )
-
-
-def resized_mask(mask: Bool[np.ndarray, "h w"], H: int, W: int) -> Bool[np.ndarray, "H W"]:
-    """Return a mask at another size, by the nearest pixel."""
-    rows = (2 * np.arange(H) + 1) * mask.shape[0] // (2 * H)
-    columns = (2 * np.arange(W) + 1) * mask.shape[1] // (2 * W)
-    return np.ascontiguousarray(mask[rows][:, columns])
 
 
 def reduced(view: View, factor: float = 1.0) -> View:
