@@ -121,7 +121,7 @@ BAD = {
     "number": (changed(lambda d: d.update(keyframes=[1, 2])), "keyframes[0]: is 1, but has to be an object"),
     "no fov": (changed(lambda d: d["keyframes"][1].pop("fov")), "keyframes[1]: lacks 'fov'"),
     "misspelt": (frame(tiem=1.0), 'keyframes[1]: has an unknown key "tiem"'),
-    "NaN": (frame(fov=float("nan")), "is not JSON (NaN is not valid JSON)"),
+    "NaN": (frame(fov=float("nan")), "is not JSON (NaN is not a JSON number)"),
     "huge": (
         frame(fov=0).replace('"fov": 0', '"fov": 1e999'),
         "keyframes[1].fov: is Infinity, but has to be a number, at most 1e+300",

@@ -12,7 +12,7 @@ import stat
 from collections.abc import Callable
 from io import BufferedReader, FileIO
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, NoReturn
 
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.text import names_a_file
@@ -91,7 +91,7 @@ def parse_json(text: str | bytes, parse_constant: Callable[[str], Any] | None = 
 
     Args:
         text: The text.
-        parse_constant: Called with "NaN", "Infinity" or "-Infinity"; None accepts them as numbers.
+        parse_constant: Called with "NaN", "Infinity" or "-Infinity", as `no_number`; None accepts them as numbers.
 
     Raises:
         ValueError: the text is not JSON, is nested too deeply, or contains a number with thousands of digits.
@@ -105,6 +105,11 @@ def parse_json(text: str | bytes, parse_constant: Callable[[str], Any] | None = 
     except ValueError as error:
         # Python's own message advises changing a limit of the interpreter.
         raise ValueError("a number has thousands of digits") if "digits" in str(error) else error from None
+
+
+def no_number(text: str) -> NoReturn:
+    """Refuse NaN and the infinities, which are no numbers of JSON; for `parse_json`."""
+    raise ValueError(f"{text} is not a JSON number")
 
 
 def stored_path(value: object) -> Path | None:

@@ -24,14 +24,14 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.plugins import plugins
-from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.reading import no_number, parse_json, read_text
 from gsplat_edu.base.validation import ArrayLike, float64_array, quoted
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.fields import CONFIG, LOG, MESH, METRICS, checked
@@ -314,13 +314,9 @@ def write_json(path: Path, value: object) -> None:
         aside.write_text(text + "\n", encoding="utf-8")
 
 
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not valid JSON")
-
-
 def _parse(text: str, where: str) -> Any:  # noqa: ANN401
     try:
-        return parse_json(text, _refuse_constant)
+        return parse_json(text, no_number)
     except ValueError as error:
         reason = str(error)[:80]
         raise CheckpointError(f"{where}: is not JSON ({reason}); fix or remove it") from None

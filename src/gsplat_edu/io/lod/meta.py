@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gsplat_edu.base.errors import SceneFormatError
-from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.reading import no_number, parse_json
 from gsplat_edu.io.sog.files import META_NAME
 from gsplat_edu.io.sog.meta import GENERATOR, MOST_SPLATS, NAME
 
@@ -147,7 +147,7 @@ def from_json(path: Path, data: bytes) -> LodMeta:
             f"{path}: has {len(data):,} bytes, too many for the index of a scene; check its name"
         )
     try:
-        document = parse_json(data, _no_number)
+        document = parse_json(data, no_number)
     except ValueError as error:
         reason = str(error).splitlines()[0][:80]
         raise SceneFormatError(f"{path}: is not JSON ({reason}); get the file again") from None
@@ -178,10 +178,6 @@ def from_json(path: Path, data: bytes) -> LodMeta:
 
 def _refuse(path: Path, what: str) -> NoReturn:
     raise SceneFormatError(f"{path}: {what}; it is damaged, get it again")
-
-
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a JSON number")
 
 
 def _whole(path: Path, value: object, key: str, low: int, high: int) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsplat_edu.base.errors import SceneFormatError
-from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.reading import no_number, parse_json
 from gsplat_edu.io.scene import extras, read_extras
 from gsplat_edu.io.sog.palette import CODEBOOK, MOST_ENTRIES
 from gsplat_edu.io.sog.values import LARGEST_LOG, Range
@@ -166,7 +166,7 @@ def from_json(path: Path, data: bytes) -> Meta:
         SceneFormatError: not a meta.json of version 2, or with impossible values.
     """
     try:
-        document = parse_json(data, _no_number)
+        document = parse_json(data, no_number)
     except ValueError as error:
         reason = str(error).splitlines()[0][:80]
         raise SceneFormatError(f"{path}: its metadata is not JSON ({reason}); get the file again") from None
@@ -222,10 +222,6 @@ def _checked(path: Path, document: dict[str, object]) -> Meta:
 
 def _refuse(path: Path, what: str) -> NoReturn:
     raise SceneFormatError(f"{path}: its metadata has {what}; it is damaged, get the file again")
-
-
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a JSON number")
 
 
 def _at(document: object, key: str) -> object:
