@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
         emitter.emit(event_of(finding))
     advice = tuple(filter(None, map(plain_of, diagnosis.advice)))
     emitter.emit(Diagnosed(diagnosis.facts, diagnosis.fine, advice))
-    console.print(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis), sep="\n", soft_wrap=True)
+    console.say(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis))
     if diagnosis.hopeless:
         emitter.finish()
         raise SystemExit(EXIT_HOPELESS)

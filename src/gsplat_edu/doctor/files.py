@@ -47,7 +47,7 @@ def check_missing(survey: Survey) -> list[Finding]:
         Finding(
             "missing",
             Severity.WARNING,
-            f"{counted(note.missing, 'missing image')} of {note.total} listed, first {note.first}",
+            f"{counted(note.photos, 'missing image')} of {note.total} listed, first {note.first}",
             "copy the missing photos to where the capture lists them, or train without them",
         )
         for note in survey.notes
