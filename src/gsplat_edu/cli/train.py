@@ -24,7 +24,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Plan, look_ahead, plan
 from gsplat_edu.budget.planned import PLANNED
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.findings import with_right_poses
+from gsplat_edu.cli.findings import record_photos, with_right_poses
 from gsplat_edu.cli.process import interruptible, process_age
 from gsplat_edu.cli.result import tell_result
 from gsplat_edu.cli.terminal import Bar, Field, Terminal, stage_bars
@@ -152,6 +152,8 @@ def _run(
             free_port(host, port, NAMES)  # before the run writes anything
         with progress_bar(console, "") as bar:
             capture = CaptureRun(options, say, photos_read(bar, interrupted), team, reader=reader)
+        if team.rank == 0:
+            record_photos(capture.options, reader)
         callbacks: list[Callback] = []
         ends = interrupted
         pace = None
