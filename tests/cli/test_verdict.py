@@ -75,60 +75,65 @@ MOVED = {"transients": {"photos": [{"name": str(i), "share": 0.1} for i in range
 
 
 @pytest.mark.parametrize(
-    ("metrics", "photos", "grade", "cause", "says"),
+    ("metrics", "photos", "judged", "says"),
     [
-        ({}, {"unposed": 20}, "Fair", "no pose", "20 of 68 photos could not be placed"),
-        (MOVED, {}, "Fair", "moving subject", "things moved in 45 % of the training photos"),
+        ({}, {"unposed": 20}, ("Fair", "no pose"), "20 of 68 photos could not be placed"),
+        (MOVED, {}, ("Fair", "moving subject"), "things moved in 45 % of the training photos"),
         (
             {"train": {"psnr": 21.0, "num_images": 44}},
             {},
-            "Fair",
-            "poor fit",
+            ("Fair", "poor fit"),
             "poses may be wrong. Train again with",
         ),
-        ({"blurred": ["b.jpg"] * 6}, {}, "Fair", "blurred", "6 photos are blurred. Leave out or retake"),
+        ({"blurred": ["b.jpg"] * 6}, {}, ("Fair", "blurred"), "6 photos are blurred. Leave out or retake"),
         (
             {"train": {"psnr": 24.5, "psnr_fitted": 32.0, "num_images": 44}},
             {},
-            "Fair",
-            "exposure",
+            ("Fair", "exposure"),
             "the photos differ in brightness",
         ),
         (
             {"test": {"psnr": 18.7, "num_images": 2}, "train": {"psnr": 33.0, "num_images": 12}},
             {"gap": ["left.jpg", "right.jpg"]},
-            "Fair",
-            "few photos",
+            ("Fair", "few photos"),
             "Fair: new views are soft, because there are only 14 photos. "
             "Take more photos between the places of left.jpg and right.jpg.",
         ),
-        ({}, {"gap": ["a", "b"], "hole": True}, "Fair", "hole", "no photo was taken between a and b"),
-        ({"usual": {"gaussians": 9000}}, {}, "Fair", "few splats", "only 2,000 of the usual 9,000 splats"),
-        ({"train": {"psnr": 33.0, "num_images": 44}}, {}, "Fair", "overfitted", "has learned its photos"),
-        ({"usual": {"iterations": 3000}}, {}, "Fair", "short training", "only 40 of 3,000 iterations"),
-        ({"iterations": 3, "full_length": 40}, {}, "Poor", "short training", "only 3 of 40 iterations"),
-        ({}, {}, "Fair", "", "Compare worst.jpg with its render."),
+        ({}, {"gap": ["a", "b"], "hole": True}, ("Fair", "hole"), "no photo was taken between a and b"),
+        ({"usual": {"gaussians": 9000}}, {}, ("Fair", "few splats"), "only 2,000 of the usual 9,000 splats"),
+        ({"train": {"psnr": 33.0, "num_images": 44}}, {}, ("Fair", "overfitted"), "has learned its photos"),
+        ({"usual": {"iterations": 3000}}, {}, ("Fair", "short training"), "only 40 of 3,000 iterations"),
+        ({"iterations": 3, "full_length": 40}, {}, ("Poor", "short training"), "only 3 of 40 iterations"),
+        ({}, {}, ("Fair", ""), "Compare worst.jpg with its render."),
         (
             {"test": {"psnr": 14.0, "num_images": 4}},
             {},
-            "Poor",
-            "overfitted",
+            ("Poor", "overfitted"),
             "Poor: new views are wrong in places",
         ),
-        ({"test": {"psnr": 27.0, "num_images": 4}}, {}, "Good", "", "Good: new views look like the photos."),
-        ({"test": {"psnr": 31.0}, "train": {"psnr": 40.0}}, {}, "Good", "", "Good: new views look like"),
-        ({"test": {"psnr": 27.0, "num_images": 4}}, {"unposed": 9}, "Good", "no pose", "but 9 of 57 photos"),
-        ({"test": {"psnr": None, "num_images": 0}}, {}, "Unknown", "", "no photo was held out"),
+        (
+            {"test": {"psnr": 27.0, "num_images": 4}},
+            {},
+            ("Good", ""),
+            "Good: new views look like the photos.",
+        ),
+        ({"test": {"psnr": 31.0}, "train": {"psnr": 40.0}}, {}, ("Good", ""), "Good: new views look like"),
+        (
+            {"test": {"psnr": 27.0, "num_images": 4}},
+            {"unposed": 9},
+            ("Good", "no pose"),
+            "but 9 of 57 photos",
+        ),
+        ({"test": {"psnr": None, "num_images": 0}}, {}, ("Unknown", ""), "no photo was held out"),
         (
             {"test": {}, "train": {}, "not_scored": {"test": 4, "train": 44}},
             {},
-            "Unknown",
-            "",
+            ("Unknown", ""),
             "Score the run.",
         ),
     ],
 )
-def test_each_cause_is_told_alike(library, run, tmp_path, capsys, metrics, photos, grade, cause, says):
+def test_each_cause_is_told_alike(library, run, tmp_path, capsys, metrics, photos, judged, says):
     folder = RunFolder(library.root / "runs" / tmp_path.name)
     shutil.copytree(run.path, folder.path)
     config = run.read_config() | {"photos": photos}
@@ -139,7 +144,7 @@ def test_each_cause_is_told_alike(library, run, tmp_path, capsys, metrics, photo
     folder.write_metrics(written)
     write_report(folder.report, Report("run", written, config=config))
     found = verdict(written, config)
-    assert (found.grade, found.cause) == (grade, cause)
+    assert (found.grade, found.cause) == judged
     assert says in str(found) and " dB" not in str(found)
     assert set(said_of(library, folder, capsys)) == {str(found)}
 

@@ -126,12 +126,7 @@ def _tuple(value: Any) -> Any:  # noqa: ANN401
     return tuple(value) if isinstance(value, list) else value
 
 
-def _run(
-    arguments: argparse.Namespace,
-    console: Console,
-    say: Callable[[str], None],
-    team: Member,
-) -> None:
+def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], None], team: Member) -> None:
     seconds = arguments.time_limit
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     options = with_poses(options_from(arguments), arguments, console, say, seconds)
@@ -152,8 +147,7 @@ def _run(
             free_port(host, port, NAMES)  # before the run writes anything
         with progress_bar(console, "") as bar:
             capture = CaptureRun(options, say, photos_read(bar, interrupted), team, reader=reader)
-        if team.rank == 0:
-            record_photos(capture.options, reader)
+            record_photos(capture.options, reader, team)
         callbacks: list[Callback] = []
         ends = interrupted
         pace = None

@@ -345,7 +345,7 @@ def _fit(run: Trained) -> list[Finding]:
         return []
     what = f"the training views reach only {_mean(run.train):.1f} dB on average: the scene does not fit even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
-    advice = f"check poses and intrinsics{place}; if they are a little off, train with --refine auto"
+    advice = f"train with --refine auto if poses are a little off; check poses and intrinsics first{place}"
     plain = "examine the capture's poses; if they are a little off, refine them in the training"
     options: tuple[tuple[str, str], ...] = (("refine", "auto"),)
     early = run.reached < run.usual and bool(run.rising)  # too few iterations may be the only cause

@@ -70,9 +70,8 @@ It raises that of `snowmiku97` by 0.1 to 0.2 dB and of `fox`, whose exposure dri
 of the photos of `snowmiku97` was multiplied by 0.66 or 1.32."""
 
 SMALL = 0.5
-"""Below this fraction of the splats that the recipe plans, the scene is too small. Of `snowmiku97` with half,
-a quarter and an eighth of them, the first loses 0.4 dB at a quarter of its width and 1.4 at a third; the others lose 1.7
-and 2.1 at a quarter."""
+"""Below this fraction of the splats that the recipe plans, the scene is too small. `snowmiku97` loses 0.4 dB
+with half of them at a quarter of its width and 1.4 dB at a third, and 1.7 dB with a quarter of them."""
 
 MOVING = 0.3
 """If at least this share of the training photos shows things that moved, a subject moves through the scene."""
