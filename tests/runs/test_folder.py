@@ -69,7 +69,7 @@ def test_numbers_that_json_lacks_are_refused(folder):
             folder.write_metrics({"psnr": bad})
     assert folder.metrics.read_bytes() == before
     folder.metrics.write_text('{"psnr": NaN}')
-    with pytest.raises(CheckpointError, match=r"metrics\.json: is not JSON \(NaN is not a JSON number\)"):
+    with pytest.raises(CheckpointError, match=r"metrics\.json: is not JSON \(NaN is not valid JSON\)"):
         folder.read_metrics()
 
 

@@ -19,7 +19,7 @@ from gsplat_edu.blocks.split import SplitOptions, check_recipe, coarse_scene, sp
 from gsplat_edu.blocks.task import train_block
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.block_table import BlockTable
-from gsplat_edu.cli.eval import result_lines
+from gsplat_edu.cli.eval import result_lines, verdict_line
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.findings import with_right_poses
 from gsplat_edu.cli.process import interruptible
@@ -208,3 +208,4 @@ def merge_and_report(
     if seams is not None and seams["psnr"] is not None:
         say(f"along the cuts: PSNR {seams['psnr']:.2f} dB, elsewhere {seams['psnr_elsewhere']:.2f} dB")
     say(f"wrote {BlocksFolder(path).merged.report}")
+    say(verdict_line(result, BlocksFolder(path).merged))

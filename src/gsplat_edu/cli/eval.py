@@ -94,6 +94,7 @@ def _evaluate(
     if result.test:
         wrote.append(f"{written.renders / 'test'}/")
     console.say(f"wrote {', '.join([*wrote, str(written.report)])}")
+    console.say(verdict_line(result, folder))
 
 
 def result_lines(result: Evaluation, folder: RunFolder) -> list[str]:
@@ -101,7 +102,12 @@ def result_lines(result: Evaluation, folder: RunFolder) -> list[str]:
     if skipped := skipped_views(result.metrics):
         how = command("eval", folder.path)
         return [f"--eval-every 0 skipped the scores of {skipped}; to score them: {how}"]
-    return [*score_lines(result.test, result.train), verdict(result.metrics)]
+    return score_lines(result.test, result.train)
+
+
+def verdict_line(result: Evaluation, folder: RunFolder) -> str:
+    """Return how good a run is, why, and what to do: the last line about it."""
+    return str(verdict(result.metrics, folder.read_config()))
 
 
 def score_lines(test: Sequence[ImageScore], train: Sequence[ImageScore]) -> list[str]:
