@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -132,14 +133,19 @@ def _matching(kind: Any, value: Any) -> Any:  # noqa: ANN401
 def _names(kind: Any) -> str:  # noqa: ANN401
     """Return what values of a type are called, as "a number or null"."""
     names = [
-        f"one of {', '.join(map(str, each.values))}"
-        if isinstance(each, inspect.LiteralType)
-        else _JSON[type(each)][0]
+        f"one of {', '.join(map(str, _choices(each)))}" if _choices(each) else _JSON[type(each)][0]
         for each in _members(kind)
     ]
     return " or ".join(
         name for name in dict.fromkeys(names) if name != "a whole number" or "a number" not in names
     )
+
+
+def _choices(kind: Any) -> Sequence[Any]:  # noqa: ANN401
+    """Return the values of a type that has only some; empty for other types."""
+    if isinstance(kind, inspect.EnumType):
+        return [each.value for each in kind.cls]
+    return kind.values if isinstance(kind, inspect.LiteralType) else ()
 
 
 def _wrong_key(value: dict[str, Any], record: Any) -> str:  # noqa: ANN401
