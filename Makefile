@@ -70,7 +70,7 @@ ifneq ($(filter neon,$(PART)),)
 endif
 ifneq ($(filter chapters,$(PART)),)
 	@echo "== soak: chapters on the full budget"
-	@$(BIN)/python tools/build_notebooks.py --out out/soak/notebooks
+	@$(BIN)/python course/build_notebooks.py --out out/soak/notebooks
 endif
 ifneq ($(filter wheels,$(PART)),)
 	@$(MAKE) wheels REPEAT=1
@@ -109,12 +109,12 @@ bench:
 notebooks:
 	@tools/set_up.sh dev
 	@echo "== notebooks: executing notebooks/source"
-	@$(BIN)/python tools/build_notebooks.py
+	@$(BIN)/python course/build_notebooks.py
 
 site:
 	@tools/set_up.sh dev
 	@echo "== site: chapters, documents and reference"
-	@$(BIN)/python tools/build_site.py
+	@$(BIN)/python course/build_site.py
 
 wheels:
 	@tools/set_up.sh wheels

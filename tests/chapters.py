@@ -2,10 +2,8 @@
 
 import ast
 import functools
-import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -13,15 +11,6 @@ ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 SOURCES = sorted((ROOT / "notebooks" / "source").glob("*.py"))
 CHAPTERS = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
-
-
-def tool(name: str) -> ModuleType:
-    """Import a script of tools/."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def top_level_names(text: str) -> set[str]:

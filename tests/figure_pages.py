@@ -5,11 +5,12 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-from chapters import ROOT, tool
+import site_figures
+from chapters import ROOT
 from waiting import until_in
 
 STATIC = ROOT / "docs" / "site" / "static"
-FIGURES = [(figure.chapter, figure.name) for figure in tool("site_figures").FIGURES]
+FIGURES = [(figure.chapter, figure.name) for figure in site_figures.FIGURES]
 CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
 HEAD = (
     '<!doctype html><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
@@ -29,7 +30,7 @@ def write_pages(out: Path, chapters: Iterable[str]) -> Path:
     for chapter in chapters:
         notebook = json.loads((ROOT / "notebooks" / f"{chapter}.ipynb").read_text())
         before = len(notebook["cells"])
-        tool("site_figures").with_figures(chapter, notebook)
+        site_figures.with_figures(chapter, notebook)
         added = [cell["source"] for cell in notebook["cells"] if cell["id"].startswith("figure-")]
         assert len(added) == len(notebook["cells"]) - before
         (out / "notebooks" / f"{chapter}.html").write_text(HEAD + "\n".join(added))

@@ -17,7 +17,10 @@ MAX_FILE_LINES = 800
 MAX_FUNCTION_LINES = 60
 MAX_PARAMETERS = 8
 
-FOLDERS = ("src", "native", "tests", "tools", "train", "lab", "benchmarks", "conformance", "notebooks")
+FOLDERS = (
+    *("src", "native", "tests", "tools", "course", "train"),
+    *("lab", "benchmarks", "conformance", "notebooks"),
+)
 SUFFIXES = {".py", ".cpp", ".h", ".js", ".sh"}
 
 EXCEPTIONS = {

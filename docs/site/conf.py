@@ -1,4 +1,4 @@
-"""Sphinx settings of the site; `tools/build_site.py` gathers the pages and runs it."""
+"""Sphinx settings of the site; `course/build_site.py` gathers the pages and runs it."""
 
 import re
 
@@ -17,7 +17,7 @@ html_math_renderer = "mathml"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 
-# What a notebook shows was made by tools/build_notebooks.py.
+# What a notebook shows was made by course/build_notebooks.py.
 nb_execution_mode = "off"
 nb_code_prompt_show = "Show the set-up code"
 nb_code_prompt_hide = "Hide the set-up code"

@@ -61,7 +61,7 @@ def test_a_run_is_scored_and_the_files_are_written(made, cli, capsys):
     assert test.split()[1:3] == ["2", f"{metrics['test']['psnr']:.2f}"]
     worst = min(metrics["test_views"], key=lambda entry: entry["psnr"])
     assert f"{worst['name']} ({worst['psnr']:.2f} dB)" in test
-    assert printed[-1] == f"wrote {folder.metrics}, {folder.renders / 'test'}/, {folder.report}"
+    assert printed[-2] == f"wrote {folder.metrics}, {folder.renders / 'test'}/, {folder.report}"
     assert all(
         path.exists() for path in (folder.metrics, folder.report, folder.renders / "test" / "view_000.png")
     )

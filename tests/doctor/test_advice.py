@@ -22,6 +22,7 @@ from gsplat_edu.doctor.finding import (
     Severity,
 )
 from gsplat_edu.doctor.residuals import Residual
+from gsplat_edu.evaluate.verdict import RANKED
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
 from splats import splats_on
@@ -142,7 +143,7 @@ def test_every_finding_has_a_place_in_the_order():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding":
                 named |= {node.args[0].value} if isinstance(node.args[0], ast.Constant) else set()
-    assert len(named) > 30 and named | {"exposure", "white balance", "depth"} == set(CAUSES)
+    assert len(named) > 30 and named | {"exposure", "white balance", "depth", *RANKED} == set(CAUSES)
     assert set(EXPLAINS) | set(itertools.chain.from_iterable(EXPLAINS.values())) <= set(CAUSES)
 
 

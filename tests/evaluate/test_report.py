@@ -145,41 +145,17 @@ def test_the_final_evaluation_is_on_the_curve(tmp_path, monkeypatch):
         assert evaluations == [(2, 20.0), (3, 25.0)]
 
 
-@pytest.mark.parametrize(
-    ("test", "train", "says"),
-    [
-        (
-            31.0,
-            32.0,
-            [
-                "renders of the held-out photos reach 31.0 dB",
-                "(very close)",
-                "1.0 dB below the training photos;",
-            ],
-        ),
-        (26.0, 25.5, ["26.0 dB", "(close)", "0.5 dB above the training photos"]),
-        (21.0, 29.5, ["soft or partly wrong", "8.5 dB below", "so the scene has overfitted to them"]),
-        (15.0, None, ["15.0 dB", "(wrong in places)"]),
-        (None, 30.0, ["renders of the training photos reach 30.0 dB", "no photo was held out"]),
-        (None, None, ["was not evaluated"]),
-    ],
-)
-def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says):
-    metrics = {"iterations": 1500}
-    metrics |= {
-        k: {"psnr": v, "num_images": 2} for k, v in (("test", test), ("train", train)) if v is not None
-    }
-    scores = [score("<i>low</i>", 12.5), score("high", 40.0)] if test is not None else []
-    metrics["test_views"] = [{"name": one.name, "psnr": one.psnr} for one in scores]
-    sentence = verdict(metrics)
-    assert all(words in sentence for words in says), sentence
-    assert sentence.count(". ") == 0 and sentence.endswith(".") and sentence[0].isupper()
-    if scores:
-        assert "the worst view is <i>low</i> at 12.5 dB" in sentence and sentence.startswith(
-            "After 1,500 iterations, "
-        )
+def test_a_report_begins_with_the_verdict_and_folds_the_figures(tmp_path):
+    scores = [score("<i>low</i>", 12.5), score("high", 40.0)]
+    views = [{"name": one.name, "psnr": one.psnr} for one in scores]
+    means = {"test": {"psnr": 21.0, "num_images": 2}, "train": {"psnr": 29.5, "num_images": 12}}
+    metrics = {"iterations": 1500, "test_views": views, **means}
+    found = verdict(metrics, {})
     write_report(tmp_path / "r.html", Report("t", metrics, scores=scores))
-    assert sentence in Page(tmp_path / "r.html").text and "<i>" not in (tmp_path / "r.html").read_text()
+    page, text = Page(tmp_path / "r.html").text, (tmp_path / "r.html").read_text()
+    assert found.details.startswith("After 1,500 iterations, ") and "<i>low</i> at 12.5 dB" in found.details
+    assert str(found) in page and found.details in page and "<i>" not in text
+    assert text.index("Fair: ") < text.index("<details><summary>Details") < text.index("After 1,500")
 
 
 def test_the_page_is_linked_or_the_command_to_write_it_is_shown(tmp_path):

@@ -341,7 +341,7 @@ def test_nodes_move_and_mirror_their_meshes(tmp_path):
         ("nodes|node 7", lambda d: d["scenes"][0].update(nodes=[7])),
         ("mode 0, not of triangles", lambda d: d["meshes"][0]["primitives"][0].update(mode=0)),
         ("beyond the file's end", lambda d: d["accessors"][0].update(count=10**9)),
-        ("offset that is no number", lambda d: d["bufferViews"][0].update(byteOffset=-4)),
+        ("offset that is impossible", lambda d: d["bufferViews"][0].update(byteOffset=-4)),
         ("type that is not supported", lambda d: d["accessors"][3].update(componentType=5126)),
         ("in another file", lambda d: d["buffers"][0].update(uri="a.bin")),
         (r"names accessors\[99\]", lambda d: d["meshes"][0]["primitives"][0].update(indices=99)),

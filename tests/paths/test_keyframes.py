@@ -120,11 +120,14 @@ BAD = {
     ),
     "number": (changed(lambda d: d.update(keyframes=[1, 2])), "keyframes[0]: is 1, but has to be an object"),
     "no fov": (changed(lambda d: d["keyframes"][1].pop("fov")), "keyframes[1]: lacks 'fov'"),
-    "misspelt": (frame(tiem=1.0), 'keyframes[1]: has an unknown key "tiem"'),
+    "misspelt": (
+        frame(tiem=1.0),
+        'keyframes[1]: has an unknown key "tiem"; known are position, rotation, fov, time, hold',
+    ),
     "NaN": (frame(fov=float("nan")), "is not JSON (NaN is not valid JSON)"),
     "huge": (
         frame(fov=0).replace('"fov": 0', '"fov": 1e999'),
-        "keyframes[1].fov: is Infinity, but has to be a number, at most 1e+300",
+        "keyframes[1].fov: is Infinity, but has to be a number, at least -1e+300 and at most 1e+300",
     ),
     "digits": (frame(fov=10**400), "keyframes[1].fov: is 1000"),
     "fov": (frame(fov=180), "keyframes[1].fov: is 180.0, but has to be between 0.01 and 179 degrees"),

@@ -1,11 +1,11 @@
 """docs/CLI.md matches the parsers, and `train --help` shows what a user needs."""
 
-import importlib.util
 import re
 from pathlib import Path
 
 import pytest
 
+from build_cli_reference import reference
 from gsplat_edu.cli import main as command_line
 from gsplat_edu.options import train
 
@@ -14,14 +14,6 @@ WRITTEN = (ROOT / "docs" / "CLI.md").read_text()
 
 MOST, MOST_OF_TRAIN = 99, 60
 """Options of all commands, each counted once, and those of `train`; further numbers are settings of `--set`."""
-
-
-@pytest.fixture(scope="module")
-def reference():
-    spec = importlib.util.spec_from_file_location("reference", ROOT / "tools" / "build_cli_reference.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.reference
 
 
 @pytest.fixture
@@ -37,11 +29,11 @@ def shown(capsys):
     return run
 
 
-def test_the_reference_of_the_command_line_is_current(reference):
+def test_the_reference_of_the_command_line_is_current():
     assert reference() == WRITTEN, "run python tools/build_cli_reference.py"
 
 
-def test_a_changed_option_makes_it_stale(reference, monkeypatch):
+def test_a_changed_option_makes_it_stale(monkeypatch):
     monkeypatch.setattr(train, "FROM_SCENE", {"means_rate": 0.5})
     assert "means_rate is 0.5 unless --set gives it" in reference()
     assert reference() != WRITTEN

@@ -204,7 +204,9 @@ def test_sections_that_links_name_exist():
 def test_files_that_documents_name_exist(path):
     text = path.read_text()
     linked = re.findall(r"\]\(([^)#]+)\)", text)
-    named = re.findall(r"`((?:src|docs|tools|tests|benchmarks|notebooks|train|conformance)/[\w./-]+)`", text)
+    named = re.findall(
+        r"`((?:src|docs|tools|course|tests|benchmarks|notebooks|train|conformance)/[\w./-]+)`", text
+    )
     for target in linked:
         assert (path.parent / target).exists(), target
     for target in named:

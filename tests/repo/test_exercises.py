@@ -1,6 +1,6 @@
 """Every chapter asks for a prediction and ends with three exercises, whose solutions run.
 
-`tools/build_notebooks.py` executes the solutions after the chapter's cells, so that
+`course/build_notebooks.py` executes the solutions after the chapter's cells, so that
 `test_notebooks.py::test_chapters_execute_on_a_reduced_budget` runs them and a wrong one stops the build.
 """
 
@@ -14,7 +14,8 @@ import nbformat
 import pytest
 from nbclient.exceptions import CellExecutionError
 
-from chapters import CHAPTERS, LINK, ROOT, SOURCES, redefinitions, tool
+import build_notebooks
+from chapters import CHAPTERS, LINK, ROOT, SOURCES, redefinitions
 
 KINDS = ("a line", "a function", "open")
 PREDICTION = re.compile(r"(?:^|\n\n)> \*\*Predict\.\*\* [^\n]+(\n> [^\n]+)*$")
@@ -72,7 +73,7 @@ def test_a_prediction_that_no_cell_answers_does_not_count():
 
 @CHAPTERS
 def test_a_chapter_has_three_exercises_with_checked_solutions(source):
-    exercises = tool("build_notebooks").solutions(source)
+    exercises = build_notebooks.solutions(source)
     assert faults(exercises) == []
     assert set().union(*(redefinitions(answer) for _, answer in exercises)) == set()
     for question, _ in exercises:
@@ -117,8 +118,7 @@ def test_an_exercise_that_breaks_a_rule_is_found(number, question, answer, what)
 
 @pytest.mark.slow
 def test_a_wrong_solution_stops_the_build(tmp_path, monkeypatch):
-    builder = tool("build_notebooks")
-    monkeypatch.setattr(builder, "EXERCISES", tmp_path / "exercises")
+    monkeypatch.setattr(build_notebooks, "EXERCISES", tmp_path / "exercises")
     (tmp_path / "exercises").mkdir()
     header = (ROOT / "notebooks" / "source" / "09_train_in_3d.py").read_text().split("# %%")[0]
     chapter = header + "# %%\nassert 1 + 1 == 2\n"
@@ -127,11 +127,11 @@ def test_a_wrong_solution_stops_the_build(tmp_path, monkeypatch):
     asked = tmp_path / "exercises" / "00_short.py"
     asked.write_text("# %% [markdown]\n# What is x?\n# %%\nassert x == 42\n")
     with pytest.raises(CellExecutionError, match="assert x == 42"):
-        builder.build(source, tmp_path / "out")
+        build_notebooks.build(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
     asked.write_text("# %% [markdown]\n# What is x?\n# %%\nassert x == 41\n")
-    builder.build(source, tmp_path / "out")
+    build_notebooks.build(source, tmp_path / "out")
     shipped = tmp_path / "out" / "00_short.ipynb"
     last = nbformat.read(shipped, as_version=4).cells[-1]
     assert last.cell_type == "markdown" and last.source.startswith("What is x?\n\n<details>")
@@ -139,18 +139,17 @@ def test_a_wrong_solution_stops_the_build(tmp_path, monkeypatch):
 
     # The text may change without a run; the code may not.
     asked.write_text("# %% [markdown]\n# And x?\n# %%\nassert x == 41\n")
-    builder.renew_prose(source, tmp_path / "out")
+    build_notebooks.renew_prose(source, tmp_path / "out")
     renewed = nbformat.read(shipped, as_version=4)
     assert renewed.cells[-1].source.startswith("And x?")
     assert [cell.execution_count for cell in renewed.cells if cell.cell_type == "code"] == [1, 2]
     source.write_text(chapter + "# %%\nx = 42\n")
     with pytest.raises(ValueError, match="its code has changed"):
-        builder.renew_prose(source, tmp_path / "out")
+        build_notebooks.renew_prose(source, tmp_path / "out")
 
 
 def test_a_question_without_a_solution_is_refused(tmp_path, monkeypatch):
-    builder = tool("build_notebooks")
-    monkeypatch.setattr(builder, "EXERCISES", tmp_path)
+    monkeypatch.setattr(build_notebooks, "EXERCISES", tmp_path)
     (tmp_path / "00_short.py").write_text("# %% [markdown]\n# What?\n# %% [markdown]\n# And what else?\n")
     with pytest.raises(ValueError, match="behind it one code cell"):
-        builder.solutions(Path("00_short.py"))
+        build_notebooks.solutions(Path("00_short.py"))

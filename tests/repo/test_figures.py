@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chapters import ROOT, tool
+import figure_data
+import figure_photos
+import site_figures
+from chapters import ROOT
 from figure_pages import CHAPTERS, FIGURES, STATIC, canvas_box, read_data, state, tap, told
 from gestures import drag, swipe
 from gsplat_edu import ALPHA_MIN, DILATION, orbit_camera, render_gaussians, sphere_shell
@@ -77,10 +80,10 @@ def test_fates_are_those_of_the_training(formulas):
 
 
 def test_the_training_on_record_is_that_of_the_chapter():
-    record, recipe = read_data("training"), tool("figure_data")
-    assert record["frames"] == list(recipe.FRAMES) and record["size"] == recipe.SIZE
-    assert read_data("density")["iteration"] == recipe.DENSIFIED
-    assert len(read_data("sphere")["means"]) == recipe.SHELL
+    record = read_data("training")
+    assert record["frames"] == list(figure_data.FRAMES) and record["size"] == figure_data.SIZE
+    assert read_data("density")["iteration"] == figure_data.DENSIFIED
+    assert len(read_data("sphere")["means"]) == figure_data.SHELL
     notebook = (ROOT / "notebooks" / "09_train_in_3d.ipynb").read_text()
     printed = re.findall(r"iter +(\d+)  L1 ([\d.]+)  K (\d+)", notebook)
     assert len(printed) == 8
@@ -196,7 +199,7 @@ def test_without_scripts_a_sentence_points_to_the_still_picture(opened, chapter)
 def test_a_figure_follows_a_picture_of_its_chapter():
     for chapter in CHAPTERS:
         notebook = json.loads((ROOT / "notebooks" / f"{chapter}.ipynb").read_text())
-        tool("site_figures").with_figures(chapter, notebook)
+        site_figures.with_figures(chapter, notebook)
         for above, cell in itertools.pairwise(notebook["cells"]):
             if cell["id"].startswith("figure-") and cell["id"] != "figure-scripts":
                 kinds = {kind for output in above["outputs"] for kind in output.get("data", {})}
@@ -206,17 +209,17 @@ def test_a_figure_follows_a_picture_of_its_chapter():
 def test_a_figure_without_its_cell_stops_the_build():
     notebook = {"cells": [{"cell_type": "code", "source": "1 + 1"}]}
     with pytest.raises(SystemExit, match="0 code cells contain"):
-        tool("site_figures").with_figures("02_gaussians_in_2d", notebook)
+        site_figures.with_figures("02_gaussians_in_2d", notebook)
 
 
 def test_the_photos_to_wipe_are_those_of_the_chapter():
-    recipe, record = tool("figure_photos"), read_data("wipe")
+    record = read_data("wipe")
     width, height = record["width"], record["height"]
-    assert (width, height) == recipe.SIZE and record["brightest"] == recipe.BRIGHTEST
+    assert (width, height) == figure_photos.SIZE and record["brightest"] == figure_photos.BRIGHTEST
     path = STATIC / "play" / "wipe.jpg"
-    assert path.stat().st_size <= recipe.LARGEST
+    assert path.stat().st_size <= figure_photos.LARGEST
     notebook = (ROOT / "notebooks" / "14_photos_to_scene.ipynb").read_text()
-    assert len(record["views"]) == recipe.VIEWS
+    assert len(record["views"]) == figure_photos.VIEWS
     for view in record["views"]:
         assert f"{view['name']} {view['psnr']:.2f} dB" in notebook
     with Image.open(path) as opened_strip:

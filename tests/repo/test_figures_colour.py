@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from chapters import ROOT, tool
+import figure_data
+from chapters import ROOT
 from figure_pages import chapter_functions, read_data, state, tap, told
 from gestures import drag, swipe
 from gsplat_edu import C0, build_cov3d_batch, eval_sh, orbit_camera, render_gaussians, sh_basis
@@ -202,9 +203,7 @@ def test_packed_numbers_are_right_to_half_a_step(formulas):
     raw = {name: rng.normal(size=(50, width)) for name, width in WIDTHS.items()}
     tensors = {name: torch.tensor(values) for name, values in raw.items()}
     tensors |= {"sh0": tensors["sh0"][:, None], "logit_opacities": tensors["logit_opacities"][:, 0]}
-    stored = tool("figure_data").scene_data(
-        Gaussians(**tensors, sh_rest=torch.zeros(50, 0, 3, dtype=torch.float64))
-    )
+    stored = figure_data.scene_data(Gaussians(**tensors, sh_rest=torch.zeros(50, 0, 3, dtype=torch.float64)))
     for name, found in unpacked(formulas("07_a_trained_scene"), stored).items():
         steps = np.ptp(raw[name], axis=0) / (65535 if name == "means" else 255)
         assert np.all(np.abs(found - raw[name]) < 0.500001 * steps), name

@@ -5,7 +5,7 @@ import base64
 import numpy as np
 import torch
 
-from chapters import tool
+import figure_data
 from figure_pages import canvas_box, read_data, state, tap, told
 from gestures import drag, swipe
 from gsplat_edu import Camera
@@ -38,7 +38,7 @@ def fit_photo():
 
 
 def test_the_fits_data_are_those_of_their_recipe():
-    stored, made = read_data("fit"), tool("figure_data").fit_data()
+    stored, made = read_data("fit"), figure_data.fit_data()
     pixels, expected = (
         np.frombuffer(base64.b64decode(one.pop("pixels")), dtype=np.uint8).astype(int)
         for one in (stored, made)

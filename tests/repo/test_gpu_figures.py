@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+import figure_data
 from browsers import GRAPHICS, chromium
-from chapters import ROOT, tool
+from chapters import ROOT
 from figure_pages import NO_ADAPTER, canvas_box, read_data, state, tap, told, write_pages
 from gestures import drag, swipe
 
@@ -83,8 +84,8 @@ def array_of(page, expression):
 
 
 def test_kernels_of_the_site_are_those_of_the_package():
-    for name, value in tool("figure_data").kernels().items():
-        assert read_data(name) == json.loads(json.dumps(value)), "run tools/figure_data.py --only kernels"
+    for name, value in figure_data.kernels().items():
+        assert read_data(name) == json.loads(json.dumps(value)), "run course/figure_data.py --only kernels"
         for module, text in read_data(name)["program"]["modules"].items():
             assert text == gpu.source(module)
 

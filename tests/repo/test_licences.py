@@ -1,17 +1,11 @@
 """The licences of the packages that pip installs with this one."""
 
-import importlib
-import sys
 from email.message import Message
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
-
-list_licences = importlib.import_module("list_licences")
+import list_licences
 
 
 def test_every_dependency_is_compatible_with_apache_2():

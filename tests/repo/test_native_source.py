@@ -1,8 +1,9 @@
 """Rules for the native source files."""
 
-import importlib.util
 import re
 from pathlib import Path
+
+import generate_constants
 
 ROOT = Path(__file__).parents[2]
 NATIVE = ROOT / "native"
@@ -32,11 +33,8 @@ ISA_FREE = {
 
 
 def test_the_constants_are_generated_from_constants_py():
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "tools" / "generate_constants.py")
-    generate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(generate)
-    assert (NATIVE / "constants.h").read_text() == generate.header()
-    assert generate.WGSL.read_text() == generate.shader()
+    assert (NATIVE / "constants.h").read_text() == generate_constants.header()
+    assert generate_constants.WGSL.read_text() == generate_constants.shader()
 
 
 def test_only_the_bindings_include_python_and_nothing_includes_torch():

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from nbclient.exceptions import CellExecutionError
 
-from chapters import CHAPTERS, LINK, ROOT, SOURCES, redefinitions, tool
+import build_notebooks
+import chapter_figures
+from chapters import CHAPTERS, LINK, ROOT, SOURCES, redefinitions
 
 LONGEST = 460  # largest number of lines of a chapter's source
 
@@ -140,7 +142,7 @@ def figure(**settings):
 
 @pytest.fixture
 def faults():
-    yield tool("chapter_figures").faults
+    yield chapter_figures.faults
     plt.close("all")
 
 
@@ -178,7 +180,7 @@ def test_a_chapter_whose_figure_lacks_labels_is_not_built(tmp_path):
     header = (ROOT / "notebooks" / "source" / "09_train_in_3d.py").read_text().split("# %%")[0]
     source.write_text(header + GOOD)
     with pytest.raises(CellExecutionError, match="no title"):
-        tool("build_notebooks").build(source, tmp_path / "out")
+        build_notebooks.build(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -248,7 +250,7 @@ def test_fifteen_chapters():
 @CHAPTERS
 def test_shipped_notebooks_match_their_source_and_were_executed(source):
     shipped = nbformat.read(ROOT / "notebooks" / f"{source.stem}.ipynb", as_version=4)
-    cells = tool("build_notebooks").assembled(source).cells
+    cells = build_notebooks.assembled(source).cells
     assert [(c.cell_type, c.source) for c in shipped.cells] == [(c.cell_type, c.source) for c in cells]
     code = [cell for cell in shipped.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), (
@@ -264,7 +266,7 @@ def test_shipped_notebooks_match_their_source_and_were_executed(source):
 @CHAPTERS
 def test_chapters_execute_on_a_reduced_budget(source, tmp_path):
     done = subprocess.run(
-        [sys.executable, str(ROOT / "tools" / "build_notebooks.py"), source.stem, "--out", str(tmp_path)],
+        [sys.executable, str(ROOT / "course" / "build_notebooks.py"), source.stem, "--out", str(tmp_path)],
         # one thread, because torch's threads wait minutes for one another on a busy machine
         env=os.environ | {"GSPLAT_EDU_BUDGET": "reduced", "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -282,7 +284,7 @@ def test_chapters_execute_on_a_reduced_budget(source, tmp_path):
 
 def test_a_chapter_that_does_not_exist_is_one_line(tmp_path):
     done = subprocess.run(
-        [sys.executable, str(ROOT / "tools" / "build_notebooks.py"), "99", "--out", str(tmp_path)],
+        [sys.executable, str(ROOT / "course" / "build_notebooks.py"), "99", "--out", str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,

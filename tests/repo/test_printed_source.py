@@ -117,7 +117,7 @@ def stale(cells: Sequence[nbformat.NotebookNode]) -> list[str]:
 def test_source_on_the_page_is_the_source_of_the_package(source, monkeypatch):
     monkeypatch.chdir(ROOT)  # where chapters are built
     cells = nbformat.read(ROOT / "notebooks" / f"{source.stem}.ipynb", as_version=4).cells
-    assert stale(cells) == [], f"rebuild the chapter: python tools/build_notebooks.py {source.stem[:2]}"
+    assert stale(cells) == [], f"rebuild the chapter: python course/build_notebooks.py {source.stem[:2]}"
 
 
 def test_source_is_found_in_the_chapters_that_print_it(monkeypatch):

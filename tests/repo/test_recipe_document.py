@@ -1,11 +1,9 @@
 """The table of docs/RECIPE.md is generated from the settings' metadata and explains each setting."""
 
 import dataclasses
-import importlib.util
 from pathlib import Path
 
-import pytest
-
+import build_recipe_table
 from gsplat_edu.train.config import (
     MILESTONES,
     ONLY_FOR,
@@ -20,23 +18,15 @@ ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs/RECIPE.md").read_text()
 
 
-@pytest.fixture(scope="module")
-def tool():
-    spec = importlib.util.spec_from_file_location("recipe_table", ROOT / "tools/build_recipe_table.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def test_the_table_is_current():
+    assert build_recipe_table.with_table(TEXT) == TEXT, "run python tools/build_recipe_table.py"
+    assert build_recipe_table.table() in TEXT
 
 
-def test_the_table_is_current(tool):
-    assert tool.with_table(TEXT) == TEXT, "run python tools/build_recipe_table.py"
-    assert tool.table() in TEXT
-
-
-def test_a_changed_setting_makes_it_stale(tool, monkeypatch):
+def test_a_changed_setting_makes_it_stale(monkeypatch):
     changed = [dataclasses.replace(SETTINGS[0], default=1), *SETTINGS[1:]]
-    monkeypatch.setattr(tool, "SETTINGS", changed)
-    assert tool.with_table(TEXT) != TEXT
+    monkeypatch.setattr(build_recipe_table, "SETTINGS", changed)
+    assert build_recipe_table.with_table(TEXT) != TEXT
 
 
 def test_every_field_is_a_setting_with_a_meaning():

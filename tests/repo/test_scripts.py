@@ -38,7 +38,7 @@ ELSEWHERE = {
     "build_wheels.py": "tests/repo/test_wheels.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
-    "landing_scene.py": "tools/build_site.py",
+    "landing_scene.py": "course/build_site.py",
     "figure_data.py": "tests/repo/test_figures.py",
     "figure_photos.py": "tests/repo/test_figures.py",
     "list_licences.py": "tests/repo/test_licences.py",
@@ -49,7 +49,7 @@ ELSEWHERE = {
     "set_up.sh": "Makefile",
     "site_figures.py": "tests/repo/test_figures.py",
 }
-"""By tool, the file that runs it."""
+"""By the name of a tool or of a script of the course, the file that runs it."""
 
 
 SCRIPT = """
@@ -120,7 +120,7 @@ def test_the_constants_are_generated(tmp_path):
 
 
 def test_every_tool_is_run_somewhere():
-    for path in (ROOT / "tools").iterdir():
+    for path in (*(ROOT / "tools").iterdir(), *(ROOT / "course").iterdir()):
         if path.suffix in (".py", ".sh") and path.name != "generate_constants.py":
             assert path.stem in (ROOT / ELSEWHERE[path.name]).read_text(), path.name
 

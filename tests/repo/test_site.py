@@ -14,11 +14,11 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from chapters import SOURCES, tool
+from build_site import built_from
+from chapters import SOURCES
 from waiting import until, until_in
 
 ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "tools"))  # where build_site.py finds its parts
 NOT_PROSE = ("pre", "code", "dt", "math", "script", "style", "title")
 """Tags whose text is not prose, such as programs, signatures and equations."""
 
@@ -54,7 +54,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     out = tmp_path_factory.mktemp("built") / "site"
-    command = [sys.executable, str(ROOT / "tools" / "build_site.py"), "--out", str(out)]
+    command = [sys.executable, str(ROOT / "course" / "build_site.py"), "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stdout + done.stderr
@@ -286,14 +286,13 @@ def test_no_equation_and_no_docstring_is_garbled(site):
 @pytest.mark.slow
 def test_every_chapter_says_which_commit_it_was_built_from(site):
     _, out = site
-    commit = tool("build_site").built_from()
+    commit = built_from()
     for source in SOURCES:
         text = re.sub(r"<[^>]+>", "", (out / "notebooks" / f"{source.stem}.html").read_text())
         assert f"This page was built from notebooks/source/{source.name} at commit {commit}." in text
 
 
 def test_the_commit_of_a_working_tree_and_of_an_archive(tmp_path, monkeypatch):
-    built_from = tool("build_site").built_from
     assert built_from(tmp_path) == "unknown"
 
     def git(*words):
@@ -322,7 +321,7 @@ def test_the_commit_of_a_working_tree_and_of_an_archive(tmp_path, monkeypatch):
 
 def test_a_folder_that_is_not_a_site_is_not_overwritten(tmp_path):
     (tmp_path / "thesis.txt").write_text("years")
-    command = [sys.executable, str(ROOT / "tools" / "build_site.py"), "--out", str(tmp_path)]
+    command = [sys.executable, str(ROOT / "course" / "build_site.py"), "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert (tmp_path / "thesis.txt").read_text() == "years"

@@ -5,7 +5,6 @@ that the set-up compiled from this checkout. `make wheels` compiles others, whic
 import base64
 import email.parser
 import hashlib
-import importlib
 import json
 import os
 import re
@@ -22,17 +21,13 @@ from pathlib import Path
 import nanobind
 import pytest
 
+import build_wheels
 import gsplat_edu._native
+from wheels import binaries, checks, repeat
+from wheels.contents import nanobind_parts
+from wheels.pack import pack
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
-
-build_wheels = importlib.import_module("build_wheels")
-binaries = importlib.import_module("wheels.binaries")
-checks = importlib.import_module("wheels.checks")
-nanobind_parts = importlib.import_module("wheels.contents").nanobind_parts
-pack = importlib.import_module("wheels.pack").pack
-repeat = importlib.import_module("wheels.repeat")
 
 FAST_TESTS = (
     *("tests/test_camera.py", "tests/io/test_ply.py"),

@@ -105,7 +105,8 @@ def test_an_evaluation_that_skips_its_views_says_so_and_removes_earlier_scores(c
     }
     assert not list((folder.renders / "test").iterdir())
     page = folder.report.read_text()
-    assert "nothing was scored: --eval-every 0 skipped 2 held-out and 3 training photos" in page
+    assert "Unknown: its photos were not compared with renders. Score the run." in page
+    assert "2 held-out and 3 training photos were not scored." in page
     assert f"gsplat-edu eval {folder.path}" in page and "held out for testing" not in page
     evaluate_run(folder, ScoredViews(views[:2], views[2:]), gaussians, RENDER)
     metrics = folder.read_metrics()

@@ -432,11 +432,11 @@ def test_a_time_limit_leaves_a_scene_and_metrics_and_can_be_lifted(capture, fini
     metrics = RunFolder(out).read_metrics()
     assert metrics["iterations"] == 1 and metrics["test"]["num_images"] == 2
     said = capsys.readouterr().out.replace("\n", " ")
-    unusable = "The scene is not usable: it was trained for 1 of 40 iterations"
-    assert "time limit" in said and unusable in said.rsplit("wrote ", 1)[1]
+    unusable = "because it was trained for only 1 of 40 iterations. Give the training more time."
+    assert "time limit" in said and said.rstrip().endswith(unusable)
     assert unusable in RunFolder(out).report.read_text() and metrics["full_length"] == 40
     assert train(capture, out, *SHORT, "--resume") == 0
-    assert "not usable" not in capsys.readouterr().out + RunFolder(out).report.read_text()
+    assert "of 40 iterations. Give" not in capsys.readouterr().out + RunFolder(out).report.read_text()
     assert ply(out, 40) == ply(finished, 40)
 
 

@@ -9,9 +9,10 @@ import torch
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.parts.transients.search import LONGEST, MASKS, TOO_LARGE, resized_mask
+from gsplat_edu.parts.transients.search import LONGEST, MASKS, TOO_LARGE
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.photo import resized_mask
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training

@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 from wheels.binaries import macos_problems, windows_problems
+from wheels.pack import record_line
 
 MAX_BYTES = 10_000_000
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,32 +30,20 @@ def named_folders(wheel: Path) -> list[str]:
         for name in archive.namelist():
             data = archive.read(name)
             found += [f"{name}: {folder}" for folder in own_folders() if folder.encode() in data]
-            for part in (
-                re.findall(rb"(?:/tmp|/home|/var/folders)/[\w./-]{3,}", data)
-                if name.endswith((".so", ".pyd"))
-                else ()
-            ):
-                found.append(f"{name}: {part.decode()}")
+            if name.endswith((".so", ".pyd")):
+                parts = re.findall(rb"(?:/tmp|/home|/var/folders)/[\w./-]{3,}", data)
+                found += [f"{name}: {part.decode()}" for part in parts]
     return found
 
 
 def wrong_hashes(wheel: Path) -> list[str]:
     """List the files of a wheel that differ from its RECORD, or are missing there."""
-    import base64
-    import hashlib
-
     with zipfile.ZipFile(wheel) as archive:
         (record,) = (name for name in archive.namelist() if name.endswith(".dist-info/RECORD"))
-        rows = [line.rsplit(",", 2) for line in archive.read(record).decode().splitlines()]
-        stated = {name: digest for name, digest, _ in rows}
-        found = []
-        for name in archive.namelist():
-            digest = (
-                base64.urlsafe_b64encode(hashlib.sha256(archive.read(name)).digest()).rstrip(b"=").decode()
-            )
-            if name not in stated or (name != record and stated[name] != f"sha256={digest}"):
-                found.append(name)
-    return found
+        stated = set(archive.read(record).decode().splitlines())
+        lines = {name: record_line(name, archive.read(name)) for name in archive.namelist()}
+    lines[record] = f"{record},,"
+    return [name for name, line in lines.items() if line not in stated]
 
 
 def foreign_imports(wheel: Path) -> list[str]:

@@ -39,9 +39,10 @@ def _entry(name: str, seconds: int) -> zipfile.ZipInfo:
     return entry
 
 
-def _record_line(name: str, data: bytes) -> str:
+def record_line(name: str, data: bytes) -> str:
+    """Return the line of a file in a wheel's RECORD."""
     digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()
-    return f"{name},sha256={digest},{len(data)}\n"
+    return f"{name},sha256={digest},{len(data)}"
 
 
 def pack(pure: Path, module: tuple[str, bytes], tag: str, bundled: list[dict[str, str]], out: Path) -> Path:
@@ -69,8 +70,8 @@ def pack(pure: Path, module: tuple[str, bytes], tag: str, bundled: list[dict[str
     seconds = epoch()
     bill = sbom(metadata, module, bundled, seconds)
     files[f"{info}/sboms/gsplat_edu.cdx.json"] = (json.dumps(bill, indent=2) + "\n").encode()
-    lines = "".join(_record_line(name, files[name]) for name in sorted(files))
-    files[record] = f"{lines}{record},,\n".encode()
+    lines = [*(record_line(name, files[name]) for name in sorted(files)), f"{record},,"]
+    files[record] = "".join(f"{line}\n" for line in lines).encode()
     out.mkdir(parents=True, exist_ok=True)
     path = out / f"{info.removesuffix('.dist-info')}-{tag}.whl"
     # The description comes last, as the format recommends.

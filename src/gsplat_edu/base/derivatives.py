@@ -1,4 +1,4 @@
-"""The guard of functions whose gradient is computed by hand, and whose gradient has none."""
+"""For functions whose gradient is computed by hand: its guard, since it has none itself, and the chain rule."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
 
@@ -39,3 +40,11 @@ def first_derivative_only(what: str, instead: str) -> Callable[[Callable[_P, _T]
         return guarded
 
     return decorate
+
+
+def chained(gradient: Tensor, grad: Tensor) -> Tensor:
+    """Return gradient * grad. grad () is almost always 1, and needless passes over an image would wake torch's threads.
+
+    A GPU is not asked for its value, because that synchronises.
+    """
+    return gradient if grad.device.type == "cpu" and float(grad) == 1.0 else gradient * grad

@@ -9,10 +9,9 @@ import errno
 import json
 import os
 import stat
-from collections.abc import Callable
 from io import BufferedReader, FileIO
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, NoReturn
 
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.text import names_a_file
@@ -86,18 +85,18 @@ def read_text(path: Path, encoding: str = "utf-8", errors: str = "strict") -> st
     return read_bytes(path).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
-def parse_json(text: str | bytes, parse_constant: Callable[[str], Any] | None = None) -> Any:  # noqa: ANN401
+def parse_json(text: str | bytes, *, strict: bool = False) -> Any:  # noqa: ANN401
     """Parse JSON.
 
     Args:
         text: The text.
-        parse_constant: Called with "NaN", "Infinity" or "-Infinity"; None accepts them as numbers.
+        strict: Refuse "NaN", "Infinity" and "-Infinity", which are no JSON, instead of reading them as numbers.
 
     Raises:
         ValueError: the text is not JSON, is nested too deeply, or contains a number with thousands of digits.
     """
     try:
-        return json.loads(text, parse_constant=parse_constant)
+        return json.loads(text, parse_constant=_refuse_constant if strict else None)
     except RecursionError:
         raise ValueError("nested too deeply") from None
     except json.JSONDecodeError:
@@ -131,6 +130,10 @@ def kind_of(path: str | Path) -> str | None:
         return KINDS.get(stat.S_IFMT(Path(path).stat().st_mode))
     except (OSError, ValueError):
         return None
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not valid JSON")
 
 
 def _check_regular(path: Path, mode: int) -> None:

@@ -20,7 +20,7 @@ from gsplat_edu.blocks.views import SIDE, Renderer, in_any_view
 from gsplat_edu.paths.orbits import resized
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.photo import Photo
+from gsplat_edu.scene.photo import Photo, resized_mask
 from gsplat_edu.scene.views import View
 
 SHARE = 0.25
@@ -109,15 +109,11 @@ def counted_views(views: Sequence[View], counted: Counted) -> tuple[View, ...]:
 
 
 def _masked(view: View, mask: Mask) -> View:
-    bits, (rows, columns) = np.packbits(mask, axis=1), mask.shape
+    bits, columns = np.packbits(mask, axis=1), mask.shape[1]
 
     def read() -> Photo:
         small = np.unpackbits(bits, axis=1, count=columns)
-        size = (view.camera.W, view.camera.H)
-        counts = (
-            cv2.resize(small, size, interpolation=cv2.INTER_NEAREST) if size != (columns, rows) else small
-        )
-        return view.read().counting(counts.view(np.bool_))
+        return view.read().counting(resized_mask(small.view(np.bool_), view.camera.H, view.camera.W))
 
     return View.stored(view.camera, read, view.name).with_depth(view.depth)
 

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Float64
 
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.records import record_of
 from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.runs.blocks_folder import MOST_BLOCKS, PLAN
 from gsplat_edu.runs.folder import write_json
@@ -112,16 +113,6 @@ class Cell:
             for name, pair in (("low", self.low), ("high", self.high))
         }
 
-    @classmethod
-    def of_json(cls, entry: dict[str, Any]) -> Cell:
-        """Read what `json` returned."""
-        low, high = (
-            tuple(infinity if value is None else float(value) for value in entry[name])
-            for name, infinity in (("low", -math.inf), ("high", math.inf))
-        )
-        (a, b), (c, d) = low, high
-        return cls((a, b), (c, d))
-
 
 @dataclass(frozen=True)
 class Block:
@@ -213,30 +204,16 @@ class BlockPlan:
             )
         try:
             found = parse_json(read_text(path))
-            area, (x, y, z) = found["area"], map(float, found["origin"])
-            ground = Ground(_triple(area["ground"]["centre"]), tuple(map(_triple, area["ground"]["axes"])))
-            low, high, heights = (_pair(area[name]) for name in ("low", "high", "heights"))
-            blocks = tuple(
-                Block(
-                    Cell.of_json(entry["core"]),
-                    tuple(map(str, entry["train"])),
-                    tuple(map(str, entry["test"])),
-                    str(entry["start"]),
-                    *(
-                        None if entry[name] is None else int(entry[name])
-                        for name in ("max_gaussians", "iterations")
-                    ),
-                )
-                for entry in found["blocks"]
-            )
-            recipe = dict(found["recipe"])
-            if not all(isinstance(recipe.get(section), dict) for section in ("train", "data")):
+            for block in found["blocks"]:
+                for name, infinity in (("low", -math.inf), ("high", math.inf)):
+                    ends = block["core"][name]
+                    block["core"][name] = [infinity if value is None else value for value in ends]
+            plan: BlockPlan = record_of("", found, cls)
+            if not all(isinstance(plan.recipe.get(section), dict) for section in ("train", "data")):
                 raise ValueError("recipe: lacks a section")
-            capture = str(found["capture"])
-            views = {str(name): str(digest) for name, digest in dict(found["views"]).items()}
-        except (ValueError, KeyError, TypeError, OverflowError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise CheckpointError(f"{path}: is damaged ({error}); restore it, or split again") from None
-        return cls(capture, (x, y, z), Area(ground, low, high, heights), blocks, recipe, views)
+        return plan
 
     def digest(self) -> str:
         """Return a digest of everything except the capture's path, which differs between machines."""

@@ -16,10 +16,7 @@ from gsplat_edu.runs.blocks_folder import BlocksFolder
 def run(arguments: argparse.Namespace) -> None:
     """Train the block, unless it is finished."""
     console = Terminal()
-
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
+    say = console.say
     path, number = arguments.run_folder, arguments.number
     folder, planned = BlocksFolder(path), BlockPlan.read(path)
     if number < len(planned.blocks) and folder.read_done(number, planned.digest()) is not None:

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.locks import locked
@@ -21,7 +19,7 @@ from gsplat_edu.blocks.split import SplitOptions, check_recipe, coarse_scene, sp
 from gsplat_edu.blocks.task import train_block
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.block_table import BlockTable
-from gsplat_edu.cli.eval import result_lines
+from gsplat_edu.cli.eval import result_lines, verdict_line
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.findings import with_right_poses
 from gsplat_edu.cli.process import interruptible
@@ -51,10 +49,7 @@ Say = Callable[[str], None]
 def run(arguments: argparse.Namespace) -> None:
     """Split, train every block, merge and report; or only split."""
     console = Terminal()
-
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
+    say = console.say
     for path in arguments.export:
         check_target("--export", path)
     cluster = None
@@ -62,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
         cluster = ClusterOptions(arguments.scheduler, arguments.workers or 1)
     check_links("--out", arguments.out)
     with locked("--out", arguments.out, "gsplat-edu train --blocks", say):
-        planned, reader = _prepared(arguments, console, say)
+        planned, reader = _prepared(arguments, console)
         folder = BlocksFolder(arguments.out)
         if arguments.until == SPLIT:
             last = len(planned.blocks) - 1
@@ -79,12 +74,10 @@ def run(arguments: argparse.Namespace) -> None:
         if is_merged(folder):
             say(f"{folder.path}: is finished, {len(planned.blocks)} blocks; nothing to do")
             return
-        merge_and_report(arguments.out, arguments.export, console, say, reader)
+        merge_and_report(arguments.out, arguments.export, console, reader)
 
 
-def _prepared(
-    arguments: argparse.Namespace, console: Console, say: Say
-) -> tuple[BlockPlan, CaptureReader | None]:
+def _prepared(arguments: argparse.Namespace, console: Terminal) -> tuple[BlockPlan, CaptureReader | None]:
     """Return the plan of a run in blocks; train the coarse model and split the capture if there is none yet.
 
     The second value reads the capture; it is None if the plan names none on this computer.
@@ -92,7 +85,7 @@ def _prepared(
     Raises:
         CheckpointError: the folder holds another run, or the options differ from its plan.
     """
-    folder = BlocksFolder(arguments.out)
+    folder, say = BlocksFolder(arguments.out), console.say
     of_block, of_coarse = parts_of_blocks(arguments)
     options = options_from(of_block)
     exists = folder.plan.is_file()
@@ -124,7 +117,7 @@ def _prepared(
             options = replace(options, config=options.config.changed(**shared))
         else:
             options = replace(options, config=options.config.changed(**_chosen_before(coarse, of_block)))
-        _train_coarse(coarse, reader, console, say)
+        _train_coarse(coarse, reader, console)
     split = SplitOptions(block_count(arguments), arguments.min_views or LEAST_VIEWS, quality_of(arguments))
     scene = coarse_scene(replace(options, scene=arguments.scene))
     return split_capture(replace(options, scene=None), scene, split, say, reader), reader
@@ -137,16 +130,18 @@ def _chosen_before(coarse: RunOptions, of_block: argparse.Namespace) -> dict[str
     return {name: stored[name] for name in names if name in stored}
 
 
-def _train_coarse(options: RunOptions, reader: CaptureReader, console: Console, say: Say) -> None:
+def _train_coarse(options: RunOptions, reader: CaptureReader, console: Terminal) -> None:
     """Train the coarse model of the whole capture, in a run folder of its own."""
-    say(f"training a coarse model of the whole: {options.config.iterations} iterations, {options.out}")
+    console.say(
+        f"training a coarse model of the whole: {options.config.iterations} iterations, {options.out}"
+    )
     given = ["max_gaussians"] if options.config.max_gaussians is not None else []
     options = plan(options, Limits(), given, reader=reader).options
     if is_finished(options):
         return
     with interruptible() as interrupted:
         with progress_bar(console, "") as bar:
-            capture = CaptureRun(options, say, photos_read(bar, interrupted), reader=reader)
+            capture = CaptureRun(options, console.say, photos_read(bar, interrupted), reader=reader)
         with progress_bar(console, "{task.fields[state]}") as bar:
             train_with_bar(capture, bar, interrupted, [])
         if interrupted():
@@ -186,7 +181,7 @@ def is_merged(folder: BlocksFolder) -> bool:
 
 
 def merge_and_report(
-    path: Path, exports: list[Path], console: Console, say: Say, reader: CaptureReader | None = None
+    path: Path, exports: list[Path], console: Terminal, reader: CaptureReader | None = None
 ) -> None:
     """Merge the blocks of a run and print the scores.
 
@@ -194,10 +189,9 @@ def merge_and_report(
         path: Folder of the run in blocks.
         exports: Files to write in other formats.
         console: The terminal.
-        say: Receives sentences for the user.
         reader: Reads the capture, from where it is on this machine; None to read it from the path in the plan.
     """
-    recipe = BlockPlan.read(path).recipe
+    recipe, say = BlockPlan.read(path).recipe, console.say
     with progress_bar(console, "") as bar:
         task = bar.add_task("evaluating", total=None)
 
@@ -214,3 +208,4 @@ def merge_and_report(
     if seams is not None and seams["psnr"] is not None:
         say(f"along the cuts: PSNR {seams['psnr']:.2f} dB, elsewhere {seams['psnr_elsewhere']:.2f} dB")
     say(f"wrote {BlocksFolder(path).merged.report}")
+    say(verdict_line(result, BlocksFolder(path).merged))

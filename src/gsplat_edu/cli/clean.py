@@ -44,13 +44,9 @@ def run(arguments: argparse.Namespace) -> None:
             raise ArgumentError(f"--out: {out} is the scene itself; give another file")
     if arguments.preview is not None:
         export.check_target("--preview", arguments.preview)
-
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
     with ExitStack() as held:
         if not arguments.dry_run:
-            held.enter_context(locked_file("--out", out, "gsplat-edu clean", say))
+            held.enter_context(locked_file("--out", out, "gsplat-edu clean", console.say))
         _clean(arguments, out, console)
 
 
@@ -63,7 +59,7 @@ def _clean(arguments: argparse.Namespace, out: Path, console: Terminal) -> None:
     backend = load_backend("cpu")  # no other one collects the statistics of each splat
     subject = open_subject(arguments.source, arguments.dataset, backend)
     for note in subject.dataset.notes:
-        console.print(str(note), soft_wrap=True)
+        console.say(str(note))
     source, dataset = subject.source, subject.dataset
     columns = (
         Field("{task.description}"),
@@ -82,13 +78,13 @@ def _clean(arguments: argparse.Namespace, out: Path, console: Terminal) -> None:
             backend,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    console.print(*report_lines(cleaning), sep="\n", soft_wrap=True)
+    console.say(*report_lines(cleaning))
     if arguments.preview is not None:
         export.write(arguments.preview, preview(source, cleaning))
         colors = ", ".join(
             f"{name}: {reason.sentence.split(':')[0]}" for reason, (name, _) in SIGNALS.items()
         )
-        console.print(f"wrote {arguments.preview} ({colors})", soft_wrap=True)
+        console.say(f"wrote {arguments.preview} ({colors})")
     if arguments.dry_run:
         console.print("dry run: no scene was written")
         return
@@ -100,7 +96,7 @@ def _clean(arguments: argparse.Namespace, out: Path, console: Terminal) -> None:
         text = for_part(carried, str(arguments.edits), edited.scene.gaussians, cleaning.kept, part)
         with written_aside(out.with_name(EDITS)) as aside:
             write_text(aside, text)
-        console.print(f"wrote {out.with_name(EDITS)}: the edits for this scene", soft_wrap=True)
+        console.say(f"wrote {out.with_name(EDITS)}: the edits for this scene")
 
 
 def _checked_edits(file: Path, source: Source, out: Path) -> bytes:
@@ -121,7 +117,7 @@ def _checked_edits(file: Path, source: Source, out: Path) -> bytes:
 def _write(out: Path, source: Source, console: Terminal) -> None:
     """Write the cleaned scene."""
     for note in export.losses(out, source):
-        console.print(note, soft_wrap=True)
+        console.say(note)
     export.write(out, source)
     emitter.report_output(out)
-    console.print(f"wrote {out}: {len(source.scene.gaussians):,} splats", soft_wrap=True)
+    console.say(f"wrote {out}: {len(source.scene.gaussians):,} splats")

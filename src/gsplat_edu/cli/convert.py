@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -43,9 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Convert, report the written file, and verify it if requested; no other command writes it meanwhile."""
     console = Terminal()
     _check(arguments)
-    with locked_file(
-        "OUT", arguments.out, "gsplat-edu convert", functools.partial(console.print, soft_wrap=True)
-    ):
+    with locked_file("OUT", arguments.out, "gsplat-edu convert", console.say):
         _convert(arguments, console)
 
 
@@ -87,7 +84,7 @@ def _convert(arguments: argparse.Namespace, console: Terminal) -> None:
         source = _joined(sources)
         if arguments.scale is not None:
             source = replace(source, scene=replace(source.scene, unit=given.unit))
-        say = functools.partial(console.print, soft_wrap=True)
+        say = console.say
         for note in (*_origin(source, arguments.out), *export.losses(arguments.out, source)):
             say(note)
         for measure in views.measures:

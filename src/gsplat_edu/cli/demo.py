@@ -20,7 +20,7 @@ def run(arguments: argparse.Namespace) -> None:
     console = Terminal()
     options, notice = options_from(arguments)
     if notice:
-        console.print(notice, soft_wrap=True)
+        console.say(notice)
     columns = (
         "[progress.description]{task.description}",
         "L1 {task.fields[loss]:.4f}  K {task.fields[count]}",
@@ -44,4 +44,4 @@ def run(arguments: argparse.Namespace) -> None:
                     bar.update(task, loss=event.loss)
 
         run_sphere(options, [advance], say=closing.append)
-    console.print(*closing, sep="\n", soft_wrap=True)
+    console.say(*closing)

@@ -27,6 +27,7 @@ from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosi
 from gsplat_edu.doctor.moving import moved_parts
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.evaluate.verdict import measured_of
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed
@@ -60,7 +61,7 @@ def run(arguments: argparse.Namespace) -> None:
         emitter.emit(event_of(finding))
     advice = tuple(filter(None, map(plain_of, diagnosis.advice)))
     emitter.emit(Diagnosed(diagnosis.facts, diagnosis.fine, advice))
-    console.print(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis), sep="\n", soft_wrap=True)
+    console.say(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis))
     if diagnosis.hopeless:
         emitter.finish()
         raise SystemExit(EXIT_HOPELESS)
@@ -178,6 +179,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         corrected=appearance != "none",
         moved=moved,
         plugged=findings(config, folder.path),
+        measured=measured_of(folder.read_metrics(), config),
     )
     views = view_lines(trained) if arguments.all_views else ()
     return examine_run(trained), [*views, *_gpu_lines(backend)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -28,18 +28,14 @@ from gsplat_edu.runs.identity import capture_difference
 def run(arguments: argparse.Namespace) -> None:
     """Score every view, print one line per split, and report the written files."""
     console = Terminal()
-
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
     folder, into = RunFolder(arguments.run_folder), None
     if arguments.out is not None:
         into = RunFolder(arguments.out)
     name, place = ("RUN", folder.path) if into is None else ("--out", into.path)
-    with locked(name, place, "gsplat-edu eval", say):
+    with locked(name, place, "gsplat-edu eval", console.say):
         if into is not None:
             _check_apart(into)  # what another command has just written there counts too
-        _evaluate(arguments, folder, into, console, say)
+        _evaluate(arguments, folder, into, console)
 
 
 def _check_apart(out: RunFolder) -> None:
@@ -56,7 +52,6 @@ def _evaluate(
     folder: RunFolder,
     into: RunFolder | None,
     console: Terminal,
-    say: Callable[[str], None],
 ) -> None:
     backend, config = resolve_backend(arguments.backend), folder.read_config()
     settings = dataclasses.replace(render_settings(config), depth=False)
@@ -71,7 +66,7 @@ def _evaluate(
             raise ArgumentError(
                 f"{what}; give the run's capture with --dataset, or add --out FOLDER to write the scores elsewhere"
             )
-        say(f"{what}; the scores are written to {into.path}")
+        console.say(f"{what}; the scores are written to {into.path}")
     gaussians = read_scene(scene).relative_to(dataset.origin).to(device_of(backend))
     judged = ScoredViews(dataset.test, dataset.train, settings.background, dataset.notes)
     with Bar(
@@ -93,12 +88,13 @@ def _evaluate(
             lambda split, score: bar.advance(task),
             into,
         )
-    console.print(*result_lines(result, folder), sep="\n", soft_wrap=True)
+    console.say(*result_lines(result, folder))
     written = into or folder
     wrote = [str(written.metrics)]
     if result.test:
         wrote.append(f"{written.renders / 'test'}/")
-    say(f"wrote {', '.join([*wrote, str(written.report)])}")
+    console.say(f"wrote {', '.join([*wrote, str(written.report)])}")
+    console.say(verdict_line(result, folder))
 
 
 def result_lines(result: Evaluation, folder: RunFolder) -> list[str]:
@@ -106,7 +102,12 @@ def result_lines(result: Evaluation, folder: RunFolder) -> list[str]:
     if skipped := skipped_views(result.metrics):
         how = command("eval", folder.path)
         return [f"--eval-every 0 skipped the scores of {skipped}; to score them: {how}"]
-    return [*score_lines(result.test, result.train), verdict(result.metrics)]
+    return score_lines(result.test, result.train)
+
+
+def verdict_line(result: Evaluation, folder: RunFolder) -> str:
+    """Return how good a run is, why, and what to do: the last line about it."""
+    return str(verdict(result.metrics, folder.read_config()))
 
 
 def score_lines(test: Sequence[ImageScore], train: Sequence[ImageScore]) -> list[str]:

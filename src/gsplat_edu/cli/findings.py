@@ -7,10 +7,12 @@ from dataclasses import replace
 
 from gsplat_edu.base.text import Told
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.certain import certain_findings, without_wrong_poses
+from gsplat_edu.doctor.certain import certain_findings, known_photos, without_wrong_poses
 from gsplat_edu.doctor.finding import Finding, counted, event_of, finding_rows, listed, table_lines
+from gsplat_edu.evaluate.verdict import PHOTOS
 from gsplat_edu.jobs import emitter
 from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.processes import Member
 
 
 def say_findings(
@@ -65,3 +67,24 @@ def with_right_poses(
         )
     )
     return replace(options, data_settings=replace(settings, left_out=chosen))
+
+
+def record_photos(options: RunOptions, reader: CaptureReader, team: Member) -> None:
+    """Write into config.json of a run that has just begun what the verdict has to know about its photos.
+
+    Only the first of the processes that share it writes.
+
+    Args:
+        options: The run.
+        reader: Its capture.
+        team: Its processes.
+
+    Raises:
+        CheckpointError: config.json is damaged.
+        OSError: it cannot be written.
+    """
+    if team.rank:
+        return
+    config = options.folder.read_config()
+    if PHOTOS not in config:
+        options.folder.write_config(config | {PHOTOS: known_photos(reader, options.data_settings.left_out)})

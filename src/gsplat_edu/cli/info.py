@@ -57,9 +57,7 @@ Fact = tuple[str, str]
 def run(arguments: argparse.Namespace) -> None:
     """Print one fact per line."""
     if arguments.path is None:
-        Terminal().print(
-            *(f"{name:<10} {value}" for name, value in _computer_facts()), sep="\n", soft_wrap=True
-        )
+        Terminal().say(*(f"{name:<10} {value}" for name, value in _computer_facts()))
         return
     path: Path = arguments.path
     if not path.exists():
@@ -76,7 +74,7 @@ def run(arguments: argparse.Namespace) -> None:
     if not console.shows(BLOCKS):
         plain = str.maketrans(BLOCKS, PLAIN_BLOCKS)
         facts = [(name, value.translate(plain)) for name, value in facts]
-    console.print(*(f"{name:<10} {value}".rstrip() for name, value in facts), sep="\n", soft_wrap=True)
+    console.say(*(f"{name:<10} {value}".rstrip() for name, value in facts))
 
 
 def _computer_facts() -> list[Fact]:

@@ -29,6 +29,4 @@ def run(arguments: argparse.Namespace) -> None:
     console = Terminal()
     left_out = {str(frame.image) for frame in frames if is_left_out(frame, capture, listed)}
     total = len({str(frame.image) for frame in frames})
-    console.print(
-        f"{len(left_out)} of {total} photos are left out", *sorted(listed), sep="\n", soft_wrap=True
-    )
+    console.say(f"{len(left_out)} of {total} photos are left out", *sorted(listed))

@@ -31,9 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
     own = " besides its own mask" if found.has_own else ""
     count = f"{len(found.shapes)} shape{'s' if len(found.shapes) != 1 else ''}"
     where = f"; mask {found.mask}" if found.mask else ""
-    console.print(
+    console.say(
         f"{legible(found.photo)}, {found.W}x{found.H}: {count}{own}{where}",
         *(shape_text(shape) for shape in found.shapes),
-        sep="\n",
-        soft_wrap=True,
     )

@@ -14,12 +14,8 @@ from gsplat_edu.viewer.export import check_target
 def run(arguments: argparse.Namespace) -> None:
     """Merge, score and report."""
     console = Terminal()
-
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
     for path in arguments.export:
         check_target("--export", path)
-    with locked("RUN", arguments.run_folder, "gsplat-edu merge", say):
+    with locked("RUN", arguments.run_folder, "gsplat-edu merge", console.say):
         reader = None if arguments.data is None else CaptureReader(arguments.data)
-        merge_and_report(arguments.run_folder, arguments.export, console, say, reader)
+        merge_and_report(arguments.run_folder, arguments.export, console, reader)

@@ -63,12 +63,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Make the mesh, write it, and say how far it can be trusted."""
     console, backend = Terminal(), load_backend(arguments.backend)
     check_writable("OUT", arguments.out)
-
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
     # the files beside an OBJ, its material and its image, are covered too
-    with locked_file("OUT", arguments.out, "gsplat-edu mesh", say), stage_bars(console) as progress:
+    with locked_file("OUT", arguments.out, "gsplat-edu mesh", console.say), stage_bars(console) as progress:
         _make(arguments, backend, console, progress)
 
 
@@ -81,13 +77,13 @@ def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal, pr
         subject = open_subject(arguments.source, arguments.dataset, load_backend("cpu"))
         source, dataset = subject.source, subject.dataset
         for note in dataset.notes:
-            console.print(str(note), soft_wrap=True)
+            console.say(str(note))
     cameras = _cameras(source, console)
     settings = _settings(arguments, source, cameras, backend, console, progress)
     gaussians = source.scene.gaussians
     result = extract_mesh(gaussians, cameras, source.settings, backend, settings, progress)
     for sentence in result.notes:
-        console.print(sentence, soft_wrap=True)
+        console.say(sentence)
     mesh = result.mesh
     if dataset is not None:
         mesh = painted(mesh, dataset, result.views, run_of(source.path), progress=progress)
@@ -99,9 +95,9 @@ def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal, pr
     others = render_depths(gaussians, held_out[:MOST_HELD_OUT], source.settings, backend, progress)
     photos, why = _photo_agreement(result, source, dataset, progress)
     trust = trust_of(result, others, scores, progress, photos)
-    console.print(*_trust(trust, why), sep="\n", soft_wrap=True)
+    console.say(*_trust(trust, why))
     if scores is not None:
-        console.print(*_compared(scores, source.scene.unit or "world units"), sep="\n", soft_wrap=True)
+        console.say(*_compared(scores, source.scene.unit or "world units"))
     kind = "collider" if arguments.collider else "mesh"
     progress("pictures", 0, 1)
     _record(MadeMesh(kind, mesh, result, trust, facts), source, dataset, console)
@@ -162,11 +158,11 @@ def _written(
         facts |= _write_convex(arguments.out, mesh, source.scene, console)
     else:
         for loss in mesh_losses(arguments.out, mesh):
-            console.print(loss, soft_wrap=True)
+            console.say(loss)
         write_mesh(arguments.out, mesh, unit, up=source.scene.up)
         counted = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
         volume = _volume(result, unit or "world units")
-        console.print(f"wrote {arguments.out}: {counted}; {volume}", soft_wrap=True)
+        console.say(f"wrote {arguments.out}: {counted}; {volume}")
     progress(stage, 1, 1)
     emitter.report_output(arguments.out)
     return facts
@@ -178,22 +174,20 @@ def _record(made: MadeMesh, source: Source, dataset: Dataset | None, console: Te
     if run is None:
         return
 
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
     def opened() -> Dataset:
         return run_dataset(run.read_config()) if dataset is None else dataset
 
     iterations = int(source.path.parent.name.removeprefix("iteration_"))
     made = replace(made, facts={**made.facts, "iterations": iterations})
     try:
-        with locked("RUN", run.path, "gsplat-edu mesh", say, PATIENCE):
+        with locked("RUN", run.path, "gsplat-edu mesh", console.say, PATIENCE):
             reported = write_mesh_record(run, made, opened, source.settings.background)
     except ArgumentError as error:  # a training runs, or the folder is not writable
-        say(f"the mesh is not added to the run's report: {error}")
+        console.say(f"the mesh is not added to the run's report: {error}")
         return
-    where = f'{run.report}, section "{KINDS[made.kind]}"'
-    say(f"wrote what is known of it to {where if reported else f'{run.meshes}; eval adds it to a report'}")
+    section = f'{run.report}, section "{KINDS[made.kind]}"'
+    where = section if reported else f"{run.meshes}; eval adds it to a report"
+    console.say(f"wrote what is known of it to {where}")
 
 
 def _volume(result: MeshResult, unit: str) -> str:
@@ -209,15 +203,14 @@ def _write_convex(out: Path, mesh: Mesh, scene: Scene, console: Terminal) -> dic
     triangles = sum(len(part.faces) for part in parts)
     counted = f"{len(parts)} convex part{'s' * (len(parts) != 1)}, {triangles:,} triangles"
     outside = f"{short_number(fit.outside, 2)} {unit or 'world units'}"
-    console.print(f"wrote {out}: {counted}", soft_wrap=True)
-    console.print(f"a vertex of the coarse mesh lies at most {outside} outside of them", soft_wrap=True)
+    console.say(f"wrote {out}: {counted}")
+    console.say(f"a vertex of the coarse mesh lies at most {outside} outside of them")
     if fit.filled is None or fit.uncovered is None:
-        console.print("the coarse mesh is open, so how much empty space they fill is unknown", soft_wrap=True)
+        console.say("the coarse mesh is open, so how much empty space they fill is unknown")
     else:
         filled, uncovered = (short_number(100.0 * share, 2) for share in (fit.filled, fit.uncovered))
-        console.print(
-            f"{filled} % of their volume is empty in the coarse mesh; they leave out {uncovered} % of its volume",
-            soft_wrap=True,
+        console.say(
+            f"{filled} % of their volume is empty in the coarse mesh; they leave out {uncovered} % of its volume"
         )
     return {"convex_parts": len(parts), **fit._asdict()}
 
@@ -229,9 +222,8 @@ def _cameras(source: Source, console: Terminal) -> Sequence[NamedCamera]:
         return own
     if source.cameras:
         return source.cameras
-    console.print(
-        f"the scene has no cameras: {ORBIT_VIEWS} views around it are used, which may see it from where no photo did",
-        soft_wrap=True,
+    console.say(
+        f"the scene has no cameras: {ORBIT_VIEWS} views around it are used, which may see it from where no photo did"
     )
     return source.probes(ORBIT_VIEWS, ORBIT_SIZE)
 
@@ -266,7 +258,7 @@ def _settings(
     plan = plan_mesh(found, demand, available_memory())
     if faces is not None and plan.triangles > faces:
         require_simplification()
-    console.print(plan.sentence, soft_wrap=True)
+    console.say(plan.sentence)
     share = 0.0 if arguments.keep == "all" else SMALLEST_SHARE
     return MeshSettings(
         arguments.voxel,

@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace) -> None:
     also = f" and their maps ({', '.join(maps)})" if maps else ""
     what = f"{len(shot.cameras)} images{also} of {len(shot.gaussians):,} Gaussians"
     what += f", {first.W}x{first.H}, {each:.0f} ms each"
-    console.print(f"wrote {out}{'' if written == [out] else '/'}: {what}", soft_wrap=True)
+    console.say(f"wrote {out}{'' if written == [out] else '/'}: {what}")
 
 
 def _backend(name: str, lens: str) -> str:

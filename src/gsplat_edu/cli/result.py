@@ -5,10 +5,9 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-from gsplat_edu.cli.eval import result_lines
+from gsplat_edu.cli.eval import result_lines, verdict_line
 from gsplat_edu.doctor.moving import moved_line
 from gsplat_edu.doctor.remedies import ENOUGH
-from gsplat_edu.evaluate.verdict import too_short
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Metric
 from gsplat_edu.render.api import render
@@ -42,8 +41,7 @@ def tell_result(
     _tell_odd_photos(capture, say, limited=limited or not capture.options.scores_at_end)
     if (planned := trainer.config.iterations) > trainer.iteration:
         say(f"the time limit ended training before iteration {planned}; --resume continues it: {folder}")
-    if short := too_short(result.metrics):
-        say(short)
+    say(verdict_line(result, capture.folder))
 
 
 def _tell_odd_photos(capture: CaptureRun, say: Callable[[str], None], *, limited: bool) -> None:

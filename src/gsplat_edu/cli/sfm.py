@@ -19,10 +19,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Find the poses with progress output."""
     options = options_from(arguments)
     console = Terminal()
-
-    def say(sentence: str) -> None:
-        console.print(sentence, soft_wrap=True)
-
+    say = console.say
     with locked("OUT", options.out, "gsplat-edu sfm", say), stage_bars(console) as progress:
         try:
             reconstruct(options, say, progress)

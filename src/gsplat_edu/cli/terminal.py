@@ -51,6 +51,10 @@ class Terminal(Console):
                 emitter.emit(Message(printable(plain)))
         super().print(*(printable(o) if isinstance(o, str) else o for o in objects), **options)
 
+    def say(self, *sentences: str) -> None:
+        """Print sentences, each on a line of its own however wide the terminal is."""
+        self.print(*sentences, sep="\n", soft_wrap=True)
+
     def shows(self, characters: str) -> bool:
         """Return whether the terminal's encoding has all of these characters."""
         try:

@@ -24,7 +24,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Plan, look_ahead, plan
 from gsplat_edu.budget.planned import PLANNED
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.findings import with_right_poses
+from gsplat_edu.cli.findings import record_photos, with_right_poses
 from gsplat_edu.cli.process import interruptible, process_age
 from gsplat_edu.cli.result import tell_result
 from gsplat_edu.cli.terminal import Bar, Field, Terminal, stage_bars
@@ -125,12 +125,7 @@ def _tuple(value: Any) -> Any:  # noqa: ANN401
     return tuple(value) if isinstance(value, list) else value
 
 
-def _run(
-    arguments: argparse.Namespace,
-    console: Console,
-    say: Callable[[str], None],
-    team: Member,
-) -> None:
+def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], None], team: Member) -> None:
     seconds = arguments.time_limit
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     options = with_poses(options_from(arguments), arguments, console, say, seconds)
@@ -151,6 +146,7 @@ def _run(
             free_port(host, port, NAMES)  # before the run writes anything
         with progress_bar(console, "") as bar:
             capture = CaptureRun(options, say, photos_read(bar, interrupted), team, reader=reader)
+            record_photos(capture.options, reader, team)
         callbacks: list[Callback] = []
         ends = interrupted
         pace = None

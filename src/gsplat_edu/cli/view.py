@@ -74,10 +74,8 @@ def _run_capture(arguments: argparse.Namespace, console: Terminal) -> None:
     path: Path = arguments.source
     with CaptureServer(arguments.host, arguments.port, capture_page.policy(), path) as server:
         found = server.prepare(_title(path))
-        console.print(
-            f"{path}: {len(found.frames):,} photos, {found.facts['count']:,} points", soft_wrap=True
-        )
-        console.print(found.facts["gap_sentence"], soft_wrap=True)
+        console.say(f"{path}: {len(found.frames):,} photos, {found.facts['count']:,} points")
+        console.say(found.facts["gap_sentence"])
         examination = Examination(server)
         examination.start()
         try:
@@ -91,10 +89,10 @@ def _serve(
 ) -> None:
     """Print the address of a server's page, open it, and answer until Ctrl-C."""
     if warning := warning_for(arguments.host, does, token=token):
-        console.print(warning, soft_wrap=True)
+        console.say(warning)
 
     def opened() -> None:
-        console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
+        console.say(f"{server.url}   (press Ctrl-C to stop)")
         if not arguments.no_open and has_screen():
             open_in_browser(server.url)
 
@@ -137,14 +135,13 @@ def _prepare(server: PageServer, console: Terminal, arguments: argparse.Namespac
     if isinstance(server, EditServer):
         editing = editing_of(source, arguments.source, server.file, ADDRESS)
         server.prepare(identity_of(source.scene), arguments.source)
-        console.print(f"edits: {server.file}", soft_wrap=True)
+        console.say(f"edits: {server.file}")
     server.page = page.html(
         source.scene, source.cameras, source.settings, title, source.held_out, tour, editing
     )
     cameras = f", {len(source.cameras)} cameras" if source.cameras else ""
-    console.print(
-        f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes",
-        soft_wrap=True,
+    console.say(
+        f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes"
     )
 
 
@@ -158,7 +155,7 @@ def _prepare_levels(server: PageServer, console: Terminal, arguments: argparse.N
     server.page, server.served = folder_page(path, _title(path.parent), arguments.budget)
     index = read_index(path)
     counts = ", ".join(f"{count:,}" for count in index.counts())
-    console.print(f"{path}: levels of {counts} splats, {len(server.served)} files", soft_wrap=True)
+    console.say(f"{path}: levels of {counts} splats, {len(server.served)} files")
 
 
 def _check_is_no_page(path: Path) -> None:

@@ -72,12 +72,7 @@ class Lens(Intrinsics):
     """Intrinsics of a camera, including distortion.
 
     Args:
-        W: Image width, px.
-        H: Image height, px.
-        fx: Focal length along x, px.
-        fy: Focal length along y, px.
-        cx: Column of the principal point, px; pixel centres have integer coordinates.
-        cy: Row of the principal point, px.
+        W, H, fx, fy, cx, cy: As for `Intrinsics`.
         coefficients: Coefficients of its model, in the model's order; missing trailing ones are zero.
         model: A name in `gsplat_edu.data.lens_formulas.FORMULAS`.
 

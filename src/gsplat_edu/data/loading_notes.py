@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_edu.data.notes import Note
+from gsplat_edu.data.notes import NamedPhotos, Note, SomePhotos
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,6 @@ class IgnoredPoints:
     total: int
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return f"{self.points} of {self.total} points are NaN, infinite or absurdly far away: ignored"
 
 
@@ -35,7 +34,6 @@ class MovedOrigin:
     origin: tuple[float, float, float]
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return f"coordinates are large: {self.origin} was subtracted from all of them"
 
 
@@ -52,159 +50,92 @@ class PanoramaFaces:
     total: int
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return f"{self.faces} of {self.total} views are faces of panoramas, cut on loading"
 
 
 @dataclass(frozen=True)
-class NativeLenses:
-    """Photos that keep their lens: they are rendered through it, not undistorted.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-    """
-
-    photos: int
-    total: int
+class NativeLenses(SomePhotos):
+    """Photos that keep their lens: they are rendered through it, not undistorted."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return f"{self.photos} of {self.total} photos are trained through their own lens, without resampling"
+        return f"{self.counted} are trained through their own lens, without resampling"
 
 
 @dataclass(frozen=True)
-class RollingShutters:
+class RollingShutters(SomePhotos):
     """Photos that were read row by row by a moving camera, and are rendered so.
 
     Args:
-        photos: Number of such photos.
-        total: Number of photos.
         turn: Median angle by which their cameras turn meanwhile, degrees.
     """
 
-    photos: int
-    total: int
     turn: float
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
-            f"{self.photos} of {self.total} photos have a rolling shutter, during which the camera turns by "
-            f"{self.turn:.2g} degrees (median): each row has its own pose"
+            f"{self.counted} have a rolling shutter, during which the camera turns by {self.turn:.2g} degrees "
+            "(median): each row has its own pose"
         )
 
 
 @dataclass(frozen=True)
-class MotionBlurs:
-    """Photos whose camera moved while they were exposed, and that are rendered so.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-    """
-
-    photos: int
-    total: int
+class MotionBlurs(SomePhotos):
+    """Photos whose camera moved while they were exposed, and that are rendered so."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
-            f"{self.photos} of {self.total} photos are rendered with the motion blur of their exposure time, so that "
-            "the scene becomes sharp"
+            f"{self.counted} are rendered with the motion blur of their exposure time, so that the scene becomes "
+            "sharp"
         )
 
 
 @dataclass(frozen=True)
-class IgnoredShutters:
+class IgnoredShutters(NamedPhotos):
     """Photos whose rolling shutter or motion blur is ignored: their cameras count as resting.
 
     Args:
-        photos: Number of such photos.
-        total: Number of photos.
-        first: Name of the first such photo.
         undistorted: Whether the photos may not keep their lens; otherwise the renderer lacks their lens model.
     """
 
-    photos: int
-    total: int
-    first: str
     undistorted: bool
 
     def __str__(self) -> str:
-        """Return the sentence."""
         remedy = (
             "train --lens native renders it" if self.undistorted else "the renderer does not have their lens"
         )
-        return (
-            f"{self.photos} of {self.total} photos have a rolling shutter or motion blur, which is ignored, first "
-            f"{self.first}: {remedy}"
-        )
+        return f"{self.counted} have a rolling shutter or motion blur, which is ignored, first {self.first}: {remedy}"
 
 
 @dataclass(frozen=True)
-class DistortedPhotos:
-    """Photos that are undistorted.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-    """
-
-    photos: int
-    total: int
+class DistortedPhotos(SomePhotos):
+    """Photos that are undistorted."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return f"{self.photos} of {self.total} photos have lens distortion and are undistorted on loading"
+        return f"{self.counted} have lens distortion and are undistorted on loading"
 
 
 @dataclass(frozen=True)
-class CroppedPhotos:
+class CroppedPhotos(NamedPhotos):
     """Photos with a wider field of view than a pinhole camera can show.
 
     Args:
-        photos: Number of such photos.
-        total: Number of photos.
-        first: Name of the first such photo.
         widest: Widest field of view that is kept whole, degrees.
         kept: Field of view of a cropped photo, degrees.
     """
 
-    photos: int
-    total: int
-    first: str
     widest: int
     kept: int
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return (
-            f"{self.photos} of {self.total} photos see more than {self.widest} degrees and are cropped to {self.kept}, "
-            f"first {self.first}"
-        )
+        return f"{self.counted} see more than {self.widest} degrees and are cropped to {self.kept}, first {self.first}"
 
 
 @dataclass(frozen=True)
-class RescaledIntrinsics:
-    """Photos whose size differs from their camera's.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-        first: Name of the first such photo.
-    """
-
-    photos: int
-    total: int
-    first: str
+class RescaledIntrinsics(NamedPhotos):
+    """Photos whose size differs from their camera's."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return (
-            f"{self.photos} of {self.total} photos differ in size from their camera, first {self.first}: "
-            "intrinsics rescaled"
-        )
+        return f"{self.counted} differ in size from their camera, first {self.first}: intrinsics rescaled"
 
 
 @dataclass(frozen=True)
@@ -223,7 +154,6 @@ class UnevenFocalLengths:
     fy: float
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
             f"{self.cameras} of {self.total} cameras have fx and fy that differ widely, first {self.fx:.4g} and "
             f"{self.fy:.4g} px: the calibration may be wrong"
@@ -231,24 +161,13 @@ class UnevenFocalLengths:
 
 
 @dataclass(frozen=True)
-class TurnedPhotos:
-    """Photos that are turned by their EXIF orientation, because their poses refer to upright photos.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-        first: Name of the first such photo.
-    """
-
-    photos: int
-    total: int
-    first: str
+class TurnedPhotos(NamedPhotos):
+    """Photos that are turned by their EXIF orientation, because their poses refer to upright photos."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
-            f"{self.photos} of {self.total} photos are turned by their EXIF orientation, because their poses refer to "
-            f"upright photos, first {self.first}"
+            f"{self.counted} are turned by their EXIF orientation, because their poses refer to upright photos, "
+            f"first {self.first}"
         )
 
 
@@ -265,7 +184,6 @@ class PhotosExceedMemory:
     budget: int
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
             f"the photos take {_spelled(self.needed)} of memory, but only {_spelled(self.budget)} are kept: the others "
             "are decoded again whenever they are used; raise --image-memory, or load smaller photos with --resolution"
@@ -277,20 +195,11 @@ def _spelled(nbytes: int) -> str:
 
 
 @dataclass(frozen=True)
-class UnlistedPhotos:
-    """Photos that neither the training nor the test list of the capture names.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-    """
-
-    photos: int
-    total: int
+class UnlistedPhotos(SomePhotos):
+    """Photos that neither the training nor the test list of the capture names."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return f"{self.photos} of {self.total} photos are in none of the capture's training and test lists: left out"
+        return f"{self.counted} are in none of the capture's training and test lists: left out"
 
 
 @dataclass(frozen=True)
@@ -298,7 +207,6 @@ class OnlyOnePhoto:
     """A capture of one photo, which leaves none for testing."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return "the capture has only one photo: it is used for training, and none is held out"
 
 
@@ -315,7 +223,6 @@ class SharedCentres:
     centres: int
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
             f"{self.photos} photos have {self.centres} centres, like the faces of panoramas: those with one centre are "
             "held out together"
@@ -340,7 +247,6 @@ class RandomStart:
     shared: bool
 
     def __str__(self) -> str:
-        """Return the sentence."""
         if not self.shared:
             where = f"within {self.cube:.4g} of the cameras, since no two photos see the same place"
         elif self.cube is not None:

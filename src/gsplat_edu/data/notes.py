@@ -11,22 +11,40 @@ NAMED_PROBLEMS = 10
 
 
 @dataclass(frozen=True)
-class MissingPhotos:
-    """Photos that the capture lists but that have no file.
+class SomePhotos:
+    """Some of a capture's photos.
 
     Args:
-        missing: Number of such photos.
-        total: Number of photos listed by the capture.
-        first: Name of the first such photo.
+        photos: Number of these photos.
+        total: Number of photos that the capture lists.
     """
 
-    missing: int
+    photos: int
     total: int
+
+    @property
+    def counted(self) -> str:
+        """How many they are, such as "3 of 40 photos"."""
+        return f"{self.photos} of {self.total} photos"
+
+
+@dataclass(frozen=True)
+class NamedPhotos(SomePhotos):
+    """Some of a capture's photos, of which the first is named.
+
+    Args:
+        first: Name of the first of them.
+    """
+
     first: str
 
+
+@dataclass(frozen=True)
+class MissingPhotos(NamedPhotos):
+    """Photos that the capture lists but that have no file."""
+
     def __str__(self) -> str:
-        """Return the sentence."""
-        return f"{self.missing} of {self.total} photos have no file: skipped, first {self.first}"
+        return f"{self.counted} have no file: skipped, first {self.first}"
 
 
 @dataclass(frozen=True)
@@ -44,53 +62,28 @@ class FilesOutside:
     folder: Path
 
     def __str__(self) -> str:
-        """Return the sentence."""
         more = f" and {self.count - 1} more files" if self.count > 1 else ""
         verb = "lie" if more else "lies"
         return f"{self.first}{more} {verb} outside of {self.folder}; the capture names {'them' if more else 'it'}"
 
 
 @dataclass(frozen=True)
-class UnclearMasks:
-    """Photos whose mask is ignored, because several photos share its bare name.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos listed by the capture.
-        first: Name of the first such photo.
-    """
-
-    photos: int
-    total: int
-    first: str
+class UnclearMasks(NamedPhotos):
+    """Photos whose mask is ignored, because several photos share its bare name."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
-            f"{self.photos} of {self.total} photos have a mask whose bare name several photos share: ignored, "
+            f"{self.counted} have a mask whose bare name several photos share: ignored, "
             f"first {self.first}; put masks into the same folders as the photos"
         )
 
 
 @dataclass(frozen=True)
-class PhotosWithoutMask:
-    """Photos without a mask in a capture where others have one.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos listed by the capture.
-        first: Name of the first such photo.
-    """
-
-    photos: int
-    total: int
-    first: str
+class PhotosWithoutMask(NamedPhotos):
+    """Photos without a mask in a capture where others have one."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return (
-            f"{self.photos} of {self.total} photos have no mask, first {self.first}: all their pixels count"
-        )
+        return f"{self.counted} have no mask, first {self.first}: all their pixels count"
 
 
 @dataclass(frozen=True)
@@ -108,7 +101,6 @@ class LossyMasks:
     first: str
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
             f"{self.masks} of {self.total} masks are stored with losses (JPEG or HEIC), first {self.first}: pixels of "
             "at least 128 count"
@@ -132,7 +124,6 @@ class OtherModels:
     others: tuple[tuple[str, int | None], ...]
 
     def __str__(self) -> str:
-        """Return the sentence."""
         others = ", ".join(f"{name} ({_photos(count)})" for name, count in self.others)
         read = f"{self.read} ({_photos(self.photos)})"
         return f"{self.folder} holds {len(self.others) + 1} models: {read} is read, {others} not"
@@ -155,7 +146,6 @@ class UnusablePhotos:
     total: int
 
     def __str__(self) -> str:
-        """Return the sentence."""
         count, shown = len(self.problems), self.problems[:NAMED_PROBLEMS]
         named = ", ".join(f"{name} ({reason})" for name, reason in shown)
         more = f" and {count - len(shown)} more" if count > len(shown) else ""
@@ -165,25 +155,13 @@ class UnusablePhotos:
 
 
 @dataclass(frozen=True)
-class RepeatedPhotos:
-    """Photos that the capture lists more than once with the same pose, and that are used once.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-        first: Name of the first such photo.
-    """
-
-    photos: int
-    total: int
-    first: str
+class RepeatedPhotos(NamedPhotos):
+    """Photos that the capture lists more than once with the same pose, and that are used once."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
         if self.photos == 1:
             return f"1 of {self.total} photos is listed more than once: only its first entry counts ({self.first})"
-        counted = f"{self.photos} of {self.total} photos are listed more than once"
-        return f"{counted}: only their first entries count, first {self.first}"
+        return f"{self.counted} are listed more than once: only their first entries count, first {self.first}"
 
 
 @dataclass(frozen=True)
@@ -199,7 +177,6 @@ class UnusedSplit:
     used: str
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return f"{self.unused}: its photos are ignored; {self.used} provides the test views"
 
 
@@ -214,24 +191,17 @@ class TwoLayouts:
     folder: Path
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return f"{self.folder} holds transforms.json and a COLMAP model: using the poses of transforms.json"
 
 
 @dataclass(frozen=True)
-class UnreadColors:
+class UnreadColors(NamedPhotos):
     """Photos whose colours are taken as sRGB although their files declare others.
 
     Args:
-        photos: Number of such photos.
-        total: Number of photos of the capture.
-        first: Name of the first such photo.
         reason: Why its colours are not converted.
     """
 
-    photos: int
-    total: int
-    first: str
     reason: str
 
     @classmethod
@@ -245,29 +215,23 @@ class UnreadColors:
         return [cls(len(found), len(problems), *found[0])] if found else []
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return f"{self.photos} of {self.total} photos are taken as sRGB, first {self.first}: {self.reason}"
+        return f"{self.counted} are taken as sRGB, first {self.first}: {self.reason}"
 
 
 @dataclass(frozen=True)
-class Background:
-    """The background of transparent photos.
+class Background(SomePhotos):
+    """Photos with an alpha channel, and their background.
 
     Args:
-        photos: Number of photos with an alpha channel.
-        total: Number of photos.
         color: (r, g, b), 0 to 1, over which they are composited on loading; None if they keep their alpha.
         usually_white: Whether published scores of such captures are usually on white.
     """
 
-    photos: int
-    total: int
     color: tuple[float, float, float] | None
     usually_white: bool
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        said = f"{self.photos} of {self.total} photos have an alpha channel"
+        said = f"{self.counted} have an alpha channel"
         if self.color is not None:
             names = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
             spelled = names.get(self.color, "RGB " + " ".join(f"{value:g}" for value in self.color))
@@ -280,22 +244,11 @@ class Background:
 
 
 @dataclass(frozen=True)
-class LeftOutPhotos:
-    """Photos that are left out: by the capture's list, or by a training because their poses are certainly wrong.
-
-    Args:
-        photos: Number of such photos.
-        total: Number of photos.
-        first: Name of the first one.
-    """
-
-    photos: int
-    total: int
-    first: str
+class LeftOutPhotos(NamedPhotos):
+    """Photos that are left out: by the capture's list, or by a training because their poses are certainly wrong."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
-        return f"{self.photos} of {self.total} photos are left out, first {self.first}"
+        return f"{self.counted} are left out, first {self.first}"
 
 
 @dataclass(frozen=True)
@@ -303,7 +256,6 @@ class OnlyInRegion:
     """The capture has a box, and only the pixels count that may show something in it."""
 
     def __str__(self) -> str:
-        """Return the sentence."""
         return (
             "only what the photos show of the box of region.json counts; --set region=none uses all of them"
         )

@@ -11,7 +11,6 @@ Source: COLMAP's documentation, "Camera Models", EQUIRECTANGULAR; Google's Photo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -19,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from gsplat_edu.base.errors import DatasetError, ShapeError
-from gsplat_edu.data.lens import MAX_REMAPPED, Lens
+from gsplat_edu.data.lens import MAX_REMAPPED, Lens, bands
 from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.scene.photo import area_mean, premultiplied, smaller_mask, unweighted
 
@@ -47,9 +46,6 @@ MARGIN = 4
 
 PANORAMIC = "equirectangular"
 """Model of `FaceLens`; it has no formula on the plane."""
-
-BAND = 128
-"""Rows of a face cut at a time."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +169,7 @@ def cut_face(
     kernel = cv2.INTER_CUBIC if alpha is None else cv2.INTER_LINEAR
     face = np.empty((side, side, wrapped.shape[2]), wrapped.dtype)
     counts = None if bits is None else np.empty((side, side), np.bool_)
-    for band in _bands(side):
+    for band in bands(side):
         u, v = _maps(R, side, finer, band, W, H)
         size = (side, band.stop - band.start)
         dense = cv2.remap(wrapped, u, v, kernel, borderMode=cv2.BORDER_REPLICATE)
@@ -185,10 +181,6 @@ def cut_face(
         return face, None, counts
     colours, opacity = unweighted(face)
     return colours, opacity, counts
-
-
-def _bands(side: int) -> Iterator[slice]:
-    return (slice(top, min(top + BAND, side)) for top in range(0, side, BAND))
 
 
 def _maps(

@@ -9,6 +9,7 @@ from pathlib import Path
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.records import record_of
 
 SCALE_FILE = "scale.json"
 """Name of the file in a capture's folder."""
@@ -38,21 +39,6 @@ class Scale:
         """Return the fields as JSON values."""
         return asdict(self)
 
-    @classmethod
-    def of_json(cls, values: object) -> Scale | None:
-        """Read the fields; None if there are none.
-
-        Raises:
-            ValueError: a field is missing or no text.
-        """
-        if values is None:
-            return None
-        fields = ("unit", "source", "detail")
-        if not isinstance(values, dict) or not all(isinstance(values.get(name), str) for name in fields):
-            raise ValueError
-        unit, source, detail = (values[name] for name in fields)
-        return cls(unit, source, detail, values.get("level") is True)
-
 
 def read_scale(folder: Path) -> Scale | None:
     """Read the scale of a capture; None if it is unknown.
@@ -67,11 +53,12 @@ def read_scale(folder: Path) -> Scale | None:
     if not path.is_file():
         return None
     try:
-        return Scale.of_json(parse_json(read_text(path)))
+        scale: Scale | None = record_of("", parse_json(read_text(path)), Scale | None)
     except OSError as error:
         raise DatasetError(unreadable(path, error)) from None
-    except ValueError:
-        raise DatasetError(f"{path}: is damaged; remove it, or make the capture again") from None
+    except ValueError as error:
+        raise DatasetError(f"{path}: is damaged ({error}); remove it, or make the capture again") from None
+    return scale
 
 
 def write_scale(folder: Path, scale: Scale) -> None:

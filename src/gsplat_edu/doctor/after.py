@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +34,11 @@ from gsplat_edu.doctor.finding import (
 from gsplat_edu.doctor.moving import check_moved
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.metrics import SPILLED
-from gsplat_edu.evaluate.verdict import OVERFITTED
+from gsplat_edu.evaluate.verdict import Cause, Measured, Verdict, causes_of, judged
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.train.config import RECIPE_ITERATIONS
-from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, planned_iterations
-
-POOR = 20.0
-"""Warn when the training views' mean PSNR is below this, dB: 20 dB is an RMS error of a tenth of the range. Three
-captures had 27 to 32 after 2,000 iterations."""
+from gsplat_edu.train.length import QUALITIES, planned_iterations, usual_iterations
 
 UNEXPLAINED = 3.0
 """Warn about a view whose PSNR is this far below the median of its split, dB: 3 dB is twice the squared error."""
@@ -101,6 +98,7 @@ class Trained:
         strategy: The run's recipe.
         corrected: Whether the training corrected exposures; the residuals then compare corrected renders, and
             `beforehand` is empty.
+        measured: What the run's files tell; None if there is only what the residuals tell.
         plugged: What plug-ins found: sentences, each with what to do about it.
         moved: Name and affected fraction of each training photo that shows objects which other photos do not; empty if
             the training masked them.
@@ -123,26 +121,43 @@ class Trained:
     corrected: bool = False
     moved: Sequence[tuple[str, float]] = ()
     plugged: Sequence[tuple[str, str]] = ()
+    measured: Measured | None = None
+
+    @cached_property
+    def causes(self) -> dict[str, Cause]:
+        """What is measured to be wrong, by the names of the findings, in their order."""
+        return {cause.name: cause for cause in causes_of(self._scored)}
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict, as the report and the studio show it."""
+        return judged(self.measured or self._scored)
+
+    @property
+    def _scored(self) -> Measured:
+        """What is measured; the residuals give the scores of a run that was not evaluated."""
+        known = self.measured or Measured(iterations=self.reached)
+        if known.test is not None or known.train is not None:
+            return known
+        test, train = (_mean(views) if views else None for views in (self.test, self.train))
+        return replace(known, test=test, train=train, photos=len(self.train) + len(self.test))
 
     @property
     def usual(self) -> int:
         """The default number of iterations of the run's recipe."""
-        return self._length(DEFAULT_QUALITY)
+        return usual_iterations(self.strategy, len(self.train))
 
     @property
     def longest(self) -> int:
         """Iterations of the longest run that is advised."""
-        return self._length(max(QUALITIES, key=lambda name: QUALITIES[name]))
+        if self.strategy != "fast":
+            return RECIPE_ITERATIONS
+        return planned_iterations(max(QUALITIES, key=lambda name: QUALITIES[name]), max(len(self.train), 1))
 
     @property
     def next_length(self) -> int:
         """Iterations of the longer run that is advised: those of the recipe first, then those of its best quality."""
         return self.usual if self.reached < self.usual else self.longest
-
-    def _length(self, quality: str) -> int:
-        if self.strategy != "fast":
-            return RECIPE_ITERATIONS
-        return planned_iterations(quality, max(len(self.train), 1))
 
     @property
     def rising(self) -> bool | None:
@@ -198,12 +213,21 @@ def examine_run(run: Trained) -> Diagnosis:
         findings += found
         if not found:
             fine.append(name)
+    named = {finding.name for finding in findings}
+    findings += [_of_cause(cause) for cause in run.causes.values() if cause.name not in named]
     return Diagnosis(_facts(run), (*findings, *foreign), tuple(fine), _otherwise(run))
 
 
+def _of_cause(cause: Cause) -> Finding:
+    """Return the finding of a cause that the verdict names and that no check of the pixels reports."""
+    advice = cause.advice[0].lower() + cause.advice[1:].removesuffix(".")
+    changes = (MORE_PHOTOS,) if cause.name in ("few photos", "hole") else ()
+    return Finding(cause.name, Severity.WARNING, cause.reason, advice, changes=changes)
+
+
 def _otherwise(run: Trained) -> tuple[Advice, ...]:
-    """Return advice for scenes with few problems."""
-    longer = run.reached < run.longest and run.rising is not False
+    """Return advice for scenes with few problems; a longer training only if nothing else is wrong."""
+    longer = run.reached < run.longest and run.rising is not False and set(run.causes) <= {"short training"}
     return (
         Advice(Told(f"view it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}", "")),
         Advice(
@@ -266,7 +290,8 @@ def view_lines(run: Trained) -> list[str]:
 
 
 def _facts(run: Trained) -> tuple[tuple[str, str], ...]:
-    facts = [("run", f"{run.path}: {run.reached:,} iterations, {len(run.gaussians):,} splats")]
+    facts = [("verdict", str(run.verdict))]
+    facts.append(("run", f"{run.path}: {run.reached:,} iterations, {len(run.gaussians):,} splats"))
     for name, views in (("test", run.test), ("train", run.train)):
         if views:
             low = sorted(views, key=lambda view: view.psnr)[:NAMED]
@@ -316,11 +341,11 @@ def _length(run: Trained) -> list[Finding]:
 
 
 def _fit(run: Trained) -> list[Finding]:
-    if not run.train or _mean(run.train) >= POOR:
+    if not run.train or "poor fit" not in run.causes:
         return []
     what = f"the training views reach only {_mean(run.train):.1f} dB on average: the scene does not fit even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
-    advice = f"check poses and intrinsics{place}; if they are a little off, train with --refine auto"
+    advice = f"train with --refine auto if poses are a little off; check poses and intrinsics first{place}"
     plain = "examine the capture's poses; if they are a little off, refine them in the training"
     options: tuple[tuple[str, str], ...] = (("refine", "auto"),)
     early = run.reached < run.usual and bool(run.rising)  # too few iterations may be the only cause
@@ -391,11 +416,9 @@ def _far_below(views: Sequence[Residual]) -> list[Residual]:
 
 
 def _gap(run: Trained) -> list[Finding]:
-    if not run.train or not run.test:
+    if not run.train or not run.test or "overfitted" not in run.causes:
         return []
     gap = _mean(run.train) - _mean(run.test)
-    if gap < OVERFITTED:
-        return []
     what = f"test views are {gap:.1f} dB below the training views: the scene overfits its {len(run.train)} photos"
     photos = "take more photos between the existing ones"
     if run.rising or _fit(run):  # the test views still gain, or the scene is too small: less would not help

@@ -5,15 +5,18 @@ Lists, poses, headers and points prove them, so that no photo is decoded.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from gsplat_edu.data.capture import Frame
 from gsplat_edu.data.left_out import is_left_out, photo_path, read_left_out
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.cameras import check_intrinsics, check_parallax, check_wrong_poses
+from gsplat_edu.doctor.cameras import TURN, check_intrinsics, check_parallax, check_wrong_poses
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.files import check_poses, check_usable
 from gsplat_edu.doctor.finding import Finding, Severity
+from gsplat_edu.doctor.gap import HOLE, widest_gap
 from gsplat_edu.doctor.survey import Survey, survey_of_poses
 
 OF_VIEWS: tuple[Callable[[Survey], list[Finding]], ...] = (
@@ -42,6 +45,28 @@ def certain_findings(reader: CaptureReader, left_out: Sequence[str] | None = Non
     found = [finding for check in checks for finding in check(survey)]
     chosen = [finding for finding in found if finding.certain and finding.severity > Severity.NOTE]
     return tuple(sorted(chosen, key=lambda finding: -finding.severity))
+
+
+def known_photos(reader: CaptureReader, left_out: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return what the verdict on a run has to know about its photos, for config.json.
+
+    Args:
+        reader: The capture.
+        left_out: Photos that are not used; None uses the capture's own list.
+
+    Returns:
+        unposed, the number of photos without a pose; and if an orbit around the subject has a gap, the names of the two
+        photos beside it as gap, and as hole whether the scene is unknown there.
+
+    Raises:
+        DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
+    """
+    survey = survey_of_poses(reader, left_out)
+    known: dict[str, Any] = {"unposed": len(survey.unposed)}
+    gap = widest_gap(survey.geometry) if len(survey.shots) > 1 else None
+    if gap is not None and 2.0 * math.pi - gap.angle >= TURN:
+        known |= {"gap": [survey.names[edge] for edge in gap.edges], "hole": gap.angle > HOLE}
+    return known
 
 
 def without_wrong_poses(reader: CaptureReader, findings: Sequence[Finding]) -> tuple[str, ...] | None:

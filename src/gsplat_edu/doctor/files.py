@@ -5,13 +5,11 @@ from __future__ import annotations
 from gsplat_edu.data.notes import MissingPhotos
 from gsplat_edu.doctor.finding import Finding, Severity, counted, listed
 from gsplat_edu.doctor.survey import Survey
+from gsplat_edu.evaluate.verdict import UNPOSED
 
 FEW = 12
 """Warn about fewer photos than this: on an orbit of 12, neighbours are 30 degrees apart, about the limit of feature
 matching."""
-
-UNPOSED = 0.1
-"""Warn when this share of the photos has no pose. A few always fail, but a tenth is a part of the scene."""
 
 
 def check_usable(survey: Survey) -> list[Finding]:
@@ -47,7 +45,7 @@ def check_missing(survey: Survey) -> list[Finding]:
         Finding(
             "missing",
             Severity.WARNING,
-            f"{counted(note.missing, 'missing image')} of {note.total} listed, first {note.first}",
+            f"{counted(note.photos, 'missing image')} of {note.total} listed, first {note.first}",
             "copy the missing photos to where the capture lists them, or train without them",
         )
         for note in survey.notes

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from gsplat_edu.base.text import plain_of
 from gsplat_edu.data.notes import Note
+from gsplat_edu.evaluate.verdict import RANKED
 from gsplat_edu.jobs.events import Found
 
 ADVICE = 3
@@ -21,21 +22,23 @@ NAMED = 3
 
 
 CAUSES = (
-    *("usable", "no parallax", "unusable", "missing", "wrong poses", "intrinsics", "sizes", "no pose"),
-    *("doubtful poses", "facing away", "unfinished", "splats", "moving subject", "poor fit"),
-    *("same photo", "duplicates", "same pose", "blurred", "exposure", "white balance", "few photos", "hole"),
-    *("far points", "unseen points", "few points", "depth", "overfitted", "short training", "unexplained"),
+    *("usable", "no parallax", "unusable", "missing", "wrong poses", "intrinsics", "sizes"),
+    *("doubtful poses", "facing away", "splats", "same photo", "duplicates", "same pose", "white balance"),
+    *RANKED,
+    *("far points", "unseen points", "few points", "depth", "unexplained"),
     *("moved", "outside cut-outs", "floaters", "huge splats", "one side", "one height", "sky", "masks"),
     *("resolution", "faint splats", "plug-in"),
 )
-"""Names of the findings, causes before what they cause. Of two pieces of advice that contradict each other, that of the
-more serious finding counts, and of equally serious ones that of the earlier in this order."""
+"""Names of the findings, causes before what they cause; the verdict ranks those of a run. Of two pieces of advice that
+contradict each other, that of the more serious finding counts, and of equally serious ones that of the earlier in this
+order."""
 
 EXPLAINS = {
     "wrong poses": ("facing away", "hole", "poor fit"),
     "unfinished": ("short training", "poor fit", "unexplained", "overfitted", "floaters"),
     "moving subject": ("unexplained", "overfitted", "moved", "floaters"),
     "overfitted": ("short training",),
+    "few photos": ("short training",),
 }
 """Findings that another one explains, so that their own advice is left out: what to do about the cause comes first."""
 

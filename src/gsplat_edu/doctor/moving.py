@@ -8,18 +8,12 @@ from pathlib import Path
 from gsplat_edu.base.text import Told
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.doctor.finding import Finding, Severity, command, counted
+from gsplat_edu.evaluate.verdict import MOVING, NOTABLE
 from gsplat_edu.parts.transients.masks import Compared, FeatureRenderer, find_masks
 from gsplat_edu.parts.transients.search import FEWEST, reduced
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
-
-NOTABLE = 0.01
-"""Report a photo only if at least this fraction of it differs."""
-
-
-SUBJECT_SHARE = 0.3
-"""If at least this share of the training photos shows things that moved, a subject moves through the scene."""
 
 
 def moved_parts(
@@ -62,7 +56,7 @@ def check_moved(moved: Sequence[tuple[str, float]], photos: int) -> list[Finding
         return []
     names = tuple(name for name, _ in moved)
     shares = tuple(f"{100 * share:.1f} %" for _, share in moved)
-    if len(names) >= max(SUBJECT_SHARE * photos, 2):
+    if len(names) >= max(MOVING * photos, 2):
         what = (
             f"a subject moves through the scene: {len(names)} of {photos} training photos show it where others"
             " do not, in per cent of their pixels"

@@ -13,7 +13,7 @@ from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.data.lens import undistortion
 from gsplat_edu.data.panorama import FaceLens, cut_face, face_side
 from gsplat_edu.photos.decoding import decode, decode_mask
-from gsplat_edu.scene.photo import Photo, shrunk
+from gsplat_edu.scene.photo import Photo, resized_mask, shrunk
 
 WORK_SIDE = 1024
 """Longest side at which sharpness is measured, px. Blur that is invisible at this size hardly harms a scene, and photos
@@ -97,7 +97,7 @@ def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
     if face := isinstance(lens, FaceLens):
         pixels, _, counts = cut_face(pixels, None, counts, lens.R, face_side(pixels.shape[1]))
     small = shrunk(pixels, THUMBNAIL_SIDE)
-    few = None if counts is None else _nearest(counts, small.shape[:2])
+    few = None if counts is None else resized_mask(counts, *small.shape[:2])
     h, w = small.shape[:2]
     if lens.distorts and not face and min(h, w) > 1:
         columns, rows, _ = undistortion(lens.scaled(w, h), slice(0, h))
@@ -119,13 +119,8 @@ def _counting(
 ) -> Bool[np.ndarray, "a b"] | None:
     """Return the pixels that are opaque and inside the mask, at another size; None if all are."""
     parts = [part for part in (None if alpha is None else alpha == 255, mask) if part is not None]
-    parts = [_nearest(part, shape) for part in parts if not part.all()]
+    parts = [resized_mask(part, *shape) for part in parts if not part.all()]
     return np.logical_and.reduce(parts) if parts else None
-
-
-def _nearest(mask: Bool[np.ndarray, "H W"], shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
-    resized = cv2.resize(mask.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.asarray(resized.astype(np.bool_))
 
 
 def _inner(counts: Bool[np.ndarray, "H W"] | None) -> Bool[np.ndarray, "H W"] | None:

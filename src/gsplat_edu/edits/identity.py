@@ -30,7 +30,7 @@ class Identity(Record, frozen=True):
     """
 
     count: Annotated[int, Meta(ge=0, le=MOST_SPLATS)]
-    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z(?#64 digits of 0-9 and a-f)")]
     origin: tuple[Coordinate, Coordinate, Coordinate]
 
     def document(self) -> dict[str, Any]:

@@ -79,6 +79,8 @@ class ImageScore:
         l1: Mean absolute difference, 0 to 1.
         psnr_fitted: dB, of the right half after an exposure fit on the left half; None if no pixel counts in the right
             half.
+        added_detail: Natural logarithm of the render's gradient energy over the photo's, at half their size and equal
+            brightness, in the worse direction (`BLURRED_FROM`); None if the photo has a mask or alpha.
     """
 
     name: str
@@ -87,7 +89,13 @@ class ImageScore:
     ssim: float
     l1: float
     psnr_fitted: float | None
+    added_detail: float | None = None
 
+
+BLURRED_FROM = 0.25
+"""From this `ImageScore.added_detail` on, a photo is blurred: the others gave the scene more detail than it shows. Of
+61 photos of `snowmiku97`, 15 of them blurred by a hundredth of their width, it finds 14 (held out: 1.44, 1.16; missed:
+0.21) and none of the others; of 27 photos without blur, trained on 14, none."""
 
 OnImage = Callable[[View, ImageScore, UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]], None]
 """Called after each scored view with the view, its score, the render and the photo, both rounded to bytes."""
@@ -253,7 +261,8 @@ def score_image(
         BackendUnavailableError: as for `ssim`.
     """
     pair = _Pair(image, truth, mask, transparency)
-    return ImageScore(name, pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1(), pair.psnr_fitted())
+    scores = (pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1(), pair.psnr_fitted())
+    return ImageScore(name, *scores, pair.added_detail())
 
 
 def score_photo(name: str, photo: Photo, output: RenderOutput, background: ArrayLike) -> ImageScore:
@@ -425,6 +434,15 @@ def _as_array(image: ArrayLike) -> np.ndarray:
     return image.numpy(force=True) if isinstance(image, torch.Tensor) else np.asarray(image)
 
 
+def _gradient_energy(image: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "2"]:
+    """Return the mean squared horizontal and vertical differences at half size, over the squared mean brightness."""
+    grey = image.mean(axis=2)
+    H, W = (side // 2 for side in grey.shape)
+    small = grey[: 2 * H, : 2 * W].reshape(H, 2, W, 2).mean(axis=(1, 3))
+    energy = np.array([np.square(np.diff(small, axis=axis)).mean() for axis in (1, 0)])
+    return np.asarray(energy / max(float(small.mean()), 1e-3) ** 2)
+
+
 class _Pair:
     """A render and its photo after validation: float64, 0 to 1, and the mask (None: all pixels count)."""
 
@@ -478,6 +496,14 @@ class _Pair:
         gains = measured_gains(image[:, :middle], photo[:, :middle], torch.from_numpy(shown))
         fitted = recolored(image[:, middle:], color_matrix(gains), None, backdrop)
         return _Pair(fitted.numpy(), self.photo[:, middle:], tested).psnr()
+
+    def added_detail(self) -> float | None:
+        if self.counts is not None or self.transparency is not None or min(self.photo.shape[:2]) < 4:
+            return None
+        render, photo = _gradient_energy(self.render), _gradient_energy(self.photo)
+        if not (render.all() and photo.all()):
+            return None
+        return float(np.log(render / photo).max())
 
     def l1(self) -> float:
         return self._mean(np.abs(self.render - self.photo))

@@ -37,7 +37,7 @@ from gsplat_edu.evaluate.report_parts import (
     section,
     slider_pair,
 )
-from gsplat_edu.evaluate.verdict import FULL_LENGTH, mean_of, skipped_views, verdict
+from gsplat_edu.evaluate.verdict import FULL_LENGTH, Verdict, mean_of, skipped_views, verdict
 
 PICTURES = 8
 """Most test views shown in a report."""
@@ -215,7 +215,7 @@ def write_report(path: Path, report: Report) -> None:
     cells = _cells(report)
     config = {key: value for key, value in report.config.items() if key != "machine"}
     sections = [
-        f'<p class="verdict">{html.escape(verdict(report.metrics))}</p>\n',
+        _verdict(verdict(report.metrics, report.config)),
         _how_to_score(path, report.metrics),
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
@@ -238,6 +238,12 @@ def write_report(path: Path, report: Report) -> None:
     )
     with written_aside(path) as aside:
         write_text(aside, page)
+
+
+def _verdict(found: Verdict) -> str:
+    """Say how good the scene is, with the figures folded below."""
+    said = f'<p class="verdict {found.grade.lower()}">{html.escape(str(found))}</p>\n'
+    return said + (folded("Details", f"<p>{html.escape(found.details)}</p>\n") if found.details else "")
 
 
 def _cells(report: Report) -> str:

@@ -49,6 +49,12 @@ MOST_NODES = 1 << 18
 REPEATS = 64
 """A file may show its own size at most so many times, by nodes that share a mesh."""
 
+NUMBERS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
+"""NumPy types of accessors' components."""
+
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+"""Numbers of each accessor type that is read."""
+
 MISREAD = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
 """What it raises to follow JSON that does not describe a file as glTF does."""
 
@@ -204,3 +210,58 @@ def node_matrices(path: Path, document: Mapping[str, Any]) -> dict[int, Float64[
             matrices[index] = outer @ node_matrix(nodes[index])
         add(nodes[index].get("children", []), matrices[index])
     return matrices
+
+
+class GlbFile:
+    """A binary glTF of any program while it is read; the methods refuse what a file may not say.
+
+    Args:
+        path: The file, for messages.
+        document: Its JSON.
+        body: Its buffer.
+    """
+
+    def __init__(self, path: Path, document: dict[str, Any], body: memoryview) -> None:
+        self._path, self._document, self._body = path, document, body
+        self._room = max(REPEATS * len(body), 1 << 20)
+
+    def _refuse(self, fault: str) -> NoReturn:
+        refuse(self._path, fault)
+
+    def _take(self, size: int, what: str) -> None:
+        """Count bytes that are read, which nodes may repeat."""
+        self._room -= size
+        if self._room < 0:
+            self._refuse(f"shows its {what} more than {REPEATS} times")
+
+    def _item(self, kind: str, index: Any) -> dict[str, Any]:  # noqa: ANN401 - of a stranger's JSON
+        """Return an entry of one of the document's lists."""
+        if type(index) is not int or not 0 <= index < len(self._document[kind]):
+            self._refuse(f"names {kind}[{str(index)[:20]}], which does not exist")
+        item: dict[str, Any] = self._document[kind][index]
+        return item
+
+    def _embedded(self, index: Any, what: str) -> bytes:  # noqa: ANN401
+        """Return the bytes of a view of the buffer."""
+        view = self._item("bufferViews", index)
+        start, size = view.get("byteOffset", 0), view["byteLength"]
+        if not (type(start) is type(size) is int and 0 <= start <= start + size <= len(self._body)):
+            self._refuse(f"has {what} beyond the file's end")
+        return bytes(self._body[start : start + size])
+
+    def _stored(self, accessor: Mapping[str, Any], label: str) -> np.ndarray:
+        """Return the numbers of an accessor as they are stored, (count, width), not copied."""
+        dtype, width = np.dtype("<" + NUMBERS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+        view, count = self._item("bufferViews", accessor["bufferView"]), accessor["count"]
+        start, row = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), dtype.itemsize * width
+        stride = view.get("byteStride", row)
+        if view.get("buffer", 0) != 0 or "uri" in self._document["buffers"][0]:
+            self._refuse(f"has values in another file in {label}; export it as one .glb")
+        if any(type(value) is not int or value < 0 for value in (count, start, stride)) or stride < row:
+            self._refuse(f"has a size or an offset that is impossible in {label}")
+        if not count:
+            return np.empty((0, width), dtype)
+        ends = accessor.get("byteOffset", 0) + (count - 1) * stride + row
+        if ends > view["byteLength"] or view.get("byteOffset", 0) + ends > len(self._body):
+            self._refuse(f"has values beyond the file's end in {label}")
+        return np.ndarray((count, width), dtype, self._body, start, (stride, dtype.itemsize))

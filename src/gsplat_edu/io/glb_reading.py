@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,8 +20,10 @@ from gsplat_edu.io.glb_container import (
     EXTENSION,
     GENERATOR,
     MISREAD,
-    REPEATS,
+    NUMBERS,
     SPZ_EXTENSION,
+    WIDTHS,
+    GlbFile,
     container,
     node_matrices,
     refuse,
@@ -41,12 +43,6 @@ PRIMITIVE = 256
 
 SUPPORTED = frozenset((EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization"))
 """Extensions that a file may require."""
-
-NUMBERS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5126: "f4"}
-"""NumPy types of accessors' components."""
-
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-"""Numbers of each accessor type."""
 
 COMPONENTS = {
     "POSITION": ("f4", "i1", "u1", "i2", "u2"),
@@ -90,18 +86,8 @@ def read(path: Path) -> Scene:
         refuse(path, "its JSON does not describe splats as glTF does")
 
 
-class _File:
-    """A file.
-
-    Args:
-        path: The file, for messages.
-        document: Its JSON.
-        body: Its buffer.
-    """
-
-    def __init__(self, path: Path, document: dict[str, Any], body: memoryview) -> None:
-        self._path, self._document, self._body = path, document, body
-        self._room = max(REPEATS * len(body), 1 << 20)
+class _File(GlbFile):
+    """A file of splats."""
 
     def scene(self) -> Scene:
         """Return the splats of all nodes, and the metadata."""
@@ -129,9 +115,6 @@ class _File:
         by = self._document["asset"].get("generator")
         return HALF_TURN_ABOUT_Y.scene(found) if str(by).startswith(ABOUT_Z) else found
 
-    def _refuse(self, fault: str) -> NoReturn:
-        refuse(self._path, fault)
-
     def _facts(self) -> tuple[bool | None, SceneFrame]:
         """Return the metadata of our own files: whether to render antialiased; up, unit and origin."""
         extras = self._document["asset"].get("extras", {})
@@ -157,7 +140,7 @@ class _File:
             if mesh not in splats:
                 splats[mesh] = list(filter(_is_splats, self._item("meshes", mesh)["primitives"]))
             for primitive in splats[mesh]:
-                self._take(PRIMITIVE)
+                self._take(PRIMITIVE, "splats")
                 yield Placed(primitive, matrix)
 
     def _moved(self, part: Placed, root: Float64[np.ndarray, "4 4"]) -> Scene:
@@ -189,12 +172,9 @@ class _File:
 
     def _packed(self, extension: Mapping[str, Any]) -> Scene:
         """Return splats that are an SPZ, in glTF's axes: as CesiumJS does, its coordinates are taken as they are."""
-        view = self._item("bufferViews", extension["bufferView"])
-        start, size = view.get("byteOffset", 0), view["byteLength"]
-        if not (type(start) is type(size) is int and 0 <= start <= start + size <= len(self._body)):
-            self._refuse("has splats that extend beyond the file's end")
-        self._take(size)
-        return spz.in_own_axes(self._path, bytes(self._body[start : start + size]))
+        data = self._embedded(extension["bufferView"], "splats")
+        self._take(len(data), "splats")
+        return spz.in_own_axes(self._path, data)
 
     def _plain(self, primitive: Mapping[str, Any]) -> Scene:
         """Return splats that are attributes."""
@@ -205,52 +185,24 @@ class _File:
         }
         return Scene(_gaussians(self._path, arrays))
 
-    def _take(self, size: int) -> None:
-        """Count bytes that are read, which nodes may repeat."""
-        self._room -= size
-        if self._room < 0:
-            self._refuse(f"shows its splats more than {REPEATS} times")
-
-    def _item(self, kind: str, index: Any) -> dict[str, Any]:  # noqa: ANN401 - of a stranger's JSON
-        """Return an entry of one of the document's lists."""
-        if type(index) is not int or not 0 <= index < len(self._document[kind]):
-            self._refuse(f"names {kind}[{str(index)[:20]}], which does not exist")
-        item: dict[str, Any] = self._document[kind][index]
-        return item
-
     def _array(self, name: str, index: Any) -> Float32[np.ndarray, "N C"]:  # noqa: ANN401
         """Return the values of an attribute."""
         accessor, label = self._item("accessors", index), f"{name} (accessor {index})"
-        number, width = NUMBERS.get(accessor["componentType"], "?"), WIDTHS.get(accessor["type"])
+        number = NUMBERS.get(accessor["componentType"], "?")
         normalized = accessor.get("normalized", False) is True
         allowed = COMPONENTS.get(name, ("f4",))
         fits = number in allowed if name == "POSITION" else number + "n" * normalized in allowed
-        if width is None or not fits or "sparse" in accessor or "bufferView" not in accessor:
+        if accessor["type"] not in WIDTHS or not fits or "sparse" in accessor or "bufferView" not in accessor:
             self._refuse(f"has values of a type that is not supported in {label}")
-        view = self._item("bufferViews", accessor["bufferView"])
-        dtype, count = np.dtype("<" + number), accessor["count"]
-        start, row = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), dtype.itemsize * width
-        stride = view.get("byteStride", row)
-        if view.get("buffer", 0) != 0 or "uri" in self._document["buffers"][0]:
-            self._refuse(f"has values in another file in {label}; export it as one .glb")
-        if any(type(value) is not int or value < 0 for value in (count, start, stride)) or stride < row:
-            self._refuse(f"has a size or an offset that is impossible in {label}")
-        ends = accessor.get("byteOffset", 0) + (count - 1) * stride + row
-        if count and (ends > view["byteLength"] or view.get("byteOffset", 0) + ends > len(self._body)):
-            self._refuse(f"has values beyond the file's end in {label}")
-        self._take(count * row)
-        values: np.ndarray = (
-            np.ndarray((count, width), dtype, self._body, start, (stride, dtype.itemsize))
-            if count
-            else np.empty((0, width), dtype)
-        )
+        values = self._stored(accessor, label)
+        self._take(values.nbytes, "splats")
         if number == "f4":
             found = values.astype(np.float32)
             if not np.isfinite(found).all():
                 self._refuse(f"has NaN or infinite values in {label}")
             return found
         if normalized:
-            return np.maximum(values / np.float64(np.iinfo(dtype).max), -1.0).astype(np.float32)
+            return np.maximum(values / np.float64(np.iinfo(values.dtype).max), -1.0).astype(np.float32)
         return values.astype(np.float32)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE, read_bytes
 from gsplat_edu.io.axes import POSITION_SIGNS, root_transform
-from gsplat_edu.io.glb_container import GENERATOR, MISREAD, REPEATS, container, node_matrices, refuse
+from gsplat_edu.io.glb_container import GENERATOR, MISREAD, NUMBERS, GlbFile, container, node_matrices, refuse
 from gsplat_edu.io.mesh_glb import TRIANGLES, UNLIT
 from gsplat_edu.io.mesh_image import decoded
 from gsplat_edu.io.mesh_parts import Polygons, StoredMesh, check_vertices, distinct_rows, triangles_in
@@ -26,17 +26,11 @@ MOST_PARTS = 100_000
 ARRAY_BYTES = 3
 """Peak memory for a byte of vertices and corners: the parts, and the arrays that they are joined to."""
 
-NUMBERS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
-"""NumPy types of accessors."""
-
 TYPES = {"POSITION": ("VEC3",), "COLOR_0": ("VEC3", "VEC4"), "TEXCOORD_0": ("VEC2",)}
 """Attributes that are read, and their types."""
 
 ATTRIBUTE_BYTES = 36
 """Most bytes of a vertex's attribute as it is converted."""
-
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-"""Numbers of each accessor type that meshes need."""
 
 
 def srgb(linear: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
@@ -54,7 +48,8 @@ def read(path: Path) -> StoredMesh:
         names = ", ".join(sorted(map(str, needed))) if isinstance(needed, list) else "?"
         refuse(path, f"needs the extension {names[:80]}, which is not supported")
     try:
-        parts = list(_File(path, document, body).parts())
+        file = _File(path, document, body)
+        parts = list(file.parts())
         unit, up = _frame(document["asset"])
     except MISREAD:
         refuse(path, "its JSON does not describe meshes as glTF does")
@@ -70,7 +65,7 @@ def read(path: Path) -> StoredMesh:
     polygons = Polygons(np.full(len(corners) // 3, 3), corners, lambda row: f"triangle {row}")
     faces = corners[triangles_in(path, points, polygons)]
     colors = _all_colors(parts)
-    texture = _texture(path, document, body, parts, faces)
+    texture = file.texture(parts, faces)
     kept, merged = _merged(points)
     colors = None if colors is None else colors[kept]
     return StoredMesh(Mesh(points[kept], merged[faces], colors, texture), unit)
@@ -121,44 +116,10 @@ def _all_colors(parts: list[_Part]) -> Float32[np.ndarray, "N 3"] | None:
     return np.concatenate(colors) if len(colors) == len(parts) else None
 
 
-def _texture(
-    path: Path,
-    document: dict[str, Any],
-    body: memoryview,
-    parts: list[_Part],
-    faces: Int64[np.ndarray, "F 3"],
-) -> Texture | None:
-    """Return the texture if one embedded image covers all parts."""
-    uvs = [part.uvs for part in parts if part.uvs is not None]
-    images = {part.image for part in parts}
-    if len(uvs) < len(parts) or len(images) != 1 or None in images:
-        return None
-    try:
-        image = document["images"][images.pop()]
-        if "bufferView" not in image:
-            return None
-        view = document["bufferViews"][image["bufferView"]]
-        start, size = view.get("byteOffset", 0), view["byteLength"]
-        if not (type(start) is type(size) is int and 0 <= start <= start + size <= len(body)):
-            refuse(path, "has an image that extends beyond the file's end")
-    except MISREAD:
-        refuse(path, "its JSON does not describe an image as glTF does")
-    return Texture(decoded(path, bytes(body[start : start + size])), np.concatenate(uvs)[faces])
+class _File(GlbFile):
+    """A file of meshes."""
 
-
-class _File:
-    """The parts of a file.
-
-    Args:
-        path: The file, for messages.
-        document: Its JSON.
-        body: Its buffer.
-    """
-
-    def __init__(self, path: Path, document: dict[str, Any], body: memoryview) -> None:
-        self._path, self._document, self._body = path, document, body
-        self._room = max(REPEATS * len(body), 1 << 20)
-        self._taken = self._parts = 0
+    _parts = _taken = 0  # parts that were read, and bytes of their arrays
 
     def parts(self) -> Iterator[_Part]:
         """Yield the primitives of the scene's nodes; of all nodes if there is no scene."""
@@ -168,20 +129,28 @@ class _File:
                 for primitive in self._item("meshes", node["mesh"])["primitives"]:
                     yield self._part(primitive, matrix)
 
-    def _item(self, kind: str, index: Any) -> dict[str, Any]:  # noqa: ANN401 - of a stranger's JSON
-        """Return an entry of one of the document's lists."""
-        if type(index) is not int or not 0 <= index < len(self._document[kind]):
-            refuse(self._path, f"names {kind}[{str(index)[:20]}], which does not exist")
-        item: dict[str, Any] = self._document[kind][index]
-        return item
+    def texture(self, parts: list[_Part], faces: Int64[np.ndarray, "F 3"]) -> Texture | None:
+        """Return the texture if one embedded image covers all parts."""
+        uvs = [part.uvs for part in parts if part.uvs is not None]
+        images = {part.image for part in parts}
+        if len(uvs) < len(parts) or len(images) != 1 or None in images:
+            return None
+        try:
+            image = self._document["images"][images.pop()]
+            if "bufferView" not in image:
+                return None
+            data = self._embedded(image["bufferView"], "an image")
+        except MISREAD:
+            self._refuse("its JSON does not describe an image as glTF does")
+        return Texture(decoded(self._path, data), np.concatenate(uvs)[faces])
 
     def _part(self, primitive: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]) -> _Part:
         if primitive.get("mode", TRIANGLES) != TRIANGLES:
-            refuse(self._path, f"has a primitive of mode {str(primitive['mode'])[:9]}, not of triangles")
+            self._refuse(f"has a primitive of mode {str(primitive['mode'])[:9]}, not of triangles")
         attributes = primitive["attributes"]
         self._parts += 1
         if self._parts > MOST_PARTS:
-            refuse(self._path, f"shows its meshes in more than {MOST_PARTS:,} parts")
+            self._refuse(f"shows its meshes in more than {MOST_PARTS:,} parts")
         self._reserve(primitive, attributes)
         with np.errstate(invalid="ignore"):  # signalling NaN; the caller looks for NaN
             points = self._array(attributes["POSITION"], *TYPES["POSITION"]).astype(np.float64)
@@ -218,11 +187,9 @@ class _File:
             len(self._view(primitive["indices"], "SCALAR", whole=True)) if "indices" in primitive else points
         )
         if any(count != points for count in counts.values()):
-            refuse(self._path, "has attributes of different numbers of vertices")
+            self._refuse("has attributes of different numbers of vertices")
         size = ATTRIBUTE_BYTES * len(counts) * points + 8 * corners
-        self._room -= 24 * points + 8 * corners
-        if self._room < 0:
-            refuse(self._path, f"shows its meshes more than {REPEATS} times")
+        self._take(24 * points + 8 * corners, "meshes")
         self._taken += size
         require_memory(str(self._path), ARRAY_BYTES * self._taken, TOO_LARGE)
 
@@ -249,25 +216,10 @@ class _File:
     def _view(self, index: Any, *types: str, whole: bool = False) -> np.ndarray:  # noqa: ANN401
         """Return the stored values of an accessor: (count, width); floats or normalised integers unless `whole`."""
         accessor = self._item("accessors", index)
-        name = f"(accessor {index})"
+        name = f"accessor {index}"
         number, kind = NUMBERS.get(accessor["componentType"]), accessor["type"]
         if number is None or kind not in types or "sparse" in accessor or "bufferView" not in accessor:
-            refuse(self._path, f"has values of a kind that is not supported {name}")
+            self._refuse(f"has values of a kind that is not supported in {name}")
         if (whole and number[0] != "u") or (not whole and number != "f4" and not accessor.get("normalized")):
-            refuse(self._path, f"has values of a type that is not supported {name}")
-        view = self._item("bufferViews", accessor["bufferView"])
-        dtype, width, count = np.dtype("<" + number), WIDTHS[kind], accessor["count"]
-        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        stride = view.get("byteStride", dtype.itemsize * width)
-        if view.get("buffer", 0) != 0 or "uri" in self._document["buffers"][0]:
-            refuse(self._path, f"has values in another file {name}; export it as one .glb")
-        if any(type(value) is not int or value < 0 for value in (count, start, stride)):
-            refuse(self._path, f"has a size or an offset that is no number {name}")
-        if not count:
-            return np.empty((0, width), np.float32)
-        if stride < dtype.itemsize * width or start + (count - 1) * stride + dtype.itemsize * width > len(
-            self._body
-        ):
-            refuse(self._path, f"has values that extend beyond the file's end {name}")
-        steps = (stride, dtype.itemsize)
-        return np.ndarray((count, width), dtype, self._body, start, steps)
+            self._refuse(f"has values of a type that is not supported in {name}")
+        return self._stored(accessor, name)

@@ -32,7 +32,7 @@ from gsplat_edu.io.mesh_parts import (
     StoredMesh,
     check_vertices,
     distinct_rows,
-    number,
+    numbers_in,
     refuse,
     triangles_in,
 )
@@ -177,9 +177,9 @@ class _Lines:
         """Add a statement; those that say nothing about surfaces are skipped."""
         match words:
             case ["v", *numbers]:
-                self._vertex(place, self._numbers(numbers, place))
+                self._vertex(place, numbers_in(self._path, numbers, place))
             case ["vt", *numbers]:
-                self.places.append([*self._numbers(numbers, place), 0.0, 0.0][:2])
+                self.places.append([*numbers_in(self._path, numbers, place), 0.0, 0.0][:2])
             case ["f", *corners]:
                 self._face(place, corners)
             case ["usemtl", name, *_]:
@@ -188,12 +188,6 @@ class _Lines:
                 self.libraries += names
             case ["#", _, "unit", unit] if unit in UNITS:
                 self.unit = unit
-
-    def _numbers(self, words: list[str], place: int) -> list[float]:
-        try:
-            return [float(word) for word in words]
-        except ValueError:
-            return [number(self._path, word, f"line {place}") for word in words]
 
     def _vertex(self, place: int, numbers: list[float]) -> None:
         if len(numbers) not in (3, 4, 6, 7):  # x y z, a weight, a colour

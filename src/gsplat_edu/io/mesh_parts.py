@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -149,17 +149,24 @@ def _quads(
     return np.asarray(np.where(first[:, None, None], one, other))
 
 
-def number(path: Path, word: str, place: str) -> float:
-    """Parse a number of a text file.
+def numbers_in(path: Path, words: Sequence[str], line: int) -> list[float]:
+    """Parse numbers of a text file.
 
     Args:
         path: The file, for messages.
-        word: The number's text.
-        place: Where in the file it is.
+        words: The numbers' texts.
+        line: The number of their line.
 
     Raises:
-        SceneFormatError: it is not a number; a decimal comma is named as such.
+        SceneFormatError: one is not a number; a decimal comma is named as such.
     """
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return [_number(path, word, f"line {line}") for word in words]
+
+
+def _number(path: Path, word: str, place: str) -> float:
     try:
         return float(word)
     except ValueError:

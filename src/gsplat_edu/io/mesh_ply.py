@@ -29,7 +29,7 @@ from gsplat_edu.io.mesh_parts import (
     StoredMesh,
     check_vertices,
     eight_bits,
-    number,
+    numbers_in,
     refuse,
     triangles_in,
 )
@@ -273,7 +273,7 @@ class _Text:
                 if at + take > len(words):
                     refuse(self._path, f"line {place}: is too short for a {element.name}")
                 (items[name] if name in lists else plain[name]).extend(
-                    self._numbers(words[at : at + take], place)
+                    numbers_in(self._path, words[at : at + take], place)
                 )
                 at += take
             if at < len(words):
@@ -283,14 +283,8 @@ class _Text:
             columns[name] = np.array(sizes[name], np.int64), self._indices(items[name])
         return columns
 
-    def _numbers(self, words: list[str], place: int) -> list[float]:
-        try:
-            return [float(word) for word in words]
-        except ValueError:
-            return [number(self._path, word, f"line {place}") for word in words]
-
     def _length(self, words: list[str], at: int, place: int) -> int:
-        count = self._numbers(words[at : at + 1], place) or [0.0]
+        count = numbers_in(self._path, words[at : at + 1], place) or [0.0]
         if not (0 <= count[0] <= len(words) and count[0] == int(count[0])):
             refuse(self._path, f"line {place}: a list cannot have {count[0]:g} numbers here")
         return int(count[0])

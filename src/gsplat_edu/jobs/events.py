@@ -7,13 +7,12 @@ has `event`, the name of the kind, and `time`, seconds since 1970; the other fie
 from __future__ import annotations
 
 import json
-import math
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
 from msgspec import Meta, to_builtins
 
 from gsplat_edu.base.reading import parse_json
-from gsplat_edu.base.records import Number, Record, record_of
+from gsplat_edu.base.records import Number, Record, record_of, without_nan
 from gsplat_edu.base.validation import LARGEST_WHOLE
 
 Whole = Annotated[int, Meta(ge=-LARGEST_WHOLE, le=LARGEST_WHOLE)]
@@ -175,7 +174,7 @@ def line_of(event: Event, time: float) -> str:
         time: Seconds since 1970.
     """
     entry = {"time": round(time, 3), **to_builtins(event)}
-    return json.dumps({name: _finite(value) for name, value in entry.items()}, allow_nan=False) + "\n"
+    return json.dumps(without_nan(entry), allow_nan=False) + "\n"
 
 
 def parse_line(line: str | bytes) -> tuple[float, Event]:
@@ -191,8 +190,3 @@ def parse_line(line: str | bytes) -> tuple[float, Event]:
     time = record_of("", entry, _Time).time
     event: Event = record_of("", {name: entry[name] for name in entry if name != "time"}, Event)
     return time, event
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401
-    """Replace NaN and infinities by None, which JSON can represent."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value

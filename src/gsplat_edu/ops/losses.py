@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA
-from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.derivatives import chained, first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, in_range
@@ -204,5 +204,4 @@ class _L1Ssim(torch.autograd.Function):
     @first_derivative_only("l1_ssim", "l1_ssim_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        # Almost always 1: a needless pass over the image would wake torch's threads.
-        return (gradient if float(grad) == 1.0 else gradient * grad), None, None
+        return chained(gradient, grad), None, None

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
-from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.derivatives import chained, first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, whole_number
@@ -401,8 +401,7 @@ class _PatchError(torch.autograd.Function):
     @staticmethod
     @first_derivative_only("patch_error", "patch_error_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        scaled = [g if float(grad) == 1.0 else g * grad for g in ctx.saved_tensors]
-        return (*scaled, None, None, None, None)
+        return (*(chained(gradient, grad) for gradient in ctx.saved_tensors), None, None, None, None)
 
 
 def _named(name: str, photo: GreyPhoto) -> dict[str, Any]:

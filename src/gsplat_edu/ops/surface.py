@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
-from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.derivatives import chained, first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, in_range
@@ -197,9 +197,7 @@ class _NormalError(torch.autograd.Function):
     @staticmethod
     @first_derivative_only("normal_error", "normal_error_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        # grad is almost always 1: needless passes over the images would wake torch's threads.
-        scaled = [g if float(grad) == 1.0 else g * grad for g in ctx.saved_tensors]
-        return (*scaled, None, None)
+        return (*(chained(gradient, grad) for gradient in ctx.saved_tensors), None, None)
 
 
 def _pinhole(camera: Camera) -> dict[str, Any]:

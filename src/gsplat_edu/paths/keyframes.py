@@ -17,7 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -249,7 +249,7 @@ def read_path(file: Path, origin: ArrayLike = NO_SHIFT) -> KeyframePath:
     """
     shift = float64_array("origin", origin, (3,))
     try:
-        found = parse_json(read_text(file), _refuse)
+        found = parse_json(read_text(file), strict=True)
     except ValueError as error:  # a UnicodeDecodeError is one, too
         raise ArgumentError(f"{file}: is not JSON ({str(error)[:80]}); give a path file") from None
     try:
@@ -340,7 +340,3 @@ def parsed_path(found: object) -> KeyframePath:
         raise ArgumentError(f'is not a camera path: its "format" has to be "{FORMAT}"')
     record: PathRecord = record_of("", found, PathRecord)
     return record.path
-
-
-def _refuse(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not valid JSON")

@@ -15,9 +15,9 @@ from gsplat_edu.base.text import image_file_names
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.loading_notes import LoadingNote
 from gsplat_edu.evaluate.comparison import save_comparison
-from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
+from gsplat_edu.evaluate.metrics import BLURRED_FROM, ImageScore, Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import Picture, Report, write_report
-from gsplat_edu.evaluate.verdict import SKIPPED
+from gsplat_edu.evaluate.verdict import BLURRED, SKIPPED
 from gsplat_edu.parts.run_values import Reported
 from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder
@@ -31,7 +31,7 @@ Image = UInt8[np.ndarray, "H W 3"]
 EVALUATED = "evaluated"
 """Key of a metrics.json written outside the run's folder: which run was scored, and on which dataset."""
 
-SCORES = ("test", "train", "test_views", "psnr_aligned")
+SCORES = ("test", "train", "test_views", "psnr_aligned", BLURRED)
 """Keys of metrics.json that hold scores."""
 
 Progress = Callable[[str, ImageScore], None]
@@ -135,7 +135,9 @@ def _scores(judged: ScoredViews, test: list[ImageScore], train: list[ImageScore]
     if judged.skipped:
         return {SKIPPED: {"test": len(judged.test), "train": len(judged.train)}}
     views = [dataclasses.asdict(score) for score in test]
-    return {"test": summarize(test), "train": summarize(train), "test_views": views}
+    means = {"test": summarize(test), "train": summarize(train), "test_views": views}
+    ranked = sorted((*test, *train), key=lambda score: -(score.added_detail or 0.0))
+    return means | {BLURRED: [score.name for score in ranked if (score.added_detail or 0.0) >= BLURRED_FROM]}
 
 
 def _appearance(config: Mapping[str, Any]) -> dict[str, Any]:

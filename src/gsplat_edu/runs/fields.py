@@ -32,6 +32,7 @@ CONFIG = _fields(
     scale=_fields(unit=str, source=str, detail=str),
     data=_fields(path=str),
     train=_fields(iterations=Whole, strategy=str),
+    photos=_fields(unposed=Whole, gap=tuple[str, str], hole=bool),
     render=dict[str, Any],
 )
 
@@ -44,7 +45,16 @@ LOG = _fields(
 
 _SPLIT = _fields(num_images=Whole, **dict.fromkeys(MEASURES, Number))
 
-METRICS = _fields(iterations=Whole, num_gaussians=Whole, seconds=Number, test=_SPLIT, train=_SPLIT)
+METRICS = _fields(
+    iterations=Whole,
+    num_gaussians=Whole,
+    seconds=Number,
+    test=_SPLIT,
+    train=_SPLIT,
+    full_length=Whole,
+    usual=dict[str, Whole],
+    blurred=list[str],
+)
 
 MESH = _fields(
     file=str,

@@ -24,7 +24,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -314,13 +314,9 @@ def write_json(path: Path, value: object) -> None:
         aside.write_text(text + "\n", encoding="utf-8")
 
 
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not valid JSON")
-
-
 def _parse(text: str, where: str) -> Any:  # noqa: ANN401
     try:
-        return parse_json(text, _refuse_constant)
+        return parse_json(text, strict=True)
     except ValueError as error:
         reason = str(error)[:80]
         raise CheckpointError(f"{where}: is not JSON ({reason}); fix or remove it") from None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -12,6 +11,7 @@ import torch
 
 from gsplat_edu.base.files import named_failure, written_aside
 from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.records import without_nan
 from gsplat_edu.train.events import Event, StepEvent
 
 IMAGES_PER_LINE = 10
@@ -72,7 +72,7 @@ class LogWriter:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("a", encoding="utf-8")
         with named_failure(self.path):
-            self._file.write(json.dumps(_finite(line), allow_nan=False) + "\n")
+            self._file.write(json.dumps(without_nan(line), allow_nan=False) + "\n")
             self._file.flush()
 
     def cut(self, iteration: int, seconds: float = 0.0) -> None:
@@ -101,10 +101,3 @@ class LogWriter:
         if self._file is not None:
             self._file.close()
             self._file = None
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401
-    """Replace NaN and infinities by null, recursively: JSON cannot represent them."""
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -14,11 +14,10 @@ from gsplat_edu.mesh.depths import DepthView, Progress
 from gsplat_edu.mesh.faces import drawn_in
 from gsplat_edu.mesh.texture import TextureSettings, TextureView, textured
 from gsplat_edu.parts.transients.files import mask_path
-from gsplat_edu.parts.transients.search import resized_mask
 from gsplat_edu.photos.decoding import decode_mask
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.mesh import Mesh
-from gsplat_edu.scene.photo import Photo, area_mean
+from gsplat_edu.scene.photo import Photo, area_mean, resized_mask
 from gsplat_edu.scene.views import View
 
 HALF_OPAQUE = 128
@@ -75,7 +74,7 @@ def _views(
             counts &= photo.alpha >= HALF_OPAQUE
         if image.shape[:2] != (H, W):
             image = area_mean(image, W, H)
-            counts = cv2.resize(counts.astype(np.uint8), (W, H), interpolation=cv2.INTER_NEAREST) > 0
+            counts = resized_mask(counts, H, W)
         if run is not None and (path := mask_path(run.path, view.name)).is_file():
             counts &= resized_mask(decode_mask(path), H, W)
         if view.lens is not None:

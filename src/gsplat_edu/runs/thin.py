@@ -25,9 +25,10 @@ from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
-from gsplat_edu.train.compose import training
+from gsplat_edu.train.compose import planned_cap, training
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.length import usual_iterations
 from gsplat_edu.train.trainer import Trainer
 
 FEWEST, MANY = 4, 30
@@ -48,6 +49,24 @@ LENGTHS = (100, 200, 400, 800)
 OVERFIT_LOSS = 0.45
 """A training is too long if its PSNR is this much below that of the best shorter one, dB. If longer trainings are
 better, trials fluctuate by 0.3 dB."""
+
+
+def usual_size(config: TrainConfig, dataset: Dataset) -> dict[str, int]:
+    """Return the "iterations" that a recipe takes for a capture by itself, and for fast the "gaussians".
+
+    Few photos may end it at the longest trial already.
+
+    Args:
+        config: The recipe.
+        dataset: The capture.
+    """
+    views = len(dataset.train)
+    length = usual_iterations(config.strategy, views)
+    if config.strategy != "fast":
+        return {"iterations": length}
+    if FEWEST <= views < MANY:
+        length = min(length, LENGTHS[-1])
+    return {"iterations": length, "gaussians": planned_cap(dataset)}
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.region import read_region
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
-from gsplat_edu.evaluate.verdict import FULL_LENGTH
+from gsplat_edu.evaluate.verdict import FULL_LENGTH, USUAL
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.parts.run_values import Captured, Finished
 from gsplat_edu.render.backends import load_backend
@@ -45,6 +45,7 @@ from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of, with_points_of_first
 from gsplat_edu.runs.source import Source, capture_scene, capture_up, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
+from gsplat_edu.runs.thin import usual_size
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.checkpoint import (
     list_checkpoints,
@@ -462,6 +463,7 @@ class CaptureRun:
             self._say(f"{lost} Gaussians are NaN or infinite and are left out of the scene")
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         facts[FULL_LENGTH] = full_length or config.iterations
+        facts[USUAL] = usual_size(config, dataset)
         if clean is not None:
             gaussians, facts["cleaning"] = clean(gaussians, learned)
         path = self.folder.scene(trainer.iteration)

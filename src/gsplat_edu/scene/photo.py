@@ -187,6 +187,13 @@ def area_mean(pixels: Shaped[np.ndarray, "H W *c"], W: int, H: int) -> Shaped[np
     return np.asarray(cv2.resize(pixels, (W, H), interpolation=cv2.INTER_AREA))
 
 
+def resized_mask(mask: Bool[np.ndarray, "h w"], H: int, W: int) -> Bool[np.ndarray, "H W"]:
+    """Return a mask at another size, by the nearest pixel."""
+    rows = (2 * np.arange(H) + 1) * mask.shape[0] // (2 * H)
+    columns = (2 * np.arange(W) + 1) * mask.shape[1] // (2 * W)
+    return np.ascontiguousarray(mask[rows][:, columns])
+
+
 def shrunk(pixels: Shaped[np.ndarray, "H W *c"], longest: int) -> Shaped[np.ndarray, "h w *c"]:
     """Return an image whose longer side is at most so long, of the same shape and dtype; see `area_mean`.
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import math
 from http import HTTPStatus
 from typing import Any
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse
 
+from gsplat_edu.base.records import without_nan
 from gsplat_edu.base.text import whole_of
 from gsplat_edu.server.refusal import RefusedError, too_large
 
@@ -106,12 +106,4 @@ class Json(JSONResponse):
         try:
             return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
         except ValueError:
-            return json.dumps(_finite(content), allow_nan=False, separators=(",", ":")).encode("ascii")
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401
-    if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+            return json.dumps(without_nan(content), allow_nan=False, separators=(",", ":")).encode("ascii")

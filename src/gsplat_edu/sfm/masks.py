@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image
@@ -15,6 +14,7 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.data.capture import PHOTO_FOLDERS, entries, is_file, is_folder
 from gsplat_edu.data.masks import MASK_ENDINGS, MASKS, MaskFolder, check_none_unused
 from gsplat_edu.photos.decoding import UPRIGHT, decode_mask, image_size, turned, upright_size
+from gsplat_edu.scene.photo import resized_mask
 
 MASK_ENDING = ".mask.png"
 """Ending of masks stored beside their photos; case does not matter."""
@@ -151,9 +151,9 @@ def write_mask(counts: Bool[np.ndarray, "H W"], target: Path, size: tuple[int, i
         size: Its width and height, px.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    small = cv2.resize(counts.astype(np.uint8) * 255, size, interpolation=cv2.INTER_NEAREST)
+    W, H = size
     with written_aside(target) as aside:
-        Image.fromarray(small).save(aside, format="PNG")
+        Image.fromarray(resized_mask(counts, H, W).astype(np.uint8) * 255).save(aside, format="PNG")
 
 
 def _direct_images(folder: Path) -> bool:

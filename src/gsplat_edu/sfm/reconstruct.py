@@ -19,6 +19,7 @@ from typing import Any
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import remove_leftovers
+from gsplat_edu.base.records import record_of
 from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.photos.decoding import UPRIGHT
@@ -458,7 +459,7 @@ class _Run:
             self.whole,
         )
         publish(self.folder, self.options.out)
-        if scale := Scale.of_json(facts["scale"]):
+        if scale := record_of("scale", facts["scale"], Scale | None):
             self._say(f"scale: {scale}")
         if self.panoramas is not None:
             names = {face: one.name for one in self.panoramas for face in one.faces}

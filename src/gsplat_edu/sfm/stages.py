@@ -15,13 +15,11 @@ from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.records import Number, Record, record_of
 
 # a text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)
-Text = Annotated[str, Meta(pattern=r"^[^\x00\ud800-\udc7f\udd00-\udfff]*\Z")]
-
-# the folder of a model, relative to the work folder
-Model = Annotated[str, Meta(pattern=r"^models/\d{1,4}/\d{1,4}\Z")]
-
-# the name of a file without a folder
-FileName = Annotated[str, Meta(pattern=r"^(?!\.)[^/\\\x00\ud800-\udc7f\udd00-\udfff]{1,255}\Z")]
+Text = Annotated[str, Meta(pattern=r"^[^\x00\ud800-\udc7f\udd00-\udfff]*\Z(?#the name or path of a file)")]
+Model = Annotated[str, Meta(pattern=r"^models/\d{1,4}/\d{1,4}\Z(?#the folder of a model)")]
+FileName = Annotated[
+    str, Meta(pattern=r"^(?!\.)[^/\\\x00\ud800-\udc7f\udd00-\udfff]{1,255}\Z(?#a file name)")
+]
 
 
 class Facts(Record, frozen=True, forbid_unknown_fields=False):
@@ -49,7 +47,7 @@ class _Features(Facts, frozen=True):
 
 
 class _Matches(Facts, frozen=True):
-    connected: Annotated[int, Meta(ge=0, lt=2**31)]
+    connected: Annotated[int, Meta(ge=0, le=2**31 - 1)]
 
 
 class _Mapping(Facts, frozen=True):

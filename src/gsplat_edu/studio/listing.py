@@ -136,7 +136,7 @@ def run_facts(library: Library, path: Path) -> dict[str, Any]:
         "iterations": None,
         "finished": False,
         "psnr": None,
-        "verdict": "",
+        "verdict": None,
         "ssim": None,
         "num_gaussians": None,
         "seconds": None,
@@ -160,12 +160,18 @@ def run_facts(library: Library, path: Path) -> dict[str, Any]:
         "iterations": last.get("iteration") if done is None else done,
         "finished": done is not None and (planned is None or done >= planned),
         "psnr": test.get("psnr"),
-        "verdict": "" if done is None else verdict(metrics),
+        "verdict": None if done is None else _verdict_facts(metrics, config),
         "ssim": test.get("ssim"),
         "num_gaussians": metrics.get("num_gaussians") or last.get("num_gaussians"),
         "seconds": metrics.get("seconds") or last.get("seconds"),
         "capture": data.get("path") if isinstance(data, dict) else None,
     }
+
+
+def _verdict_facts(metrics: dict[str, Any], config: dict[str, Any]) -> dict[str, str]:
+    """Return the grade of a run, the sentence about it, and the figures for those who ask."""
+    found = verdict(metrics, config)
+    return {"grade": found.grade, "sentence": legible(str(found)), "details": legible(found.details)}
 
 
 def last_logged(path: Path) -> dict[str, Any]:

@@ -100,7 +100,7 @@ async def json_body(request: Request) -> Any:  # noqa: ANN401
     if not size:
         return None
     try:
-        return parse_json(b"".join(pieces), _no_constant)
+        return parse_json(b"".join(pieces), strict=True)
     except ValueError as error:
         raise RefusedError(f"body: is not JSON ({str(error)[:80]})") from None
 
@@ -158,7 +158,3 @@ def fields(body: Any, **wanted: type) -> Mapping[str, Any]:  # noqa: ANN401
     if unknown := sorted(set(body) - set(wanted)):
         raise RefusedError(f"{shortened(unknown[0])}: is not known; see docs/STUDIO.md")
     return body
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")

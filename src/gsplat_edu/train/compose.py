@@ -151,10 +151,14 @@ def _with_cap(config: TrainConfig, dataset: TrainingData, start: int) -> TrainCo
     """Return the configuration with the cap that fast plans for these views, unless it has one."""
     if config.strategy != "fast" or config.max_gaussians is not None:
         return config
+    return dataclasses.replace(config, max_gaussians=max(planned_cap(dataset), start))
+
+
+def planned_cap(dataset: TrainingData) -> int:
+    """Return the number of Gaussians that the recipe fast grows to for the training views of a dataset."""
     cameras = [view.camera for view in dataset.train]
     pixels = float(np.mean([camera.W * camera.H for camera in cameras]))
-    planned = planned_gaussians(pixels, len(cameras), separate_views(cameras, dataset.points))
-    return dataclasses.replace(config, max_gaussians=max(planned, start))
+    return planned_gaussians(pixels, len(cameras), separate_views(cameras, dataset.points))
 
 
 def _begun(setup: Setup) -> tuple[dict[str, Term], ViewModel, dict[str, Masker]]:

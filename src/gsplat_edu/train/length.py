@@ -9,6 +9,7 @@ from __future__ import annotations
 from gsplat_edu.base.text import easily_read
 from gsplat_edu.base.validation import one_of, whole_number
 from gsplat_edu.train.capacity import PLANNED_VIEWS
+from gsplat_edu.train.config import RECIPE_ITERATIONS
 
 QUALITIES = {"draft": 1, "standard": 3, "high": 10}
 """Length of the recipe fast by the name of its quality, as a multiple of the capture's own unit."""
@@ -62,6 +63,16 @@ def planned_iterations(quality: str, views: int, measured: bool = True, batch: i
     whole = min(QUALITIES[quality] * unit_iterations(views, measured), LONGEST)
     rounded = easily_read(int(whole))
     return rounded + -rounded % batch
+
+
+def usual_iterations(strategy: str, views: int) -> int:
+    """Return the iterations of a recipe if none are asked for.
+
+    Args:
+        strategy: Its strategy.
+        views: Number of training views.
+    """
+    return planned_iterations(DEFAULT_QUALITY, max(views, 1)) if strategy == "fast" else RECIPE_ITERATIONS
 
 
 def reasons(views: int, measured: bool = True) -> str:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
-from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.derivatives import chained, first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.ops.losses import LossKernel, photo_loss
@@ -241,7 +241,7 @@ class _MeanOpacity(torch.autograd.Function):
     @first_derivative_only("the mean opacity", "weight * torch.sigmoid(logits).mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return _scaled(gradient, grad), None, None
+        return chained(gradient, grad), None, None
 
 
 class _EmptyOutside(torch.autograd.Function):
@@ -259,7 +259,7 @@ class _EmptyOutside(torch.autograd.Function):
     @first_derivative_only("the alpha outside masks", "weight * (1 - transmittance)[outside].sum()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return _scaled(gradient, grad), None, None
+        return chained(gradient, grad), None, None
 
 
 class _MeanScale(torch.autograd.Function):
@@ -279,9 +279,4 @@ class _MeanScale(torch.autograd.Function):
     @first_derivative_only("the mean scale", "weight * log_scales.exp().mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return _scaled(gradient, grad), None, None
-
-
-def _scaled(gradient: Tensor, grad: Tensor) -> Tensor:
-    """Return gradient * grad. grad is almost always 1; a GPU is not asked, because that synchronises."""
-    return gradient if grad.device.type == "cpu" and float(grad) == 1.0 else gradient * grad
+        return chained(gradient, grad), None, None

@@ -18,6 +18,7 @@ import torch
 from gsplat_edu.base.errors import SplatError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.locks import POLL
+from gsplat_edu.base.records import without_nan
 from gsplat_edu.base.text import Told
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.output import RenderOutput
@@ -308,7 +309,7 @@ class Figures:
         if self._event is None:
             return
         now, iteration = time.perf_counter(), trainer.iteration
-        self.loss, self.psnr = _finite(self._event.loss), _psnr(trainer)
+        self.loss, self.psnr = without_nan(self._event.loss), _psnr(trainer)
         self.photo_factor = self._event.photo_factor
         if self._since is not None and iteration > self._since[1]:
             speed = (iteration - self._since[1]) / max(now - self._since[0], 1e-9)
@@ -407,10 +408,6 @@ def _all_finite(gaussians: Gaussians) -> bool:
 
 def _psnr(trainer: Trainer) -> float | None:
     try:
-        return None if trainer.last is None else _finite(psnr(*trainer.last))
+        return None if trainer.last is None else without_nan(psnr(*trainer.last))
     except SplatError:  # an image with NaN or infinity has no PSNR
         return None
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None

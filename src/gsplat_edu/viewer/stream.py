@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
+
 from gsplat_edu.io.lod import codec
 from gsplat_edu.io.lod.meta import LodMeta
 from gsplat_edu.io.sog.codec import read_meta
@@ -46,7 +48,7 @@ def described(path: Path, index: LodMeta, budget: int | None) -> dict[str, Any]:
             "low": region.low,
             "high": region.high,
             "errors": region.errors,
-            "runs": {level: vars(run) for level, run in region.runs.items() if run.count},
+            "runs": {level: asdict(run) for level, run in region.runs.items() if run.count},
         }
         for region in index.regions
     ]

@@ -6,14 +6,17 @@ Source: PlayCanvas' specification of streamed SOG, version 1.
 from __future__ import annotations
 
 import json
-import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any
 
-from gsplat_edu.base.errors import SceneFormatError
+from msgspec import Meta, field
+
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.records import ABSENT, Absent, Record, as_json, record_of
 from gsplat_edu.io.sog.files import META_NAME
 from gsplat_edu.io.sog.meta import GENERATOR, MOST_SPLATS, NAME
 
@@ -38,8 +41,22 @@ DIGITS = 7
 """Significant digits of numbers that are not whole."""
 
 
-@dataclass(frozen=True)
-class Run:
+_Count = Annotated[int, Meta(ge=0, le=MOST_SPLATS)]
+_Coordinate = Annotated[float, Meta(ge=-1e39, le=1e39)]
+_Name = Annotated[
+    str,
+    Meta(
+        pattern=rf"^({NAME.pattern}/){{1,{MOST_PARTS - 1}}}{re.escape(META_NAME)}\Z"
+        rf"(?#FOLDER/{META_NAME} below its own folder)"
+    ),
+]
+
+
+class _Part(Record, frozen=True, forbid_unknown_fields=False):
+    """A part of a lod-meta.json, in which other programs may store more."""
+
+
+class Run(_Part, frozen=True):
     """Consecutive splats of a file.
 
     Args:
@@ -48,9 +65,30 @@ class Run:
         count: Number of splats.
     """
 
-    file: int
-    offset: int
-    count: int
+    file: Annotated[int, Meta(ge=0)]
+    offset: _Count
+    count: _Count
+
+
+class _Bound(_Part, frozen=True):
+    min: tuple[_Coordinate, _Coordinate, _Coordinate]
+    max: tuple[_Coordinate, _Coordinate, _Coordinate]
+
+
+class _Node(_Part, frozen=True):
+    bound: Any = None
+    children: tuple[Any, Any] | None = None
+    lods: dict[str, Any] | None = None
+    errors: Any = None
+
+
+class _Document(_Part, frozen=True):
+    levels: Annotated[int, Meta(ge=1, le=MOST_LEVELS)] = field(name="lodLevels")
+    filenames: tuple[_Name, ...]
+    tree: Any = None
+    environment: _Name | None = None
+    counts: list[int] | Absent = ABSENT
+    count: int | Absent = ABSENT
 
 
 @dataclass(frozen=True)
@@ -147,131 +185,87 @@ def from_json(path: Path, data: bytes) -> LodMeta:
             f"{path}: has {len(data):,} bytes, too many for the index of a scene; check its name"
         )
     try:
-        document = parse_json(data, _no_number)
+        document = parse_json(data, strict=True)
     except ValueError as error:
         reason = str(error).splitlines()[0][:80]
         raise SceneFormatError(f"{path}: is not JSON ({reason}); get the file again") from None
-    if not isinstance(document, dict):
-        _refuse(path, "is no object")
-    version = document.get("version", VERSION)
+    version = document.get("version", VERSION) if isinstance(document, dict) else VERSION
     if version != VERSION or isinstance(version, bool):
         raise SceneFormatError(
             f"{path}: is a streamed SOG of another version than {VERSION}; write it again with an older program"
         )
-    levels = _whole(path, document.get("lodLevels"), "lodLevels", 1, MOST_LEVELS)
-    names = document.get("filenames")
-    if not isinstance(names, list):
-        _refuse(path, "has no list of filenames")
-    filenames = tuple(_name(path, name) for name in names)
+    try:
+        return _read(record_of("", document, _Document))
+    except ArgumentError as error:
+        raise SceneFormatError(f"{path}: is damaged ({error}); get it again") from None
+
+
+def _read(document: _Document) -> LodMeta:
+    filenames = document.filenames
     if len(set(filenames)) < len(filenames):
-        _refuse(path, "names a file twice")
-    environment = document.get("environment")
-    meta = LodMeta(
-        levels,
-        filenames,
-        tuple(_regions(path, document.get("tree"), levels, len(filenames))),
-        None if environment is None else _name(path, environment),
-    )
-    _check(path, document, meta)
+        raise ArgumentError("filenames: names a file twice")
+    regions = tuple(_regions(document.tree, document.levels, len(filenames)))
+    meta = LodMeta(document.levels, filenames, regions, document.environment)
+    _check_runs(meta)
+    counts = meta.counts()
+    if document.counts not in (ABSENT, counts) or document.count not in (ABSENT, sum(counts)):
+        raise ArgumentError("counts: differ from the sums over its leaves")
     return meta
 
 
-def _refuse(path: Path, what: str) -> NoReturn:
-    raise SceneFormatError(f"{path}: {what}; it is damaged, get it again")
-
-
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a JSON number")
-
-
-def _whole(path: Path, value: object, key: str, low: int, high: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        _refuse(path, f"has no whole number from {low} to {high} in {key}")
-    return value
-
-
-def _name(path: Path, name: object) -> str:
-    """Check that a name leads to a meta.json inside the folder."""
-    parts = name.split("/") if isinstance(name, str) else []
-    if not (1 < len(parts) <= MOST_PARTS and parts[-1] == META_NAME and all(map(NAME.fullmatch, parts))):
-        _refuse(path, f"names a file that is not FOLDER/{META_NAME} below its own folder")
-    return "/".join(parts)
-
-
-def _regions(path: Path, tree: object, levels: int, files: int) -> Iterator[Region]:
+def _regions(tree: object, levels: int, files: int) -> Iterator[Region]:
     """Yield the leaves of the tree from left to right."""
     waiting: list[tuple[object, int]] = [(tree, 1)]
     while waiting:
-        node, depth = waiting.pop()
-        if not isinstance(node, dict) or depth > DEEPEST:
-            _refuse(path, f"has a node that is no object, or more than {DEEPEST} nodes deep")
-        children, lods = node.get("children"), node.get("lods")
-        if (children is None) == (lods is None):
-            _refuse(path, "has a node with neither or both of children and lods")
-        if children is None:
-            yield _region(path, node, levels, files)
-        elif isinstance(children, list) and len(children) == 2:
-            waiting += [(children[1], depth + 1), (children[0], depth + 1)]
-        else:
-            _refuse(path, "has a node whose children are not two")
+        entry, depth = waiting.pop()
+        if depth > DEEPEST:
+            raise ArgumentError(f"tree: is more than {DEEPEST} nodes deep")
+        node: _Node = record_of("node", entry, _Node)
+        if (node.children is None) == (node.lods is None):
+            raise ArgumentError("node: has neither or both of children and lods")
+        if node.lods is not None:
+            yield _region(node, node.lods, levels, files)
+        waiting += [(child, depth + 1) for child in reversed(node.children or ())]
 
 
-def _region(path: Path, node: dict[str, Any], levels: int, files: int) -> Region:
-    lods, bound = node["lods"], node.get("bound")
-    if not isinstance(lods, dict) or not isinstance(bound, dict):
-        _refuse(path, "has a leaf without lods or without a bound")
-    low, high = (_point(path, bound.get(key)) for key in ("min", "max"))
-    if any(a > b for a, b in zip(low, high, strict=True)):
-        _refuse(path, "has a leaf whose bound is inside out")
+def _region(leaf: _Node, lods: dict[str, Any], levels: int, files: int) -> Region:
+    bound: _Bound = record_of("node.bound", leaf.bound, _Bound)
+    if any(a > b for a, b in zip(bound.min, bound.max, strict=True)):
+        raise ArgumentError("node.bound: is inside out")
     runs = {}
     known = {str(level): level for level in range(levels)}
-    for key, found in lods.items():
-        if key not in known or not isinstance(found, dict):
-            _refuse(path, f"has a leaf with a level outside 0 to {levels - 1}")
-        runs[known[key]] = Run(
-            _whole(path, found.get("file"), "file", 0, files - 1),
-            _whole(path, found.get("offset"), "offset", 0, MOST_SPLATS),
-            _whole(path, found.get("count"), "count", 0, MOST_SPLATS),
-        )
-    return Region(low, high, dict(sorted(runs.items())), _errors(node.get("errors"), levels))
-
-
-def _point(path: Path, value: object) -> tuple[float, float, float]:
-    if not (isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))):
-        _refuse(path, "has a bound without three numbers")
-    x, y, z = (float(number) for number in value)
-    return x, y, z
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= 1e39
+    for key, entry in lods.items():
+        if key not in known:
+            raise ArgumentError(f"node.lods: has a level outside 0 to {levels - 1}")
+        runs[known[key]] = run = record_of(f"node.lods.{key}", entry, Run)
+        if run.file >= files:
+            raise ArgumentError(f"node.lods.{key}.file: is {as_json(run.file)}, but there are {files} files")
+    return Region(bound.min, bound.max, dict(sorted(runs.items())), _errors(leaf.errors, levels))
 
 
 def _errors(value: object, levels: int) -> tuple[float, ...]:
     """Read a leaf's errors; none if another program stores something else there."""
-    if not (isinstance(value, list) and len(value) == levels and all(map(_is_number, value))):
+    try:
+        errors: tuple[float, ...] = record_of("", value, tuple[Annotated[float, Meta(ge=0.0, le=1e39)], ...])
+    except ArgumentError:
         return ()
-    found = tuple(float(number) for number in value)
-    return found if all(number >= 0 and math.isfinite(number) for number in found) else ()
+    return errors if len(errors) == levels else ()
 
 
-def _check(path: Path, document: dict[str, Any], meta: LodMeta) -> None:
-    """Check that runs do not overlap, a file has one level, and the counts are those of the runs."""
+def _check_runs(meta: LodMeta) -> None:
+    """Check that runs do not overlap, and a file has one level."""
     level_of: dict[int, int] = {}
     runs: dict[int, list[Run]] = {}
     for region in meta.regions:
         for level, run in region.runs.items():
             if level_of.setdefault(run.file, level) != level:
-                _refuse(path, f"has splats of two levels in {meta.filenames[run.file]}")
+                raise ArgumentError(f"has splats of two levels in {meta.filenames[run.file]}")
             runs.setdefault(run.file, []).append(run)
     for file, name in enumerate(meta.filenames):
         end = 0
         for run in sorted(runs.get(file, []), key=lambda run: (run.offset, run.count)):
             if run.offset != end:
-                _refuse(path, f"has runs in {name} that overlap or leave a gap")
+                raise ArgumentError(f"has runs in {name} that overlap or leave a gap")
             end += run.count
         if end > MOST_SPLATS:
-            _refuse(path, f"has {end:,} splats in {name}, but a file has at most {MOST_SPLATS:,}")
-    counts = meta.counts()
-    if document.get("counts", counts) != counts or document.get("count", sum(counts)) != sum(counts):
-        _refuse(path, "has counts that differ from the sums over its leaves")
+            raise ArgumentError(f"has {end:,} splats in {name}, but a file has at most {MOST_SPLATS:,}")

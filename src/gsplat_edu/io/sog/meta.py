@@ -9,13 +9,15 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
-from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.records import Record, record_of
 from gsplat_edu.io.scene import extras, read_extras
 from gsplat_edu.io.sog.palette import CODEBOOK, MOST_ENTRIES
 from gsplat_edu.io.sog.values import LARGEST_LOG, Range
@@ -166,13 +168,11 @@ def from_json(path: Path, data: bytes) -> Meta:
         SceneFormatError: not a meta.json of version 2, or with impossible values.
     """
     try:
-        document = parse_json(data, _no_number)
+        document = parse_json(data, strict=True)
     except ValueError as error:
         reason = str(error).splitlines()[0][:80]
         raise SceneFormatError(f"{path}: its metadata is not JSON ({reason}); get the file again") from None
-    if not isinstance(document, dict):
-        _refuse(path, "no object")
-    version = document.get("version")
+    version = _at(document, "version")
     if version is None and _at(document, "means.shape") is not None:
         version = 1  # version 1 has no such key
     if isinstance(version, bool) or version != VERSION:
@@ -180,52 +180,92 @@ def from_json(path: Path, data: bytes) -> Meta:
         raise SceneFormatError(
             f"{path}: is SOG of {said}, but only version 2 is supported; export it as version 2"
         )
-    return _checked(path, document)
-
-
-def _checked(path: Path, document: dict[str, object]) -> Meta:
-    antialiased = document.get("antialias")
-    if not (antialiased is None or isinstance(antialiased, bool)):
-        _refuse(path, "antialias, which is neither true nor false")
-    if antialiased is None and document.get("model") in MODELS:
-        antialiased = document["model"] == ANTIALIASED_MODEL
-    keys = ("means.mins", "means.maxs")
-    low, high = (_numbers(path, key, _at(document, key), 3, LARGEST_LOG) for key in keys)
-    harmonics = None
-    if document.get("shN") is not None:
-        harmonics = Harmonics(
-            entries=_whole(path, document, "shN.count", 1, MOST_ENTRIES),
-            degree=_whole(path, document, "shN.bands", min(COEFFICIENTS), max(COEFFICIENTS)),
-            codebook=_codebook(path, document, "shN.codebook"),
-            files=_files(path, document, "shN.files", len(SHN)),
-        )
     try:
-        up, unit, origin = read_extras(_at(document, "asset.extras"))
-    except ValueError:
-        _refuse(path, "an origin that is not three numbers")
+        return _read(record_of("", document, _Document), *read_extras(_at(document, "asset.extras")))
+    except ValueError as error:
+        raise SceneFormatError(f"{path}: its metadata is damaged ({error}); get the file again") from None
+
+
+def _read(document: _Document, up: Vector | None, unit: str | None, origin: Vector) -> Meta:
+    antialiased, means, palette = document.antialias, document.means, document.harmonics
+    if antialiased is None and document.model in MODELS:
+        antialiased = document.model == ANTIALIASED_MODEL
     return Meta(
-        count=_whole(path, document, "count", 0, MOST_SPLATS),
-        span=(low, high),
-        scales=_codebook(path, document, "scales.codebook"),
-        sh0=_codebook(path, document, "sh0.codebook"),
-        harmonics=harmonics,
+        count=document.count,
+        span=(np.array(means.mins), np.array(means.maxs)),
+        scales=document.scales.entries(),
+        sh0=document.sh0.entries(),
+        harmonics=Harmonics(palette.count, palette.bands, palette.entries(), palette.files)
+        if palette
+        else None,
         antialiased=antialiased,
         up=up,
         unit=unit,
         origin=origin,
-        means=_files(path, document, "means.files", len(MEANS)),
-        quats=_files(path, document, "quats.files", len(QUATS)),
-        log_scales=_files(path, document, "scales.files", len(SCALES)),
-        colors=_files(path, document, "sh0.files", len(SH0)),
+        means=means.files,
+        quats=document.quats.files,
+        log_scales=document.scales.files,
+        colors=document.sh0.files,
     )
 
 
-def _refuse(path: Path, what: str) -> NoReturn:
-    raise SceneFormatError(f"{path}: its metadata has {what}; it is damaged, get the file again")
+_File = Annotated[str, msgspec.Meta(pattern=rf"^{NAME.pattern}\Z(?#a plain file name)")]
+_Log = Annotated[float, msgspec.Meta(ge=-LARGEST_LOG, le=LARGEST_LOG)]
+_Entry = Annotated[float, msgspec.Meta(ge=-LARGEST_FLOAT, le=LARGEST_FLOAT)]
 
 
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a JSON number")
+class _Part(Record, frozen=True, forbid_unknown_fields=False):
+    """A part of a meta.json, in which other programs may store more."""
+
+
+class _Means(_Part, frozen=True):
+    mins: tuple[_Log, _Log, _Log]
+    maxs: tuple[_Log, _Log, _Log]
+    files: tuple[_File, _File]
+
+
+class _Quats(_Part, frozen=True):
+    files: tuple[_File]
+
+
+class _Codebook(_Part, frozen=True):
+    """A codebook. Those of scenes with infinite values start with null, which is extrapolated downwards."""
+
+    codebook: Annotated[tuple[_Entry | None, ...], msgspec.Meta(min_length=CODEBOOK, max_length=CODEBOOK)]
+
+    def __post_init__(self) -> None:
+        """Check that only the first entry is null."""
+        if None in self.codebook[1:]:
+            raise ArgumentError(f"codebook[{self.codebook.index(None, 1)}]: is null, but has to be a number")
+
+    def entries(self) -> Float32[np.ndarray, "256"]:
+        """Return the codebook's entries."""
+        entries = np.array(self.codebook, np.float64)
+        if self.codebook[0] is None:
+            step = (entries[-1] - entries[1]) / (CODEBOOK - 1)
+            entries[0] = np.clip(entries[1] - step, -LARGEST_FLOAT, LARGEST_FLOAT)
+        return entries.astype(np.float32)
+
+
+class _Coded(_Codebook, frozen=True):
+    files: tuple[_File]
+
+
+class _Palette(_Codebook, frozen=True):
+    count: Annotated[int, msgspec.Meta(ge=1, le=MOST_ENTRIES)]
+    bands: Annotated[int, msgspec.Meta(ge=min(COEFFICIENTS), le=max(COEFFICIENTS))]
+    files: tuple[_File, _File]
+
+
+class _Document(_Part, frozen=True):
+    count: Annotated[int, msgspec.Meta(ge=0, le=MOST_SPLATS)]
+    means: _Means
+    scales: _Coded
+    quats: _Quats
+    sh0: _Coded
+    harmonics: _Palette | None = msgspec.field(name="shN", default=None)
+    antialias: bool | None = None
+    model: Any = None
 
 
 def _at(document: object, key: str) -> object:
@@ -233,48 +273,3 @@ def _at(document: object, key: str) -> object:
     for part in key.split("."):
         document = document.get(part) if isinstance(document, dict) else None
     return document
-
-
-def _is_number(value: object, largest: float) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
-
-
-def _numbers(
-    path: Path, key: str, found: object, length: int, largest: float
-) -> Float64[np.ndarray, " length"]:
-    if not isinstance(found, list) or len(found) != length:
-        _refuse(path, f"no {length} numbers in {key}")
-    for index, value in enumerate(found):
-        if not _is_number(value, largest):
-            _refuse(path, f"a value in {key}[{index}] that is not a number or is out of range")
-    return np.array(found, dtype=np.float64)
-
-
-def _codebook(path: Path, document: dict[str, object], key: str) -> Float32[np.ndarray, "256"]:
-    """Read a codebook. Those of scenes with infinite values start with null, which is extrapolated downwards."""
-    found = _at(document, key)
-    lacks_first = isinstance(found, list) and len(found) == CODEBOOK and found[0] is None
-    if isinstance(found, list) and lacks_first:
-        found = [found[1], *found[1:]]
-    entries = _numbers(path, key, found, CODEBOOK, LARGEST_FLOAT)
-    if lacks_first:
-        step = (entries[-1] - entries[1]) / (CODEBOOK - 1)
-        entries[0] = np.clip(entries[1] - step, -LARGEST_FLOAT, LARGEST_FLOAT)
-    return entries.astype(np.float32)
-
-
-def _whole(path: Path, document: dict[str, object], key: str, low: int, high: int) -> int:
-    found = _at(document, key)
-    if not isinstance(found, int) or isinstance(found, bool) or not low <= found <= high:
-        _refuse(path, f"no whole number from {low} to {high} in {key}")
-    return found
-
-
-def _files(path: Path, document: dict[str, object], key: str, length: int) -> tuple[str, ...]:
-    found = _at(document, key)
-    if not isinstance(found, list) or len(found) != length:
-        _refuse(path, f"no {length} file names in {key}")
-    for name in found:
-        if not isinstance(name, str) or not NAME.fullmatch(name):
-            _refuse(path, f"an entry in {key} that is not a plain file name")
-    return tuple(found)

@@ -20,8 +20,9 @@ from gsplat_edu.evaluate.masked import MaskedPicture
 from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.parts.run_values import Reported
 from gsplat_edu.parts.transients.masks import LARGEST_SHARE
-from gsplat_edu.parts.transients.search import Transients, resized_mask
+from gsplat_edu.parts.transients.search import Transients
 from gsplat_edu.photos.decoding import decode_mask
+from gsplat_edu.scene.photo import resized_mask
 from gsplat_edu.scene.views import View
 
 FOLDER = "transients"

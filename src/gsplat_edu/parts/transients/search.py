@@ -20,6 +20,7 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.photo import resized_mask
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.saved import check_entries, check_tensor_kind
@@ -149,13 +150,6 @@ def check_enough(count: int) -> None:
             f"transients: {count} training photos are too few to tell what moved; give at least {FEWEST}, or"
             " none"
         )
-
-
-def resized_mask(mask: Bool[np.ndarray, "h w"], H: int, W: int) -> Bool[np.ndarray, "H W"]:
-    """Return a mask at another size, by the nearest pixel."""
-    rows = (2 * np.arange(H) + 1) * mask.shape[0] // (2 * H)
-    columns = (2 * np.arange(W) + 1) * mask.shape[1] // (2 * W)
-    return np.ascontiguousarray(mask[rows][:, columns])
 
 
 def reduced(view: View, factor: float = 1.0) -> View:

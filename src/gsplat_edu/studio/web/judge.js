@@ -35,9 +35,17 @@ export function slider(left, right, names, label, { W, H }) {
   );
 }
 
+// How good a run is and what to do, in words, with the decibels folded; empty without a verdict.
+export function verdictOf({ verdict: found }) {
+  if (!found) return [];
+  const { grade, sentence, details } = found;
+  const said = want("p", { class: `verdict ${grade.toLowerCase()}` }, sentence);
+  return details ? [said, want("details", {}, want("summary", {}, "Details"), want("p", {}, details))] : [said];
+}
+
 export function judge({ place, store, entry, where }) {
   const line = errorLine();
-  const facts = h("p", { class: "facts" });
+  const facts = h("div", { class: "facts" });
   const list = h("ul", { class: "views", "aria-label": "held-out views" });
   const large = h("div", { class: "large" });
   const order = h(
@@ -128,9 +136,9 @@ export function judge({ place, store, entry, where }) {
 
   function showViews({ views: found }) {
     views = found;
-    facts.textContent = found.length
-      ? `${now.verdict} Differences are shown 4 times as strong.`
-      : "There are no held-out views yet. They are rendered when the training ends.";
+    const none = "There are no held-out views yet. They are rendered when the training ends.";
+    const hint = found.length ? "Differences are shown 4 times as strong." : none;
+    patch(facts, [...verdictOf(now), want("p", {}, hint)]);
     show();
   }
 

@@ -7,7 +7,6 @@ import {
   bytes,
   button,
   count,
-  decibels,
   errorLine,
   h,
   heading,
@@ -51,7 +50,7 @@ export function factsOf(entry) {
         : entry.planned
           ? `${whole(done)} of ${whole(entry.planned)} iterations`
           : "no iterations yet",
-    entry.psnr === null ? "" : decibels(entry.psnr),
+    entry.verdict?.grade ?? "",
     entry.num_gaussians ? `${whole(entry.num_gaussians)} splats` : "",
     entry.edited ? "edited" : "",
   ];

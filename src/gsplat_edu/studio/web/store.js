@@ -58,7 +58,7 @@ function runOf({ subject, created }) {
     ssim: null,
     num_gaussians: null,
     seconds: null,
-    verdict: "",
+    verdict: null,
   };
   const entry = { kind: "runs", name: subject.slice(5), entry: subject, path: "", adopted: null, modified: created };
   return { ...entry, ...nothing, files: 0, bytes: 0, finished: false, capture: null, problem: null, edited: false };

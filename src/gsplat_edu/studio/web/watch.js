@@ -2,6 +2,7 @@
 
 import { at, get, getQuietly, head } from "./api.js";
 import { decibels, duration, h, heading, link, patch, put, want, whole } from "./dom.js";
+import { verdictOf } from "./judge.js";
 import { curve } from "./curves.js";
 import { beside, frame } from "./frame.js";
 import { jobPlace } from "./jobs.js";
@@ -61,7 +62,7 @@ export function watch({ place, store, entry }) {
     count: curve("Splats", whole),
   };
   const next = h("p", { class: "next row" });
-  const verdict = h("p"); // how good the scene is, in words
+  const verdict = h("div"); // how good the scene is, in words
   place.append(
     h(
       "div",
@@ -148,7 +149,7 @@ export function watch({ place, store, entry }) {
       else if (now.files) scene.show(page.address(now));
       else scene.show(null, "There is no scene.");
       showFigures(figures, now, view, data);
-      verdict.textContent = active ? "" : now.verdict;
+      patch(verdict, active ? [] : verdictOf(now));
       if (now.finished && !active && !next.children.length) {
         next.append(link("Judge it", `${addressOf(now)}/judge`, { class: "button" }));
       }
@@ -162,8 +163,6 @@ function showFigures(list, now, view, { points }) {
   const splats = (view?.active && points[2].at(-1)) || now.num_gaussians;
   const rows = [
     ["iterations", now.planned ? `${whole(done)} of ${whole(now.planned)}` : "–"],
-    ["PSNR of held-out views", now.psnr === null ? "–" : decibels(now.psnr)],
-    ["SSIM", now.ssim === null ? "–" : now.ssim.toFixed(3)],
     ["splats", splats ? whole(splats) : "–"],
     ["time", now.seconds ? duration(now.seconds) : "–"],
   ];

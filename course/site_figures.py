@@ -1,7 +1,7 @@
 """Put the moving figures into the pages of chapters, below the pictures that stand for them where scripts are off.
 
-The scripts are in docs/site/static/play, their data from `tools/figure_data.py` and `tools/figure_photos.py`. Notebooks
-do not contain the figures.
+The scripts are in docs/site/static/play, their data from `figure_data.py` and `figure_photos.py`. Notebooks do not
+contain the figures.
 """
 
 from __future__ import annotations
@@ -62,6 +62,22 @@ STATIC = "../_static/play/"
 STILL = "This figure needs JavaScript. The picture above shows the same without motion."
 
 
+def behind(figure: Figure, notebook: dict[str, Any]) -> int:
+    """Return the index behind the cell of a notebook that a figure follows.
+
+    Raises:
+        SystemExit: no code cell, or more than one, has the figure's text.
+    """
+    places = [
+        place
+        for place, cell in enumerate(notebook["cells"])
+        if cell["cell_type"] == "code" and figure.after in "".join(cell["source"])
+    ]
+    if len(places) != 1:
+        raise SystemExit(f"{figure.chapter}: {len(places)} code cells contain {figure.after!r}, not 1")
+    return places[0] + 1
+
+
 def with_figures(chapter: str, notebook: dict[str, Any]) -> None:
     """Add the figures of a chapter and their scripts.
 
@@ -70,24 +86,14 @@ def with_figures(chapter: str, notebook: dict[str, Any]) -> None:
         notebook: The notebook; its cells are changed.
 
     Raises:
-        SystemExit: no cell, or more than one, has the text that a figure follows.
+        SystemExit: see `behind`.
     """
     chosen = [figure for figure in FIGURES if figure.chapter == chapter]
     scripts = ["play.js", "algebra.js"] if chosen else []
     scripts += dict.fromkeys(script for figure in chosen for script in figure.shared)
     for figure in chosen:
-        cells = notebook["cells"]
-        places = [
-            place
-            for place, cell in enumerate(cells)
-            if cell["cell_type"] == "code" and figure.after in "".join(cell["source"])
-        ]
-        if len(places) != 1:
-            raise SystemExit(
-                f"site_figures.py: {chapter}: {len(places)} code cells contain {figure.after!r}, not 1"
-            )
-        cells.insert(
-            places[0] + 1,
+        notebook["cells"].insert(
+            behind(figure, notebook),
             _cell(
                 f'<figure class="play" data-play="{figure.name}" data-base="{STATIC}">'
                 f"<figcaption>{figure.caption}</figcaption><noscript>{STILL}</noscript></figure>",

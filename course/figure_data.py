@@ -1,6 +1,6 @@
 """Write the data of the site's moving figures: docs/site/static/play/*-data.js and frames.jpg.
 
-    python tools/figure_data.py [--only kernels | --only fit | --only scene]
+    python course/figure_data.py [--only kernels | --only fit | --only scene]
 
 Trains the sphere of chapters 07 and 09 with the backend cpu (half a minute), except for the fit of chapter 08. The
 figures read scripts and pictures instead of JSON, because pages that are opened from disk may load these.
@@ -22,6 +22,7 @@ from PIL import Image
 from gsplat_edu import Camera, sphere_shell
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.engine.passes import Program, manifest
+from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.fit2d.fit import shrunk_photo
 from gsplat_edu.fit2d.splats import random_splats_2d
 from gsplat_edu.photos.decoding import decode
@@ -93,7 +94,7 @@ class Diary:
         """Keep the held-out view as bytes, and its mean absolute error."""
         with torch.no_grad():
             image = render(gaussians, self.capture.held_out.camera, backend="cpu").image.numpy()
-        self.frames.append(np.uint8(np.clip(image, 0, 1) * 255 + 0.5))
+        self.frames.append(to_bytes(image))
         self.errors.append(round(float(np.abs(image - self.capture.held_out.image).mean()), 4))
 
     def note(self, trainer: Trainer, event: object) -> None:
@@ -142,7 +143,7 @@ def fit_data() -> dict[str, object]:
     tall, wide, _ = photo.shape
     start = random_splats_2d(FIT_SPLATS, tall, wide, np.random.default_rng(FIT_SEED))
     rows = np.concatenate([array.reshape(FIT_SPLATS, -1) for array in start.arrays().values()], axis=1)
-    pixels = base64.b64encode(np.uint8(np.clip(photo, 0, 1) * 255 + 0.5).tobytes()).decode()
+    pixels = base64.b64encode(to_bytes(photo).tobytes()).decode()
     return {"wide": wide, "tall": tall, "pixels": pixels, "start": np.round(rows, 4).tolist()}
 
 
@@ -188,7 +189,7 @@ def main() -> None:
     write("scene", scene_data(trainer.gaussians))
     if only:
         return
-    truth = np.uint8(np.clip(diary.capture.held_out.image, 0, 1) * 255 + 0.5)
+    truth = to_bytes(diary.capture.held_out.image)
     Image.fromarray(np.concatenate([*diary.frames, truth], axis=1)).save(OUT / "frames.jpg", quality=88)
     print(f"frames.jpg: {(OUT / 'frames.jpg').stat().st_size / 1e3:.0f} kB")
     run = {"frames": FRAMES, "errors": diary.errors, "losses": diary.losses, "counts": diary.counts}

@@ -1,10 +1,10 @@
 """Build the site: chapters, documents and the reference of every module, as pages that open from disk.
 
-    python tools/build_site.py [--out out/site]
+    python course/build_site.py [--out out/site]
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
-set-up cells folded and with moving figures (`tools/site_figures.py`).
+set-up cells folded and with moving figures (`course/site_figures.py`).
 """
 
 from __future__ import annotations
@@ -316,14 +316,14 @@ def _toctree(options: str, pages: Iterable[str]) -> str:
 
 def _contents(chapters: list[Path]) -> str:
     """Return the sidebar with its sections: learn, use, build on."""
-    sections = {
-        "Learn": [str(page.with_suffix("")) for page in chapters]
-        + [f"{title} <{name.removesuffix('.md')}>" for name, title in LEARN.items()],
-        "Use": [f"{title} <{name.removesuffix('.md')}>" for name, title in USE.items()],
-        "Build on": [f"{title} <{name.removesuffix('.md')}>" for name, title in BUILD_ON.items()],
+    sections = {"Learn": LEARN, "Use": USE, "Build on": BUILD_ON}
+    entries = {
+        section: [f"{title} <{name.removesuffix('.md')}>" for name, title in documents.items()]
+        for section, documents in sections.items()
     }
+    entries["Learn"] = [*(str(page.with_suffix("")) for page in chapters), *entries["Learn"]]
     return "\n".join(
-        _toctree(f"caption: {title}\n:hidden:\n:maxdepth: 2", pages) for title, pages in sections.items()
+        _toctree(f"caption: {section}\n:hidden:\n:maxdepth: 2", pages) for section, pages in entries.items()
     )
 
 

@@ -1,6 +1,6 @@
 """Write the data of chapter 14's moving figure: docs/site/static/play/wipe-data.js and wipe.jpg.
 
-    python tools/figure_photos.py
+    python course/figure_photos.py
 
 Executes the chapter's cells with the full budget up to its first trained scene (some minutes), so that the figure
 shows the scene that the chapter shows.
@@ -8,25 +8,20 @@ shows the scene that the chapter shows.
 
 from __future__ import annotations
 
-import json
-import sys
 import tempfile
 from pathlib import Path
 
 import nbformat
 import numpy as np
-from nbclient import NotebookClient
 from PIL import Image
 
-sys.path.append(str(Path(__file__).resolve().parent))
+from build_notebooks import SOURCES, assembled, execute
+from figure_data import OUT, write
+from gsplat_edu.evaluate.metrics import psnr
+from site_figures import FIGURES, behind
 
-from build_notebooks import ROOT, SOURCES, assembled
-
-OUT = ROOT / "docs" / "site" / "static" / "play"
-CHAPTER = SOURCES / "14_photos_to_scene.py"
-
-TRAINS = "held_out = sorted("
-"""The figure follows the code cell with this text; it defines `held_out`, worst first, `final` and `picture`."""
+(WIPE,) = (figure for figure in FIGURES if figure.name == "wipe")
+"""The figure follows a code cell that defines `held_out`, worst first, `final` and `picture`."""
 
 SIZE = (240, 180)
 """Width and height of a picture, px."""
@@ -59,19 +54,12 @@ def trained(kept: Path) -> None:
         kept: The file, .npz.
 
     Raises:
-        SystemExit: no code cell, or more than one, has the text of `TRAINS`.
+        SystemExit: see `behind`.
     """
-    notebook = assembled(CHAPTER)
-    places = [
-        place
-        for place, cell in enumerate(notebook.cells)
-        if cell.cell_type == "code" and TRAINS in cell.source
-    ]
-    if len(places) != 1:
-        raise SystemExit(f"figure_photos.py: {len(places)} code cells contain {TRAINS!r}, not 1")
-    del notebook.cells[places[0] + 1 :]
+    notebook = assembled(SOURCES / f"{WIPE.chapter}.py")
+    del notebook.cells[behind(WIPE, notebook) :]
     notebook.cells.append(nbformat.v4.new_code_cell(KEEP.format(views=VIEWS, path=str(kept))))
-    NotebookClient(notebook, timeout=3600, resources={"metadata": {"path": str(ROOT)}}).execute()
+    execute(notebook)
 
 
 def strip(photos: np.ndarray, renders: np.ndarray) -> Image.Image:
@@ -91,11 +79,6 @@ def strip(photos: np.ndarray, renders: np.ndarray) -> Image.Image:
     return made
 
 
-def psnr_of(render: np.ndarray, photo: np.ndarray) -> float:
-    """Return the PSNR of bytes, dB."""
-    return float(-10 * np.log10((((render / 255) - (photo / 255)) ** 2).mean()))
-
-
 def main() -> None:
     """Train, and write the files."""
     with tempfile.TemporaryDirectory() as folder:
@@ -104,7 +87,7 @@ def main() -> None:
         with np.load(kept) as stored:
             names, photos, renders = (stored[key] for key in ("names", "photos", "renders"))
     views = [
-        {"name": str(name), "psnr": round(psnr_of(render, photo), 2)}
+        {"name": str(name), "psnr": round(psnr(render / 255, photo), 2)}
         for name, render, photo in zip(names, renders, photos, strict=True)
     ]
     picture, path = strip(photos, renders), OUT / "wipe.jpg"
@@ -114,8 +97,7 @@ def main() -> None:
             break
     print(f"wipe.jpg: {path.stat().st_size / 1e3:.0f} kB at quality {quality}; {views}")
     value = {"width": SIZE[0], "height": SIZE[1], "brightest": BRIGHTEST, "views": views}
-    text = json.dumps(value, separators=(",", ":"))
-    (OUT / "wipe-data.js").write_text(f"(window.gsplatData ??= {{}}).wipe = {text};\n", encoding="utf-8")
+    write(WIPE.name, value)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
 """Execute the chapters: notebooks/source/NN_name.py (jupytext percent) -> notebooks/NN_name.ipynb.
 
-    python tools/build_notebooks.py                      every chapter, with the full budget
-    python tools/build_notebooks.py 09 --out DIR         chapters whose names start with 09, into another folder
-    python tools/build_notebooks.py --prose 02           only the text: outputs stay, because no code has changed
+    python course/build_notebooks.py                      every chapter, with the full budget
+    python course/build_notebooks.py 09 --out DIR         chapters whose names start with 09, into another folder
+    python course/build_notebooks.py --prose 02           only the text: outputs stay, because no code has changed
 
 A chapter's exercises are in notebooks/exercises/NN_name.py: a markdown cell for each question, behind it a code cell
 with the solution. The solutions run in the kernel after the chapter's cells, and appear at the end of the notebook,
 folded.
 
 GSPLAT_EDU_BUDGET=reduced in the environment shortens the trainings. A cell that raises, or a figure without titles and
-labels (tools/chapter_figures.py), stops the build with exit code 1 and leaves the existing notebook unchanged.
+labels (course/chapter_figures.py), stops the build with exit code 1 and leaves the existing notebook unchanged.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from nbclient.exceptions import CellExecutionError
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "notebooks" / "source"
 EXERCISES = ROOT / "notebooks" / "exercises"
-TOOLS = str(ROOT / "tools")
-STRICT_FIGURES = f"import sys; sys.path.append({TOOLS!r}); import chapter_figures; chapter_figures.install()"
+HERE = str(ROOT / "course")
+STRICT_FIGURES = f"import sys; sys.path.append({HERE!r}); import chapter_figures; chapter_figures.install()"
 """Code that the kernel executes before the first cell."""
 
 CELL_TIMEOUT = 3600  # seconds; the full training of chapter 09 takes minutes on two cores
@@ -80,6 +80,24 @@ def assembled(source: Path) -> nbformat.NotebookNode:
     return notebook
 
 
+def execute(notebook: nbformat.NotebookNode) -> None:
+    """Execute the cells of a notebook in place, with the root as their folder and strict about figures.
+
+    Raises:
+        CellExecutionError: a cell raised.
+    """
+    NotebookClient(
+        notebook,
+        timeout=CELL_TIMEOUT,
+        record_timing=False,
+        extra_arguments=[
+            "--IPKernelApp.log_level=40",  # errors only; otherwise it warns about its own local port
+            f"--IPKernelApp.exec_lines={STRICT_FIGURES}",
+        ],
+        resources={"metadata": {"path": str(ROOT)}},
+    ).execute()
+
+
 def build(source: Path, out: Path) -> None:
     """Execute one chapter and the solutions of its exercises, and write it atomically.
 
@@ -94,16 +112,7 @@ def build(source: Path, out: Path) -> None:
     notebook = assembled(source)
     length = len(notebook.cells)
     notebook.cells += [nbformat.v4.new_code_cell(answer) for _, answer in solutions(source)]
-    NotebookClient(
-        notebook,
-        timeout=CELL_TIMEOUT,
-        record_timing=False,
-        extra_arguments=[
-            "--IPKernelApp.log_level=40",  # errors only; otherwise it warns about its own local port
-            f"--IPKernelApp.exec_lines={STRICT_FIGURES}",
-        ],
-        resources={"metadata": {"path": str(ROOT)}},
-    ).execute()
+    execute(notebook)
     del notebook.cells[length:]
     _write(notebook, source, out)
 

@@ -1,6 +1,6 @@
 """Check that every figure of a chapter has titles and axis labels.
 
-`tools/build_notebooks.py` installs the check in the kernel that executes a chapter. An incomplete figure stops the
+`course/build_notebooks.py` installs the check in the kernel that executes a chapter. An incomplete figure stops the
 build at its cell.
 """
 

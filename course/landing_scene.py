@@ -1,6 +1,6 @@
 """The scene of the site's landing page: two by two blocks of the procedural city, as flat Gaussians on its surfaces.
 
-    python tools/landing_scene.py FOLDER        writes FOLDER/scene.html and FOLDER/scene.jpg
+    python course/landing_scene.py FOLDER        writes FOLDER/scene.html and FOLDER/scene.jpg
 
 Nothing is trained, so that the site builds in seconds: each face of a box and the ground carry Gaussians on a grid,
 with the colours that the ray tracer of `lab/captures/city.py` paints there.
