@@ -137,7 +137,9 @@ def test_every_page_has_a_poster_of_its_start(made, tmp_path):
     convert(folder.path, tmp_path / "a.html")
     text = (tmp_path / "a.html").read_text()
     poster = re.search(r'<img id="poster" alt="[^"]+" src="data:image/jpeg;base64,([^"]+)">', text)
-    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster[1]))))
+    data = base64.b64decode(poster[1])
+    picture = np.asarray(Image.open(io.BytesIO(data)))
+    assert len(data) <= 60_000
     camera = parts_of(tmp_path / "a.html")[0]["start"]["camera"]
     assert picture.shape == (camera["H"], camera["W"], 3) and picture.std() > 10
     facts, seen, photos = parts_of(tmp_path / "a.html")

@@ -44,11 +44,14 @@ FEWEST = 2
 PHOTO_SIDE = 480
 """Longer side of an embedded photo, px; smaller photos stay as they are."""
 
-PHOTO_QUALITY, POSTER_QUALITY = 80, 75
-"""JPEG quality of photos and of the poster."""
+PHOTO_QUALITY, POSTER_QUALITIES = 80, (75, 60, 45, 30, 15)
+"""JPEG quality of photos, and those of the poster, from the best one."""
 
 POSTER_SIDE = 960
 """Longer side of the poster, px."""
+
+POSTER_MOST = 60_000
+"""Largest poster, bytes; the quality falls until it fits."""
 
 HELD_OUT_PART = 3
 """At most one in this many embedded photos is a held-out one, rounded up."""
@@ -211,14 +214,15 @@ def poster_jpeg(source: Source, camera: Camera) -> bytes:
         camera: The camera of the page's start view.
 
     Returns:
-        A JPEG of the camera's shape.
+        A JPEG of the camera's shape, at most `POSTER_MOST` bytes; empty if no quality makes it so small.
     """
     camera = stand_in(camera)
     small = camera if max(camera.W, camera.H) <= POSTER_SIDE else resized(camera, POSTER_SIDE)
     with torch.no_grad():
         image = render(source.scene.gaussians, small, settings=source.settings, backend="cpu").image
     levels = np.rint(255.0 * np.clip(np.nan_to_num(image.numpy(force=True)), 0.0, 1.0))
-    return _jpeg(levels.astype(np.uint8), POSTER_QUALITY)
+    tried = (_jpeg(levels.astype(np.uint8), quality) for quality in POSTER_QUALITIES)
+    return next((jpeg for jpeg in tried if len(jpeg) <= POSTER_MOST), b"")
 
 
 def _through_pinhole(
