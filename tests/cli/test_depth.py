@@ -36,11 +36,11 @@ def test_a_run_learns_from_depth_logs_it_and_resumes(capture, tmp_path, capsys):
     train(folder, tmp_path / "run", "--depth", str(maps))
     assert "depth maps of 8 of 8 photos: z in a unit of" in lines_of(capsys)
     config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert config["data"]["depth"] == str(maps.resolve()) and len(config["depth"]) == 64
+    assert config["data"]["depth"] == str(maps.resolve()) and len(config["digests"]["given_depth"]) == 64
     log = (tmp_path / "run" / "log.jsonl").read_text()
     assert '"depth"' in log
     assert train(folder, tmp_path / "run", "--resume", "--iterations", "30") == 2  # without its depth
-    assert "was started with other depth" in lines_of(capsys)
+    assert "was started with other given depth" in lines_of(capsys)
     train(folder, tmp_path / "run", "--depth", str(maps), "--resume", "--iterations", "30")
     assert "extended from 20 to 30" in lines_of(capsys)
 

@@ -87,7 +87,10 @@ MOVED = {"transients": {"photos": [{"name": str(i), "share": 0.1} for i in range
         ),
         ({"blurred": ["b.jpg"] * 6}, {}, ("Fair", "blurred"), "6 photos are blurred. Leave out or retake"),
         (
-            {"train": {"psnr": 24.5, "psnr_fitted": 32.0, "num_images": 44}},
+            {
+                "train": {"psnr": 24.5, "psnr_fitted": 32.0, "num_images": 44},
+                "test": {"psnr": 20.0, "psnr_fitted": 25.0, "num_images": 4},
+            },
             {},
             ("Fair", "exposure"),
             "the photos differ in brightness",

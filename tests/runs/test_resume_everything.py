@@ -68,7 +68,7 @@ def whole(capture, tmp_path_factory):
         if isinstance(event, StepEvent):
             outside.append(float(event.terms["outside"]))
 
-    assert run._shell.holds(run.trainer.gaussians.means).sum() > 10
+    assert run.trainer.stepper.parts.shell.holds(run.trainer.gaussians.means).sum() > 10
     run.train(callbacks=[watch])
     tensors, numbers = run.trainer.state()
     assert max(outside) > 0 and tensors["transients.masks"].any()

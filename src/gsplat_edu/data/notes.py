@@ -33,7 +33,7 @@ class NamedPhotos(SomePhotos):
     """Some of a capture's photos, of which the first is named.
 
     Args:
-        first: Name of the first of them.
+        first: Name of the first of these photos.
     """
 
     first: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -214,12 +214,17 @@ def examine_run(run: Trained) -> Diagnosis:
         if not found:
             fine.append(name)
     named = {finding.name for finding in findings}
-    findings += [_of_cause(cause) for cause in run.causes.values() if cause.name not in named]
+    findings += [_of_cause(cause, named) for cause in run.causes.values() if cause.name not in named]
     return Diagnosis(_facts(run), (*findings, *foreign), tuple(fine), _otherwise(run))
 
 
-def _of_cause(cause: Cause) -> Finding:
-    """Return the finding of a cause that the verdict names and that no check of the pixels reports."""
+def _of_cause(cause: Cause, named: Collection[str]) -> Finding:
+    """Return the finding of a cause that the verdict names and that no check of the pixels reports.
+
+    Too few photos are advised against with the overfitting that they cause, if that is `named`.
+    """
+    if cause.name == "few photos" and "overfitted" in named:
+        return Finding(cause.name, Severity.WARNING, cause.reason, "")
     advice = cause.advice[0].lower() + cause.advice[1:].removesuffix(".")
     changes = (MORE_PHOTOS,) if cause.name in ("few photos", "hole") else ()
     return Finding(cause.name, Severity.WARNING, cause.reason, advice, changes=changes)

@@ -160,7 +160,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add_scale(photos)
     _add_results(parser.add_argument_group("results"))
     _add_view(parser.add_argument_group("live view"))
-    _add_recipe(parser.add_argument_group("recipe", "docs/RECIPE.md explains it."))
+    _add_recipe(parser, parser.add_argument_group("recipe", "docs/RECIPE.md explains it."))
 
 
 def _add_number(
@@ -317,12 +317,13 @@ def _add_background(group: argparse._ArgumentGroup) -> None:
     add_setting(group, "random_background")
 
 
-def _add_recipe(group: argparse._ArgumentGroup) -> None:
+def _add_recipe(parser: argparse.ArgumentParser, group: argparse._ArgumentGroup) -> None:
     for name in ("antialiased", "batch", "sh_degree", "surface"):
         add_setting(group, name)
-    for setting in SETTINGS:
-        if setting.plugin and setting.option:
-            add_setting(group, setting.name)
+    listed = {action.dest for action in parser._actions}
+    for name in WITH_OPTION:
+        if name not in listed:  # those of plug-ins, and of ours that no other group lists
+            add_setting(group, name)
     add_settings(group)
 
 

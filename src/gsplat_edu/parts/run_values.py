@@ -89,7 +89,7 @@ class Reported:
         metrics: The contents of metrics.json.
         log: The entries of the log.
         views: The training views that were scored.
-        gaussians: The scene.
+        gaussians: The scene, without gradients.
         renderer: Renders Gaussians from a camera, over `background`.
         background: (3,) colour behind photos that are not opaque.
     """

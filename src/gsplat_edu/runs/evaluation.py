@@ -121,7 +121,10 @@ def evaluate_run(
     metrics = {**earlier, **_scores(judged, test, train), "num_gaussians": len(gaussians)}
     metrics |= _appearance(config) | dict(facts or {})
     title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", [*map(str, judged.notes)]
-    run = Reported(folder.path, config, metrics, log, train_views, gaussians, render, judged.background)
+    run = Reported(
+        *(folder.path, config, metrics, log, train_views),
+        *(gaussians.map(lambda tensor: tensor.detach()), render, judged.background),
+    )
     known = mesh_entries(folder), sections(run)
     report = Report(title, metrics, log, config, test, gallery.pictures, notes, *known)
     write_report(into.report, report)

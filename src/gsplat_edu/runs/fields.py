@@ -28,6 +28,7 @@ CONFIG = _fields(
     backend=str,
     fingerprint=str,
     plugins=dict[str, str],
+    digests=dict[str, str],
     origin=Place,
     scale=_fields(unit=str, source=str, detail=str),
     data=_fields(path=str),

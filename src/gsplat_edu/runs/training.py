@@ -258,7 +258,7 @@ class CaptureRun:
         """Check that all processes start from equal data, and load the first one's checkpoint in all."""
         views = [(view.name, view.camera.W, view.camera.H) for view in self.dataset.train]
         start = {"photos": fingerprint(self.dataset), "views": digest_of(repr(views).encode())}
-        start |= {name: self._digests().get(name, "none") for name in parts()}
+        start |= dict.fromkeys(parts(), "none") | self._digests()
         check_alike(team, "start alike", start | {"Gaussians": scene_digest(gaussians)})
         checkpoints = list_checkpoints(self.folder.checkpoints) if self._leads else []
         state = team.shared_state(read_checkpoint(checkpoints[-1]) if checkpoints else None)

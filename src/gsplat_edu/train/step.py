@@ -51,7 +51,7 @@ def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
 
 @dataclass(frozen=True)
 class StepParts:
-    """The parts of a step; `gsplat_edu.train.training` makes those that a configuration asks for.
+    """The parts of a step; `gsplat_edu.train.compose` makes those that a configuration asks for.
 
     Args:
         objective: The objective to minimise.
@@ -381,7 +381,7 @@ class TensorStepper:
         self.shown = Shown(rendered.image.detach(), rendered.target, rendered.draw.view.name)
 
     def apply(self, iteration: int, in_backward: AdamInBackward | None = None) -> None:
-        """Take an optimiser step with the stored gradients at the rates of the iteration, then clear them.
+        """Take an optimiser step at the rates of the iteration with the stored gradients, which the optimiser clears.
 
         Args:
             iteration: The step's first image, counted from 0.
