@@ -307,16 +307,7 @@ export class Viewer {
     this.meshes?.show(camera);
     this.compare?.place();
     this.frustums.place(camera);
-    this.uncover();
-  }
-
-  // The poster gives way to the first picture.
-  uncover() {
-    const poster = element("poster");
-    if (!poster || poster.classList.contains("gone")) return;
-    poster.classList.add("gone");
-    if (STILL_PREFERRED.matches || getComputedStyle(poster).transitionDuration === "0s") poster.remove();
-    else poster.addEventListener("transitionend", () => poster.remove(), { once: true });
+    element("poster")?.classList.add("gone"); // printed all the same
   }
 
   // Shows the picture again, after a change of what lies over the splats.

@@ -5,6 +5,9 @@ import { element } from "./common.js";
 const ALONE = 3000; // milliseconds without a move after which the picture is alone
 const CLOSE_TO = [document.body, document.documentElement, null]; // has the focus if nothing else has it
 
+const SHEETS = ["tools", "help"]; // above the bar, in the same place
+const CARDS = ["guide", "compare-card"];
+
 export class Visitor {
   constructor(viewer) {
     this.viewer = viewer;
@@ -17,6 +20,11 @@ export class Visitor {
       ? "Drag to look around"
       : "Drag with a finger to look around";
     element("hint").hidden = false;
+    const opened = new MutationObserver((changes) =>
+      changes.forEach(({ target }) => target.hidden || this.closeFor(target)),
+    );
+    for (const id of [...SHEETS, ...CARDS]) opened.observe(element(id), { attributeFilter: ["hidden"] });
+    this.offerBounds();
     this.offerTour();
     this.offerFullScreen();
     addEventListener("hashchange", () => this.followAddress());
@@ -34,8 +42,31 @@ export class Visitor {
   rest() {
     const focused = document.activeElement;
     const isFree = CLOSE_TO.includes(focused) || focused === this.viewer.canvas;
-    if (isFree && element("tools").hidden && element("help").hidden) document.body.classList.add("resting");
+    if (isFree && SHEETS.every((id) => element(id).hidden)) document.body.classList.add("resting");
     else this.wake();
+  }
+
+  // Closes the sheets in favour of the sheet or card that has been opened.
+  closeFor({ id }) {
+    if (id !== "tools") this.viewer.panel.folded.hide(true);
+    if (id !== "help") element("help").hidden = true;
+  }
+
+  // What no photo saw fades into the colour that most photos have at their border; a switch shows all of the scene.
+  offerBounds() {
+    const { viewer } = this;
+    const { border, cameras } = viewer.facts;
+    const plain = viewer.settings.background;
+    element("keep").hidden = !cameras.length;
+    const follow = () => {
+      const { checked } = element("kept");
+      viewer.view.bounds = checked ? "photos" : "none";
+      viewer.settings.background = (checked && border) || plain;
+      if (viewer.seen) viewer.renderer.seen.faded = checked ? 1 : 0;
+      viewer.refresh();
+    };
+    element("kept").addEventListener("change", follow);
+    follow();
   }
 
   offerTour() {
@@ -50,9 +81,7 @@ export class Visitor {
     const before = guide.onToggle;
     guide.onToggle = (on) => {
       before(on);
-      document.body.classList.toggle("touring", on);
       if (on) [element("hint").hidden, begin.hidden] = [true, true];
-      if (on && !element("tools").hidden) this.viewer.panel.folded.hide(true);
     };
   }
 
