@@ -17,7 +17,7 @@ def opened(tab):
     go(tab, "scenes/wall/edit")
     # by its title, because the screen before this one may have had a scene as well
     frame = tab.wait_for_selector("iframe[title='editor of wall']:not([hidden])").content_frame()
-    frame.wait_for_selector("#edit")
+    frame.wait_for_selector("#edit-side")
     until_in(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
     return frame
 
@@ -82,7 +82,7 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     tab.reload()
     frame = opened(tab)
     assert frame.inner_text("#edit-count") == left
-    assert frame.inner_text("#edit-list summary") == "operations (2)"
+    assert frame.inner_text("#edit-list summary") == "History (2)"
 
     tab.keyboard.press("3")  # the focus is outside of the frame, so the key is the page's
     person.reach("#/scenes/wall/share")
@@ -227,12 +227,12 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
         and frame.inner_text("#edit-saved") != "not saved"
     )
     tab.get_by_role("button", name="Use mine").click()
-    assert frame.inner_text("#edit-list summary") == "operations (1)"
+    assert frame.inner_text("#edit-list summary") == "History (1)"
     shares(tab)
     stored.write_text(json.dumps(mine))
     frame = opened(tab)
     tab.get_by_role("button", name="Discard them").click()
-    assert frame.inner_text("#edit-list summary") == "operations (2)"
+    assert frame.inner_text("#edit-list summary") == "History (2)"
     tabs.get_by_role("link", name="Edit", exact=True).wait_for()
 
 

@@ -125,7 +125,7 @@ class Editor(Visit):
     """An open page with the editor. Its buttons are named by what they do, because some have the same text."""
 
     def ready(self):
-        self.tab.wait_for_selector("#edit")
+        self.tab.wait_for_selector("#edit-side")
         until(self.tab, "window.editor")
         return super().ready()
 

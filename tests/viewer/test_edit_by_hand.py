@@ -42,7 +42,7 @@ def served(edit_site):
 def opened(served, visit):
     """Return a function that opens the served page in a tab."""
 
-    def make(width=900, height=420, **options):
+    def make(width=1440, height=800, **options):
         shown = visit(width, height, url=served.url, kind=Editor, **options).ready()
         shown.expected = "status of 412"
         return shown

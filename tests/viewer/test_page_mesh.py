@@ -276,7 +276,7 @@ def test_measuring_snaps_to_the_mesh(visit, tmp_path, random_gaussians):
     html = page.html(scene, source.cameras, source.settings, "scene", (), tour, editing)
     (tmp_path / "edit.html").write_bytes(html)
     tab = visit(width=1200, height=600).open(tmp_path / "edit.html").ready().tab
-    tab.wait_for_selector("#edit")
+    tab.wait_for_selector("#edit-side")
     assert tab.evaluate("viewer.meshes.share") == 1  # the picture to edit is that of the splats
     tab.evaluate("document.querySelector('[data-tool=measure]').click()")
     tab.evaluate("() => { viewer.goTo(0); return viewer.settled(); }")
@@ -338,7 +338,7 @@ def editor_of(visit, tmp_path, gaussians, mesh):
     html = page.html(scene, source.cameras, settings, "scene", (), tour, editing)
     (tmp_path / "edit.html").write_bytes(html)
     shown = visit(width=1200, height=600).open(tmp_path / "edit.html").ready()
-    shown.tab.wait_for_selector("#edit")
+    shown.tab.wait_for_selector("#edit-side")
     return shown, source
 
 

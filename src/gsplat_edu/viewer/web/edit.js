@@ -2,6 +2,7 @@
 
 import { cross, dot, plus } from "./camera.js";
 import { element } from "./common.js";
+import { ViewCube } from "./edit_cube.js";
 import { FlagTexture } from "./edit_draw.js";
 import { SELECTED } from "./edit_flags.js";
 import { Leveller } from "./edit_level.js";
@@ -55,6 +56,8 @@ class Editor {
     this.tools = new EditTools(this);
     this.look = new EditLook(this);
     this.tour = new EditTour(this);
+    this.cube = new ViewCube(viewer);
+    this.grid = null; // its lines, while it is shown
     this.follow();
     this.stateChanged();
     document.body.classList.add("editing");
@@ -83,6 +86,8 @@ class Editor {
 
   drawOverlay(camera) {
     this.overlay.begin(camera);
+    this.cube.follow(camera);
+    if (this.grid) this.overlay.lines(this.grid, "#fff9");
     for (const { points, note } of this.history.views().measures) {
       this.overlay.lines([points], "#7fd4ff");
       this.overlay.dot(points[0], "", "#7fd4ff");
@@ -121,6 +126,15 @@ class Editor {
   chooseFront(frontOnly) {
     this.frontOnly = frontOnly;
     this.changed();
+  }
+
+  chooseGrid(isShown) {
+    this.grid = isShown ? this.cube.grid(this.values) : null;
+    this.changed();
+  }
+
+  find() {
+    this.panel.search.open();
   }
 
   // Applies an operation and adds it to the list. An error of ours leaves the list as it was.
@@ -177,6 +191,7 @@ class Editor {
     view.start = upright ? levelled(camera, view.up) : camera;
     view.pivot = start ? start.pivot : this.opened.pivot;
     if (before.some((x, i) => x !== view.up[i])) view.camera = levelled(view.camera, view.up);
+    if (this.grid) this.grid = this.cube.grid(this.values);
     const wanted = path === undefined ? this.opened.path : pathOf(path);
     if (JSON.stringify(storedPath(wanted)) !== JSON.stringify(storedPath(keyframes.path))) {
       keyframes.path = wanted;

@@ -10,7 +10,7 @@ const CHART_HEIGHT = 90; // CSS pixels
 const LEAST_DISTANCE = 1e-6; // of the largest one: smaller ones lie in the first bar
 
 export const HISTOGRAM_PANEL = `
-<details id="edit-histogram"><summary>by opacity, size or distance</summary>
+<details id="edit-histogram"><summary>By opacity, size or distance</summary>
 <p class="row"><label>of <select id="edit-quantity"><option value="opacity">opacity</option><option value="size">size</option>
 <option value="distance">distance to the pivot</option></select></label></p>
 <canvas id="edit-chart" role="img" aria-label="bar chart"></canvas>

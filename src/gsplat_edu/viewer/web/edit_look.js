@@ -21,6 +21,7 @@ export const LOOK_ROW = `
 <button data-look="centres" aria-pressed="false" title="7: show the centre of every splat">centres</button>
 <button data-look="rings" aria-pressed="false" title="8: show every splat as a ring">rings</button>
 <button data-look="outline" aria-pressed="false" title="9: outline the selection in place of the tint, also where it is hidden">outline</button>
+<button data-do="grid" aria-pressed="false" title="Show a grid on the ground">grid</button>
 </p>`;
 
 // Every renderer of the page gets the uniforms of its look; an editor sets the look.

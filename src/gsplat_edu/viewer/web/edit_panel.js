@@ -9,27 +9,57 @@ import { EditHistogram, HISTOGRAM_PANEL } from "./edit_histogram.js";
 import { LOOK_ROW } from "./edit_look.js";
 import { NEAR_PANEL, proposedRadius } from "./edit_near.js";
 import { POLYGON_ROW } from "./edit_polygon.js";
+import { EditSearch } from "./edit_search.js";
 import { length3, shortNumber } from "./edit_shapes.js";
 import { POINTS_OF } from "./edit_tools.js";
 import { TOUR_ROW } from "./edit_tour.js";
 import { want } from "./patch.js";
 
+// Tools: name, what its button is called, its key and what it does, and the strokes of its icon on a grid of 24.
+const TOOLS = [
+  ["navigate", "navigate", "V: drags turn the view", "M5 3l14 8-6 1.5L10 19z"],
+  [
+    "rectangle",
+    "rectangle",
+    "T: select by a rectangle",
+    "M4 8V4h4m3 0h2m3 0h4v4m0 3v2m0 3v4h-4m-3 0h-2m-3 0H4v-4m0-3v-2",
+  ],
+  [
+    "lasso",
+    "lasso",
+    "L: select by a freehand outline",
+    "M12 4c5 0 8 2.2 8 5s-3 5-8 5-8-2.2-8-5 3-5 8-5zM7 13.5c-2 2-1 3.5 1 4s1.5 2.5-1 3",
+  ],
+  ["polygon", "polygon", "Shift L: select by a polygon, corner after corner", "M12 3l8 6-3 11H7L4 9z"],
+  [
+    "brush",
+    "brush",
+    "B: select by painting; [ and ] change the size",
+    "M20 4l-9.5 9.5M8.5 13C6 13 5 15 5 17c0 1.3-.8 2.2-2 2.7 4 1.2 8 .3 8-3.7A3 3 0 0 0 8.5 13z",
+  ],
+  ["sphere", "sphere", "O: select by a sphere", "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zM3 12c2 2.8 16 2.8 18 0"],
+  ["box", "box", "X: select by a box, or crop to it", "M12 3l8 4.5v9L12 21l-8-4.5v-9zM4 7.5l8 4.5 8-4.5M12 12v9"],
+  [
+    "move",
+    "move",
+    "Shift V: move and turn the selected splats",
+    "M12 3v18M3 12h18M9.5 5.5L12 3l2.5 2.5m-5 13L12 21l2.5-2.5m-9-9L3 12l2.5 2.5m13-5L21 12l-2.5 2.5",
+  ],
+  ["color", "colour", "G: select by colour", "M12 3s6 6.5 6 11a6 6 0 0 1-12 0c0-4.5 6-11 6-11z"],
+  ["floor", "floor", "Z: turn the scene upright by three points of the floor", "M3 9h18v6H3zM9 9v6m6-6v6m-3-3v.01"],
+  ["scale", "scale", "C: set the scale by two points", "M4 20L20 4M4 15v5h5M15 4h5v5"],
+  ["measure", "measure", "M: measure between two points", "M3 16L16 3l5 5L8 21zM7 12l2 2m1-5l2 2m1-5l2 2"],
+];
+
+const toolButton = ([tool, name, title, strokes]) =>
+  `<button data-tool="${tool}" title="${title}"><svg viewBox="0 0 24 24" aria-hidden="true"><path d="${strokes}"/></svg><span>${name}</span></button>`;
+
 const EDIT_PANEL = `
 <section id="edit" aria-label="editor">
-<p class="row" role="toolbar" aria-label="tools">
-<button data-tool="navigate" title="V: drags turn the view">navigate</button>
-<button data-tool="rectangle" title="T: select by a rectangle">rectangle</button>
-<button data-tool="lasso" title="L: select by a freehand outline">lasso</button>
-<button data-tool="polygon" title="Shift L: select by a polygon, corner after corner">polygon</button>
-<button data-tool="brush" title="B: select by painting; [ and ] change the size">brush</button>
-<button data-tool="sphere" title="O: select by a sphere">sphere</button>
-<button data-tool="box" title="X: select by a box, or crop to it">box</button>
-<button data-tool="move" title="Shift V: move and turn the selected splats">move</button>
-<button data-tool="color" title="G: select by colour">colour</button>
-<button data-tool="floor" title="Z: turn the scene upright by three points of the floor">floor</button>
-<button data-tool="scale" title="C: set the scale by two points">scale</button>
-<button data-tool="measure" title="M: measure between two points">measure</button>
-</p>
+<div id="edit-rail" role="toolbar" aria-label="tools" aria-orientation="vertical">
+${TOOLS.map(toolButton).join("\n")}
+</div>
+<div id="edit-options">
 <p id="edit-hint"></p>
 <p class="row" data-for="rectangle lasso polygon brush sphere box color" role="group" aria-label="how selections combine">
 <button data-how="replace" title="1: select only these">new</button>
@@ -39,13 +69,11 @@ const EDIT_PANEL = `
 </p>
 ${FRONT_ROW}${POLYGON_ROW}
 <p class="row" data-for="brush"><label>size <input id="edit-radius" type="range" min="2" max="200" value="24"></label></p>
-<div data-for="sphere box">
-<p class="row" id="edit-center" role="group" aria-label="centre"><span>centre</span></p>
+<p class="row" id="edit-center" data-for="sphere box" role="group" aria-label="centre"><span>centre</span></p>
 <p class="row" data-for="sphere"><label>radius <input id="edit-sphere" type="number" step="any" min="0"></label></p>
 <p class="row" data-for="box" id="edit-half" role="group" aria-label="half sizes"><span>half size</span></p>
-<p class="row"><button data-do="select-shape" title="Enter">select</button>
+<p class="row" data-for="sphere box"><button data-do="select-shape" title="Enter">select</button>
 <button data-do="crop" data-for="box" title="Delete everything outside the box">crop to box</button></p>
-</div>
 <div data-for="move">
 <p class="row numbers" id="edit-by" role="group" aria-label="moved by"><span>moved by</span></p>
 <p class="row"><button data-do="move" title="Enter">move</button></p>
@@ -67,6 +95,22 @@ ${FRONT_ROW}${POLYGON_ROW}
 <button data-do="scale" title="Enter">set scale</button></p>
 <p class="row" data-for="measure"><label>note <input id="edit-note" maxlength="200"></label>
 <button data-do="measure" title="Enter">keep</button></p>
+</div>
+<div id="edit-column">
+<div id="edit-history">
+<p class="row">
+<button data-do="undo" title="U or Ctrl Z: undo">undo</button>
+<button data-do="redo" title="Y or Ctrl Shift Z: redo">redo</button>
+<button data-do="save" title="Ctrl S: save the edits">save</button>
+<button data-do="download" title="Download the edits as a file">download</button>
+<button data-do="search" title="Ctrl K: find an action by its name">find</button>
+<span id="edit-saved" role="status"></span>
+</p>
+<p id="edit-message" role="alert"></p>
+</div>
+<div id="edit-side">
+<h2>Selection</h2>
+<p id="edit-count" role="status"></p>
 <p class="row" role="group" aria-label="selection">
 <button data-do="all" title="0: select all">all</button>
 <button data-do="none" title="N: select nothing">none</button>
@@ -77,7 +121,7 @@ ${FRONT_ROW}${POLYGON_ROW}
 </p>
 ${LOOK_ROW}
 ${NEAR_PANEL}${HISTOGRAM_PANEL}
-<details><summary>by numbers of opacity and size</summary>
+<details><summary>By numbers of opacity and size</summary>
 <p class="row"><label>opacity from <input id="edit-opacity-low" type="number" min="0" max="1" step="0.01" value="0"></label>
 <label>to <input id="edit-opacity-high" type="number" min="0" max="1" step="0.01" value="0.1"></label>
 <button data-do="select-opacity">select</button></p>
@@ -85,15 +129,7 @@ ${NEAR_PANEL}${HISTOGRAM_PANEL}
 <label>to <input id="edit-size-high" type="number" min="0" step="any"></label>
 <button data-do="select-size">select</button></p>
 </details>${FLOATERS_PANEL}
-<p id="edit-count" role="status"></p>
-<p class="row">
-<button data-do="undo" title="U or Ctrl Z: undo">undo</button>
-<button data-do="redo" title="Y or Ctrl Shift Z: redo">redo</button>
-<button data-do="save" title="Ctrl S: save the edits">save</button>
-<button data-do="download" title="Download the edits as a file">download</button>
-<span id="edit-saved" role="status"></span>
-</p>
-<p id="edit-message" role="alert"></p>
+<details id="edit-list"><summary></summary><ol></ol></details>
 <details id="edit-views"><summary></summary>
 <p class="row"><button data-do="start" title="The exported page opens in this view">start here</button>
 <label>name <input id="edit-name" maxlength="100"></label></p>
@@ -101,9 +137,10 @@ ${NEAR_PANEL}${HISTOGRAM_PANEL}
 <textarea id="edit-text" maxlength="2000" rows="2"></textarea>
 <p class="row"><button data-do="view" title="A view of the same name is replaced">keep view</button></p>
 <ol></ol>${TOUR_ROW}</details>
-<details id="edit-list"><summary></summary><ol></ol></details>
-<details id="edit-commands"><summary>commands</summary><p>The saved edits, applied:</p><pre tabindex="0"></pre>
+<details id="edit-commands"><summary>Commands</summary><p>The saved edits, applied:</p><pre tabindex="0"></pre>
 <p>Video of the camera path (preview: P):</p><pre tabindex="0"></pre></details>
+</div>
+</div>
 </section>`;
 
 const EDIT_HINTS = {
@@ -175,6 +212,7 @@ export class EditPanel {
     this.listKeys();
     this.histogram = new EditHistogram(editor);
     this.floaters = new EditFloaters(editor, this);
+    this.search = new EditSearch(this.root);
     element("edit-near").value = proposedRadius(editor.values);
     this.numbers = { center: this.addNumbers("edit-center"), half: this.addNumbers("edit-half") };
     this.root.addEventListener("click", (event) => this.click(event.target.closest("button")));
@@ -261,6 +299,8 @@ export class EditPanel {
       start: () => editor.startHere(),
       view: () => editor.keepView(element("edit-name").value.trim(), element("edit-text").value.trim()),
       tour: () => editor.tour.guide.toggle(),
+      search: () => this.search.open(),
+      grid: () => editor.chooseGrid(!editor.grid),
       scale: () => editor.setScale(values("edit-length"), element("edit-unit").value),
       measure: () => editor.keepMeasure(element("edit-note").value.trim()),
       "select-shape": () => editor.selectShape(),
@@ -336,6 +376,7 @@ export class EditPanel {
     this.showCounts(history.counts());
     this.button("undo").disabled = !history.done.length;
     this.button("redo").disabled = !history.undone.length;
+    this.button("grid").setAttribute("aria-pressed", Boolean(this.editor.grid));
     this.button("front").setAttribute("aria-pressed", this.editor.frontOnly);
     this.button("close-polygon").disabled = !tools.polygon.canClose;
     this.button("corner-back").disabled = !tools.polygon.corners.length;
@@ -397,7 +438,7 @@ export class EditPanel {
     if (views.start) rows.unshift(row(button("start", "go to the start view", () => editor.goTo(views.start))));
     this.fill("edit-views", rows);
     editor.tour.follow(views);
-    element("edit-views").querySelector("summary").textContent = `views (${rows.length})`;
+    element("edit-views").querySelector("summary").textContent = `Views (${rows.length})`;
     const operations = [...history.done, ...[...history.undone].reverse()];
     const step = (at, text) => {
       const current = { "aria-current": String(at === history.done.length) };
@@ -411,7 +452,7 @@ export class EditPanel {
     const items = operations.map((operation, i) => step(i + 1, describeOperation(operation)));
     if (operations.length) items.unshift(step(0, "as opened"));
     this.fill("edit-list", items);
-    element("edit-list").querySelector("summary").textContent = `operations (${history.done.length})`;
+    element("edit-list").querySelector("summary").textContent = `History (${history.done.length})`;
   }
 
   // Goes to a named view, whose name and text can then be changed.

@@ -354,7 +354,7 @@ export class EditTools {
     const types = target.closest?.("input, textarea, select");
     if (types || event.altKey) return;
     if (event.ctrlKey || event.metaKey) {
-      const undone = { z: event.shiftKey ? "redo" : "undo", y: "redo", s: "store" }[key.toLowerCase()];
+      const undone = { z: event.shiftKey ? "redo" : "undo", y: "redo", s: "store", k: "find" }[key.toLowerCase()];
       if (!undone) return;
       this.take(event);
       this.editor[undone]();

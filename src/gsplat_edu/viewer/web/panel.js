@@ -15,7 +15,7 @@ export class Panel {
     element("fly").addEventListener("click", () => actions.fly());
     element("reset").addEventListener("click", () => actions.reset());
     element("help-button").addEventListener("click", () => this.help());
-    this.folded = new Fold(facts.shared ? "all" : SMALL); // visitors open the controls
+    this.folded = new Fold(facts.shared || facts.edit ? "all" : SMALL); // visitors and the editor have the picture first
     this.fillDegrees(actions);
     this.fillCameras(actions);
     this.atRest();
