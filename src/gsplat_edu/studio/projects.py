@@ -10,8 +10,8 @@ from typing import Any
 from gsplat_edu.base.files import newest_first
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.record import ACTIVE, Job, State
-from gsplat_edu.studio.commands import COLLIDER, EXPORTS, SURFACE
-from gsplat_edu.studio.library import KINDS, Library
+from gsplat_edu.studio.commands import COLLIDER, SURFACE
+from gsplat_edu.studio.library import EXPORTS, KINDS, Library
 from gsplat_edu.studio.origins import makers, origins
 from gsplat_edu.studio.renaming import FormerNames
 

@@ -89,7 +89,6 @@ export async function attempt(pressed, line, act) {
 export function versioned(line, ask, show, after = () => {}) {
   let [asked, failed] = [null, false];
   return {
-    forget: () => (asked = null),
     read(version) {
       if (version === asked) return;
       asked = version;

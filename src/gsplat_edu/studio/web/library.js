@@ -1,8 +1,7 @@
 // The library: everything in the folder, with pictures and states.
 
-import { at, get, post, remove } from "./api.js";
+import { at, get, post } from "./api.js";
 import {
-  announce,
   attempt,
   bytes,
   button,
@@ -20,6 +19,7 @@ import { follow } from "./draft.js";
 import { intake } from "./intake.js";
 import { badge } from "./jobs.js";
 import { nextStep, timeline } from "./project.js";
+import { discard } from "./undo.js";
 
 const KINDS = { photos: "Photos", captures: "Capture", runs: "Run", scenes: "Scene" };
 
@@ -227,9 +227,7 @@ export function management(store, entry) {
   const too = h("label", { class: "check", hidden: true }, all, said);
   const away = button("Move to the trash", () =>
     attempt(away, line, async () => {
-      await remove(at(entry.entry));
-      announce(`Moved ${entry.name} to the trash`);
-      await store.refresh();
+      await discard(store, at(entry.entry), entry.name);
       location.hash = "#/";
     }),
   );

@@ -1,6 +1,6 @@
 // Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
 
-import { at, get, remove } from "./api.js";
+import { at, get } from "./api.js";
 import {
   attempt,
   bytes,
@@ -20,6 +20,7 @@ import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
 import { meshes, newestOf } from "./mesh.js";
+import { discard } from "./undo.js";
 
 const FORMATS = [
   ["html", "HTML page", "one file that shows the scene in any browser, also offline"],
@@ -123,9 +124,7 @@ export function share({ place, store, entry }) {
   function item({ file, command, modified, job: by, bytes: size, psnr }) {
     const onclick = ({ currentTarget }) =>
       attempt(currentTarget, line, async () => {
-        await remove(at(entry.entry, "exports", file));
-        exported.forget();
-        store.refresh();
+        await discard(store, at(entry.entry, "exports", file), file);
       });
     const href = at(entry.entry, "exports", file);
     const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
@@ -138,7 +137,7 @@ export function share({ place, store, entry }) {
         want("strong", { class: "name" }, file),
         want("span", { class: "quiet facts" }, [bytes(size), isVideo(file) ? "" : exact].filter(Boolean).join(" · ")),
         want("a", { href, class: "button", download: file }, "Download"),
-        want("button", { type: "button", onclick }, "Remove"),
+        want("button", { type: "button", onclick }, "Move to the trash"),
       ),
       command ? want("details", {}, want("summary", {}, "The same as a command"), commandLine(command)) : null,
     );
