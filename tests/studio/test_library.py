@@ -335,14 +335,19 @@ def test_a_capture_says_what_the_search_for_its_poses_found(page, studio):
     folder = entry(studio, "captures", "box", cameras__txt=b"")
     assert page.get("/api/captures/box").json()["search"] is None
     (folder / "sfm").mkdir()
-    found = {"photos": {"names": list("abc")}, "mapping": {"names": list("ab")}, "capture": {"error": 0.364}}
+    found = {"photos": {"names": list("abc")}, "mapping": {"names": list("ab")}, "capture": {"error": 0.364, "left_out": ["c"]}}
     stages = {name: {"options": {}, "facts": facts} for name, facts in found.items()}
     file = folder / "sfm" / "stages.json"
     text = json.dumps({"stages": stages})
     file.write_text(text)
-    assert page.get("/api/captures/box").json()["search"] == {"photos": 3, "posed": 2, "error": 0.364}
+    assert page.get("/api/captures/box").json()["search"] == {
+        "photos": 3,
+        "posed": 2,
+        "unplaced": ["c"],
+        "error": 0.364,
+    }
     file.write_text(json.dumps({"stages": stages | {"faces": {"options": {}, "facts": {}}}}))
-    assert page.get("/api/captures/box").json()["search"] == {"photos": None, "posed": None, "error": 0.364}
+    assert page.get("/api/captures/box").json()["search"]["photos"] is None
     unfinished = json.dumps({"stages": stages | {"capture": {"options": {}, "facts": None}}})
     for damaged in ("[]", "{", unfinished, text.replace("0.364", "NaN")):
         file.write_text(damaged)

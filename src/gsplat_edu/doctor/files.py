@@ -80,8 +80,8 @@ def check_poses(survey: Survey) -> list[Finding]:
         Finding(
             "no pose",
             Severity.WARNING if serious else Severity.NOTE,
-            f"{len(survey.unposed)} of {total} photos in the folder, not used",
-            "find poses for the photos that have none: more overlap with their neighbours, or another matching",
+            f"{len(survey.unposed)} of {total} photos could not be placed, and are not used",
+            "take two more photos beside each of those that were not placed, and find the poses again",
             survey.unposed,
             certain=True,
         )

@@ -29,6 +29,7 @@ from gsplat_edu.doctor.photos import PhotoStats, measure_photo, unmeasured
 from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.photos.decoding import PhotoHeaders, recorded_exposure
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.sfm.stages import without_pose
 
 WORKERS = 2
 """Photos decoded at the same time: a JPEG briefly takes up to 40 MB, other formats their full size."""
@@ -87,7 +88,7 @@ class Survey:
         layout: "COLMAP", "transforms.json" or "Blender".
         shots: Readable photos, sorted by name.
         refused: Unusable photos, sorted by name.
-        unposed: Names of photos in the same folders that have no pose.
+        unposed: Names of photos that have no pose: those in the same folders, and those that the search left out.
         points: (N, 3) the capture's own points, world units; N is 0 if it has none.
         notes: Notes of the capture's reader.
         observed: Number of points observed in each photo, by shot name; empty if unknown.
@@ -205,7 +206,7 @@ def _survey(
         capture.layout,
         tuple(shots),
         tuple(refused),
-        _unposed(capture),
+        tuple(dict.fromkeys((*_unposed(capture), *without_pose(reader.path)))),
         _points(capture),
         (*capture.notes, *left, *UnreadColors.of([(shot.name, shot.colors) for shot in shots])),
         observed_points(reader.path) if capture.layout == "COLMAP" else {},

@@ -57,6 +57,14 @@ class _Mapping(Facts, frozen=True):
     unclear: tuple[Text, ...]
 
 
+class _WithoutPose(Record, frozen=True, forbid_unknown_fields=False):
+    """Names of photos in the facts of the stage "capture", by the reason why they have no pose that counts."""
+
+    left_out: tuple[Text, ...] = ()
+    unclear: tuple[Text, ...] = ()
+    doubtful: tuple[Text, ...] = ()
+
+
 FACTS: Mapping[str, type[Facts]] = {
     "frames": Facts,
     "faces": _Faces,
@@ -160,3 +168,17 @@ class Stages:
     def _write(self) -> None:
         with written_aside(self.path) as aside:
             aside.write_text(json.dumps({"stages": self._stages}, indent=1) + "\n", encoding="utf-8")
+
+
+def without_pose(capture: Path) -> tuple[str, ...]:
+    """Return the names of the photos for which the search that made a capture found no pose that counts.
+
+    Args:
+        capture: Its folder; without a record of a search, or with a damaged one, the result is empty.
+    """
+    try:
+        facts = parse_json(read_text(capture / "sfm" / "stages.json"))["stages"]["capture"]["facts"]
+        names = record_of("facts", facts, _WithoutPose)
+    except (OSError, ValueError, KeyError, TypeError, ArgumentError):
+        return ()
+    return (*names.left_out, *names.unclear, *names.doubtful)

@@ -148,7 +148,8 @@ class _State:
             return self._after_training(result)
         if (capture := _newest(filter(_is_posed, _of(group, "captures")))) is not None:
             work = {"command": "train", "subject": capture["entry"], "options": {"quality": "standard"}}
-            return "training", {"label": "Start training", "request": work}
+            start = {"label": "Start training", "request": work}
+            return "training", {"label": "Look at the cameras", "place": capture["entry"], "then": start}
         return self._before_poses(group)
 
     def steps(self, group: Sequence[Facts]) -> list[Facts]:
