@@ -211,7 +211,6 @@ export function showFindings(
     stale && want("p", { class: "error" }, "This has changed since the doctor looked; examine it again."),
     state === "done" && !findings.length && want("p", { class: "good" }, "The doctor found nothing wrong."),
     line,
-    want("ul", { class: "findings" }, items),
     advice.length > 1 && [
       want("p", {}, "Most useful first:"),
       want(
@@ -220,6 +219,7 @@ export function showFindings(
         advice.map((one) => want("li", {}, one)),
       ),
     ],
+    want("ul", { class: "findings" }, items),
     facts.length > 0 &&
       want(
         "details",

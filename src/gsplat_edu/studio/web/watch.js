@@ -68,7 +68,7 @@ export function watch({ place, store, entry }) {
       "div",
       { class: "watch" },
       h("div", { class: "left-side" }, scene.element, slider.element, page.element),
-      h("div", { class: "right-side" }, figures, verdict, next, job.element),
+      h("div", { class: "right-side" }, verdict, next, figures, job.element),
     ),
     h(
       "section",
