@@ -297,7 +297,9 @@ def test_a_gap_to_the_training_views_comes_before_a_longer_training(scene, strat
     assert diagnosis.ranked[0].name == run.verdict.cause == ("few photos" if photos < 30 else "overfitted")
     told = [diagnosis.advice, [event_of(one).advice for one in diagnosis.ranked if one.advice]]
     for advice in told:
-        assert advice[0].startswith("take more photos") and not any("train for" in one for one in advice), advice
+        assert advice[0].startswith("take more photos") and not any("train for" in one for one in advice), (
+            advice
+        )
     assert run.verdict.advice == "Take more photos between the existing ones."
 
 

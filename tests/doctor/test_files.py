@@ -118,7 +118,11 @@ def test_photos_that_a_search_left_out_are_reported_though_the_capture_has_none_
     """The folder of a capture that a search made holds only what has a pose."""
     views, points = orbit
     write_colmap(tmp_path, views[6:], points, np.full_like(points, 0.5))
-    left = {"left_out": ["a.jpg", "day 2/b.jpg"], "unclear": ["c.jpg"], "doubtful": ["d.jpg", "e.jpg", "f.jpg"]}
+    left = {
+        "left_out": ["a.jpg", "day 2/b.jpg"],
+        "unclear": ["c.jpg"],
+        "doubtful": ["d.jpg", "e.jpg", "f.jpg"],
+    }
     stages = {"capture": {"options": {}, "facts": {"error": 0.5, **left}}}
     (tmp_path / "sfm").mkdir()
     (tmp_path / "sfm" / "stages.json").write_text(json.dumps({"stages": stages}))

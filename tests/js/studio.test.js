@@ -63,6 +63,20 @@ test("a new job with the id of a removed one is known before the stream tells of
   assert.equal((await startJob(store, {})).job.state, "queued");
 });
 
+test("what to do while the studio is gone is its whole command", async () => {
+  const start = "gsplat-edu studio '/home/me/my library' --port 8091";
+  globalThis.fetch = async () => Response.json({ trouble: [], start });
+  const store = new Store();
+  await store.refresh();
+  globalThis.fetch = async () => Promise.reject(new TypeError("failed"));
+  await store.refresh();
+  assert.match(store.trouble, /^The studio does not answer\. .* this command and open the address that it prints: /);
+  assert.ok(store.trouble.endsWith(start));
+  globalThis.fetch = async () => new Response("403 Forbidden: open the URL, including its token", { status: 403 });
+  await store.refresh();
+  assert.match(store.trouble, /^The studio was started again\. Open the address/);
+});
+
 test("an older answer about the library does not replace a newer one", async () => {
   const answers = [];
   globalThis.fetch = () => new Promise((resolve) => answers.push(resolve));

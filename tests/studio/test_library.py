@@ -142,7 +142,9 @@ def test_a_removed_export_comes_back_from_the_trash(page, studio):
     assert page.get("/api/trash").json() == {"trash": []}
 
 
-@pytest.mark.parametrize("source", ["runs/../exports", "runs/a/live", "runs/a/exports/b", ".studio/a/exports", "a"])
+@pytest.mark.parametrize(
+    "source", ["runs/../exports", "runs/a/live", "runs/a/exports/b", ".studio/a/exports", "a"]
+)
 def test_a_trash_from_elsewhere_restores_nothing_outside_of_exports(page, studio, source):
     entry(studio, "runs", "a")
     folder = studio.library.hidden("trash") / f"{7:020d}"
@@ -335,7 +337,11 @@ def test_a_capture_says_what_the_search_for_its_poses_found(page, studio):
     folder = entry(studio, "captures", "box", cameras__txt=b"")
     assert page.get("/api/captures/box").json()["search"] is None
     (folder / "sfm").mkdir()
-    found = {"photos": {"names": list("abc")}, "mapping": {"names": list("ab")}, "capture": {"error": 0.364, "left_out": ["c"]}}
+    found = {
+        "photos": {"names": list("abc")},
+        "mapping": {"names": list("ab")},
+        "capture": {"error": 0.364, "left_out": ["c"]},
+    }
     stages = {name: {"options": {}, "facts": facts} for name, facts in found.items()}
     file = folder / "sfm" / "stages.json"
     text = json.dumps({"stages": stages})

@@ -68,12 +68,18 @@ def test_photos_that_were_not_placed_come_first_and_the_next_step_leads_to_the_c
     (capture / "sfm" / "stages.json").write_text(json.dumps({"stages": stages}))
     person = visitor()
     tab = person.tab
-    tab.get_by_role("article", name="lamp").get_by_role("link", name="Next: Look at the cameras, lamp").click()
+    tab.get_by_role("article", name="lamp").get_by_role(
+        "link", name="Next: Look at the cameras, lamp"
+    ).click()
     person.reach("#/captures/lamp")
     missing = tab.get_by_role("group", name="photos that were not placed")
     missing.get_by_text("8 of 20 photos were not placed.").wait_for()
     assert "Take two more photos beside each of them" in missing.inner_text()
-    until_in(tab, tab, "[...document.querySelectorAll('.unplaced img')].filter((one) => one.naturalWidth).length === 8")
+    until_in(
+        tab,
+        tab,
+        "[...document.querySelectorAll('.unplaced img')].filter((one) => one.naturalWidth).length === 8",
+    )
     for later in ("cameras", "training", "photos", "doctor"):
         box = tab.get_by_role("region", name=later).bounding_box()
         assert box["y"] > missing.bounding_box()["y"], later

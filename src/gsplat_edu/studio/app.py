@@ -99,7 +99,7 @@ def application(
     guard = Middleware(Guard, host=host, policy=POLICY, token=token, cookie=cookie)
     patience = Middleware(Patience, seconds=studio.uploads.limits.stall)
     app = Starlette(routes=routes, middleware=[guard, patience], lifespan=lifespan)
-    app.state.studio = studio
+    app.state.studio, app.state.host = studio, host
     return app
 
 

@@ -199,9 +199,7 @@ def _capture_of(studio: Studio, run: Path) -> Path | None:
 
 
 def _source_places(studio: Studio, capture: Path) -> dict[str, str]:
-    """Return the photos that the poses of a capture were searched for, as `_photo_places` does; those without a pose
-    are nowhere else.
-    """
+    """Return the photos of the search that made a capture as `_photo_places` does: those without a pose too."""
     made_by = makers(studio.queue.jobs())
     sources = origins(studio.library, summaries(studio.library), made_by, studio.former)
     source = sources.get(studio.library.name(capture))

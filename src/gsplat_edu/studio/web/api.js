@@ -7,8 +7,16 @@ export class ApiError extends Error {
   }
 }
 
-const GONE = "The studio does not answer. Start it again with: gsplat-edu studio";
-const LOCKED = "This page belongs to an earlier start of the studio. Open the URL that it printed last.";
+let start = ""; // the command that starts the studio again, which only the studio knows
+const LOCKED = "The studio was started again. Open the address that it printed last in its terminal.";
+
+export const startsBy = (command) => (start = command);
+
+// What to do while the studio does not answer.
+export const gone = () => {
+  const how = start ? `this command and open the address that it prints: ${start}` : "the same command as before.";
+  return `The studio does not answer. If it has ended, start it again in a terminal with ${how}`;
+};
 
 // "captures/NAME" or parts of a path as an address.
 export const at = (...parts) => `/api/${parts.join("/").split("/").map(encodeURIComponent).join("/")}`;
@@ -26,7 +34,7 @@ async function ask(method, address, body) {
   const given =
     body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
   const answer = await fetch(address, { method, ...given }).catch(() => {
-    throw new ApiError(GONE, 0);
+    throw new ApiError(gone(), 0);
   });
   const isJson = (answer.headers.get("content-type") ?? "").startsWith("application/json");
   const text = method === "HEAD" && isJson ? await fetch(address).then((other) => other.text()) : await answer.text();
