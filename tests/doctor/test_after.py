@@ -284,7 +284,7 @@ def test_a_short_training_is_reported(scene, reached, gain, severity, says):
 @pytest.mark.parametrize("strategy", ["fast", "adc"])
 @pytest.mark.parametrize("photos", [12, 60])
 def test_a_gap_to_the_training_views_comes_before_a_longer_training(scene, strategy, photos):
-    """14.3 dB between training and held-out views, after a fraction of the usual length, with a PSNR that still rose."""
+    """14.3 dB between training and held-out views, after a short training whose PSNR still rose."""
     gaussians, views = scene
     run = trained(gaussians, views, reached=900, planned=900, capture=Path("a"), strategy=strategy)
     run = replace(

@@ -120,7 +120,11 @@ def test_a_photo_waits_for_the_picture_of_its_view(visitor, runs):
         tab.get_by_text("Drawing this view ...").wait_for()
         assert not photo.is_visible() and tab.get_by_label("Photo ↔ render").is_disabled()
         frame.evaluate("viewer.frameAsked = 0; held.splice(0).forEach((draw) => draw())")
-        until_in(tab, frame, "viewer.isWhole || (viewer.frameAsked = 0, held.splice(0).forEach((draw) => draw()), false)")
+        until_in(
+            tab,
+            frame,
+            "viewer.isWhole || (viewer.frameAsked = 0, held.splice(0).forEach((draw) => draw()), false)",
+        )
         photo.wait_for()
         name = view.locator("option").nth(index).inner_text().split(" ")[0]
         assert name in photo.get_attribute("src")

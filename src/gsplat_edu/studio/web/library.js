@@ -66,13 +66,8 @@ export function searchOf({ search }) {
   return [all, `mean error ${search.error.toFixed(2)} px`].filter(Boolean).join(", ");
 }
 
-// Address of a small picture of an entry; null if there is none.
+// Address of a small picture of photos; null if there is none.
 async function pictureOf(entry) {
-  if (entry.kind === "runs") {
-    if (entry.psnr === null) return null; // nothing is rendered yet
-    const { views } = await get(at(entry.entry, "views"));
-    return views.length ? at(entry.entry, "views", String(views.at(-1).index), "render.jpg") : null;
-  }
   if (!entry.photos) return null;
   const { photos } = await get(at(entry.entry, "photos"));
   const good = photos.find(({ problem }) => !problem);
@@ -159,8 +154,9 @@ function picture(element, entry) {
   const version = `${entry.entry} ${entry.modified} ${entry.files} ${entry.finished}`;
   if (element.version === version) return;
   element.version = version;
-  if (entry.kind === "scenes") {
-    element.cover = entry.file && `${at(entry.entry, "cover")}?of=${entry.modified}`;
+  if (entry.kind === "scenes" || entry.kind === "runs") {
+    const isThere = entry.kind === "runs" ? entry.psnr !== null : entry.file;
+    element.cover = isThere && `${at(entry.entry, "cover")}?of=${entry.modified}`;
     covers.unobserve(element);
     covers.observe(element); // tells at once if it is seen
     return;
