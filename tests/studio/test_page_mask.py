@@ -242,7 +242,7 @@ def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swa
             }""",
             address,
         )
-    assert answer[0] == 409 and "is used by job" in answer[1] and (swapped / DRAWN).exists()
+    assert answer[0] == 409 and "is used by “" in answer[1] and (swapped / DRAWN).exists()
     assert job.work.inputs == ("captures/wrong",)
 
 

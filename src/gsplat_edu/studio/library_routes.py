@@ -184,5 +184,5 @@ async def _upload_zip(request: Request) -> Response:
 def _length(request: Request) -> int | None:
     length = content_length(request)
     if length == 0:
-        raise RefusedError("file: is empty; send its bytes as the body")
+        raise RefusedError("file: is empty; choose another one")
     return length

@@ -24,7 +24,8 @@ export const at = (...parts) => `/api/${parts.join("/").split("/").map(encodeURI
 const lineOf = (status, text) => {
   if (status === 403) return text.includes("token") ? LOCKED : text.trim();
   try {
-    return JSON.parse(text).error;
+    const { plain, error } = JSON.parse(text);
+    return plain ?? error;
   } catch {
     return text.trim().split("\n")[0] || `The studio answered ${status}.`;
   }
@@ -50,7 +51,7 @@ async function quietly(method, address) {
     if (error instanceof SyntaxError) return ""; // it has come in between, and is no JSON
     throw error;
   });
-  if (typeof found?.error === "string") throw new ApiError(found.error, found.status);
+  if (typeof found?.error === "string") throw new ApiError(found.plain ?? found.error, found.status);
   return found;
 }
 

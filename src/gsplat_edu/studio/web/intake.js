@@ -95,8 +95,9 @@ class Batch {
 
   refuse(name, error) {
     this.refused += 1;
-    const repeated = `file: '${name}' `; // some of the server's lines begin so
-    const what = error.message.startsWith(repeated) ? error.message.slice(repeated.length) : error.message;
+    const base = name.split("/").at(-1); // some of the server's sentences begin with it
+    const repeated = [`'${base}' `, `“${base}” `].find((start) => error.message.startsWith(start)) ?? "";
+    const what = error.message.slice(repeated.length);
     this.errors.append(h("li", { class: "error" }, h("strong", {}, name), ": ", what));
   }
 

@@ -113,7 +113,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     waits.textContent = job.state === "queued" ? waitingFor(store, job.waits_for) : "";
     waits.hidden = !waits.textContent;
     line.classList.toggle("error", job.state !== "cancelled"); // stopping is no error
-    if (job.line) put(line, job.line);
+    if (job.line) put(line, job.plain ?? job.line);
     pause.hidden = job.state !== "running" || job.cancelling;
     resume.hidden = !(job.state === "paused" || (job.resumable && !found.active));
     resume.textContent = { failed: "Try again", held: "Start" }[job.state] ?? "Resume";
