@@ -119,6 +119,10 @@ def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_ent
     tab.get_by_label("HTML page").check()
     box.check()
     tab.get_by_label("Title and name of the file").fill("both")
+    go(tab, "scenes/wall")
+    go(tab, "scenes/wall/share")
+    assert tab.get_by_label("Title and name of the file").input_value() == "both", "it is remembered"
+    box.check()
     tab.get_by_role("button", name="Export").click()
     listed.filter(has_text="both.html").wait_for()
     command = person.command("export of both.html")

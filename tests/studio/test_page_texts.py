@@ -21,7 +21,8 @@ CARDS = """async ([text, left]) => {
   const states = ["running", "paused", "queued", "failed", "cancelled", "interrupted", "held", "done"];
   const cards = states.map((state, index) => {
     const id = String(index + 1).padStart(6, "0");
-    const view = store.put({ ...job, id, state, line: /ed$/.test(state) ? text : "", waits_for: state === "queued" ? waits : [] });
+    const [line, waits_for] = [/ed$/.test(state) ? text : "", state === "queued" ? waits : []];
+    const view = store.put({ ...job, id, state, line, waits_for });
     const events = [
       { event: "stage", name: "reading photos" },
       { event: "stage", name: text },

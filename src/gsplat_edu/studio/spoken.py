@@ -34,7 +34,8 @@ ITSELF = "It"
 _PROGRAM = re.compile(r"gsplat-edu \S+: ")
 _SUBJECT = re.compile(r"((?:job )?\S[^:;]{0,300}): +(?=\S)")
 _PATH = re.compile(
-    r"'?(?<![\w.:/])/(?:[^/:;,']+/)*([^/\s:;,'][^/:;,']*?)'?(?= (?:is|has|does|holds|overlaps|leads|exists|cannot)\b|[:;,.)]|$)"
+    r"'?(?<![\w.:/])/(?:[^/:;,']+/)*([^/\s:;,'][^/:;,']*?)'?"
+    r"(?= (?:is|has|does|holds|overlaps|leads|exists|cannot)\b|[:;,.)]|$)"
 )
 _COMMAND = re.compile(r"--[a-z]|gsplat-edu |\.jsonl?\b|docs/")
 _ALTERNATIVE = re.compile(r",? or (?:set|give|use|by|with) --[\w-]+")

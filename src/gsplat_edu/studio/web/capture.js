@@ -87,7 +87,17 @@ function training({ main, store }, entry) {
   const missing = h("div", {});
   const runs = h("ul", { class: "plain" });
   const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
-  main.append(head.element, missing, taken.element, start.element, past, checked.element, pictures.element, line, later);
+  main.append(
+    head.element,
+    missing,
+    taken.element,
+    start.element,
+    past,
+    checked.element,
+    pictures.element,
+    line,
+    later,
+  );
   let version = entry.modified;
   return {
     close: () => taken.close(),

@@ -148,6 +148,14 @@ export function leftOf({ done, total, seconds_left: left, is_least: isLeast }, i
     : `${share}, ${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
 }
 
+// Why there is no picture of a training yet.
+export function waitsFor(view) {
+  if (view?.job.state === "queued") return "This training waits for other jobs.";
+  const { progress, stage } = view ?? {};
+  const share = progress?.total ? `, ${Math.floor((100 * progress.done) / progress.total)} %` : "";
+  return stage ? `The picture comes with the training. First: ${stage}${share}.` : "The training is starting.";
+}
+
 // The newest job about an entry; the card is replaced when another job begins.
 export function jobPlace(store, subject, commands, options = {}) {
   const element = h("div", { class: "job-place" });

@@ -1,23 +1,10 @@
 // The library: everything in the folder, with pictures and states.
 
 import { at, get, post } from "./api.js";
-import {
-  attempt,
-  bytes,
-  button,
-  count,
-  errorLine,
-  h,
-  heading,
-  link,
-  patch,
-  put,
-  want,
-  whole,
-} from "./dom.js";
+import { attempt, bytes, button, count, errorLine, h, heading, link, patch, put, want, whole } from "./dom.js";
 import { follow } from "./draft.js";
 import { intake } from "./intake.js";
-import { badge } from "./jobs.js";
+import { badge, leftOf } from "./jobs.js";
 import { nextStep, timeline } from "./project.js";
 import { discard } from "./undo.js";
 
@@ -82,6 +69,8 @@ function card(store, project) {
     h("span", { class: "facts quiet" }),
     h("span", { class: "states" }),
   ];
+  const [bar, left] = [h("progress", { max: 1, value: 0 }), h("span", { class: "left quiet" })];
+  const running = h("div", { class: "progress", hidden: true }, bar, left);
   const top = h(
     "a",
     { class: "card" },
@@ -97,6 +86,7 @@ function card(store, project) {
     "article",
     { class: "project" },
     top,
+    running,
     stages.element,
     next.element,
     h("details", {}, summary, list),
@@ -111,6 +101,15 @@ function card(store, project) {
     facts.textContent = factsOf(present).filter(Boolean).join(" · ");
     const all = entries.map((entry) => stateOf(store, entry));
     patch(states, badges(all.findLast(Boolean)));
+    const view = entries.flatMap((entry) => store.jobsOf(entry.entry)).find(({ job }) => job.state === "running");
+    running.hidden = !view;
+    if (view) {
+      const { progress, stage, job } = view;
+      bar.setAttribute("aria-label", `progress of ${job.title}`);
+      if (progress?.total) [bar.max, bar.value] = [progress.total, progress.done];
+      else bar.removeAttribute("value");
+      left.textContent = `${stage || job.title}${progress?.total ? `: ${leftOf(progress, view.stages.length > 1)}` : ""}`;
+    }
     stages.update(now);
     next.update(now, now.next);
     summary.textContent = `Everything in it (${entries.length})`;

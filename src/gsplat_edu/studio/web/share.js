@@ -36,7 +36,15 @@ const isVideo = (file) => /\.mp4$/i.test(file);
 
 export function share({ place, store, entry }) {
   const line = errorLine();
-  const title = h("input", { id: "title", type: "text", required: true, value: entry.name, autocomplete: "off" });
+  const known = `title of ${entry.entry}`; // the browser remembers what was typed
+  const title = h("input", {
+    id: "title",
+    type: "text",
+    required: true,
+    value: localStorage.getItem(known) ?? entry.name,
+    autocomplete: "off",
+    onchange: () => (title.value ? localStorage.setItem(known, title.value) : localStorage.removeItem(known)),
+  });
   const edits = h("input", { type: "checkbox", checked: true });
   const withEdits = h("label", { class: "check", hidden: true }, edits, " apply the edits");
   const surface = h("input", { type: "checkbox" });

@@ -44,7 +44,14 @@ export function trash({ main, store }) {
     );
   }
 
-  main.append(heading(1, "Trash"), empty, list, h("p", { class: "row" }, clear), line, h("p", {}, link("Back to the library", "#/")));
+  main.append(
+    heading(1, "Trash"),
+    empty,
+    list,
+    h("p", { class: "row" }, clear),
+    line,
+    h("p", {}, link("Back to the library", "#/")),
+  );
   attempt(null, line, read);
   return {};
 }

@@ -5,7 +5,7 @@ import { decibels, duration, h, heading, link, patch, put, want, whole } from ".
 import { verdictOf } from "./judge.js";
 import { curve } from "./curves.js";
 import { beside, frame } from "./frame.js";
-import { jobPlace } from "./jobs.js";
+import { jobPlace, waitsFor } from "./jobs.js";
 import { addressOf } from "./library.js";
 
 const EVERY = 2000; // milliseconds between two looks at the curves
@@ -141,8 +141,7 @@ export function watch({ place, store, entry }) {
         seen = phase;
         readCurves();
       }
-      const waits =
-        view?.job.state === "queued" ? "This training waits for other jobs." : "The training has not begun yet.";
+      const waits = waitsFor(view);
       page.element.hidden = active;
       if (active && view.job.state !== "queued" && now.files) scene.show(at(entry.entry, "live", "page"), waits);
       else if (active) scene.show(null, waits);
