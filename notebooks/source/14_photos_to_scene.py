@@ -44,8 +44,8 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import advice_lines, diagnosis_lines
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.doctor.diagnosis import advice_lines, diagnosis_lines
+from gsplat_edu.survey.capture import prepare
 from gsplat_edu.evaluate.metrics import psnr, summarize, to_bytes
 from gsplat_edu.render.numpy_reference import project
 from gsplat_edu.runs.training import CaptureRun, RunOptions
