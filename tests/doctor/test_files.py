@@ -12,8 +12,9 @@ from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.certain import certain_findings, known_photos
-from gsplat_edu.doctor.finding import Severity, advice_lines
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.doctor.diagnosis import advice_lines
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.finding import Severity
 
 
 @pytest.fixture

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from gsplat_edu.data.notes import MissingPhotos
-from gsplat_edu.doctor.finding import Finding, Severity, counted, listed
-from gsplat_edu.doctor.survey import Survey
 from gsplat_edu.evaluate.verdict import UNPOSED
+from gsplat_edu.survey.capture import Survey
+from gsplat_edu.survey.finding import Finding, Severity, counted, listed
 
 FEW = 12
 """Warn about fewer photos than this: on an orbit of 12, neighbours are 30 degrees apart, about the limit of feature

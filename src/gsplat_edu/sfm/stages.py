@@ -12,10 +12,8 @@ from msgspec import Meta
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
-from gsplat_edu.base.records import Number, Record, record_of
+from gsplat_edu.base.records import Number, Record, Text, record_of
 
-# a text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)
-Text = Annotated[str, Meta(pattern=r"^[^\x00\ud800-\udc7f\udd00-\udfff]*\Z(?#the name or path of a file)")]
 Model = Annotated[str, Meta(pattern=r"^models/\d{1,4}/\d{1,4}\Z(?#the folder of a model)")]
 FileName = Annotated[
     str, Meta(pattern=r"^(?!\.)[^/\\\x00\ud800-\udc7f\udd00-\udfff]{1,255}\Z(?#a file name)")
@@ -55,14 +53,6 @@ class _Mapping(Facts, frozen=True):
     names: tuple[Text, ...]
     doubtful: tuple[Text, ...]
     unclear: tuple[Text, ...]
-
-
-class _WithoutPose(Record, frozen=True, forbid_unknown_fields=False):
-    """Names of photos in the facts of the stage "capture", by the reason why they have no pose that counts."""
-
-    left_out: tuple[Text, ...] = ()
-    unclear: tuple[Text, ...] = ()
-    doubtful: tuple[Text, ...] = ()
 
 
 FACTS: Mapping[str, type[Facts]] = {
@@ -168,17 +158,3 @@ class Stages:
     def _write(self) -> None:
         with written_aside(self.path) as aside:
             aside.write_text(json.dumps({"stages": self._stages}, indent=1) + "\n", encoding="utf-8")
-
-
-def without_pose(capture: Path) -> tuple[str, ...]:
-    """Return the names of the photos for which the search that made a capture found no pose that counts.
-
-    Args:
-        capture: Its folder; without a record of a search, or with a damaged one, the result is empty.
-    """
-    try:
-        facts = parse_json(read_text(capture / "sfm" / "stages.json"))["stages"]["capture"]["facts"]
-        names = record_of("facts", facts, _WithoutPose)
-    except (OSError, ValueError, KeyError, TypeError, ArgumentError):
-        return ()
-    return (*names.left_out, *names.unclear, *names.doubtful)

@@ -13,11 +13,11 @@ from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.base.text import legible
+from gsplat_edu.data.left_out import without_pose
 from gsplat_edu.data.reader import layout_of
 from gsplat_edu.evaluate.verdict import verdict
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.server.refusal import RefusedError
-from gsplat_edu.sfm.stages import without_pose
 from gsplat_edu.studio.contents import extent_of
 from gsplat_edu.studio.library import KINDS, Library, scene_file
 

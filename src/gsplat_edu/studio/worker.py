@@ -309,7 +309,7 @@ def certain(capture: str) -> dict[str, Any]:
     from gsplat_edu.base.errors import DatasetError
     from gsplat_edu.data.reader import CaptureReader
     from gsplat_edu.doctor.certain import certain_findings
-    from gsplat_edu.doctor.finding import event_of
+    from gsplat_edu.doctor.diagnosis import event_of
 
     try:
         return {"findings": [asdict(event_of(one)) for one in certain_findings(CaptureReader(capture))]}

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.paths.orbits import common_up, orbit_of_scene
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.survey.geometry import FORWARD, INWARD, Geometry
 
 SIDE = 800
 """Size of the initial image if there is no camera, px; the page replaces it by the window's size."""
