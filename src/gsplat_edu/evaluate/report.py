@@ -246,7 +246,7 @@ def _typical(pictures: Sequence[Picture], scores: Sequence[ImageScore]) -> Pictu
 
 def _opening(found: Verdict, picture: Picture | None, scores: Sequence[ImageScore]) -> str:
     """Show a typical view, photo against render, and say how good the scene is; the figures are folded."""
-    said = f'<p class="banner {found.grade.lower()}">{html.escape(str(found))}</p>\n'
+    said = f'<p class="verdict {found.grade.lower()} banner">{html.escape(str(found))}</p>\n'
     details = f"<p>{html.escape(found.details)}</p>\n" if found.details else ""
     shown = ""
     if picture is not None:
@@ -254,7 +254,7 @@ def _opening(found: Verdict, picture: Picture | None, scores: Sequence[ImageScor
         shown = f"<figure><div>{slider_pair(picture.name, (photo, above), (render, below))}</div></figure>\n"
         caption = f'{_scored(picture, scores)} <span class="quiet">(above: {difference})</span>'
         details += f"<figure>{jpeg_image(difference, apart)}<figcaption>{caption}</figcaption></figure>\n"
-    return f'<div class="opening">\n{shown}<div>{said}{folded("Details", details)}</div>\n</div>\n'
+    return f'<div class="opening">\n{shown}<div>\n{said}{folded("Details", details)}</div>\n</div>\n'
 
 
 def _cells(report: Report) -> str:
