@@ -223,7 +223,7 @@ def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swa
     part.get_by_role("button", name="Mask this: view_005.png").first.click()
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
-    until_in(tab, tab, "document.querySelector('.sheet img').complete")
+    until_in(tab, tab, "document.querySelector('.painted img').complete")
     draw(tab, dialog.locator("svg").bounding_box(), (10, 10), (80, 60))
     saved(dialog)
     dialog.get_by_role("button", name="Close").click()

@@ -12,6 +12,7 @@ from typing import Any
 
 from gsplat_edu.base import constants
 from gsplat_edu.base.content_policy import content_policy, policy_element
+from gsplat_edu.base.styles import tokens
 from gsplat_edu.viewer.modules import script, web
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "mesh.vert", "mesh.frag")
@@ -109,7 +110,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
 
 
 def _style(kind: Kind) -> str:
-    return "".join(web(name) for name in ("style.css", *kind.styles))
+    return tokens() + "".join(web(name) for name in ("style.css", *kind.styles))
 
 
 def _text_element(name: str, text: str) -> str:

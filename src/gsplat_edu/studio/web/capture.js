@@ -136,7 +136,14 @@ function startForm(store, entry, draw) {
     const facts = h("span", { class: "forecast quiet" }, "\u00a0");
     said.set(value, facts);
     const input = h("input", { type: "radio", name: "quality", value, checked: index === 1 });
-    return h("label", { class: "choice" }, input, h("strong", {}, title), h("span", { class: "quiet" }, hint), facts);
+    return h(
+      "label",
+      { class: "choice card" },
+      input,
+      h("strong", {}, title),
+      h("span", { class: "quiet" }, hint),
+      facts,
+    );
   });
   const more = choices(draw);
   const name = h("input", {

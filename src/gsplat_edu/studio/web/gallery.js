@@ -1,7 +1,7 @@
 // Previews of photos, and what the doctor says about them.
 
 import { at, get, post } from "./api.js";
-import { announce, attempt, bytes, count, errorLine, h, heading, patch, want } from "./dom.js";
+import { announce, attempt, bytes, count, errorLine, h, heading, patch, toned, want } from "./dom.js";
 import { drawMask } from "./mask.js";
 
 const FEW = 8; // pictures of photos that were not placed
@@ -190,14 +190,8 @@ export function showFindings(
       });
       return want(
         "li",
-        { class: `finding ${severity}`, "data-key": name },
-        want(
-          "p",
-          {},
-          want("span", { class: `badge ${severity}` }, SEVERITIES[severity] ?? severity),
-          " ",
-          want("strong", {}, name),
-        ),
+        { class: "finding card", "data-key": name },
+        want("p", {}, toned(severity, SEVERITIES[severity] ?? severity), " ", want("strong", {}, name)),
         want("p", {}, sentence),
         what && want("p", { class: "quiet" }, what),
         pictures.length ? want("div", { class: "figures" }, pictures) : null,
@@ -209,7 +203,7 @@ export function showFindings(
   patch(
     place,
     stale && want("p", { class: "error" }, "This has changed since the doctor looked; examine it again."),
-    state === "done" && !findings.length && want("p", { class: "good" }, "The doctor found nothing wrong."),
+    state === "done" && !findings.length && want("p", { class: "banner good" }, "The doctor found nothing wrong."),
     line,
     advice.length > 1 && [
       want("p", {}, "Most useful first:"),

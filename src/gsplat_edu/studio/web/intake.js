@@ -80,9 +80,9 @@ class Batch {
     this.stop = button("Stop", () => this.stopping.abort());
     this.element = h(
       "article",
-      { class: "job" },
+      { class: "job card" },
       heading(3, `${kind}/${name}`),
-      h("div", { class: "row progress" }, this.bar, this.text, this.stop),
+      h("div", { class: "progress" }, this.bar, this.text, this.stop),
       this.errors,
     );
   }

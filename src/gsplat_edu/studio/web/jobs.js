@@ -1,7 +1,7 @@
 // Jobs: how far each one is, its buttons, and the command that repeats it.
 
 import { at, get, post, remove } from "./api.js";
-import { attempt, button, commandLine, duration, errorLine, h, heading, link, patch, put, want } from "./dom.js";
+import { attempt, button, commandLine, duration, errorLine, h, heading, link, patch, put, toned, want } from "./dom.js";
 
 const STATES = {
   held: "waits for you",
@@ -18,7 +18,7 @@ const STATES = {
 const REMOVE = "Remove from the list";
 
 // For patch().
-export const badge = (state) => want("span", { class: `badge ${state}` }, STATES[state] ?? state);
+export const badge = (state) => toned(state, STATES[state] ?? state);
 
 // Starts a job; its answer is in the store when this returns.
 export async function startJob(store, request) {
@@ -71,10 +71,10 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const command = h("div", {});
   const element = h(
     "article",
-    { class: "job", "aria-label": view.job.title },
+    { class: "job card", "aria-label": view.job.title },
     h("div", { class: "row" }, heading(level, view.job.title), state),
     stages,
-    h("div", { class: "row progress" }, bar, left),
+    h("div", { class: "progress" }, bar, left),
     said,
     waits,
     line,

@@ -84,7 +84,7 @@ function card(store, project) {
   const [summary, list] = [h("summary", {}), h("ul", { class: "plain" })];
   const element = h(
     "article",
-    { class: "project" },
+    { class: "project card" },
     top,
     running,
     stages.element,

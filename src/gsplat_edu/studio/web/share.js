@@ -66,7 +66,7 @@ export function share({ place, store, entry }) {
   const note = h("p", { class: "quiet" });
   const choices = FORMATS.map(([value, name, hint], index) => {
     const input = h("input", { type: "radio", name: "format", value, checked: index === 0, onchange: () => explain() });
-    return h("label", { class: "choice" }, input, h("strong", {}, name), h("span", { class: "quiet" }, hint));
+    return h("label", { class: "choice card" }, input, h("strong", {}, name), h("span", { class: "quiet" }, hint));
   });
   const form = h("form", { id: "export", "data-next": `convert ${entry.entry}` });
   const make = h("button", {}, "Export");
@@ -138,7 +138,7 @@ export function share({ place, store, entry }) {
     const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
     return want(
       "li",
-      { "data-key": `${file} ${modified} ${by}` },
+      { "data-key": `${file} ${modified} ${by}`, class: "card" },
       want(
         "div",
         { class: "row" },

@@ -79,7 +79,7 @@ export function undoBegun(store, entry) {
     }),
   );
   const said = h("span", {});
-  const element = h("div", { class: "begun", hidden: true }, h("p", { class: "row" }, said, undo, keep), line);
+  const element = h("div", { class: "begun", hidden: true }, h("p", { class: "toast" }, said, undo, keep), line);
   return {
     element,
     update() {

@@ -55,7 +55,7 @@ export function watch({ place, store, entry }) {
   const slider = beside(scene, captureOf);
   const page = edited(store, entry);
   const job = jobPlace(store, entry.entry, ["train"], { main: true, level: 2 });
-  const figures = h("dl", { class: "figures-list" });
+  const figures = h("dl", { class: "figures-list card" });
   const curves = {
     loss: curve("Loss", (value) => value.toPrecision(3)),
     psnr: curve("PSNR", decibels),
