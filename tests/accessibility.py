@@ -1,7 +1,9 @@
-"""Faults of accessibility that axe-core finds in pages."""
+"""Faults of accessibility that axe-core finds in pages, and the contrast of colours."""
 
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from waiting import resize
@@ -53,3 +55,24 @@ def grave_faults_in_all_styles(tab):
         resize(tab, width, height)
         found += [f"{width} px, {scheme}: {fault}" for fault in grave_faults(tab)]
     return found
+
+
+def numbers(color):
+    """Return red, green and blue from 0 to 255 and the opacity of a computed colour, (4,)."""
+    found = [float(number) for number in re.findall(r"[\d.]+", color)]
+    return np.array([*found, 1.0][:4])
+
+
+def contrast(one, other):
+    """Return the contrast ratio of WCAG 2 of two colours, red, green and blue from 0 to 255."""
+    low, high = sorted((_luminance(one), _luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def _luminance(color):
+    value = np.asarray(color) / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) @ (
+        0.2126,
+        0.7152,
+        0.0722,
+    )

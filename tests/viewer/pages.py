@@ -105,6 +105,11 @@ class Visit:
         for key in keys:
             self.tab.keyboard.press(key)
 
+    def open_controls(self):
+        """Open the sheet with numbers and controls, which a visitor's page keeps closed."""
+        self.tab.click("#fold")
+        return self
+
     def camera(self):
         """Return the camera of the current view."""
         found = self.evaluate("viewer.camera()")

@@ -15,13 +15,14 @@ from viewer.handles import until
 from waiting import FRAMES, awaited, resize
 
 SIZE = (640, 400)
-MIDDLE = (400, 250)  # right of the panel
+MIDDLE = (130, 180)  # left of the controls
 
 
 @pytest.fixture
 def tour(show, random_gaussians, three_views):
-    """Open a small page with three cameras."""
-    return show(random_gaussians(60), three_views, width=SIZE[0], height=SIZE[1], has_touch=True, fresh=True)
+    """Open a small page with three cameras, and its controls."""
+    size = {"width": SIZE[0], "height": SIZE[1]}
+    return show(random_gaussians(60), three_views, **size, has_touch=True, fresh=True).open_controls()
 
 
 def pivot(visit):
@@ -29,13 +30,13 @@ def pivot(visit):
 
 
 def drag(visit, dx, dy, button="left"):
-    """Drag from the middle; return the camera afterwards."""
+    """Drag beside the controls; return the camera afterwards."""
     gestures.drag(visit.tab, MIDDLE, (MIDDLE[0] + dx, MIDDLE[1] + dy), button=button)
     return visit.camera()
 
 
 def touch(visit, before, after):
-    """Put fingers down, move and lift them; positions are (right, down) from the middle."""
+    """Put fingers down, move and lift them; positions are (right, down) from `MIDDLE`."""
     session = visit.tab.context.new_cdp_session(visit.tab)
     for kind, places in (("touchStart", before), ("touchMove", after), ("touchEnd", ())):
         gestures.touch(session, kind, *((MIDDLE[0] + x, MIDDLE[1] + y) for x, y in places))
@@ -135,8 +136,8 @@ def test_keys_move_along_the_cameras_axes_while_they_are_held_and_show_help(tour
     assert tour.tab.is_hidden("#help")
 
     tour.tab.wait_for_selector("#rate:empty", state="attached")
-    text = tour.tab.inner_text("#panel")
-    assert "reflections" in text and "harmonics" not in text and "rest" not in text
+    text = tour.open_controls().tab.inner_text("#tools")
+    assert "Shine" in text and "harmonics" not in text and "rest" not in text
     assert tour.tab.locator("#degree option").all_inner_texts() == ["off", "1 of 3", "2 of 3", "full"]
 
 
@@ -198,7 +199,7 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
         views.append(
             (f"{angle:.2f}", Camera(look_at(eye, (0, 0, 0)), eye, 300.0, 300.0, 80.0, 120.0, H=240, W=400))
         )
-    page.write(tmp_path / "ball.html", Scene(ball), views)
+    (tmp_path / "ball.html").write_bytes(page.html(Scene(ball), views))
     seen = visit(390, 844).open(tmp_path / "ball.html").ready()
     covered = seen.evaluate("viewer.panel.covered()")
     assert covered > 0
@@ -219,7 +220,7 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
 def test_the_page_fits_a_phone_and_follows_its_colours(
     visit, tmp_path, random_gaussians, three_views, scheme
 ):
-    page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views)
+    (tmp_path / "a.html").write_bytes(page.html(Scene(random_gaussians(9)), three_views))
     seen = visit(390, 844, color_scheme=scheme, has_touch=True).open(tmp_path / "a.html").ready()
     assert not seen.tab.is_visible("#tools"), "the panel is closed at first"
     resize(seen.tab, 1200, 844)
@@ -248,7 +249,7 @@ def test_the_page_fits_a_phone_and_follows_its_colours(
 
 def test_held_out_cameras_are_marked_and_none_is_the_start(visit, tmp_path, random_gaussians, three_views):
     page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views, held_out={"first"})
-    seen = visit().open(tmp_path / "a.html").ready()
+    seen = visit(640, 480).open(tmp_path / "a.html").ready().open_controls()
     seen.tab.click("#cameras summary")
     names = seen.tab.locator("#cameras button").all_inner_texts()
     assert names == ["photo 1 held out", "photo 2", "photo 3"]
@@ -346,7 +347,6 @@ def test_one_click_or_two_distant_clicks_do_not_set_the_pivot(wall):
 )
 def test_the_help_matches_the_visitors_device(show, random_gaussians, options, shown):
     seen = show(random_gaussians(9), width=390, height=600, fresh=True, **options)
-    seen.tab.click("#fold")
     seen.tab.click("#help-button")
     visible = seen.tab.locator("#help tr:visible")
     assert visible.count() > 3
@@ -390,5 +390,5 @@ def test_arrows_orbit_with_shift_and_without_cameras_to_step_through(show, rando
     assert orbits(seen, "Shift+ArrowRight") and orbits(seen, "ArrowUp")
     seen.press("ArrowRight")
     assert any(stands_at(seen, camera) for _, camera in three_views), "as before: the next camera"
-    seen.tab.focus("#degree")
+    seen.open_controls().tab.focus("#degree")
     assert not orbits(seen, "ArrowDown"), "the panel keeps its keys"

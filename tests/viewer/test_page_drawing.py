@@ -80,7 +80,7 @@ def test_scenes_of_lower_degrees(show, random_gaussians, camera, rest):
 
 def test_a_lower_degree_is_chosen(show, random_gaussians, camera):
     gaussians = random_gaussians(300)
-    visit = show(gaussians, [("first", camera)], PLAIN)
+    visit = show(gaussians, [("first", camera)], PLAIN).open_controls()
     for degree in (0, 2, 3):
         visit.tab.select_option("#degree", str(degree))
         assert likeness(drawn, visit, gaussians, camera, replace(PLAIN, sh_degree=degree)) >= ALIKE

@@ -67,6 +67,7 @@ def test_a_box_shows_and_hides_the_outlines(shown):
         return canvas.toDataURL() === blank.toDataURL() ? 0 : 1;
     }"""
     assert tab.evaluate(drawn) == 0
+    tab.click("#fold")
     tab.locator("#cameras summary").click()
     box = tab.get_by_label("show in the scene")
     box.check()

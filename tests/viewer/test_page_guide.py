@@ -80,7 +80,7 @@ def becomes(seen, x, y, color):
 def test_the_tour_goes_by_keys(shown):
     seen, (first, _, last) = shown(), cameras()
     tab = seen.tab
-    assert tab.inner_text("#tour") == "guided tour (2)" and not tab.is_visible("#guide")
+    assert tab.inner_text("#tour") == "Guided tour (2)" and not tab.is_visible("#guide")
     tab.keyboard.press("t")
     arrives(seen, first)
     assert tab.inner_text("#guide h2") == "1. Door"
@@ -100,7 +100,7 @@ def test_the_tour_goes_by_keys(shown):
     tab.keyboard.press("Escape")
     assert not tab.is_visible("#guide")
     tab.keyboard.press("ArrowRight")
-    assert tab.inner_text("#views [aria-current=true]") == "Bookmark", (
+    assert tab.text_content("#views [aria-current=true]") == "Bookmark", (
         "the arrows step through all views again"
     )
 
@@ -153,7 +153,6 @@ def test_a_photo_is_slid_over_the_picture_by_pointer(shown):
     seen, tab = (found := shown()), found.tab
     tab.click("#compare")
     arrives(seen, cameras()[0])
-    tab.click("#fold")
     assert tab.inner_text("#compare-card strong") == "photo 1: used for training (1 of 2)"
     becomes(seen, 250, 240, RED)
     assert not is_color(color_at(seen, 400, 240), RED)
@@ -167,7 +166,9 @@ def test_a_photo_is_slid_over_the_picture_by_pointer(shown):
     becomes(seen, 430, 240, BLUE)
     tab.click("#compare-close")
     assert not tab.is_visible("#photo") and not tab.is_visible("#photo-line")
-    assert tab.evaluate("document.activeElement.id") == "canvas", "the focus is on something visible"
+    assert tab.evaluate("document.activeElement.id") == "compare", (
+        "the focus is on what opened the comparison"
+    )
     assert not is_color(color_at(seen, 430, 240), BLUE)
 
 
@@ -245,7 +246,7 @@ def test_a_screen_reader_gets_a_name_for_everything(shown, key):
         for node in nodes
         if not node["ignored"]
     ]
-    assert len([name for role, name in found if role == "button"]) > 8
+    assert len([name for role, name in found if role == "button"]) >= 8
     assert [role for role, name in found if role in NAMELESS and not name.strip()] == []
     ids = seen.evaluate("[...document.querySelectorAll('[id]')].map(({ id }) => id)")
     assert len(ids) == len(set(ids))
@@ -263,11 +264,12 @@ def test_the_poster_is_shown_until_the_first_picture_and_without_scripts(visit, 
     held.open(path)
     assert is_color(color_at(held, 320, 100), RED), "the page has not drawn yet"
     drawn = visit(*SIZE, fresh=True).open(path).ready()
-    assert drawn.tab.locator("#poster").count() == 0 and not is_color(color_at(drawn, 320, 100), RED)
+    drawn.tab.wait_for_selector("#poster", state="hidden")
+    assert not is_color(color_at(drawn, 320, 100), RED)
 
 
 def test_axe_finds_nothing_serious_in_a_page_with_a_tour_and_photos(shown):
-    tab = shown().tab
+    tab = shown().open_controls().tab
     for summary in tab.locator("summary:visible").all():
         summary.click()
     tab.keyboard.press("h")

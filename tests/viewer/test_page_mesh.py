@@ -218,6 +218,7 @@ def test_the_line_has_splats_on_its_left_and_the_mesh_on_its_right(opened):
         assert abs(found[:, :cut] - splats[:, :cut]).max(initial=0) <= 1
         assert (found[:, cut:] == mesh[:, cut:]).all()
     # by keyboard, and by dragging the line
+    seen.open_controls()
     slider = tab.get_by_role("slider")
     slider.focus()
     tab.keyboard.press("ArrowRight")
@@ -233,6 +234,7 @@ def test_wireframe_and_collider(opened):
     seen = opened(ball(), collider, width=320, height=240)
     tab = seen.tab
     surface = drawn(seen).astype(int)
+    seen.open_controls()
     tab.select_option("#mesh-style", "edges")
     edges = drawn(seen).astype(int)
     darker = (edges < surface - 20).any(axis=2)
@@ -372,7 +374,7 @@ def test_a_mesh_follows_a_move_of_all_splats(visit, opened, tmp_path, random_gau
     assert apart.stays and (apart.surface.vertices == moved.surface.vertices).all()
     assert opened(apart.surface).tab.locator("#mesh-stays").is_hidden()
     path = written(tmp_path, random_gaussians, apart)
-    assert visit().open(path).ready().tab.locator("#mesh-stays").is_visible()
+    assert visit().open(path).ready().open_controls().tab.locator("#mesh-stays").is_visible()
     tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(WHOLE) + len(PART))
     assert note.is_hidden() and (drawn(shown) == before).all()
 

@@ -42,7 +42,7 @@ def test_an_embedded_path_is_played_to_its_end_and_stops_when_somebody_moves(ope
     shown = opened(path, fresh=True)
     before = shown.evaluate("viewer.view.camera.eye")
     shown.tab.click("#path summary")
-    assert shown.tab.inner_text("#path summary") == "camera path (3)"
+    assert shown.tab.inner_text("#path summary") == "Camera path (3)"
     shown.tab.click("#play")
     shown.tab.wait_for_selector('#play[aria-pressed="false"]')
     stands_at(shown, AROUND[2])
@@ -69,7 +69,7 @@ def downloaded(shown, tmp_path):
 
 def test_saved_views_become_the_file_that_render_reads(opened, tmp_path):
     shown = opened(fresh=True)
-    assert shown.tab.inner_text("#path summary") == "camera path (0)"
+    assert shown.tab.inner_text("#path summary") == "Camera path (0)"
     shown.tab.click("#path summary")
     assert [shown.tab.is_disabled(name) for name in BUTTONS] == [False, True, True]
     shown.press("p")  # an empty path cannot be played, without a complaint
@@ -78,7 +78,7 @@ def test_saved_views_become_the_file_that_render_reads(opened, tmp_path):
         shown.press(press)
         views.append(shown.evaluate("viewer.view.camera"))
     shown.tab.click("#save-view")
-    assert shown.tab.inner_text("#path summary") == "camera path (3)"
+    assert shown.tab.inner_text("#path summary") == "Camera path (3)"
     assert [shown.tab.is_disabled(name) for name in BUTTONS] == [False, False, False]
     found = read_path(downloaded(shown, tmp_path), ORIGIN)
     assert not found.loop and found.duration is None and not found.timed
@@ -100,10 +100,10 @@ def test_a_held_key_saves_one_view_and_the_focus_stays_in_the_list(opened):
     tab.keyboard.down("k")
     tab.keyboard.down("k")  # as the keyboard repeats it
     tab.keyboard.up("k")
-    assert tab.inner_text("#path summary") == "camera path (1)"
+    assert tab.inner_text("#path summary") == "Camera path (1)"
     tab.focus('button[aria-label="go to view 1"]')
     tab.keyboard.press("k")
-    assert tab.inner_text("#path summary") == "camera path (2)"
+    assert tab.inner_text("#path summary") == "Camera path (2)"
     assert tab.evaluate("document.activeElement.getAttribute('aria-label')") == "go to view 1"
 
 
@@ -129,6 +129,6 @@ def test_an_embedded_path_is_written_unchanged_and_keeps_its_times_when_it_grows
     shown.tab.focus('button[aria-label="remove view 1"]')
     for left in (4, 3, 2, 1):
         shown.press("Enter")  # the next button has the focus
-        assert shown.tab.inner_text("#path summary") == f"camera path ({left})"
+        assert shown.tab.inner_text("#path summary") == f"Camera path ({left})"
     shown.tab.click("#save-view")
     assert not read_path(downloaded(shown, tmp_path), ORIGIN).timed, "a single time determines no speed"

@@ -2,10 +2,12 @@
 
 import dataclasses
 import gzip
+import io
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.base.errors import ArgumentError
@@ -14,7 +16,14 @@ from gsplat_edu.render.api import render
 from gsplat_edu.runs.source import Source, file_settings
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.viewer import page
-from gsplat_edu.viewer.page_proof import MOST_COUNTED, Proof, chosen_views, rounded_counts, seen_of
+from gsplat_edu.viewer.page_proof import (
+    MOST_COUNTED,
+    Proof,
+    ShownPhoto,
+    chosen_views,
+    rounded_counts,
+    seen_of,
+)
 
 TINT, GREY = np.array([230, 159, 0]) / 255, np.array([0.299, 0.587, 0.114])
 
@@ -64,6 +73,7 @@ def test_the_tint_is_that_of_the_native_kernels_counts(visit, tmp_path, source):
     assert 0.1 < few < 0.9, "the test scene has splats of both kinds"
     shown = visit(fresh=True).open(written(tmp_path / "a.html", source, Proof(seen))).ready()
     views = [source.cameras[0][1], source.cameras[3][1]]
+    shown.open_controls().tab.uncheck("#kept")
 
     def native(gaussians, camera):
         with torch.no_grad():
@@ -83,6 +93,26 @@ def test_the_tint_is_that_of_the_native_kernels_counts(visit, tmp_path, source):
     assert shown.tab.get_attribute("#seen", "aria-pressed") == "false" and not shown.tab.is_visible("#legend")
     for camera in views:
         assert psnr(shown.picture(camera), native(source.scene.gaussians, camera)) > LEAST_PSNR
+
+
+def test_what_no_photo_saw_fades_into_the_colour_of_the_photos_borders(visit, tmp_path, source):
+    photo = io.BytesIO()
+    Image.fromarray(np.full((40, 60, 3), (200, 100, 50), np.uint8)).save(photo, "JPEG", quality=95)
+    proof = Proof(seen_of(source), [ShownPhoto(0, photo.getvalue())])
+    np.testing.assert_allclose(proof.border(), np.array((200, 100, 50)) / 255, atol=0.02)
+    shown = visit(fresh=True).open(written(tmp_path / "a.html", source, proof)).ready()
+    whole = source.scene.gaussians
+    opacity = torch.sigmoid(whole.logit_opacities) * torch.where(torch.tensor(proof.seen == 0), 0.15, 1.0)
+    fading = dataclasses.replace(whole, logit_opacities=torch.logit(opacity))
+    settings = dataclasses.replace(source.settings, background=proof.border())
+    camera = source.cameras[3][1]
+    with torch.no_grad():
+        expected = render(fading, camera, settings=settings, backend="cpu").image.numpy()
+        plain = render(whole, camera, settings=source.settings, backend="cpu").image.numpy()
+    assert psnr(expected, plain) < LEAST_PSNR - 10, "the measure tells faded splats"
+    assert psnr(shown.picture(camera), expected) > LEAST_PSNR
+    shown.open_controls().tab.uncheck("#kept")
+    assert psnr(shown.picture(camera), plain) > LEAST_PSNR
 
 
 def test_held_out_photos_do_not_count(source):

@@ -1,11 +1,11 @@
 """What a page shows at first, in windows of any shape: nothing that matters is cropped or lies under the panel."""
 
-import re
 
 import numpy as np
 import pytest
 import torch
 
+from accessibility import contrast, numbers
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.viewer import page
@@ -74,7 +74,7 @@ def test_a_cover_shows_the_whole_subject_in_the_middle(random_gaussians, W, H):
 
 def test_the_panel_of_a_phone_lies_above_the_subject(visit, tmp_path, random_gaussians):
     body, head = figure(random_gaussians)
-    page.write(tmp_path / "figure.html", Scene(body), around(480, 640, 940.0))
+    (tmp_path / "figure.html").write_bytes(page.html(Scene(body), around(480, 640, 940.0)))
     seen = visit(*PHONE).open(tmp_path / "figure.html").ready()
     below = seen.evaluate("element('panel').getBoundingClientRect().bottom")
     columns, rows = on_the_screen(seen, head)
@@ -108,32 +108,17 @@ def test_a_saved_view_keeps_its_content_in_a_window_of_any_shape(visit, tmp_path
         assert columns.max() - columns.min() > 0.4 * min(size), "and is not small"
 
 
-def brightness(color):
-    """Relative luminance of WCAG 2 of a colour in 0 to 255."""
-    value = np.array(color) / 255
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) @ (
-        0.2126,
-        0.7152,
-        0.0722,
-    )
-
-
 @pytest.mark.parametrize("scheme", ["dark", "light"])
 @pytest.mark.parametrize("scene", [0, 255])
 def test_buttons_are_seen_over_a_scene_of_any_brightness(
     visit, tmp_path, random_gaussians, three_views, scheme, scene
 ):
-    page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views)
+    (tmp_path / "a.html").write_bytes(page.html(Scene(random_gaussians(9)), three_views))
     seen = visit(640, 480, color_scheme=scheme).open(tmp_path / "a.html").ready()
     seen.press("h")
     found = seen.evaluate(EDGES)
     assert len(found) >= 5
     for name, edge, sheet in found:
-        line, (*color, opacity) = (
-            [float(x) for x in re.findall(r"[\d.]+", one)][:4]
-            for one in (edge, sheet if "rgba" in sheet else f"{sheet} 1")
-        )
-        behind = opacity * np.array(color) + (1 - opacity) * scene
-        lights = sorted((brightness(line[:3]), brightness(behind)))
-        ratio = (lights[1] + 0.05) / (lights[0] + 0.05)
+        (*color, opacity), (*line, _) = numbers(sheet), numbers(edge)
+        ratio = contrast(line, opacity * np.array(color) + (1 - opacity) * scene)
         assert ratio >= 3, f"{name or 'a button'}: contrast {ratio:.2f} of its edge with the panel"

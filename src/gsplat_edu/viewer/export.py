@@ -129,7 +129,7 @@ def write(
         tour = tour or page.Tour()
         if len(source.scene.gaussians):
             start = tour.start or page.usual_start(source.scene, source.cameras, source.held_out)
-            tour = replace(tour, poster=poster_jpeg(source, start.camera))
+            tour = replace(tour, poster=poster_jpeg(source, start.camera, tour.proof))
         page.write(path, source.scene, source.cameras, source.settings, source.held_out, tour)
     elif path.name.lower() == LOD_META:
         lod_codec.write(path, source.scene, options)

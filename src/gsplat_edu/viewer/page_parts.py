@@ -94,6 +94,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
         "title": html_text.escape(title),
         "policy": policy_element(policy(kind)),
         "style": _style(kind),
+        "body": "visitor glass" if "shared" in facts else "",
         "poster": _poster(poster),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
@@ -110,7 +111,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
 
 
 def _style(kind: Kind) -> str:
-    return tokens() + "".join(web(name) for name in ("style.css", *kind.styles))
+    return tokens() + "".join(web(name) for name in ("style.css", "visitor.css", *kind.styles))
 
 
 def _text_element(name: str, text: str) -> str:

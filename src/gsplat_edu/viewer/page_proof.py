@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Int32, UInt8
+from jaxtyping import Float64, Int32, UInt8
 from PIL import Image
 
 from gsplat_edu.base.errors import ArgumentError
@@ -52,6 +52,9 @@ POSTER_SIDE = 960
 
 POSTER_MOST = 60_000
 """Largest poster, bytes; the quality falls until it fits."""
+
+BORDER_PART = 0.04
+"""Width of the border of a photo whose mean colour stands for what no photo saw, in the photo's shorter sides."""
 
 HELD_OUT_PART = 3
 """At most one in this many embedded photos is a held-out one, rounded up."""
@@ -95,7 +98,14 @@ class Proof:
             found["photos"] = [
                 {"index": views_before + photo.index, "bytes": len(photo.jpeg)} for photo in self.photos
             ]
+            found["border"] = self.border()
         return found
+
+    def border(self) -> tuple[float, float, float]:
+        """Return the mean colour of the photos at their borders, RGB from 0 to 1; black without photos."""
+        means = [_border_mean(photo.jpeg) for photo in self.photos]
+        red, green, blue = np.mean(means or [np.zeros(3)], axis=0).round(4).tolist()
+        return red, green, blue
 
     def share(self) -> float:
         """Return the fraction of the splats that fewer than `FEWEST` photos saw."""
@@ -206,20 +216,24 @@ def photo_jpeg(view: View, background: Sequence[float]) -> bytes:
     return _jpeg(pixels, PHOTO_QUALITY)
 
 
-def poster_jpeg(source: Source, camera: Camera) -> bytes:
+def poster_jpeg(source: Source, camera: Camera, proof: Proof | None = None) -> bytes:
     """Render the still that a page shows before its first picture.
 
     Args:
         source: The scene.
         camera: The camera of the page's start view.
+        proof: The page's evidence: where the scene is transparent, the poster has the colour of the photos' borders.
 
     Returns:
         A JPEG of the camera's shape, at most `POSTER_MOST` bytes; empty if no quality makes it so small.
     """
     camera = stand_in(camera)
     small = camera if max(camera.W, camera.H) <= POSTER_SIDE else resized(camera, POSTER_SIDE)
+    settings = source.settings
+    if proof is not None and proof.photos:
+        settings = replace(settings, background=proof.border())
     with torch.no_grad():
-        image = render(source.scene.gaussians, small, settings=source.settings, backend="cpu").image
+        image = render(source.scene.gaussians, small, settings=settings, backend="cpu").image
     levels = np.rint(255.0 * np.clip(np.nan_to_num(image.numpy(force=True)), 0.0, 1.0))
     tried = (_jpeg(levels.astype(np.uint8), quality) for quality in POSTER_QUALITIES)
     return next((jpeg for jpeg in tried if len(jpeg) <= POSTER_MOST), b"")
@@ -238,6 +252,17 @@ def _through_pinhole(
     # a panorama continues at its other side
     across = cv2.BORDER_WRAP if lens.projection.kind == "equirectangular" else cv2.BORDER_CONSTANT
     found: UInt8[np.ndarray, "H W 3"] = cv2.remap(photo, columns, rows, cv2.INTER_LINEAR, borderMode=across)
+    return found
+
+
+def _border_mean(jpeg: bytes) -> Float64[np.ndarray, "3"]:
+    """Return the mean colour of a JPEG's border, RGB from 0 to 1."""
+    with Image.open(io.BytesIO(jpeg)) as image:
+        pixels = np.asarray(image.convert("RGB")) / 255.0
+    width = max(1, round(BORDER_PART * min(pixels.shape[:2])))
+    inside = np.zeros(pixels.shape[:2], dtype=bool)
+    inside[width:-width, width:-width] = True
+    found: Float64[np.ndarray, "3"] = pixels[~inside].mean(axis=0)
     return found
 
 

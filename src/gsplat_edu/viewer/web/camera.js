@@ -7,6 +7,9 @@ const ORBIT_STEP = Math.PI / 180;
 const NEAREST = 0.01; // distance to the pivot, in initial distances
 const FARTHEST = 3; // the same, and of the pivot from the initial one, in distances of the farthest camera
 
+const AMONG = 1.1; // distance from the subject up to which the eye is among the photos' cameras, in that of the farthest
+const YIELD = 0.1; // beyond it, a move outward shrinks by a factor of e per this distance
+
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 export const plus = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
@@ -96,6 +99,7 @@ export class View {
     this.pivot = pivot;
     this.up = up;
     this.region = new Region(eyes);
+    this.bounds = "directions"; // what slows a move: directions that no photo shows, "photos": distance too, or "none"
     this.goTo(camera);
     this.pace = this.distance; // flying covers this distance in two seconds
     this.reach = Math.max(this.pace, ...eyes.map((eye) => Math.hypot(...plus(eye, pivot, -1))));
@@ -160,7 +164,7 @@ export class View {
     const offset = plus(this.camera.eye, this.focus, -1);
     const before = this.region.distance(offset);
     let [R, around] = this.orbited(offset, right, down);
-    if (this.region.distance(around) > before) {
+    if (this.bounds !== "none" && this.region.distance(around) > before) {
       const share = this.region.share(before, this.allowed);
       [R, around] = this.orbited(offset, share * right, share * down);
     }
@@ -174,10 +178,18 @@ export class View {
     return [R, [0, 1, 2].map((i) => R[0][i] * seen[0] + R[1][i] * seen[1] + R[2][i] * seen[2])];
   }
 
+  // Fraction of a move of the eye that is applied: all of it among the photos' cameras, and towards them.
+  share(next) {
+    const away = (eye) => Math.hypot(...plus(eye, this.pivot, -1)) / this.reach;
+    const now = away(this.camera.eye);
+    return this.bounds === "photos" && away(next) > now ? Math.exp(-Math.max(0, now - AMONG) / YIELD) : 1;
+  }
+
   // Moves by world units along the camera's axes (right, down, forward), but not so far away that the scene is lost.
   move(steps) {
     const before = this.focus;
-    let after = steps.reduce((at, step, i) => plus(at, this.camera.R[i], step), before);
+    const asked = steps.reduce((at, step, i) => plus(at, this.camera.R[i], step), [0, 0, 0]);
+    let after = plus(before, asked, this.share(plus(this.camera.eye, asked)));
     const away = (point) => Math.hypot(...plus(point, this.pivot, -1));
     const most = Math.max(FARTHEST * this.reach, away(before));
     if (away(after) > most) after = plus(this.pivot, plus(after, this.pivot, -1), most / away(after));
@@ -194,8 +206,9 @@ export class View {
   // Moves closer to the pivot (factor below 1) or farther away.
   zoom(factor) {
     const most = Math.max(FARTHEST * this.reach, this.distance);
-    const distance = Math.min(Math.max(this.distance * factor, NEAREST * this.pace), most);
     const offset = plus(this.camera.eye, this.focus, -1);
+    const share = this.share(plus(this.focus, offset, factor));
+    const distance = Math.min(Math.max(this.distance * (1 + share * (factor - 1)), NEAREST * this.pace), most);
     this.camera = { ...this.camera, eye: plus(this.focus, offset, distance / this.distance) };
   }
 }

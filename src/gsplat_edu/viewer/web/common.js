@@ -6,6 +6,8 @@ export const element = (id) => document.getElementById(id);
 
 export function say(text) {
   element("message").textContent = text;
+  element("message").classList.remove("waiting");
+  element("unpacking")?.remove();
   element("message").hidden = !text;
 }
 

@@ -213,7 +213,6 @@ export class EditPanel {
       row.insertCell().textContent = what;
     }
     element("help").append(heading, table);
-    element("help").tabIndex = 0; // it is long enough to scroll
   }
 
   addNumbers(id) {

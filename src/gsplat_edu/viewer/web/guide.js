@@ -14,7 +14,7 @@ export class Guide {
       .filter(({ text }) => text);
     if (edit || !steps.length) return null;
     offer(element("tour"));
-    element("tour").textContent = `guided tour (${steps.length})`;
+    element("tour").querySelector("span").textContent = `Guided tour (${steps.length})`;
     const guide = new Guide(viewer, element("tour"), steps);
     guide.button.addEventListener("click", () => guide.toggle());
     return guide;

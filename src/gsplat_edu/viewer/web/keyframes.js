@@ -103,7 +103,7 @@ export class Keyframes {
 
   list() {
     const { loop, keyframes } = this.path;
-    element("path").querySelector("summary").textContent = `camera path (${keyframes.length})`;
+    element("path").querySelector("summary").textContent = `Camera path (${keyframes.length})`;
     element("loop").checked = loop;
     for (const name of ["play", "download-path"]) element(name).disabled = !this.playable;
     const button = (text, label, onclick) => want("button", { "aria-label": label, onclick }, text);

@@ -4,8 +4,14 @@ import { startPage } from "./common.js";
 import { FACTS } from "./facts.js";
 import { unpackSplats } from "./scene.js";
 import { showScene, Viewer } from "./viewer.js";
+import { tellUnpacked, Visitor } from "./visitor.js";
+
+// page.html?ui=0 is the picture alone, for a page that embeds it.
+if (new URLSearchParams(location.search).get("ui") === "0") document.documentElement.classList.add("bare");
 
 startPage(async () => {
-  const splats = await unpackSplats(FACTS);
-  await showScene(new Viewer(FACTS, splats), splats);
+  const splats = await unpackSplats(FACTS, tellUnpacked);
+  const viewer = new Viewer(FACTS, splats);
+  await showScene(viewer, splats);
+  if (FACTS.shared) new Visitor(viewer);
 });

@@ -15,7 +15,7 @@ export class Panel {
     element("fly").addEventListener("click", () => actions.fly());
     element("reset").addEventListener("click", () => actions.reset());
     element("help-button").addEventListener("click", () => this.help());
-    this.folded = new Fold(SMALL);
+    this.folded = new Fold(facts.shared ? "all" : SMALL); // visitors open the controls
     this.fillDegrees(actions);
     this.fillCameras(actions);
     this.atRest();
@@ -23,9 +23,9 @@ export class Panel {
 
   // How much of the window the closed panel covers at the top, CSS px: on a phone it is as wide as the window.
   covered() {
-    if (!matchMedia(SMALL).matches) return 0;
+    if (this.facts.shared || !matchMedia(SMALL).matches) return 0;
     const { top, width } = element("panel").getBoundingClientRect();
-    const { bottom } = element("count").parentElement.getBoundingClientRect();
+    const { bottom } = element("bar").getBoundingClientRect();
     return width ? bottom + 2 * top : 0; // with as much space inside and below as above it
   }
 
@@ -64,12 +64,12 @@ export class Panel {
     });
     this.listed(
       "views",
-      "views",
+      "Views",
       this.buttons.filter((_, i) => cameras[i].saved),
     );
     this.listed(
       "cameras",
-      shared ? "photos" : "cameras",
+      shared ? "Photos" : "Cameras",
       this.buttons.filter((_, i) => !cameras[i].saved),
     );
   }

@@ -14,9 +14,10 @@ export function layout(facts) {
 
 // Returns the splats as typed arrays by name. The text is removed from the page piece by piece, so that it and the
 // numbers are never in memory together.
-export async function unpackSplats(facts) {
+// `tell` hears how much is unpacked, from 0 to 1.
+export async function unpackSplats(facts, tell) {
   const total = layout(facts).reduce((sum, part) => sum + lengthOf(part, facts) * part.type.BYTES_PER_ELEMENT, 0);
-  const bytes = await inflated(document.querySelectorAll("script.splats"), total);
+  const bytes = await inflated(document.querySelectorAll("script.splats"), total, tell);
   return arraysIn(bytes.buffer, 0, facts);
 }
 
@@ -34,7 +35,7 @@ export function arraysIn(buffer, begin, facts) {
   return arrays;
 }
 
-export async function inflated(elements, total) {
+export async function inflated(elements, total, tell = () => {}) {
   if (typeof DecompressionStream === "undefined") {
     throw new Error("This browser cannot unpack the scene: it lacks DecompressionStream; use a newer version.");
   }
@@ -55,6 +56,7 @@ export async function inflated(elements, total) {
     for (let { done, value } = await reader.read(); !done; { done, value } = await reader.read()) {
       bytes.set(value, filled);
       filled += value.length;
+      tell(filled / total);
     }
   } catch {
     filled = -1; // the details would not help the reader of the message

@@ -9,7 +9,7 @@ const UNSEEN = [230 / 255, 159 / 255, 0]; // orange on grey: told apart with any
 export class SeenTexture {
   constructor(renderer) {
     const { gl, textureWidth, facts } = renderer;
-    Object.assign(this, { renderer, fewest: 0, unit: renderer.textures.length + 2 }); // behind the order and the flags
+    Object.assign(this, { renderer, fewest: 0, faded: 0, unit: renderer.textures.length + 2 }); // behind the order and the flags
     gl.activeTexture(gl.TEXTURE0 + this.unit);
     this.texture = nearestTexture(gl);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R8UI, textureWidth, Math.max(1, Math.ceil(facts.count / textureWidth)));
@@ -32,6 +32,7 @@ export class SeenTexture {
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
     gl.uniform1i(gl.getUniformLocation(program, "photos_seen"), this.unit);
     gl.uniform1ui(gl.getUniformLocation(program, "fewest"), this.fewest);
+    gl.uniform1ui(gl.getUniformLocation(program, "faded"), this.fewest ? 0 : this.faded);
     gl.uniform3fv(gl.getUniformLocation(program, "tint"), UNSEEN);
   }
 }
@@ -67,6 +68,5 @@ export class Seen {
 
 // Shows a button of the panel, and its line in the help.
 export function offer(button) {
-  for (const hidden of [button, element("proof"), ...document.querySelectorAll(`#help [data-for=${button.id}]`)])
-    hidden.hidden = false;
+  for (const hidden of [button, ...document.querySelectorAll(`#help [data-for=${button.id}]`)]) hidden.hidden = false;
 }

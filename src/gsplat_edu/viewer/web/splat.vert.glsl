@@ -30,7 +30,9 @@ uniform float highlight_share;   // of it in their colour
 #ifdef SEEN
 uniform highp usampler2D photos_seen;  // number of photos that saw a splat
 uniform uint fewest;             // splats that fewer photos saw are tinted, the others grey; 0 for neither
+uniform uint faded;              // splats that fewer photos saw are nearly transparent; 0 for none
 uniform vec3 tint;
+const float FADED = 0.15;        // of their opacity
 #endif
 uniform int texture_width;
 uniform int coefficients;  // stored per splat
@@ -159,6 +161,9 @@ void main() {
 
     float opacity = 1.0 / (1.0 + exp(-texelFetch(logit_opacities, place, 0).r));
     if (antialiased) opacity *= sqrt(max(det0, DET_FLOOR) / det);
+#ifdef SEEN
+    if (texelFetch(photos_seen, place, 0).r < faded) opacity *= FADED;
+#endif
     if (!(opacity >= ALPHA_MIN && a * c + det < FINITE)) return;
 
     mean2d = focal * p.xy / p.z + middle;

@@ -310,7 +310,7 @@ export class Viewer {
     this.meshes?.show(camera);
     this.compare?.place();
     this.frustums.place(camera);
-    element("poster")?.remove();
+    element("poster")?.classList.add("gone"); // printed all the same
   }
 
   // Shows the picture again, after a change of what lies over the splats.
