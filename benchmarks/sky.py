@@ -29,6 +29,7 @@ from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.running import run_command
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.remedies import remedies_for
 from gsplat_edu.evaluate.metrics import psnr
@@ -40,6 +41,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.capture import Undecided
 from lab.captures.outdoors import outdoor_capture, photograph
 
 Judges = Sequence[tuple[View, Bool[np.ndarray, "_ _"]]]
@@ -148,7 +150,7 @@ def measure(arguments: argparse.Namespace) -> None:
             write_colmap(folder, made.views, made.points, made.colors)
             every = list(zip(made.views, made.sky, strict=True))
             groups = {"held out": every[::8], "outside": outside(width, height)}
-        remedy = remedies_for(CaptureReader(folder), ["sky"])["sky"]
+        remedy = remedies_for(Undecided(CaptureReader(folder), DataSettings()), ["sky"])["sky"]
         print(f"--sky auto: {remedy.value}{remedy.reason and ': '}{remedy.reason}")
         asked = ("none", "shell") if arguments.capture is None else ("none", remedy.value)
         result = compare(folder, arguments, groups, tuple(dict.fromkeys(asked)))

@@ -10,7 +10,7 @@ from typing import Any
 HERE = str(Path(__file__).parent)
 """Folder in which a program that a test starts finds this module."""
 
-PATIENCE = 40.0
+PATIENCE = 300.0
 """Seconds until a state that does not come fails a test, long enough for a computer that runs other tests as well."""
 
 PAUSE = 0.01

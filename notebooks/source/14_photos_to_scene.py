@@ -44,14 +44,14 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import advice_lines, diagnosis_lines
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.doctor.diagnosis import advice_lines, diagnosis_lines
 from gsplat_edu.evaluate.metrics import psnr, summarize, to_bytes
 from gsplat_edu.render.numpy_reference import project
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.scene.gaussians import cov3d_t
 from gsplat_edu.scene.views import View
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from gsplat_edu.survey.capture import prepare
 from gsplat_edu.train.config import recipe
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())

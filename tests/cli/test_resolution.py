@@ -9,7 +9,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.survey.capture import prepare
 from gsplat_edu.train import capacity
 from gsplat_edu.train.capacity import PIXELS_PER_GAUSSIAN, advised_side, resolvable_pixels, wanted_gaussians
 from gsplat_edu.train.config import recipe

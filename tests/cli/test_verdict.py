@@ -8,12 +8,12 @@ import pytest
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.doctor.finding import CAUSES
 from gsplat_edu.evaluate.report import Report, write_report
 from gsplat_edu.evaluate.verdict import RANKED, verdict
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.listing import summary
+from gsplat_edu.survey.order import CAUSES
 
 SHORT = ("--iterations", "40", "--backend", "cpu", "--set", "densify_start=5", "--set", "densify_every=10")
 

@@ -9,7 +9,7 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.colmap import read_images
 from gsplat_edu.data.colmap_files import observations_txt
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.doctor.support import observed_points
+from gsplat_edu.survey.support import observed_points
 
 EVERYTHING = DataSettings(test_every=0)
 POSE = "0.8 0.6 0 0 1 2 3"

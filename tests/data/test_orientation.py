@@ -10,7 +10,6 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.orientation import QUARTER_TURNS
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.photos.decoding import (
     decode,
     decode_mask,
@@ -20,6 +19,7 @@ from gsplat_edu.photos.decoding import (
     upright_image_size,
     upright_size,
 )
+from gsplat_edu.survey.capture import prepare
 from phone_photos import ORIENTATIONS, as_stored, exif_bytes, quarters, save
 
 EVERYTHING = DataSettings(test_every=0)

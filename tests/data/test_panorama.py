@@ -22,8 +22,8 @@ from gsplat_edu.data.panorama import (
 )
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.cameras import check_sizes
-from gsplat_edu.doctor.photos import measure_photo
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.photos import measure_photo
 
 
 def directions(W, H):

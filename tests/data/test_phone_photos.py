@@ -15,10 +15,10 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.budget.costs import Facts
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.photos.colors import make_profile
 from gsplat_edu.photos.decoding import decode, decode_mask, image_header, image_orientation, image_size
 from gsplat_edu.photos.image_files import is_image
+from gsplat_edu.survey.capture import prepare
 from phone_photos import ORIENTATIONS, P3, as_stored, p3_as_srgb, p3_range, quarters, save
 
 pytest.importorskip("pillow_heif")

@@ -8,8 +8,9 @@ import pytest
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import Diagnosis, Severity
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.doctor.diagnosis import Diagnosis
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.finding import Severity
 
 
 @pytest.fixture

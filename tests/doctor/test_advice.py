@@ -8,23 +8,20 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings, strategies as st
 
-import gsplat_edu.doctor as doctor_package
+import gsplat_edu
 from doctor.rooms import replaced, room
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.doctor.after import Trained, examine_run
-from gsplat_edu.doctor.finding import (
-    CAUSES,
-    EXPLAINS,
-    Advice,
-    Change,
-    Diagnosis,
-    Finding,
-    Severity,
-)
-from gsplat_edu.doctor.residuals import Residual
+from gsplat_edu.doctor.after import examine_run
+from gsplat_edu.doctor.diagnosis import Advice, Diagnosis
 from gsplat_edu.evaluate.verdict import RANKED
+from gsplat_edu.parts.transients.findings import check_moved
+from gsplat_edu.runs.parts import judgements
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.finding import Change, Examined, Finding, Severity
+from gsplat_edu.survey.order import CAUSES, CHECKS, EXPLAINS
+from gsplat_edu.survey.residuals import Residual
+from gsplat_edu.survey.trained import Trained
 from splats import splats_on
 
 TURNS = {
@@ -57,6 +54,12 @@ def residuals_of(scores):
     return [Residual(f"{i:02}.png", psnr, stops, veiled) for i, (psnr, stops, veiled) in enumerate(scores)]
 
 
+def examined(run, moved=()):
+    """Examine a run with what the parts of its training find, and these photos of things that moved."""
+    things = {"things that moved": check_moved(moved, len(run.train))}
+    return examine_run(run, [*judgements({}, run), Examined(things)])
+
+
 VIEWS = st.lists(
     st.tuples(
         st.sampled_from([8.0, 18.0, 24.0, 26.0, 31.0, 36.0]),
@@ -86,10 +89,8 @@ def test_no_advice_about_a_run_contradicts_another(
         {"iteration": reached * k // 8, "psnr": 20.0 + gain * k, "loss": 0.1 * 0.8**k} for k in range(1, 9)
     ]
     run = Trained(Path("a"), gaussians, 3.0, residuals_of(train), residuals_of(test), reached, reached + left)
-    run = replace(
-        run, log=log, strategy=strategy, capture=Path("c"), moved=[(f"{i:02}.png", 0.1) for i in range(moved)]
-    )
-    diagnosis = examine_run(run)
+    run = replace(run, log=log, strategy=strategy, capture=Path("c"))
+    diagnosis = examined(run, [(f"{i:02}.png", 0.1) for i in range(moved)])
     assert not opposed(diagnosis.advice)
     assert not opposed([finding.advice for finding in diagnosis.findings])
     directions = {}
@@ -138,12 +139,13 @@ def test_no_combination_of_findings_gives_advice_that_contradicts_itself(found, 
 
 
 def test_every_finding_has_a_place_in_the_order():
-    named = set()
-    for path in Path(doctor_package.__file__).parent.glob("*.py"):
+    named, package = set(), Path(gsplat_edu.__file__).parent
+    for path in (*package.glob("doctor/*.py"), *package.glob("parts/*/*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding":
                 named |= {node.args[0].value} if isinstance(node.args[0], ast.Constant) else set()
     assert len(named) > 30 and named | {"exposure", "white balance", "depth", *RANKED} == set(CAUSES)
+    assert "exposure" in CHECKS and len(CHECKS) == len(set(CHECKS))
     assert set(EXPLAINS) | set(itertools.chain.from_iterable(EXPLAINS.values())) <= set(CAUSES)
 
 
@@ -156,15 +158,14 @@ def overfitted(gaussians, reached):
 
 def test_a_scene_that_overfits_is_not_trained_for_longer(gaussians):
     for reached in (1000, 3000):
-        diagnosis = examine_run(overfitted(gaussians, reached))
+        diagnosis = examined(overfitted(gaussians, reached))
         assert diagnosis.advice[0].startswith("take more photos")
         assert not any("longer" in text or "--iterations" in text for text in diagnosis.advice)
 
 
 @pytest.mark.parametrize(("count", "name"), [(1, "moved"), (6, "moving subject")])
 def test_a_subject_that_moves_through_the_scene_is_named(gaussians, count, name):
-    run = replace(overfitted(gaussians, 10_000), moved=[(f"{i}.png", 0.2) for i in range(count)])
-    diagnosis = examine_run(run)
+    diagnosis = examined(overfitted(gaussians, 10_000), [(f"{i}.png", 0.2) for i in range(count)])
     found = {finding.name: finding for finding in diagnosis.findings}
     assert name in found and ("overfitted" in found)
     assert diagnosis.advice[0].startswith("train with --transients mask" if count > 1 else "take more photos")

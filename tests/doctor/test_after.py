@@ -8,18 +8,22 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.cli.doctor import exposure_beforehand
-from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.after import Trained, examine_run, view_lines
-from gsplat_edu.doctor.finding import Finding, Severity, diagnosis_lines
-from gsplat_edu.doctor.residuals import residuals
+from gsplat_edu.doctor.after import examine_run, view_lines
+from gsplat_edu.doctor.diagnosis import diagnosis_lines, event_of
 from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.parts.exposure.findings import Beforehand, beforehand, check_jumps
+from gsplat_edu.parts.transients.findings import check_moved
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.parts import judgements
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.finding import Examined, Finding, Severity
+from gsplat_edu.survey.residuals import residuals
+from gsplat_edu.survey.trained import Trained
 from splats import splats_on
 
 BACKGROUND = (0.2, 0.3, 0.4)
@@ -52,8 +56,21 @@ def trained(gaussians, views, **changes):
     return replace(run, **changes)
 
 
+def examined(run, checks=None):
+    """Examine a run with what the parts of its training find; `checks` replaces some of that."""
+    found = judgements({}, run)
+    if checks is not None:
+        found = [one for one in found if not checks.keys() & one.checks.keys()] + [Examined(checks)]
+    return examine_run(run, found)
+
+
+def fitted(run, before):
+    """Examine a run of whose photos this was found before the training."""
+    return examined(run, {"exposure": check_jumps(run, Beforehand([before]))})
+
+
 def warnings(run):
-    return {f.name: f for f in examine_run(run).findings if f.severity > Severity.NOTE}
+    return {f.name: f for f in examined(run).findings if f.severity > Severity.NOTE}
 
 
 def with_photo(views, i, change):
@@ -65,7 +82,7 @@ def with_photo(views, i, change):
 def test_a_good_run_gets_no_warning(scene):
     gaussians, views = scene
     run = trained(gaussians, views)
-    diagnosis = examine_run(run)
+    diagnosis = examined(run)
     assert diagnosis.findings == () and not diagnosis.hopeless
     assert diagnosis.fine == (
         "length",
@@ -200,7 +217,7 @@ def test_faint_splats(scene, share, severity):
     gaussians, views = scene
     faint = torch.arange(len(gaussians)) < share * len(gaussians)
     logits = torch.where(faint, torch.tensor(-6.0), gaussians.logit_opacities)
-    diagnosis = examine_run(trained(replace(gaussians, logit_opacities=logits), views))
+    diagnosis = examined(trained(replace(gaussians, logit_opacities=logits), views))
     found = [f.severity for f in diagnosis.findings if f.name == "faint splats"]
     assert found == ([severity] if severity else [])
 
@@ -269,7 +286,7 @@ def test_a_short_training_is_reported(scene, reached, gain, severity, says):
     run = trained(gaussians, views, reached=reached, planned=reached, log=log, capture=Path("a b/$c"))
     measured = np.mean([view.psnr for view in run.test])
     assert abs(measured - 34.0) < 0.5, "`evaluations` assumes 34 dB"
-    diagnosis = examine_run(run)
+    diagnosis = examined(run)
     found = [finding for finding in diagnosis.findings if finding.name == "short training"]
     assert [finding.severity for finding in found] == ([] if severity is None else [severity])
     assert ("length" in diagnosis.fine) is (severity is None)
@@ -279,6 +296,28 @@ def test_a_short_training_is_reported(scene, reached, gain, severity, says):
     longer = "gsplat-edu train 'a b/$c' --iterations 30000 --out out/a_30000"
     assert (longer in advice) is (severity is Severity.WARNING)
     assert ("better photos" in advice) is (severity is not Severity.WARNING)
+
+
+@pytest.mark.parametrize("strategy", ["fast", "adc"])
+@pytest.mark.parametrize("photos", [12, 60])
+def test_a_gap_to_the_training_views_comes_before_a_longer_training(scene, strategy, photos):
+    """14.3 dB between training and held-out views, after a short training whose PSNR still rose."""
+    gaussians, views = scene
+    run = trained(gaussians, views, reached=900, planned=900, capture=Path("a"), strategy=strategy)
+    run = replace(
+        run,
+        train=[replace(view, psnr=32.3) for view in run.train for _ in range(photos // 12)],
+        test=[replace(view, psnr=18.0) for view in run.test],
+        log=evaluations(900, 1.0),
+    )
+    diagnosis = examine_run(run)
+    assert diagnosis.ranked[0].name == run.verdict.cause == ("few photos" if photos < 30 else "overfitted")
+    told = [diagnosis.advice, [event_of(one).advice for one in diagnosis.ranked if one.advice]]
+    for advice in told:
+        assert advice[0].startswith("take more photos") and not any("train for" in one for one in advice), (
+            advice
+        )
+    assert run.verdict.advice == "Take more photos between the existing ones."
 
 
 @pytest.mark.parametrize("gain", [1.0, -1.0])
@@ -296,7 +335,7 @@ def test_a_run_of_the_fast_recipe_is_judged_by_its_lengths(scene, reached, is_sh
     """Its standard length is 3,000 iterations, its longest 10,000. PSNR rises until the end of a run of any length."""
     gaussians, views = scene
     run = trained(gaussians, views, reached=reached, planned=reached, capture=Path("a b/$c"), strategy="fast")
-    diagnosis = examine_run(replace(run, log=evaluations(reached, gain)))
+    diagnosis = examined(replace(run, log=evaluations(reached, gain)))
     found = [finding for finding in diagnosis.findings if finding.name == "short training"]
     assert ("length" in diagnosis.fine) is (not found) is (not is_short)
     if found:
@@ -314,7 +353,7 @@ def test_the_longer_run_of_the_fast_recipe_keeps_the_mean_pace(scene):
     gaussians, views = scene
     log = [{"iteration": i, "ms": 100.0 if i <= 1_500 else 300.0} for i in range(10, 3_001, 10)]
     run = trained(gaussians, views, reached=3_000, planned=3_000, log=log, capture=Path("a"), strategy="fast")
-    said = " ".join(one.text for one in examine_run(run).otherwise)
+    said = " ".join(one.text for one in examined(run).otherwise)
     assert "train for longer (about 33 min 20 s at this run's pace): gsplat-edu train a " in said
 
 
@@ -323,7 +362,7 @@ def test_advice_to_train_for_longer_gives_the_time_at_this_runs_pace(scene):
     gaussians, views = scene
     log = [{"iteration": i, "ms": 50.0 if i <= 300 else 800.0} for i in range(10, 401, 10)]
     run = trained(gaussians, views, reached=400, planned=400, log=log, capture=Path("a"))
-    (found,) = [finding for finding in examine_run(run).findings if finding.name == "short training"]
+    (found,) = [finding for finding in examined(run).findings if finding.name == "short training"]
     assert found.advice.startswith(
         "train for longer (6 h 40 min or more at this run's pace): gsplat-edu train a "
     )
@@ -342,7 +381,7 @@ def test_a_warning_about_the_photos_remains_after_training(scene):
     """A trained scene fits photos of differing exposure, so comparing renders with photos does not reveal the fault."""
     gaussians, views = scene
     before = Finding("exposure", Severity.WARNING, "1 of 12 photos", "fix it", ("a.jpg",), ("+0.6",))
-    diagnosis = examine_run(trained(gaussians, views, beforehand=[before]))
+    diagnosis = fitted(trained(gaussians, views), before)
     (found,) = (finding for finding in diagnosis.findings if finding.name == "exposure")
     assert found.images == before.images and found.severity is Severity.WARNING
     assert (
@@ -356,25 +395,28 @@ def test_an_unexplained_photo_is_not_also_reported_as_fitted(scene):
     run = trained(gaussians, views)
     poor = replace(run.train[0], psnr=run.train[0].psnr - 20.0)
     before = Finding("exposure", Severity.WARNING, "1 of 12 photos", "fix it", (poor.name,), ("+0.4",))
-    run = replace(run, train=[poor, *run.train[1:]], beforehand=[before])
-    found = {finding.name: finding for finding in examine_run(run).findings}
+    run = replace(run, train=[poor, *run.train[1:]])
+    found = {finding.name: finding for finding in fitted(run, before).findings}
     assert poor.name in found["unexplained"].images
     assert found["exposure"].sentence == "1 of 12 photos"
 
 
 def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     gaussians, views = scene
-    findings, why, correction = exposure_beforehand(CaptureReader(tmp_path / "gone"), Terminal())
+    gone = functools.partial(prepare, CaptureReader(tmp_path / "gone"))
+    findings, why, correction = beforehand(gone)
     assert findings == () and "gone" in why and correction == "none"
-    said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
+    said = diagnosis_lines(examined(trained(gaussians, views, survey=gone)))
     (line,) = [line for line in said if line.startswith("exposure ")]
     assert line.endswith(f"not between photos: {why}")
-    assert not any("not between" in line for line in diagnosis_lines(examine_run(trained(gaussians, views))))
+    assert not any("not between" in line for line in diagnosis_lines(examined(trained(gaussians, views))))
 
 
 def test_photos_with_objects_that_others_lack_are_named_with_the_option(scene):
     assert "moved" not in warnings(trained(*scene))
-    found = warnings(trained(*scene, moved=(("b.png", 0.123), ("a.png", 0.02))))["moved"]
+    run = trained(*scene)
+    (found,) = check_moved((("b.png", 0.123), ("a.png", 0.02)), len(run.train))
+    assert found in examined(run, {"things that moved": [found]}).findings
     assert found.labels == ("b.png (12.3 %)", "a.png (2.0 %)") and "2 photos" in found.sentence
     assert "--transients mask" in found.advice
 
@@ -390,7 +432,7 @@ def test_a_photo_below_the_others_is_suspicious_only_if_the_scene_fits_the_other
             level[name] = [replace(view, psnr=usual + 0.1 * i) for i, view in enumerate(found)]
         level[split][0] = replace(level[split][0], psnr=usual - 8.0)
         changed = replace(run, train=level["train"], test=level["test"])
-        (found,) = [finding for finding in examine_run(changed).findings if finding.name == "unexplained"]
+        (found,) = [finding for finding in examined(changed).findings if finding.name == "unexplained"]
         return found.advice
 
     assert advice(31.0).endswith("has a wrong pose, train without it")
@@ -404,7 +446,7 @@ def test_a_phantom_of_a_short_run_is_named(scene, share, is_named):
     """Means over the views of trainings: the worst without a phantom, and the two slightest with one."""
     run = trained(*scene)
     run = replace(run, train=[replace(view, outside=share) for view in run.train], test=[])
-    found = {finding.name: finding.sentence for finding in examine_run(run).findings}
+    found = {finding.name: finding.sentence for finding in examined(run).findings}
     assert ("outside cut-outs" in found) == is_named
     assert not is_named or found["outside cut-outs"].startswith(f"{100 * share:.0f} %")
 
@@ -412,4 +454,4 @@ def test_a_phantom_of_a_short_run_is_named(scene, share, is_named):
 def test_a_phantom_of_three_hundredths_is_named(scene):
     run = trained(*scene)
     run = replace(run, train=[replace(view, outside=0.03) for view in run.train], test=[])
-    assert "outside cut-outs" in {finding.name for finding in examine_run(run).findings}
+    assert "outside cut-outs" in {finding.name for finding in examined(run).findings}

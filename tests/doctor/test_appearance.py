@@ -23,9 +23,9 @@ from doctor.rooms import (
 )
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.doctor.appearance import check_exposure, correction_of
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.parts.exposure.findings import check_exposure, correction_of
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.capture import prepare
 
 SPOILED = (4, 13)
 """Views that faults are planted in."""

@@ -14,11 +14,11 @@ from doctor.rooms import replaced, room, turned, with_camera
 from gsplat_edu.data.reader import read_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.cameras import check_away
-from gsplat_edu.doctor.finding import Severity
-from gsplat_edu.doctor.photos import PhotoStats
-from gsplat_edu.doctor.support import observed_points
-from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.survey.capture import Shot, Survey
+from gsplat_edu.survey.finding import Severity
+from gsplat_edu.survey.photos import PhotoStats
+from gsplat_edu.survey.support import observed_points
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

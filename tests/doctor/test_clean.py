@@ -9,8 +9,8 @@ from gsplat_edu.data import procedural
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_blender
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import Severity
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.finding import Severity
 
 LAYOUTS = ("orbit", "forward", "outward", "walk")
 

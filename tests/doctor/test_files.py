@@ -11,8 +11,10 @@ from gsplat_edu.data.notes import MissingPhotos
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import Severity, advice_lines
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.doctor.certain import certain_findings, known_photos
+from gsplat_edu.doctor.diagnosis import advice_lines
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.finding import Severity
 
 
 @pytest.fixture
@@ -111,6 +113,30 @@ def test_photos_without_a_pose_are_reported(tmp_path, orbit, count, severity):
     (found,) = [f for f in examine(prepare(CaptureReader(tmp_path))).findings if f.name == "no pose"]
     assert found.severity is severity
     assert found.images == tuple(f"extra_{i}.JPG" for i in range(count))
+
+
+def test_photos_that_a_search_left_out_are_reported_though_the_capture_has_none_of_them(tmp_path, orbit):
+    """The folder of a capture that a search made holds only what has a pose."""
+    views, points = orbit
+    write_colmap(tmp_path, views[6:], points, np.full_like(points, 0.5))
+    left = {
+        "left_out": ["a.jpg", "day 2/b.jpg"],
+        "unclear": ["c.jpg"],
+        "doubtful": ["d.jpg", "e.jpg", "f.jpg"],
+    }
+    stages = {"capture": {"options": {}, "facts": {"error": 0.5, **left}}}
+    (tmp_path / "sfm").mkdir()
+    (tmp_path / "sfm" / "stages.json").write_text(json.dumps({"stages": stages}))
+    certain = certain_findings(CaptureReader(tmp_path))
+    for findings in (certain, examine(prepare(CaptureReader(tmp_path))).findings):
+        (found,) = [one for one in findings if one.name == "no pose"]
+        assert found.severity is Severity.WARNING
+        assert found.images == ("a.jpg", "day 2/b.jpg", "c.jpg", "d.jpg", "e.jpg", "f.jpg")
+        assert found.sentence.startswith(f"6 of {len(views)} photos could not be placed")
+    assert known_photos(CaptureReader(tmp_path))["unposed"] == 6  # what the verdict on a run is told
+    for damaged in ("{", "[]", json.dumps({"stages": {"capture": {"facts": {"left_out": [1]}}}})):
+        (tmp_path / "sfm" / "stages.json").write_text(damaged)
+        assert known_photos(CaptureReader(tmp_path))["unposed"] == 0
 
 
 @pytest.mark.parametrize(("count", "name"), [(24, None), (8, "few photos"), (1, "usable")])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from doctor.rooms import room, with_camera
-from gsplat_edu.doctor.finding import advice_lines, diagnosis_lines
+from gsplat_edu.doctor.diagnosis import advice_lines, diagnosis_lines
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.views import View
 

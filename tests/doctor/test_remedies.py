@@ -5,9 +5,12 @@ import pytest
 
 from doctor.rooms import replaced, room, with_photo
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_blender, write_colmap
-from gsplat_edu.doctor.remedies import remedies_for, transients_for
+from gsplat_edu.doctor.remedies import remedies_for
+from gsplat_edu.parts.transients.findings import transients_for
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.capture import Undecided
 from lab.captures.outdoors import outdoor_capture
 
 
@@ -16,8 +19,12 @@ def written(folder, views, points):
     return folder
 
 
+def chosen_for(path, *names):
+    return remedies_for(Undecided(CaptureReader(path), DataSettings()), names)
+
+
 def appearance_for(path):
-    return remedies_for(CaptureReader(path), ["appearance"])["appearance"]
+    return chosen_for(path, "appearance")["appearance"]
 
 
 def brighter(view, stops):
@@ -74,9 +81,7 @@ def test_transients_are_masked_if_there_are_enough_photos(count, value):
 def test_a_sky_gets_a_shell_and_its_colours_on_a_dome_do_not(tmp_path):
     for name, dome in (("sky", np.inf), ("dome", 10.0)):
         made = outdoor_capture(96, 72, 16, points=800, dome=dome)
-        remedies = remedies_for(
-            CaptureReader(written(tmp_path / name, made.views, made.points)), ["appearance", "sky"]
-        )
+        remedies = chosen_for(written(tmp_path / name, made.views, made.points), "appearance", "sky")
         assert remedies["appearance"].value == "none"
         assert remedies["sky"].value == {"sky": "shell", "dome": "none"}[name]
         assert ("lie at infinity" in remedies["sky"].reason) == (name == "sky")
@@ -84,5 +89,5 @@ def test_a_sky_gets_a_shell_and_its_colours_on_a_dome_do_not(tmp_path):
 
 def test_the_reason_says_that_a_sky_is_plain_white(tmp_path):
     made = outdoor_capture(96, 72, 16, points=800, clouds=0.0)
-    remedy = remedies_for(CaptureReader(written(tmp_path, made.views, made.points)), ["sky"])["sky"]
+    remedy = chosen_for(written(tmp_path, made.views, made.points), "sky")["sky"]
     assert remedy.value == "shell" and remedy.reason.endswith("are one white above the horizon")

@@ -8,9 +8,9 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import Severity
-from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.finding import Severity
 
 WHITE = (1.0, 1.0, 1.0)
 

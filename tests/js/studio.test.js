@@ -5,7 +5,7 @@ import { test } from "node:test";
 const events = new EventTarget();
 globalThis.addEventListener = events.addEventListener.bind(events);
 
-const { leftOf, startJob } = await import("../../src/gsplat_edu/studio/web/jobs.js");
+const { leftOf, startJob, waitsFor } = await import("../../src/gsplat_edu/studio/web/jobs.js");
 const { Store } = await import("../../src/gsplat_edu/studio/web/store.js");
 
 const JOB = { id: "1", title: "training of a", subject: "runs/a", command: "", state: "running", waits_for: [] };
@@ -61,6 +61,31 @@ test("a new job with the id of a removed one is known before the stream tells of
   store.heard.set("000007", 3); // of the removed job
   globalThis.fetch = async () => Response.json({ id: "000007", state: "queued", subject: "runs/a" });
   assert.equal((await startJob(store, {})).job.state, "queued");
+});
+
+test("before the first picture, a training says what it works on", () => {
+  const work = { command: "train", inputs: ["captures/a"], outputs: ["runs/a"], options: {} };
+  const view = new Store().put({ ...JOB, work });
+  assert.equal(waitsFor(view), "The training is starting.");
+  view.take({ number: 1, event: "stage", name: "reading photos" });
+  view.take({ number: 2, event: "progress", stage: "reading photos", done: 5, total: 20, seconds_left: null });
+  assert.equal(waitsFor(view), "The picture comes with the training. First: reading photos, 25 %.");
+  view.job.state = "queued";
+  assert.equal(waitsFor(view), "This training waits for other jobs.");
+});
+
+test("what to do while the studio is gone is its whole command", async () => {
+  const start = "gsplat-edu studio '/home/me/my library' --port 8091";
+  globalThis.fetch = async () => Response.json({ trouble: [], start });
+  const store = new Store();
+  await store.refresh();
+  globalThis.fetch = async () => Promise.reject(new TypeError("failed"));
+  await store.refresh();
+  assert.match(store.trouble, /^The studio does not answer\. .* this command and open the address that it prints: /);
+  assert.ok(store.trouble.endsWith(start));
+  globalThis.fetch = async () => new Response("403 Forbidden: open the URL, including its token", { status: 403 });
+  await store.refresh();
+  assert.match(store.trouble, /^The studio was started again\. Open the address/);
 });
 
 test("an older answer about the library does not replace a newer one", async () => {

@@ -108,7 +108,7 @@ def test_a_training_with_it_is_recorded_and_judged(site, run, tmp_path):
     changed = shutil.copytree(run, tmp_path / "changed")
     (changed / "config.json").write_text(json.dumps(config))
     said = command("doctor", changed, site=site)[1]
-    assert "the weight of solid splats outweighs the photos" in " ".join(said.split())
+    assert "warning too solid: the weight of solid splats outweighs the photos" in " ".join(said.split())
     code, _, errors = command("convert", run, tmp_path / "centres.xyz", site=site)
     assert code == 0, errors
     code, said, _ = command("count", *run.glob("point_cloud/*/*.ply"), site=site)

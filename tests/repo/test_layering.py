@@ -49,6 +49,7 @@ def test_the_contracts_hold(copy):
         ("scene/sh.py", "import torch"),
         ("cli/main.py", "from lab.captures import solids"),
         ("ops/losses.py", "import gsplat_edu.data"),
+        ("survey/finding.py", "import gsplat_edu.parts.sky.part"),
         ("train/density/surgery.py", "import gsplat_edu.train.density.adc"),
     ],
 )

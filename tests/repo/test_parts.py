@@ -9,8 +9,6 @@ from gsplat_edu.train.part import OWN_PARTS
 
 IMPORTERS = {
     "budget/costs.py",
-    "doctor/moving.py",
-    "doctor/remedies.py",
     "runs/cleaning.py",
     "runs/lod_refinement.py",
     "runs/meshes.py",
@@ -27,7 +25,7 @@ SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
     [
         *("train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"),
         *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py"),
-        "evaluate/report.py",
+        *("evaluate/report.py", "doctor/diagnosis.py", "survey/trained.py", "cli/result.py"),
     ],
 )
 def test_the_source_names_no_part(module):
@@ -35,6 +33,14 @@ def test_the_source_names_no_part(module):
     assert len(OWN_PARTS) >= 6
     named = [name for name in OWN_PARTS if re.search(rf"(?<![a-z]){name}(?![a-z])", text)]
     assert not named
+
+
+@pytest.mark.parametrize("module", sorted(path.name for path in SOURCE.glob("doctor/*.py")))
+def test_the_doctor_names_no_setting_of_a_part(module):
+    """It may speak of the poses and the exposure of photos, but what a part changes is for the part to advise."""
+    settings = "sky|appearance|refine|transients|surface|depth"
+    text = (SOURCE / "doctor" / module).read_text()
+    assert not re.findall(rf"--(?:{settings})\b|[\"'](?:{settings})[\"']", text)
 
 
 def test_no_other_module_imports_a_part():

@@ -13,9 +13,9 @@ from PIL import Image
 from gsplat_edu.data.colmap import read_images
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import Severity
-from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.sfm import mapping
+from gsplat_edu.survey.capture import prepare
+from gsplat_edu.survey.finding import Severity
 from sfm.engine_check import printed
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("colmap")]

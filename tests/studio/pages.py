@@ -140,7 +140,7 @@ def mask_dialog(tab, photo):
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
     until_in(tab, tab, "document.activeElement === document.querySelector('dialog.mask svg')")
-    until_in(tab, tab, "document.querySelector('.sheet img').complete")
+    until_in(tab, tab, "document.querySelector('.painted img').complete")
     return dialog, dialog.locator("svg").bounding_box()
 
 

@@ -1,5 +1,7 @@
 """The studio's application: it is guarded, has a policy, serves its page's files and refuses other bodies than JSON."""
 
+import shlex
+
 import pytest
 from starlette.testclient import TestClient
 
@@ -41,6 +43,23 @@ def test_every_address_is_guarded(stranger, headers):
         assert answer.status_code == 403 and answer.text.startswith("403 Forbidden: "), path
         assert "set-cookie" not in answer.headers and "access-control-allow-origin" not in answer.headers
     assert stranger.delete("/api/trash", headers=headers).status_code == 403
+
+
+def test_a_person_without_the_token_reads_what_to_open(stranger):
+    """After a restart, reloading the page used to say "403 Forbidden" only."""
+    answer = stranger.get("/", headers={"Accept": "text/html,application/xhtml+xml"})
+    assert answer.status_code == 403 and answer.headers["content-type"].startswith("text/html")
+    assert "begins with\n<strong>http://127.0.0.1:8090/?token=</strong>" in answer.text
+    assert TOKEN not in answer.text and "library" not in answer.text
+    rebinding = {"Accept": "text/html", "Host": "evil.example"}
+    assert stranger.get("/", headers=rebinding).text.startswith("403 Forbidden: ")
+
+
+@pytest.mark.parametrize(("at_once", "more"), [(1, ""), (3, " --jobs 3")])
+def test_the_page_knows_the_whole_command_that_starts_the_studio_again(page, studio, at_once, more):
+    studio.queue.at_once = at_once
+    command = page.get("/api/library").json()["start"]
+    assert command == f"gsplat-edu studio {shlex.quote(str(studio.library.root))}{more}"
 
 
 def test_every_answer_has_the_headers_that_keep_other_pages_out(page, stranger):

@@ -119,6 +119,42 @@ def test_places_that_cannot_be_adopted_are_refused(page, studio, tmp_path):
     )
 
 
+def test_a_removed_export_comes_back_from_the_trash(page, studio):
+    """Under whatever name its run has by then, and never over another file."""
+    exports = entry(studio, "runs", "a") / "exports"
+    exports.mkdir()
+    (exports / "a.mesh.glb").write_bytes(b"eight minutes")
+    number = page.delete("/api/runs/a/exports/a.mesh.glb").json()["trash"]
+    assert page.get("/api/runs/a/exports").json() == {"exports": []}
+    (removed,) = page.get("/api/trash").json()["trash"]
+    assert (removed["kind"], removed["name"], removed["entry"]) == ("exports", "a.mesh.glb", "runs/a")
+    assert page.post("/api/runs/a/rename", json={"to": "b"}).status_code == 200
+    exports = exports.parent.with_name("b") / "exports"
+    (exports / "a.mesh.glb").write_bytes(b"newer")
+    assert page.post(f"/api/trash/{number}/restore").status_code == 409
+    shutil.rmtree(exports)
+    run = page.delete("/api/runs/b").json()["trash"]
+    answer = page.post(f"/api/trash/{number}/restore")
+    assert answer.status_code == 409 and "runs/b: does not exist; restore it first" in answer.json()["error"]
+    assert page.post(f"/api/trash/{run}/restore").status_code == 200
+    assert page.post(f"/api/trash/{number}/restore").json()["entry"] == "runs/b"
+    assert (exports / "a.mesh.glb").read_bytes() == b"eight minutes"
+    assert page.get("/api/trash").json() == {"trash": []}
+
+
+@pytest.mark.parametrize(
+    "source", ["runs/../exports", "runs/a/live", "runs/a/exports/b", ".studio/a/exports", "a"]
+)
+def test_a_trash_from_elsewhere_restores_nothing_outside_of_exports(page, studio, source):
+    entry(studio, "runs", "a")
+    folder = studio.library.hidden("trash") / f"{7:020d}"
+    folder.mkdir()
+    (folder / "from.txt").write_text(source)
+    (folder / "pause").touch()
+    assert page.post(f"/api/trash/{folder.name}/restore").status_code in (400, 404)
+    assert (folder / "pause").exists()
+
+
 def test_rename_remove_and_restore(page, studio, jpeg):
     entry(studio, "captures", "a", photo__jpg=jpeg)
     entry(studio, "captures", "b")
@@ -301,14 +337,23 @@ def test_a_capture_says_what_the_search_for_its_poses_found(page, studio):
     folder = entry(studio, "captures", "box", cameras__txt=b"")
     assert page.get("/api/captures/box").json()["search"] is None
     (folder / "sfm").mkdir()
-    found = {"photos": {"names": list("abc")}, "mapping": {"names": list("ab")}, "capture": {"error": 0.364}}
+    found = {
+        "photos": {"names": list("abc")},
+        "mapping": {"names": list("ab")},
+        "capture": {"error": 0.364, "left_out": ["c"]},
+    }
     stages = {name: {"options": {}, "facts": facts} for name, facts in found.items()}
     file = folder / "sfm" / "stages.json"
     text = json.dumps({"stages": stages})
     file.write_text(text)
-    assert page.get("/api/captures/box").json()["search"] == {"photos": 3, "posed": 2, "error": 0.364}
+    assert page.get("/api/captures/box").json()["search"] == {
+        "photos": 3,
+        "posed": 2,
+        "unplaced": ["c"],
+        "error": 0.364,
+    }
     file.write_text(json.dumps({"stages": stages | {"faces": {"options": {}, "facts": {}}}}))
-    assert page.get("/api/captures/box").json()["search"] == {"photos": None, "posed": None, "error": 0.364}
+    assert page.get("/api/captures/box").json()["search"]["photos"] is None
     unfinished = json.dumps({"stages": stages | {"capture": {"options": {}, "facts": None}}})
     for damaged in ("[]", "{", unfinished, text.replace("0.364", "NaN")):
         file.write_text(damaged)

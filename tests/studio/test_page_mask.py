@@ -223,7 +223,7 @@ def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swa
     part.get_by_role("button", name="Mask this: view_005.png").first.click()
     dialog = tab.locator("dialog.mask[open]")
     dialog.wait_for()
-    until_in(tab, tab, "document.querySelector('.sheet img').complete")
+    until_in(tab, tab, "document.querySelector('.painted img').complete")
     draw(tab, dialog.locator("svg").bounding_box(), (10, 10), (80, 60))
     saved(dialog)
     dialog.get_by_role("button", name="Close").click()
@@ -242,7 +242,7 @@ def test_a_run_is_trained_again_with_the_mask_of_a_finding(visitor, library, swa
             }""",
             address,
         )
-    assert answer[0] == 409 and "is used by job" in answer[1] and (swapped / DRAWN).exists()
+    assert answer[0] == 409 and "is used by “" in answer[1] and (swapped / DRAWN).exists()
     assert job.work.inputs == ("captures/wrong",)
 
 

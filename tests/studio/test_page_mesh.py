@@ -59,6 +59,34 @@ def test_a_mesh_is_made_shown_beside_the_splats_and_downloaded(visitor, library,
     assert download.value.path().read_bytes() == stored
 
 
+def test_a_removed_mesh_is_undone_at_once_or_from_the_trash(visitor, library, wall_entry):
+    exports = wall_entry / "exports"
+    shutil.rmtree(exports, ignore_errors=True)  # of another test of this library
+    exports.mkdir()
+    mesh = exports / "wall.mesh.glb"
+    mesh.write_bytes(b"eight minutes")
+    tab = visitor().tab
+    go(tab, "scenes/wall/share")
+    listed = tab.locator(".exports li", has_text="wall.mesh.glb")
+    away = listed.get_by_role("button", name="Move to the trash")
+    away.click()
+    listed.wait_for(state="detached")
+    assert not mesh.exists()
+    tab.get_by_role("button", name="Undo", exact=True).click()
+    listed.wait_for()
+    assert mesh.read_bytes() == b"eight minutes"
+    assert not tab.get_by_text("wall.mesh.glb is in the trash").is_visible()
+
+    away.click()
+    go(tab, "trash")
+    tab.get_by_text("wall.mesh.glb, a file of scenes/wall").wait_for()
+    clear = tab.get_by_role("button", name="Empty the trash").bounding_box()
+    assert clear["width"] < tab.viewport_size["width"] / 2
+    tab.get_by_role("button", name="Restore").click()
+    tab.get_by_text("The trash is empty.").wait_for()
+    assert mesh.read_bytes() == b"eight minutes"
+
+
 def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_entry):
     exports = wall_entry / "exports"
     shutil.rmtree(exports, ignore_errors=True)  # of another test of this library
@@ -91,6 +119,10 @@ def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_ent
     tab.get_by_label("HTML page").check()
     box.check()
     tab.get_by_label("Title and name of the file").fill("both")
+    go(tab, "scenes/wall")
+    go(tab, "scenes/wall/share")
+    assert tab.get_by_label("Title and name of the file").input_value() == "both", "it is remembered"
+    box.check()
     tab.get_by_role("button", name="Export").click()
     listed.filter(has_text="both.html").wait_for()
     command = person.command("export of both.html")

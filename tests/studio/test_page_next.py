@@ -97,8 +97,9 @@ def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tm
 
     press_next(tab, "Find the poses")
     go(tab, "")
-    press_next(tab, "Start training", 240)
-    press_next(tab, "Start it")
+    press_next(tab, "Look at the cameras", 240)
+    person.reach("#/captures/photos")
+    press_next(tab, "Start training")
     person.reach("#/runs/photos")
     press_next(tab, "Share it", 600)
     person.reach("#/runs/photos/share")

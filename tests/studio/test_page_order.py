@@ -168,7 +168,7 @@ def test_other_tabs_hear_of_a_removed_export(page, studio):
     exports.mkdir(parents=True)
     (exports / "wall.spz").write_bytes(b"x")
     told = []
-    studio.stream.library_changed = lambda: told.append(len(list(exports.iterdir())))
+    studio.library.changed = lambda: told.append(len(list(exports.iterdir())))
     assert page.delete("/api/scenes/wall/exports/wall.spz").status_code == 200
     assert told == [0]
 

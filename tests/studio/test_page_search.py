@@ -1,9 +1,13 @@
-"""Photos that share nothing, in Chromium: the search for their poses fails, and leaves one next step."""
+"""Searches for poses, in Chromium: one that fails leaves one next step, and photos that have no pose come first."""
 
+import json
 import re
 
 import pytest
 
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.sfm.photos import fingerprint, photo_files
 from studio.pages import DROP, encoded, go, png
 from waiting import until_in
 
@@ -43,3 +47,45 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     assert tab.evaluate(f"{PRIMARY}.length") == 1
     back.click()
     person.reach("#/photos/photos")
+
+
+def test_photos_that_were_not_placed_come_first_and_the_next_step_leads_to_the_cameras(visitor, library):
+    root = library[0].library.root
+    photos, capture = root / "photos" / "lamp", root / "captures" / "lamp"
+    views, points, colors = procedural_capture(24, 18, splats=60)
+    write_colmap(capture, views[6:], points, colors)
+    photos.mkdir()
+    for i in range(20):
+        (photos / f"{i:02d}.png").write_bytes(png(i))
+    names = [f"{i:02d}.png" for i in range(8)]
+    given = fingerprint(photo_files(photos), photos)
+    stages = {
+        "photos": {"options": {"photos": given}, "facts": {"names": [f"{i:02d}.png" for i in range(20)]}},
+        "mapping": {"options": {}, "facts": {"names": [f"{i:02d}.png" for i in range(8, 20)]}},
+        "capture": {"options": {}, "facts": {"error": 0.7, "left_out": names}},
+    }
+    (capture / "sfm").mkdir()
+    (capture / "sfm" / "stages.json").write_text(json.dumps({"stages": stages}))
+    person = visitor()
+    tab = person.tab
+    tab.get_by_role("article", name="lamp").get_by_role(
+        "link", name="Next: Look at the cameras, lamp"
+    ).click()
+    person.reach("#/captures/lamp")
+    missing = tab.get_by_role("group", name="photos that were not placed")
+    missing.get_by_text("8 of 20 photos were not placed.").wait_for()
+    assert "Take two more photos beside each of them" in missing.inner_text()
+    until_in(
+        tab,
+        tab,
+        "[...document.querySelectorAll('.unplaced img')].filter((one) => one.naturalWidth).length === 8",
+    )
+    for later in ("cameras", "training", "photos", "doctor"):
+        box = tab.get_by_role("region", name=later).bounding_box()
+        assert box["y"] > missing.bounding_box()["y"], later
+    doctor = tab.get_by_role("region", name="doctor")
+    finding = doctor.locator(".finding", has_text="8 of 20 photos could not be placed")
+    finding.wait_for()  # without an examination: it is certain
+    assert finding.locator("img").count() == 8
+    assert finding.get_by_role("button").count() == 0  # what has no pose is not used anyway
+    tab.get_by_role("button", name="Next: Start training").wait_for()

@@ -104,6 +104,33 @@ def test_a_photo_that_comes_late_is_not_laid_over_another_view(visitor, runs):
     assert all(names[1].split(" ")[0] in one for one in shown), shown
 
 
+def test_a_photo_waits_for_the_picture_of_its_view(visitor, runs):
+    """Neither the photo nor the render beside it may be of another camera, however slowly the scene is drawn."""
+    tab = go(visitor().tab, "runs/egg")
+    frame = frame_of(tab)
+    until_in(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
+    frame.evaluate(
+        "window.held = []; viewer.frame = ((frame) => (now) => held.push(() => frame.call(viewer, now)))(viewer.frame)"
+    )
+    view, photo = tab.get_by_label("View", exact=True), tab.locator(".over-photo")
+    for index in (1, 2):
+        view.select_option(index=index)
+        until_in(tab, frame, "held.length > 0")
+        until_in(tab, tab, "document.querySelector('.over-photo').complete")
+        tab.get_by_text("Drawing this view ...").wait_for()
+        assert not photo.is_visible() and tab.get_by_label("Photo ↔ render").is_disabled()
+        frame.evaluate("viewer.frameAsked = 0; held.splice(0).forEach((draw) => draw())")
+        until_in(
+            tab,
+            frame,
+            "viewer.isWhole || (viewer.frameAsked = 0, held.splice(0).forEach((draw) => draw()), false)",
+        )
+        photo.wait_for()
+        name = view.locator("option").nth(index).inner_text().split(" ")[0]
+        assert name in photo.get_attribute("src")
+        assert not tab.get_by_text("Drawing this view ...").is_visible()
+
+
 def test_clean_says_what_it_removed_and_carries_the_edits_over(visitor, runs):
     source = open_source(runs / "egg-2")
     identity = identity_of(source.scene)

@@ -83,9 +83,10 @@ def test_a_project_goes_from_photos_to_an_export(page, studio):
     add_capture(studio, "walk", {})
     project = only(page)
     assert (project["entries"], project["stage"]) == (["photos/walk", "captures/walk"], "training")
-    assert project["next"]["label"] == "Start training"
+    cameras = project["next"]
+    assert (cameras["label"], cameras["place"]) == ("Look at the cameras", "captures/walk")
 
-    job = job_of(studio, **project["next"]["request"])
+    job = job_of(studio, **cameras["then"]["request"])
     project = only(page)
     assert project["next"] == {"label": "Watch the training", "place": "runs/walk"}
     assert project["entries"][-1] == "runs/walk", "it has no folder yet"
@@ -133,7 +134,7 @@ def test_an_entry_has_the_next_step_of_what_was_made_from_it(page, studio):
     answer = page.get("/api/library").json()
     (project,), (first, second) = answer["projects"], answer["captures"]
     assert project["next"]["label"] == first["next"]["label"] == "Look at the result"
-    assert second["next"]["request"]["subject"] == "captures/walk-poses-2"
+    assert second["next"]["place"] == "captures/walk-poses-2"
     assert second["made_from"] == "photos/walk" and answer["runs"][0]["made_from"] == "captures/walk"
 
 

@@ -229,6 +229,12 @@ def test_damaged_edits_are_not_stored(page, run, damage):
     assert not (run.path / "edits.json").exists()
 
 
+def test_the_cover_of_a_run_is_its_start_view_in_the_shape_of_a_card(page, run):
+    answer = page.get("/api/runs/r/cover")
+    assert answer.status_code == 200 and answer.headers["content-type"] == "image/jpeg"
+    assert Image.open(io.BytesIO(answer.content)).size == (512, 384)
+
+
 def test_findings_name_photos(page, studio, trained):
     shutil.copytree(trained / "box", studio.library.root / "captures" / "box")
     assert page.get("/api/captures/box/findings").json()["job"] is None

@@ -16,14 +16,15 @@ from gsplat_edu.data import procedural
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_blender, write_colmap, write_transforms
-from gsplat_edu.doctor.after import Trained, examine_run
-from gsplat_edu.doctor.residuals import residuals
+from gsplat_edu.doctor.after import examine_run
 from gsplat_edu.evaluate.metrics import score_views
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.cleaning import report_lines
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.residuals import residuals
+from gsplat_edu.survey.trained import Trained
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe

@@ -11,10 +11,10 @@ from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.native_lens import native_intrinsics
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.gap import widest_gap
-from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.survey.finding import Finding, Severity
+from gsplat_edu.survey.geometry import Geometry
 from gsplat_edu.viewer import capture_data
 from gsplat_edu.viewer.capture_data import (
     FEW,

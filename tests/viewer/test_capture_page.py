@@ -225,7 +225,11 @@ def test_photos_are_left_out_and_used_again_but_for_the_last_one(opened, folder)
     assert read_left_out(folder) == (name,)
     tab.evaluate("viewer.choose(-1)")
     first = tab.evaluate("8 * viewer.cameras.firsts[1]")
-    assert tab.evaluate("at => [...viewer.cameras.styles.slice(at, at + 3)]", first) == [136, 136, 136]
+    assert tab.evaluate("at => [...viewer.cameras.styles.slice(at, at + 3)]", first) == [
+        115,
+        123,
+        134,
+    ]  # --edge
     assert tab.evaluate("[...viewer.cameras.styles.slice(0, 4)]") == plain
     assert "left out (1)" in tab.inner_text("#legend")
     tab.evaluate("viewer.choose(1)")
@@ -305,15 +309,15 @@ def test_findings_color_cameras_when_the_doctor_is_done(opened, served):
     assert "blurred (1)" in tab.inner_text("#legend")
     styles = "i => [...viewer.cameras.styles.slice(8 * viewer.cameras.firsts[i], 8 * viewer.cameras.firsts[i] + 3)]"
     assert tab.evaluate(styles, 3) == [255, 170, 0]
-    assert tab.evaluate(styles, 2) == [102, 204, 255]
+    assert tab.evaluate(styles, 2) == [138, 180, 248]  # --accent
     tab.evaluate("viewer.choose(3)")
     assert "blurred" in tab.inner_text("#facts-of")
 
 
 def test_light_and_dark_have_their_colors(opened):
     dark, light = opened(color_scheme="dark"), opened(color_scheme="light")
-    assert tuple(pixels(dark)[-1, -1]) == (17, 17, 17)
-    assert tuple(pixels(light)[-1, -1]) == (238, 238, 238)
+    assert tuple(pixels(dark)[-1, -1]) == (20, 23, 27)  # --background
+    assert tuple(pixels(light)[-1, -1]) == (245, 246, 248)
 
 
 def test_on_a_phone_everything_fits_and_is_large_enough(opened):

@@ -194,6 +194,17 @@ def test_a_photo_is_slid_by_keys_and_touch(shown):
     assert not tab.is_visible("#compare-card")
 
 
+def test_a_photo_waits_until_the_picture_of_its_camera_is_on_the_screen(shown):
+    tab = shown().tab
+    for index in (2, 0):
+        before = f"viewer.compare.on || viewer.compare.toggle(), viewer.goTo({index}), viewer.exact = null"
+        assert tab.evaluate(f"({before}, document.getElementById('photo').hidden)"), index
+        until(
+            tab,
+            f"!document.getElementById('photo').hidden && viewer.isWhole && viewer.cameraIndex === {index}",
+        )
+
+
 def test_a_photo_lies_exactly_over_the_picture_of_its_camera(shown):
     """The photo's corners are where the page's camera sees the corners of the camera's image."""
     seen = shown()

@@ -56,6 +56,21 @@ def test_no_head_is_cut_off_in_a_wide_window(visit, tmp_path, random_gaussians):
     assert rows.min() > 0, f"the head begins {-rows.min():.0f} px above the window"
 
 
+@pytest.mark.parametrize(("W", "H"), [(640, 480), (480, 640), (900, 300)])
+def test_a_cover_shows_the_whole_subject_in_the_middle(random_gaussians, W, H):
+    """Photos of each shape, whose upper edge cuts the head, or which see the body as a narrow strip."""
+    body, head = figure(random_gaussians)
+    views = around(W, H, 1.5 * H)
+    camera = page.cover_view(Scene(body), views, {"0.00"}, None, (512, 384))
+    assert (camera.W, camera.H) == (512, 384)
+    for points in (head, body.means.double().numpy()):
+        u, v, z = camera.project(camera.world_to_cam(points))
+        assert (z > 0).all() and u.min() > 0 and u.max() < 511 and v.min() > 0 and v.max() < 383
+    assert not np.allclose(camera.eye, views[0][1].eye), "it was held out"
+    chosen = Start(views[5][1], np.zeros(3), UP, -1)
+    assert np.allclose(page.cover_view(Scene(body), views, set(), chosen, (512, 384)).eye, views[5][1].eye)
+
+
 def test_the_panel_of_a_phone_lies_above_the_subject(visit, tmp_path, random_gaussians):
     body, head = figure(random_gaussians)
     (tmp_path / "figure.html").write_bytes(page.html(Scene(body), around(480, 640, 940.0)))

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -17,16 +17,12 @@ from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.text import plain_of
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
+from gsplat_edu.data.depths import own_depth
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.after import Trained, examine_run, view_lines
-from gsplat_edu.doctor.appearance import check_exposure, compares_exposure, correction_of
+from gsplat_edu.doctor.after import examine_run, view_lines
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.cameras import side_for_training
-from gsplat_edu.doctor.depth import own_depth
-from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, event_of, table_lines
-from gsplat_edu.doctor.moving import moved_parts
-from gsplat_edu.doctor.residuals import residuals
-from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.doctor.diagnosis import Diagnosis, advice_lines, diagnosis_lines, event_of, table_lines
 from gsplat_edu.evaluate.verdict import measured_of
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
@@ -35,7 +31,10 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.runs.parts import findings
+from gsplat_edu.runs.parts import judgements
+from gsplat_edu.survey.capture import Survey, prepare
+from gsplat_edu.survey.residuals import residuals
+from gsplat_edu.survey.trained import Trained
 from gsplat_edu.train.config import DEFAULT_STRATEGY, TrainConfig, recipe
 from gsplat_edu.train.length import DEFAULT_QUALITY, planned_iterations
 
@@ -151,16 +150,9 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
             residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task), appearance)
             for views in (dataset.train, dataset.test)
         )
-    masked = isinstance(section, dict) and section.get("transients", "none") != "none"
-    moved = (
-        []
-        if masked
-        else moved_parts(gaussians, dataset.train, functools.partial(render, backend=backend), settings)
-    )
     extent = scene_extent([view.camera for view in dataset.train])
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
-    before = BeforeTraining() if appearance != "none" else exposure_beforehand(reader, console)
     trained = Trained(
         folder.path,
         gaussians,
@@ -172,17 +164,15 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         log=folder.log(),
         capture=reader.path,
         options=_options(config),
-        beforehand=before.findings,
-        uncompared=before.uncompared,
-        correction=before.correction,
         strategy=_strategy(section),
-        corrected=appearance != "none",
-        moved=moved,
-        plugged=findings(config, folder.path),
         measured=measured_of(folder.read_metrics(), config),
+        views=dataset.train,
+        features=functools.partial(render, backend=backend),
+        settings=settings,
+        survey=functools.cache(functools.partial(_surveyed, reader, console)),
     )
     views = view_lines(trained) if arguments.all_views else ()
-    return examine_run(trained), [*views, *_gpu_lines(backend)]
+    return examine_run(trained, judgements(config, trained)), [*views, *_gpu_lines(backend)]
 
 
 def _strategy(section: object) -> str:
@@ -222,27 +212,11 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
     return (*words, *(flag for flag, key in flags.items() if train.get(key)))
 
 
-class BeforeTraining(NamedTuple):
-    """What the photos alone tell about their exposure."""
-
-    findings: Sequence[Finding] = ()
-    uncompared: str = ""  # why there are none; empty if the photos were compared
-    correction: str = "none"  # what `--appearance auto` chooses
-
-
-def exposure_beforehand(reader: CaptureReader, console: Console) -> BeforeTraining:
-    """Check the photos' exposure as before training."""
+def _surveyed(reader: CaptureReader, console: Console) -> Survey:
+    """Survey the capture of a run, with a progress bar."""
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
-        try:
-            survey = prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))
-        except DatasetError as error:
-            return BeforeTraining(uncompared=str(error))
-        if len(survey.shots) < 2:
-            return BeforeTraining(uncompared="fewer than two photos can be read")
-        if not compares_exposure(survey):
-            return BeforeTraining(uncompared="the capture has no points, and its photos no EXIF exposure")
-        return BeforeTraining(check_exposure(survey), correction=correction_of(survey).value)
+        return prepare(reader, lambda done, total: bar.update(task, completed=done, total=total))
 
 
 def _bar(console: Console) -> Progress:

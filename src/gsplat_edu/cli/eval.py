@@ -13,7 +13,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.locks import LOCK, locked
 from gsplat_edu.cli.terminal import Bar, Terminal
-from gsplat_edu.doctor.finding import command
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.evaluate.verdict import skipped_views, verdict
 from gsplat_edu.io.formats import read_scene
@@ -23,6 +22,7 @@ from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.evaluation import EVALUATED, Evaluation, ScoredViews, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.identity import capture_difference
+from gsplat_edu.survey.finding import command
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -8,11 +8,11 @@ from dataclasses import replace
 from gsplat_edu.base.text import Told
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.certain import certain_findings, known_photos, without_wrong_poses
-from gsplat_edu.doctor.finding import Finding, counted, event_of, finding_rows, listed, table_lines
+from gsplat_edu.doctor.diagnosis import event_of, finding_rows, table_lines
 from gsplat_edu.evaluate.verdict import PHOTOS
 from gsplat_edu.jobs import emitter
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.runs.processes import Member
+from gsplat_edu.survey.finding import Finding, counted, listed
 
 
 def say_findings(
@@ -69,22 +69,17 @@ def with_right_poses(
     return replace(options, data_settings=replace(settings, left_out=chosen))
 
 
-def record_photos(options: RunOptions, reader: CaptureReader, team: Member) -> None:
-    """Write into config.json of a run that has just begun what the verdict has to know about its photos.
-
-    Only the first of the processes that share it writes.
+def with_known_photos(options: RunOptions, reader: CaptureReader) -> RunOptions:
+    """Return the options of a new run with what the verdict has to know about its photos, for config.json.
 
     Args:
-        options: The run.
+        options: The run; a resumed one has that in its config.json.
         reader: Its capture.
-        team: Its processes.
 
     Raises:
-        CheckpointError: config.json is damaged.
-        OSError: it cannot be written.
+        DatasetError: there is no capture, or its poses cannot be read.
     """
-    if team.rank:
-        return
-    config = options.folder.read_config()
-    if PHOTOS not in config:
-        options.folder.write_config(config | {PHOTOS: known_photos(reader, options.data_settings.left_out)})
+    if options.folder.exists():
+        return options
+    known = {PHOTOS: known_photos(reader, options.data_settings.left_out)}
+    return replace(options, records={**options.records, **known})

@@ -6,25 +6,25 @@ import functools
 from collections.abc import Callable
 
 from gsplat_edu.cli.eval import result_lines, verdict_line
-from gsplat_edu.doctor.moving import moved_line
-from gsplat_edu.doctor.remedies import ENOUGH
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Metric
+from gsplat_edu.parts.run_values import Ended
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.train.part import parts
 
 
 def tell_result(
     capture: CaptureRun, result: Evaluation, say: Callable[[str], None], *, limited: bool
 ) -> None:
-    """Say how a training ended: its time, its scores, its files, and photos that do not fit the scene.
+    """Say how a training ended: its time, its scores, its files, and what the parts remark.
 
     Args:
         capture: The run, finished.
         result: Its scores.
         say: Receives sentences.
-        limited: Whether a time limit is running; then only the command that compares photos is named.
+        limited: Whether a time limit is running; then no photos are compared for a remark.
     """
     trainer = capture.trainer
     rate = f"{1e3 * capture.seconds / max(trainer.iteration, 1):.1f} ms/iter"
@@ -38,20 +38,19 @@ def tell_result(
         emitter.emit(Metric(name, result.metrics["test"][name], unit, "test"))
     emitter.report_output(folder)
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
-    _tell_odd_photos(capture, say, limited=limited or not capture.options.scores_at_end)
+    _tell_remarks(capture, say, limited=limited or not capture.options.scores_at_end)
     if (planned := trainer.config.iterations) > trainer.iteration:
         say(f"the time limit ended training before iteration {planned}; --resume continues it: {folder}")
     say(verdict_line(result, capture.folder))
 
 
-def _tell_odd_photos(capture: CaptureRun, say: Callable[[str], None], *, limited: bool) -> None:
-    """Name the photos that show what others do not; with a time limit or without scores, the command that does."""
-    trainer, options = capture.trainer, capture.options
-    if trainer.maskers or len(capture.dataset.train) < ENOUGH:
-        return
+def _tell_remarks(capture: CaptureRun, say: Callable[[str], None], *, limited: bool) -> None:
+    """Say what the parts remark; with a time limit or without scores, they may not compare photos."""
+    options = capture.options
     features = None if limited else functools.partial(render, backend=options.backend)
-    line = moved_line(
-        capture.folder.path, trainer.gaussians, capture.dataset, features, options.render_settings
+    run = Ended(
+        capture.folder.path, capture.trainer.gaussians, capture.dataset, features, options.render_settings
     )
-    if line:
-        say(line)
+    for name, part in parts().items():
+        if line := part.remark(options.config.settings_of(name), run):
+            say(line)

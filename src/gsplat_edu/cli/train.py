@@ -24,7 +24,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Plan, look_ahead, plan
 from gsplat_edu.budget.planned import PLANNED
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.findings import record_photos, with_right_poses
+from gsplat_edu.cli.findings import with_known_photos, with_right_poses
 from gsplat_edu.cli.process import interruptible, process_age
 from gsplat_edu.cli.result import tell_result
 from gsplat_edu.cli.terminal import Bar, Field, Terminal, stage_bars
@@ -33,8 +33,7 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.doctor.finding import Remedy
-from gsplat_edu.doctor.remedies import BY_COUNT, CHOICES, remedies_for
+from gsplat_edu.doctor.remedies import remedies_for
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.length import quality_of
@@ -49,6 +48,8 @@ from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.server.address import PORT, free_port, warning_for
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
+from gsplat_edu.survey.capture import Undecided
+from gsplat_edu.survey.finding import Remedy
 from gsplat_edu.train.capacity import advised_side
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
@@ -144,9 +145,9 @@ def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], N
 
             port = PORT if port is None else port
             free_port(host, port, NAMES)  # before the run writes anything
+        options = with_known_photos(options, reader)
         with progress_bar(console, "") as bar:
             capture = CaptureRun(options, say, photos_read(bar, interrupted), team, reader=reader)
-            record_photos(capture.options, reader, team)
         callbacks: list[Callback] = []
         ends = interrupted
         pace = None
@@ -374,17 +375,14 @@ def with_choices(
             say(Told(f"{option_flag(name)} {remedy.value}: {remedy.reason}", remedy.reason))
         return replace(options, config=options.config.changed(**{name: remedy.value}))
 
-    if by_photos := [name for name in names if name in CHOICES]:
+    if undecided := [name for name in names if name != TRIED]:
         with progress_bar(console, "") as bar:
+            progress = photos_read(bar, lambda: False)
             remedies = remedies_for(
-                reader, by_photos, photos_read(bar, lambda: False), options.data_settings.left_out
+                Undecided(reader, options.data_settings, options.points, progress), undecided
             )
         for name, remedy in remedies.items():
             options = take(options, name, remedy)
-    if by_count := [name for name in names if name in BY_COUNT]:
-        count = len(Dataset.of(reader, options.data_settings, points=options.points).train)
-        for name in by_count:
-            options = take(options, name, BY_COUNT[name](count))
     asked = "" if TRIED in names else getattr(options.config, TRIED)
     if TRIED in names or (asked in NEED_TRIALS and not (options.resume and options.folder.exists())):
         with progress_bar(console, "") as bar:
@@ -396,7 +394,11 @@ def with_choices(
                 asked,
                 *(() if time is None else (time.is_over,)),
             )
-        options = take(replace(options, trials=chosen.record), TRIED, Remedy(chosen.value, chosen.reason))
+        options = take(
+            replace(options, records={**options.records, **chosen.record}),
+            TRIED,
+            Remedy(chosen.value, chosen.reason),
+        )
     return options
 
 

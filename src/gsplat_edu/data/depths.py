@@ -85,6 +85,12 @@ class DepthSource:
     unit: float = 0.0
 
 
+def own_depth(reader: CaptureReader) -> Path | None:
+    """Return the source of the depth maps that a capture brings along; None if it has none."""
+    named = any(frame.depth is not None for frame in reader.capture.frames)
+    return CAPTURE if named or is_folder(reader.path / GEOMETRIC_MAPS) else None
+
+
 @dataclass(frozen=True)
 class DepthReport:
     """What was found about the depth of a capture.

@@ -1,4 +1,4 @@
-"""Photos that a capture keeps but that nothing uses: the list left_out.txt in its folder.
+"""Photos that a capture keeps but that nothing uses: the list left_out.txt in its folder, and those without a pose.
 
 Each line names a photo: by its path below the folder, or as the capture names it. Lines that begin with # are
 comments. A photo that is taken off the list is used again. Which views are held out does not change with the list.
@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.reading import read_text
+from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.records import Record, Text, record_of
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import Frame, is_file, is_folder
 from gsplat_edu.data.changes import changing
@@ -185,3 +186,25 @@ def _found(photo: str, paths: dict[str, str], capture: Path) -> str:
 
 def _list_of(capture: Path) -> Path:
     return (capture if is_folder(capture) else capture.parent) / LEFT_OUT
+
+
+class WithoutPose(Record, frozen=True, forbid_unknown_fields=False):
+    """Names of photos in the facts of the stage "capture", by the reason why they have no pose that counts."""
+
+    left_out: tuple[Text, ...] = ()
+    unclear: tuple[Text, ...] = ()
+    doubtful: tuple[Text, ...] = ()
+
+
+def without_pose(capture: Path) -> tuple[str, ...]:
+    """Return the names of the photos for which the search that made a capture found no pose that counts.
+
+    Args:
+        capture: Its folder; without a record of a search, or with a damaged one, the result is empty.
+    """
+    try:
+        facts = parse_json(read_text(capture / "sfm" / "stages.json"))["stages"]["capture"]["facts"]
+        names = record_of("facts", facts, WithoutPose)
+    except (OSError, ValueError, KeyError, TypeError, ArgumentError):
+        return ()
+    return (*names.left_out, *names.unclear, *names.doubtful)

@@ -1,4 +1,4 @@
-"""Run all checks of a capture before training and combine them into one diagnosis.
+"""Run all checks of a capture before training, those of the parts too, and combine them into one diagnosis.
 
 Chapter: 14_photos_to_scene.
 """
@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.notes import Background, MissingPhotos, Note
-from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure, compares_exposure
+from gsplat_edu.doctor.appearance import check_blur, check_duplicates
 from gsplat_edu.doctor.cameras import (
     check_away,
     check_coverage,
@@ -22,10 +22,11 @@ from gsplat_edu.doctor.cameras import (
 )
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.cut_out import check_masks
+from gsplat_edu.doctor.diagnosis import Advice, Diagnosis, in_order, new_run
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
-from gsplat_edu.doctor.finding import Advice, Diagnosis, Finding, command, new_run
-from gsplat_edu.doctor.remedies import check_sky
-from gsplat_edu.doctor.survey import Survey
+from gsplat_edu.survey.capture import Survey
+from gsplat_edu.survey.finding import Finding, command
+from gsplat_edu.train.part import parts
 
 Check = Callable[[Survey], list[Finding]]
 
@@ -33,7 +34,7 @@ OF_FILES: tuple[tuple[str, Check], ...] = (
     ("enough photos", check_usable),
     ("files", check_readable),
 )
-"""Checks that need no usable photo, most harmful faults first."""
+"""Checks that need no usable photo."""
 
 OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("parallax", check_parallax),
@@ -42,11 +43,9 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("places", check_wrong_poses),
     ("viewing directions", check_away),
     ("sharpness", check_blur),
-    ("exposure", check_exposure),
     ("coverage", check_coverage),
     ("duplicates", check_duplicates),
     ("cloud", check_cloud),
-    ("sky", check_sky),
     ("masks", check_masks),
     ("resolution", check_resolution),
 )
@@ -68,18 +67,18 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
             --resolution auto where the photos are much larger than the scene resolves.
     """
     checks = [*OF_FILES, *(OF_VIEWS if len(survey.shots) > 1 else ()), *OF_LISTS]
-    if survey.depth is not None:
-        checks.append(("depth", lambda survey: list(survey.depth.findings) if survey.depth else []))
-    findings, fine = list[Finding](), list[str]()
-    for name, check in checks:
-        found = check(survey)
-        findings += found
-        if not found and (check is not check_exposure or compares_exposure(survey)):
-            fine.append(name)
+    by_parts = [found for part in parts().values() if (found := part.examine(survey)) is not None]
+    findings, fine = in_order(
+        [
+            *((name, check(survey)) for name, check in checks),
+            *(check for part in by_parts for check in part.checks.items()),
+        ]
+    )
     if "--resolution" not in options and any(finding.name == "resolution" for finding in findings):
         options = (*options, "--resolution", "auto")
     advice = _otherwise(survey, options)
-    return Diagnosis(_facts(survey), tuple(findings), tuple(fine), advice, _notes(survey))
+    facts = (*_facts(survey), *(fact for part in by_parts for fact in part.facts))
+    return Diagnosis(facts, findings, fine, advice, _notes(survey))
 
 
 def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
@@ -94,8 +93,6 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
         facts.append(("cameras", _arrangement(survey)))
-    if survey.depth is not None and survey.depth.report is not None:
-        facts.append(("depth", survey.depth.report.lines()[0]))
     return tuple(facts)
 
 

@@ -13,12 +13,12 @@ from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.dataset import TEST_EVERY
 from gsplat_edu.data.panorama import FaceLens
-from gsplat_edu.doctor.finding import FEWER_PHOTOS, MORE_PHOTOS, NAMED, Finding, Severity, command
 from gsplat_edu.doctor.gap import HOLE, ring_of
-from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
-from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import FAR_AWAY, SAME_PLACE, far_ratios, settled_eyes, stray_eyes
+from gsplat_edu.survey.capture import Shot, Survey
+from gsplat_edu.survey.finding import FEWER_PHOTOS, MORE_PHOTOS, NAMED, Finding, Severity, command
+from gsplat_edu.survey.geometry import AWAY_FACTOR, INWARD, Geometry, facing_away, inside
 from gsplat_edu.train.capacity import advised_side
 
 OFF_CENTRE = 0.1
@@ -42,20 +42,6 @@ FEW_ZOOMED = 0.2
 NO_PARALLAX = 5e-3
 """Depth cannot be estimated if the cameras' spread is below this multiple of the subject's depth: a point then moves by
 at most one degree across all photos, less than 10 px of 1000."""
-
-AWAY = math.radians(45.0)
-"""A camera faces away if its axis points at least this far from the point or direction that the others look at: more
-than half of any usual field of view."""
-
-AWAY_FACTOR = 2.5
-"""The angle must also exceed this multiple of the cameras' 75th percentile, since close-ups of details face aside."""
-
-SEES_LITTLE = 0.05
-"""A camera faces away if it sees fewer points than this fraction of the median camera's count."""
-
-ALONE = 0.05
-"""A camera is isolated if no neighbour sees more than this share of what it sees. The lowest share among 158 cameras of
-three captures was 0.7."""
 
 SUPPORT = 30
 """A pose is reliable with at least this many points observed in the photo: COLMAP's own limit for registration."""
@@ -327,35 +313,6 @@ def _past(geometry: Geometry) -> Bool[np.ndarray, " C"]:
         return np.zeros(len(geometry.cameras), dtype=np.bool_)
     angles = geometry.angles_to(geometry.centre)
     return np.asarray(angles > max(PAST, AWAY_FACTOR * float(np.quantile(angles, 0.75))))
-
-
-def facing_away(geometry: Geometry) -> set[int]:
-    """Return the cameras that face away from the subject, see few points, or share no view with others."""
-    return _aside(geometry) | _few_points(geometry) | _alone(geometry)
-
-
-def _aside(geometry: Geometry) -> set[int]:
-    """Return the cameras whose axis misses the common centre or, in a forward capture, the common direction."""
-    if geometry.arrangement == INWARD and geometry.centre is not None:
-        angles = geometry.angles_to(geometry.centre)
-    elif geometry.arrangement == FORWARD:
-        angles = geometry.angles_to_mean
-    else:
-        return set()
-    limit = max(AWAY, AWAY_FACTOR * float(np.quantile(angles, 0.75)))
-    return set(np.flatnonzero(angles > limit).tolist())
-
-
-def _few_points(geometry: Geometry) -> set[int]:
-    """Return the cameras that see far fewer points than others."""
-    counts = geometry.in_sight.sum(axis=1)
-    return set(np.flatnonzero(counts < SEES_LITTLE * np.median(counts)).tolist())
-
-
-def _alone(geometry: Geometry) -> set[int]:
-    """Return the cameras whose subject no other camera sees; none if that is usual in this capture."""
-    best = np.array([max(shares.values(), default=0.0) for shares in geometry.shares])
-    return set(np.flatnonzero(best < ALONE).tolist()) if np.median(best) > 2 * ALONE else set()
 
 
 def check_coverage(survey: Survey) -> list[Finding]:

@@ -15,9 +15,9 @@ from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.doctor.cameras import TURN, check_intrinsics, check_parallax, check_wrong_poses
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.files import check_poses, check_usable
-from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.gap import HOLE, widest_gap
-from gsplat_edu.doctor.survey import Survey, survey_of_poses
+from gsplat_edu.survey.capture import Survey, survey_of_poses
+from gsplat_edu.survey.finding import Finding, Severity
 
 OF_VIEWS: tuple[Callable[[Survey], list[Finding]], ...] = (
     check_parallax,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gsplat_edu.base.text import short_number
-from gsplat_edu.doctor.finding import Finding, Severity
-from gsplat_edu.doctor.survey import Survey
+from gsplat_edu.survey.capture import Survey
+from gsplat_edu.survey.finding import Finding, Severity
 
 FAR = 20.0
 """A point is far outside if its distance from the cloud's median exceeds this multiple of the 80th percentile. The

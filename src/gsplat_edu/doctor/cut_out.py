@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from gsplat_edu.base.text import Told
-from gsplat_edu.doctor.finding import Finding, Remedy, Severity
-from gsplat_edu.doctor.survey import Survey
+from gsplat_edu.survey.capture import Survey
+from gsplat_edu.survey.finding import Finding, Remedy, Severity
 
 MOST_KEPT = 0.75
 """An object's mask keeps at most this share of the photo's pixels."""
@@ -65,7 +65,7 @@ def outside_masks_for(masks: Sequence[Bool[np.ndarray, "h w"]], photos: int) -> 
     """Choose `--outside-masks` for a capture.
 
     Args:
-        masks: The masks of its photos, from `gsplat_edu.doctor.photos.PhotoStats`.
+        masks: The masks of its photos, from `gsplat_edu.survey.photos.PhotoStats`.
         photos: The number of its photos, with and without a mask.
     """
     if not masks:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from gsplat_edu.data.notes import MissingPhotos
-from gsplat_edu.doctor.finding import Finding, Severity, counted, listed
-from gsplat_edu.doctor.survey import Survey
 from gsplat_edu.evaluate.verdict import UNPOSED
+from gsplat_edu.survey.capture import Survey
+from gsplat_edu.survey.finding import Finding, Severity, counted, listed
 
 FEW = 12
 """Warn about fewer photos than this: on an orbit of 12, neighbours are 30 degrees apart, about the limit of feature
@@ -80,8 +80,8 @@ def check_poses(survey: Survey) -> list[Finding]:
         Finding(
             "no pose",
             Severity.WARNING if serious else Severity.NOTE,
-            f"{len(survey.unposed)} of {total} photos in the folder, not used",
-            "find poses for the photos that have none: more overlap with their neighbours, or another matching",
+            f"{len(survey.unposed)} of {total} photos could not be placed, and are not used",
+            "take two more photos beside each of those that were not placed, and find the poses again",
             survey.unposed,
             certain=True,
         )

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsplat_edu.doctor.geometry import INWARD, Geometry
 from gsplat_edu.paths.orbits import common_up
+from gsplat_edu.survey.geometry import INWARD, Geometry
 
 LEAST = math.radians(30.0)
 """Narrower arcs are no gap: photos 30 degrees apart still share most of what they show."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.region import Region
+from gsplat_edu.survey.geometry import Geometry
 
 MIDDLE = 0.5
 """Width and height of the middle of a photo, as fractions of its own."""

@@ -21,6 +21,7 @@ from jaxtyping import UInt8
 from gsplat_edu.base.content_policy import content_policy, policy_element
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import stored_path
+from gsplat_edu.base.styles import sheet
 from gsplat_edu.base.text import write_text
 from gsplat_edu.evaluate.block_figures import blocks_table, cells_figure
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
@@ -39,8 +40,8 @@ from gsplat_edu.evaluate.report_parts import (
 )
 from gsplat_edu.evaluate.verdict import FULL_LENGTH, Verdict, mean_of, skipped_views, verdict
 
-PICTURES = 8
-"""Most test views shown in a report."""
+PICTURES = 7
+"""Most test views shown in a report below the one that it opens with."""
 
 SCORES = (
     ("psnr", "PSNR (dB)"),
@@ -61,43 +62,36 @@ NAMES = {
 }
 """Labels for the keys of metrics.json that are not plain English."""
 
-STYLE = """
-:root { color-scheme: light dark; --text: #222; --ground: #fff; --code: #f2f2f2; --line: #bbb; --faint: #eee;
-  --quiet: #666; --link: #06c; }
-@media (prefers-color-scheme: dark) {
-  :root { --text: #e6e8ea; --ground: #15181b; --code: #262b30; --line: #666; --faint: #2c3136; --quiet: #a5adb5;
-    --link: #8ab4f8; }
-  svg { filter: invert(.92) hue-rotate(180deg); } /* black lines on white become light ones on the ground */
-}
-a { color: var(--link); }
-body { font: 15px/1.5 system-ui, sans-serif; color: var(--text); background: var(--ground); max-width: 1080px;
-  margin: 2rem auto; padding: 0 1rem; overflow-wrap: anywhere; }
-h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
-.verdict { font-size: 1.1rem; max-width: 46rem; } code { background: var(--code); padding: .1rem .3rem; }
-.table { overflow-x: auto; }
-table { border-collapse: collapse; } th, td { text-align: left; padding: .2rem 1rem .2rem 0; vertical-align: top; }
-th { font-weight: 600; overflow-wrap: normal; }
-thead th { border-bottom: 1px solid var(--line); vertical-align: bottom; }
-td { border-bottom: 1px solid var(--faint); font-variant-numeric: tabular-nums; min-width: 4rem; }
-td.n, th.n { text-align: right; } td.n { white-space: nowrap; overflow-wrap: normal; min-width: 0; }
-summary { cursor: pointer; margin: .5rem 0; }
-figure { margin: 1.5rem 0; } figure > div { display: flex; flex-wrap: wrap; gap: 4px; }
-figure .pair, figure .difference { flex: 1 1 320px; min-width: 0; } figure img { display: block; width: 100%; }
+STYLE = (
+    sheet("page", "code", "table", "banner")
+    + """
+body { max-width: 1080px; margin: 0 auto; padding: var(--space-24) var(--space-16) var(--space-48); }
+h1 { margin-bottom: var(--space-16); } h2 { margin: var(--space-32) 0 var(--space-8); }
+p, ul { margin: var(--space-8) 0; }
+figure { margin: var(--space-24) 0; } figure > div { display: flex; flex-wrap: wrap; gap: var(--space-4); }
+.opening { display: grid; gap: var(--space-16) var(--space-24); grid-template-columns: minmax(0, 1fr); }
+.opening { align-items: start; }
+.opening > figure, .opening .banner { margin: 0; } .opening .banner { font-size: var(--type-20); line-height: 1.4; }
+@media (min-width: 900px) { .opening:has(> figure) { grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); } }
+figure .pair, figure .difference { flex: 1 1 320px; min-width: 0; }
+figure img { display: block; width: 100%; border-radius: var(--radius-8); }
 .pair { position: relative; align-self: flex-start; --at: 50%; }
 .pair img + img { position: absolute; inset: 0; clip-path: inset(0 0 0 var(--at)); }
 .pair::after { content: ""; position: absolute; top: 0; bottom: 0; left: var(--at); width: 2px; margin-left: -1px;
-  background: #fff; box-shadow: 0 0 3px #000; pointer-events: none; }
-.pair span { position: absolute; top: 6px; padding: 0 .4rem; font-size: .8rem; color: #fff; background: #000a;
-  pointer-events: none; }
-.pair .left { left: 6px; } .pair .right { right: 6px; }
+  background: var(--on-glass); box-shadow: 0 0 3px var(--halo); pointer-events: none; }
+.pair span { position: absolute; top: var(--space-8); padding: 0 var(--space-8); font-size: var(--type-12);
+  color: var(--on-glass); background: var(--glass); border-radius: var(--radius-8); pointer-events: none; }
+.pair .left { left: var(--space-8); } .pair .right { right: var(--space-8); }
 .pair input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0; cursor: ew-resize;
   touch-action: pan-y; }
-.pair:focus-within { outline: 3px solid var(--link); outline-offset: 2px; }
-.curves { display: grid; gap: 8px; grid-template-columns: repeat(auto-fill, minmax(min(100%, 400px), 1fr)); }
-.curves svg { width: 100%; height: auto; }
-figcaption { font-size: .9rem; } .quiet { color: var(--quiet); }
-@media (max-width: 600px) { th, td { padding-right: .6rem; } }
+.pair:focus-within { outline: 3px solid var(--focus); outline-offset: 2px; }
+.curves { display: grid; gap: var(--space-8); grid-template-columns: repeat(auto-fill, minmax(min(100%, 400px), 1fr)); }
+.curves svg { width: 100%; height: auto; } figcaption { font-size: var(--type-14); margin-top: var(--space-4); }
+/* black lines on white become light ones on the ground */
+@media (prefers-color-scheme: dark) { svg { filter: invert(.92) hue-rotate(180deg); } }
+@media (max-width: 600px) { th, td { padding-right: var(--space-8); } }
 """
+)
 
 SCRIPT = """
 for (const slider of document.querySelectorAll(".pair input")) {
@@ -174,7 +168,8 @@ class Report:
         log: Entries of the log: `iteration`, and any of loss, psnr (of an evaluation), num_gaussians, ms.
         config: The run's configuration.
         scores: Scores of the test views.
-        pictures: Pictures of test views. At most 8 are shown, the best and the worst among them.
+        pictures: Pictures of test views. The one with the median PSNR opens the report; at most 7 others
+            are shown, the best and the worst among them.
         notes: Notes for the reader, one sentence each.
         meshes: What is known of the meshes of the scene.
         sections: The sections of the training's parts.
@@ -214,14 +209,16 @@ def write_report(path: Path, report: Report) -> None:
     curves = "".join(svg_element(figure, str(number)) for number, figure in enumerate(figures))
     cells = _cells(report)
     config = {key: value for key, value in report.config.items() if key != "machine"}
+    typical = _typical(report.pictures, report.scores)
+    others = [picture for picture in report.pictures if picture is not typical]
     sections = [
-        _verdict(verdict(report.metrics, report.config)),
+        _opening(verdict(report.metrics, report.config), typical, report.scores),
         _how_to_score(path, report.metrics),
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
         section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
         section("Blocks", cells),
-        _views(report.scores, report.pictures, skipped_views(report.metrics)),
+        _views(report.scores, others, skipped_views(report.metrics)),
         *(section(part.heading, f"{bullets(part.sentences)}{part.figures}") for part in report.sections),
         mesh_section(report.meshes),
         _exports(report.metrics.get("exports")),
@@ -240,10 +237,24 @@ def write_report(path: Path, report: Report) -> None:
         write_text(aside, page)
 
 
-def _verdict(found: Verdict) -> str:
-    """Say how good the scene is, with the figures folded below."""
-    said = f'<p class="verdict {found.grade.lower()}">{html.escape(str(found))}</p>\n'
-    return said + (folded("Details", f"<p>{html.escape(found.details)}</p>\n") if found.details else "")
+def _typical(pictures: Sequence[Picture], scores: Sequence[ImageScore]) -> Picture | None:
+    """Return the picture with the median PSNR; None if there are none."""
+    psnr = {score.name: score.psnr for score in scores}
+    ranked = sorted(pictures, key=lambda picture: psnr.get(picture.name, 0.0))
+    return ranked[len(ranked) // 2] if ranked else None
+
+
+def _opening(found: Verdict, picture: Picture | None, scores: Sequence[ImageScore]) -> str:
+    """Show a typical view, photo against render, and say how good the scene is; the figures are folded."""
+    said = f'<p class="verdict {found.grade.lower()} banner">{html.escape(str(found))}</p>\n'
+    details = f"<p>{html.escape(found.details)}</p>\n" if found.details else ""
+    shown = ""
+    if picture is not None:
+        (render, below), (photo, above), (difference, apart) = picture.panels
+        shown = f"<figure><div>{slider_pair(picture.name, (photo, above), (render, below))}</div></figure>\n"
+        caption = f'{_scored(picture, scores)} <span class="quiet">(above: {difference})</span>'
+        details += f"<figure>{jpeg_image(difference, apart)}<figcaption>{caption}</figcaption></figure>\n"
+    return f'<div class="opening">\n{shown}<div>\n{said}{folded("Details", details)}</div>\n</div>\n'
 
 
 def _cells(report: Report) -> str:
@@ -351,11 +362,7 @@ def _views(scores: Sequence[ImageScore], pictures: Sequence[Picture], skipped: s
         f"<p>Best: {html.escape(high.name)} ({_score('psnr', high.psnr)} dB). "
         f"Worst: {html.escape(low.name)} ({_score('psnr', low.psnr)} dB).</p>\n"
     )
-    by_name = {score.name: score for score in scores}
-    figures = [
-        _figure(picture, by_name.get(picture.name))
-        for picture in _chosen(pictures, keep=(high.name, low.name))
-    ]
+    figures = [_figure(picture, scores) for picture in _chosen(pictures, keep=(high.name, low.name))]
     head = "".join(f'<th class="n">{label}</th>' for _, label in SCORES)
     rows = "".join(
         f"<tr><td>{html.escape(score.name)}</td>"
@@ -376,15 +383,21 @@ def _chosen(pictures: Sequence[Picture], keep: Sequence[str]) -> list[Picture]:
     return [picture for i, picture in enumerate(pictures) if i in chosen]
 
 
-def _figure(picture: Picture, score: ImageScore | None) -> str:
+def _figure(picture: Picture, scores: Sequence[ImageScore]) -> str:
     """Lay the photo over the render with a slider between them; put the difference beside them."""
     (render, below), (photo, above), (difference, apart) = picture.panels
-    name = html.escape(picture.name)
     pair = slider_pair(picture.name, (photo, above), (render, below))
     beside = f'<div class="difference">{jpeg_image(difference, apart)}</div>'
-    numbers = f": PSNR {_score('psnr', score.psnr)} dB, SSIM {_score('ssim', score.ssim)}" if score else ""
-    caption = f'{name}{numbers} <span class="quiet">(drag or use the arrow keys; right or below: {difference})</span>'
+    how = f"(drag or use the arrow keys; right or below: {difference})"
+    caption = f'{_scored(picture, scores)} <span class="quiet">{how}</span>'
     return f"<figure><div>{pair}{beside}</div><figcaption>{caption}</figcaption></figure>\n"
+
+
+def _scored(picture: Picture, scores: Sequence[ImageScore]) -> str:
+    """Return the name of a view and its scores."""
+    score = next((score for score in scores if score.name == picture.name), None)
+    numbers = f": PSNR {_score('psnr', score.psnr)} dB, SSIM {_score('ssim', score.ssim)}" if score else ""
+    return html.escape(picture.name) + numbers
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

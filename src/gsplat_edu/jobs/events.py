@@ -74,7 +74,7 @@ class Message(_Event, frozen=True):
 
 
 class Found(_Event, frozen=True):
-    """A finding of the doctor (`gsplat_edu.doctor.finding.Finding`).
+    """A finding of the doctor (`gsplat_edu.survey.finding.Finding`).
 
     Args:
         name: One or two words.

@@ -12,6 +12,8 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.alignment import TensorRenderer
 from gsplat_edu.evaluate.metrics import Renderer
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.far import Shell
@@ -77,6 +79,25 @@ class Finished:
     renderer: TensorRenderer
     is_scored: bool
     say: Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Ended:
+    """A run that has just been scored.
+
+    Args:
+        path: The run's folder.
+        gaussians: The trained scene.
+        dataset: The capture.
+        render: Renders features (`gsplat_edu.render.api.render`); None if there is no time to compare photos.
+        settings: The run's render settings.
+    """
+
+    path: Path
+    gaussians: Gaussians
+    dataset: Dataset
+    render: Callable[..., RenderOutput] | None
+    settings: RenderSettings
 
 
 @dataclass(frozen=True, eq=False)

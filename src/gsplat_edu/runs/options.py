@@ -32,7 +32,7 @@ class RunOptions:
             at any time.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
         resume: Continue from the last checkpoint of the folder.
-        trials: Scores of the short trainings that chose settings, for config.json, by their key there.
+        records: What led to the options, for config.json by its key there: short trainings, facts about the photos.
 
     Raises:
         ArgumentError: a number is out of range.
@@ -49,7 +49,7 @@ class RunOptions:
     eval_every: int = 1_000
     save_every: int = 500
     resume: bool = False
-    trials: Mapping[str, Any] = field(default_factory=dict)
+    records: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.report_parts import Section
 from gsplat_edu.parts.run_values import Reported
+from gsplat_edu.survey.finding import Examined
+from gsplat_edu.survey.trained import Trained
 from gsplat_edu.train.config import BY_NAME, TrainConfig
 from gsplat_edu.train.part import PLUGGED_PARTS, Part, parts
 
@@ -24,17 +25,19 @@ def sections(run: Reported) -> list[Section]:
     return [section for section in found if section is not None]
 
 
-def findings(config: Mapping[str, Any], run: Path) -> list[tuple[str, str]]:
-    """Return what parts find in a run: sentences, each with what to do about it.
+def judgements(config: Mapping[str, Any], run: Trained) -> list[Examined]:
+    """Return what the parts of a run's training find in it.
 
     Args:
         config: The run's config.json.
-        run: Its folder.
+        run: The run.
 
     Raises:
         CheckpointError: config.json has a setting that is out of range.
+        DatasetError: a photo cannot be read.
     """
-    return [said for part, settings in _used(config) for said in part.findings(settings, run)]
+    found = (part.judge(settings, run) for part, settings in _used(config))
+    return [one for one in found if one is not None]
 
 
 def _used(config: Mapping[str, Any]) -> Iterator[tuple[Part, Any]]:

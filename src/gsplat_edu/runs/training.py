@@ -83,7 +83,7 @@ def document(options: RunOptions) -> dict[str, Any]:
         "render": dataclasses.asdict(options.render_settings),
         "backend": options.backend,
         "machine": machine_facts(),
-        **options.trials,
+        **options.records,
     }
 
 

@@ -16,6 +16,7 @@ No answer has CORS headers, so no other page can read it.
 
 from __future__ import annotations
 
+import html
 import http.cookies
 import secrets
 import urllib.parse
@@ -23,7 +24,7 @@ from collections.abc import Sequence
 from http import HTTPStatus
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from gsplat_edu.server.address import names_this_computer
@@ -39,6 +40,24 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
 }
 """Headers of every answer that does not have its own."""
+
+
+LOCKED = "open the URL that was printed, including its token"
+"""Why a request without the token is refused."""
+
+LOCKED_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>403 Forbidden</title>
+<h1>This address needs its key</h1>
+<p>The key is new whenever the program starts. Look in the terminal where it runs for the last line that begins with
+<strong>http://{host}/?token=</strong> and open that whole address. If no program runs there any more, start it again by
+the same command; it prints the address.</p>
+</html>
+"""
+"""What a person sees who opens the page without the token. It says nothing that is not known to everybody."""
 
 
 class Guard:
@@ -78,9 +97,7 @@ class Guard:
         if fault is None:
             await self.app(scope, receive, guarded)
         else:
-            line = f"403 Forbidden: {fault}\n"
-            refusal = PlainTextResponse(line, HTTPStatus.FORBIDDEN, headers={"Connection": "close"})
-            await refusal(scope, receive, guarded)
+            await _refusal(fault, Headers(scope=scope))(scope, receive, guarded)
 
     def _fault(self, scope: Scope, headers: Headers, opened: bool) -> str | None:
         """Return why a request is refused, in one line for the user; None if it is accepted."""
@@ -97,7 +114,7 @@ class Guard:
         if self._is_token(bearer.removeprefix("Bearer ")) and bearer.startswith("Bearer "):
             return None
         if not opened and not any(map(self._is_token, cookie_values(headers.getlist("cookie"), self.cookie))):
-            return "open the URL that was printed, including its token"
+            return LOCKED
         if scope["method"] not in READING and not origins:
             return "requests that change something need an Origin, or the token in Authorization"
         return None
@@ -111,6 +128,15 @@ class Guard:
 
     def _is_token(self, given: str) -> bool:
         return secrets.compare_digest(given.encode("utf-8", "surrogatepass"), self.token.encode())
+
+
+def _refusal(fault: str, headers: Headers) -> Response:
+    """Return the answer to a refused request: a page where a person opens one without the token, else one line."""
+    close = {"Connection": "close"}
+    if fault == LOCKED and headers.get("accept", "").startswith("text/html"):
+        page = LOCKED_PAGE.format(host=html.escape(headers["host"]))
+        return HTMLResponse(page, HTTPStatus.FORBIDDEN, headers=close)
+    return PlainTextResponse(f"403 Forbidden: {fault}\n", HTTPStatus.FORBIDDEN, headers=close)
 
 
 def cookie_values(headers: Sequence[str], name: str) -> list[str]:

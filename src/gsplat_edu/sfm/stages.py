@@ -12,10 +12,8 @@ from msgspec import Meta
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
-from gsplat_edu.base.records import Number, Record, record_of
+from gsplat_edu.base.records import Number, Record, Text, record_of
 
-# a text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)
-Text = Annotated[str, Meta(pattern=r"^[^\x00\ud800-\udc7f\udd00-\udfff]*\Z(?#the name or path of a file)")]
 Model = Annotated[str, Meta(pattern=r"^models/\d{1,4}/\d{1,4}\Z(?#the folder of a model)")]
 FileName = Annotated[
     str, Meta(pattern=r"^(?!\.)[^/\\\x00\ud800-\udc7f\udd00-\udfff]{1,255}\Z(?#a file name)")

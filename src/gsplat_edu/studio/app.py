@@ -88,6 +88,7 @@ def application(
         act("/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio")),
         # with the path that it has in the package, so that an import leads to the same file here and in node
         act("/viewer/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.viewer")),
+        act("/base/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.base")),
         *job_routes.routes(),
         *live_routes.routes(),
         *run_routes.routes(),
@@ -99,7 +100,7 @@ def application(
     guard = Middleware(Guard, host=host, policy=POLICY, token=token, cookie=cookie)
     patience = Middleware(Patience, seconds=studio.uploads.limits.stall)
     app = Starlette(routes=routes, middleware=[guard, patience], lifespan=lifespan)
-    app.state.studio = studio
+    app.state.studio, app.state.host = studio, host
     return app
 
 

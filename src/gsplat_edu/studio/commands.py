@@ -19,12 +19,9 @@ from gsplat_edu.options.offers import check_words, offered, words_of
 from gsplat_edu.server.refusal import RefusedError, conflict
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.contents import files_within
-from gsplat_edu.studio.library import Library, scene_file
+from gsplat_edu.studio.library import EXPORTS, Library, scene_file
 from gsplat_edu.studio.listing import is_unfinished
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
-
-EXPORTS = "exports"
-"""Folder of an entry with the files that were exported from it."""
 
 EDITS = "edits.json"
 """File of an entry with the edits of its scene."""

@@ -19,6 +19,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from gsplat_edu.data.capture import is_folder
 from gsplat_edu.server.refusal import RefusedError, conflict, not_found
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.adopted import adopted, note_adopted
-from gsplat_edu.studio.names import checked_name, name_after
+from gsplat_edu.studio.names import LONGEST, LONGEST_FILE, below, checked_name, name_after
 
 KINDS = ("photos", "captures", "runs", "scenes")
 """Kinds of entries, and their folders."""
@@ -40,6 +41,9 @@ HIDDEN = ".studio"
 
 PARTS = ("jobs", "trash", "uploads", "cache")
 """Folders in `HIDDEN`."""
+
+EXPORTS = "exports"
+"""Folder of an entry with the files that were exported from it."""
 
 SCENE_ENDINGS = (".ply", ".splat", ".spz", ".sog", ".glb")
 """Endings of scene files that can be taken in."""
@@ -301,6 +305,9 @@ class Library:
             self._check_free(path)
             target = self.fresh(kind, to)
             path.rename(target)
+            for one in self.trash():
+                if one["entry"] == self.name(path):
+                    self._note_source(self.hidden("trash") / one["id"], target / EXPORTS)
         self.changed()
         return target
 
@@ -310,49 +317,87 @@ class Library:
         Raises:
             RefusedError: there is none, or a job uses it.
         """
+        return self.discard(self.entry(kind, name))
+
+    def discard(self, path: Path) -> str:
+        """Move an entry, or a file that was exported from one, to the trash; return its id there.
+
+        Raises:
+            RefusedError: a job uses it, or it has just been removed.
+        """
         with self.lock:
-            path = self.entry(kind, name)
             self._check_free(path)
+            if not os.path.lexists(path):
+                raise not_found(self.name(path))
             number = f"{time.time_ns():020d}"
             folder = self.hidden("trash") / number
             folder.mkdir()
-            with written_aside(folder / "from.txt") as aside:
-                aside.write_text(kind, encoding="utf-8")
+            self._note_source(folder, path.parent)
             path.rename(folder / path.name)
         self.changed()
         return number
 
+    def _note_source(self, folder: Path, source: Path) -> None:
+        """Write into a folder of the trash from which folder of the library its thing came."""
+        with written_aside(folder / "from.txt") as aside:
+            aside.write_text(self.name(source), encoding="utf-8")
+
     def trash(self) -> list[dict[str, Any]]:
-        """Return what is in the trash, newest first."""
+        """Return what is in the trash, newest first: id, kind, name, entry and when it was removed (s).
+
+        Kind and name are those of an entry; of an exported file, kind is "exports" and `entry` what it was made from
+        ("runs/toy"), which is None for an entry.
+        """
         found = []
         for folder in sorted(self.hidden("trash").iterdir(), reverse=True):
             number = whole_of(folder.name.lstrip("0"))
             if number is None or folder.is_symlink() or not folder.is_dir():
                 continue
-            kind = _removed_from(folder / "from.txt")
-            for path in folder.iterdir() if kind in KINDS else ():
+            source = _removed_from(folder / "from.txt")
+            if source is None:
+                continue
+            kind, entry = source
+            for path in folder.iterdir():
                 if path.name != "from.txt":
-                    found.append(
-                        {"id": folder.name, "kind": kind, "name": path.name, "removed": number / 1e9}
-                    )
+                    facts = {"kind": kind, "name": legible(path.name), "entry": entry}
+                    found.append({"id": folder.name, **facts, "removed": number / 1e9})
         return found
 
     def restore(self, number: str) -> Path:
-        """Move an entry back from the trash.
+        """Move an entry, or a file that was exported from one, back from the trash; return the entry.
 
         Raises:
-            RefusedError: there is none, or its name is taken.
+            RefusedError: there is none, its name is taken, or the entry of the file is gone.
         """
         with self.lock:
-            for entry in self.trash():
-                if entry["id"] == number:
-                    target = self.fresh(entry["kind"], entry["name"])
+            for removed in self.trash():
+                if removed["id"] == number:
+                    name, of = removed["name"], removed["entry"]
+                    target = self.fresh(removed["kind"], name) if of is None else self._fresh_export(of, name)
                     folder = self.hidden("trash") / number
-                    (folder / entry["name"]).rename(target)
+                    (folder / as_file_name(name)).rename(target)
                     _delete(folder)
                     self.changed()
-                    return target
+                    return target if of is None else target.parent.parent
         raise not_found(f"trash/{shortened(number)}")
+
+    def _fresh_export(self, entry: str, name: str) -> Path:
+        """Return the place of a file that returns to the exports of an entry; the folder is made if it is missing.
+
+        Raises:
+            RefusedError: the entry is gone, a file of that name is there, or a link leads out of the entry.
+        """
+        try:
+            _, owner = self.named(entry)
+        except RefusedError as error:
+            if error.status != HTTPStatus.NOT_FOUND:
+                raise
+            raise conflict(f"{entry}: does not exist; restore it first, then {name}") from None
+        path = below(owner, Path(EXPORTS, checked_name("file", name, LONGEST_FILE)), entry)
+        if os.path.lexists(path):
+            raise conflict(f"{entry}/{EXPORTS}/{name}: exists already; remove that file first")
+        path.parent.mkdir(exist_ok=True)
+        return path
 
     def empty_trash(self) -> None:
         """Delete what is in the trash; adopted entries lose only their link."""
@@ -365,7 +410,7 @@ class Library:
 
     def _check_free(self, path: Path) -> None:
         if (why := self.in_use(path)) is not None:
-            raise conflict(f"{path.parent.name}/{path.name}: {why}")
+            raise conflict(f"{self.name(path)}: {why}")
 
 
 def check_own_folders(root: Path) -> None:
@@ -408,14 +453,19 @@ def _existing(source: Path) -> Path:
     return source
 
 
-def _removed_from(path: Path) -> str | None:
-    """Return the kind that a file of the trash names; None if it names none."""
+def _removed_from(path: Path) -> tuple[str, str | None] | None:
+    """Return kind and entry, as `Library.trash` gives them, that a file of the trash names; None if it names none."""
     try:
         with open_file(path) as file:
-            kind = file.read(40).decode("ascii", errors="replace")
+            text = file.read(4 * LONGEST).decode("utf-8", errors="replace")
     except OSError:
         return None
-    return kind if kind in KINDS and not path.is_symlink() else None
+    kind, *rest = text.split("/")
+    if kind not in KINDS or path.is_symlink():
+        return None
+    if not rest:
+        return kind, None
+    return (EXPORTS, f"{kind}/{rest[0]}") if rest[1:] == [EXPORTS] else None
 
 
 def scene_file(folder: Path) -> Path | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
+from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.record import State
+from gsplat_edu.options.studio import PORT
 from gsplat_edu.server.bodies import Json, content_length
 from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.listing import summaries, summary
@@ -52,7 +55,8 @@ def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
     lists = summaries(library, unreadable)
     grouped = projects(library, lists, studio.queue.jobs(), studio.former)
     return {
-        "folder": str(library.root),
+        "folder": legible(str(library.root)),
+        "start": _start_command(studio, request),
         "free_bytes": shutil.disk_usage(library.root).free,
         "used_bytes": studio.uploads.used(),
         "trash_bytes": studio.uploads.trash_size(),
@@ -71,6 +75,16 @@ def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
         "projects": grouped,
         **lists,
     }
+
+
+def _start_command(studio: Studio, request: Request) -> str:
+    """Return the command that starts this server again, with the same library and at the same address."""
+    host, port = request.app.state.host, request.scope["server"][1]
+    words = ["gsplat-edu", "studio", legible(str(studio.library.root))]
+    words += ["--host", host] if host != LOOPBACK else []
+    words += ["--port", str(port)] if port != PORT else []
+    words += ["--jobs", str(studio.queue.at_once)] if studio.queue.at_once > 1 else []
+    return shlex.join(words)
 
 
 def _few(lines: list[str], summary: str) -> list[str]:
@@ -170,5 +184,5 @@ async def _upload_zip(request: Request) -> Response:
 def _length(request: Request) -> int | None:
     length = content_length(request)
     if length == 0:
-        raise RefusedError("file: is empty; send its bytes as the body")
+        raise RefusedError("file: is empty; choose another one")
     return length

@@ -13,6 +13,7 @@ from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.base.files import described
 from gsplat_edu.base.reading import open_file, parse_json, read_text
 from gsplat_edu.base.text import legible
+from gsplat_edu.data.left_out import without_pose
 from gsplat_edu.data.reader import layout_of
 from gsplat_edu.evaluate.verdict import verdict
 from gsplat_edu.runs.folder import RunFolder
@@ -85,8 +86,8 @@ def search_facts(path: Path) -> dict[str, Any] | None:
     """Return what a finished search for poses found; None if the capture does not come from one.
 
     Returns:
-        photos, the number that it was given; posed, those with a pose, both null for panoramas; and error, the mean
-        reprojection error, px.
+        photos, the number that it was given; posed, those with a pose, both null for panoramas; unplaced, the names of
+        those without one; and error, the mean reprojection error, px.
     """
     file = path / "sfm" / "stages.json"
     try:
@@ -108,7 +109,9 @@ def _search_facts(file: Path, modified: int, size: int) -> dict[str, Any] | None
     if not math.isfinite(error):
         return None
     faces = "faces" in stages
-    return {"photos": None if faces else given, "posed": None if faces else posed, "error": error}
+    counts = {"photos": None if faces else given, "posed": None if faces else posed}
+    unplaced = [legible(name) for name in without_pose(file.parent.parent)]
+    return counts | {"unplaced": unplaced, "error": error}
 
 
 def is_unfinished(path: Path) -> bool:

@@ -10,8 +10,8 @@ from typing import Any
 from gsplat_edu.base.files import newest_first
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.record import ACTIVE, Job, State
-from gsplat_edu.studio.commands import COLLIDER, EXPORTS, SURFACE
-from gsplat_edu.studio.library import KINDS, Library
+from gsplat_edu.studio.commands import COLLIDER, SURFACE
+from gsplat_edu.studio.library import EXPORTS, KINDS, Library
 from gsplat_edu.studio.origins import makers, origins
 from gsplat_edu.studio.renaming import FormerNames
 
@@ -148,7 +148,8 @@ class _State:
             return self._after_training(result)
         if (capture := _newest(filter(_is_posed, _of(group, "captures")))) is not None:
             work = {"command": "train", "subject": capture["entry"], "options": {"quality": "standard"}}
-            return "training", {"label": "Start training", "request": work}
+            start = {"label": "Start training", "request": work}
+            return "training", {"label": "Look at the cameras", "place": capture["entry"], "then": start}
         return self._before_poses(group)
 
     def steps(self, group: Sequence[Facts]) -> list[Facts]:

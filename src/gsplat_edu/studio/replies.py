@@ -20,6 +20,7 @@ from gsplat_edu.base.reading import open_file, parse_json
 from gsplat_edu.base.text import bounded, legible, shortened
 from gsplat_edu.server.bodies import Json, content_length, drain
 from gsplat_edu.server.refusal import RefusedError, conflict, not_found, too_large
+from gsplat_edu.studio.spoken import spoken
 from gsplat_edu.studio.state import Studio
 
 MOST_JSON = 16 << 20
@@ -62,20 +63,21 @@ def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Re
         except SplatError as error:
             line, status = str(error), HTTPStatus.BAD_REQUEST
         except ClientDisconnect:
-            return refusal("the browser closed the connection", HTTPStatus.BAD_REQUEST)
+            return refusal("body: the browser closed the connection", HTTPStatus.BAD_REQUEST)
         except OSError as error:
             line, status = described(error), HTTPStatus.INTERNAL_SERVER_ERROR
         await drain(request, status)
         if request.method in ("GET", "HEAD") and request.query_params.get(QUIET) == "1":
-            return Json({"error": line, "status": int(status)})
+            return Json({"error": line, "plain": spoken(line), "status": int(status)})
         return refusal(line, status)
 
     return safe
 
 
 def refusal(line: str, status: HTTPStatus) -> JSONResponse:
-    """Return an error as an answer: {"error": the line}."""
-    return JSONResponse({"error": bounded(legible(line))}, status, headers=CLOSE | FRAMED)
+    """Return an error as an answer: {"error": the line, "plain": the same for people}."""
+    plain = bounded(legible(spoken(line)))
+    return JSONResponse({"error": bounded(legible(line)), "plain": plain}, status, headers=CLOSE | FRAMED)
 
 
 async def json_body(request: Request) -> Any:  # noqa: ANN401

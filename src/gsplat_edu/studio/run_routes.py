@@ -21,7 +21,8 @@ from gsplat_edu.jobs.record import Job
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.contents import photo_names
-from gsplat_edu.studio.origins import renamed_capture
+from gsplat_edu.studio.listing import summaries
+from gsplat_edu.studio.origins import makers, origins, renamed_capture
 from gsplat_edu.studio.photo_masks import masked
 from gsplat_edu.studio.pictures import left_out
 from gsplat_edu.studio.proposals import proposals, train_again
@@ -131,6 +132,8 @@ def _with_photos(
 ) -> list[dict[str, Any]]:
     """Return findings with the affected photos, and with what the page offers to do."""
     places = {} if capture is None else _photo_places(capture)
+    if capture is not None and any(name not in places for finding in findings for name in finding.images):
+        places = _source_places(studio, capture) | places
     out, drawn = set[str](), set[str]()
     if capture is not None:
         prefix = f"captures/{legible(capture.name)}/"
@@ -195,11 +198,20 @@ def _capture_of(studio: Studio, run: Path) -> Path | None:
     return capture if capture.parent == parent and capture.is_dir() else None
 
 
+def _source_places(studio: Studio, capture: Path) -> dict[str, str]:
+    """Return the photos of the search that made a capture as `_photo_places` does: those without a pose too."""
+    made_by = makers(studio.queue.jobs())
+    sources = origins(studio.library, summaries(studio.library), made_by, studio.former)
+    source = sources.get(studio.library.name(capture))
+    return {} if source is None else _photo_places(studio.library.named(source)[1])
+
+
 def _photo_places(entry: Path) -> dict[str, str]:
-    """Return the photos of a capture as "captures/NAME/thumbs" names them, by their names."""
+    """Return the photos of an entry as "captures/NAME/thumbs" names them, by their names."""
     found: dict[str, str] = {}
+    place = f"{entry.parent.name}/{legible(entry.name)}"
     for name in photo_names(entry):
         parts = name.split("/")
         for start in range(len(parts)):
-            found.setdefault("/".join(parts[start:]), f"captures/{legible(entry.name)}/{legible(name)}")
+            found.setdefault("/".join(parts[start:]), f"{place}/{legible(name)}")
     return found

@@ -23,9 +23,9 @@ from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import State
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.server.bodies import content_length, drain
-from gsplat_edu.server.refusal import RefusedError, conflict, not_found, too_large
-from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, MESHES, scene_of
-from gsplat_edu.studio.library import Library
+from gsplat_edu.server.refusal import RefusedError, not_found, too_large
+from gsplat_edu.studio.commands import EDITS, FORMATS, MESHES, scene_of
+from gsplat_edu.studio.library import EXPORTS, Library
 from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name
 from gsplat_edu.studio.replies import CLOSE, act, entry_of, file_answer
 from gsplat_edu.studio.state import Studio
@@ -255,12 +255,7 @@ def _export(studio: Studio, request: Request, body: Any) -> Response:  # noqa: A
 
 
 def _remove_export(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    path = _export_file(studio, request)
-    if (why := studio.in_use(path)) is not None:
-        raise conflict(f"{path.name}: {why}")
-    path.unlink()
-    studio.stream.library_changed()
-    return {"removed": legible(path.name)}
+    return {"trash": studio.library.discard(_export_file(studio, request))}
 
 
 def _plain(endpoint: Any) -> Any:  # noqa: ANN401

@@ -105,7 +105,7 @@ class Studio:
         for job in others:
             if job.work == work or set(job.work.outputs) & set(work.outputs):
                 title = title_of(job.work)
-                raise conflict(f"job {job.id}: {title} works there; wait until it ends, or cancel it")
+                raise conflict(f"job {job.id}: “{title}” works there; wait until it has ended, or stop it")
 
     def rename(self, kind: str, name: str, to: object) -> Path:
         """Give an entry another name; jobs that made or used it can be resumed there.
@@ -185,5 +185,5 @@ class Studio:
         """Return which job uses a path of the library, which may then not be moved."""
         for job in self._pending():
             if job.work.uses(self.library.name(path)):
-                return f"is used by job {job.id} ({title_of(job.work)}); wait until it ends, or cancel it"
+                return f"is used by “{title_of(job.work)}”; wait until that has ended, or stop it"
         return None

@@ -22,6 +22,7 @@ from gsplat_edu.jobs.following import Follower
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job
 from gsplat_edu.studio.commands import subject_of, title_of
+from gsplat_edu.studio.spoken import spoken
 
 KEPT = 4_000
 """Number of events that are kept for browsers that missed them. A browser that missed more reads the list of jobs
@@ -52,6 +53,7 @@ def job_document(job: Job) -> dict[str, Any]:
         "ended": job.ended,
         "attempts": job.attempts,
         "line": job.line,
+        "plain": spoken(job.line) if job.line else "",
         "waits_for": [{"job": name, "place": place} for name, place in job.waits_for],
         "resumable": job.resumable,
         "begun_by": job.begun_by,

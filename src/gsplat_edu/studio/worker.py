@@ -22,8 +22,8 @@ from gsplat_edu.base.files import described, written_aside
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.base.text import legible
 
-COVER = 512
-"""Longest side of the picture of a scene's start view, px."""
+COVER = 512, 384
+"""Size of the picture of a scene's start view, px: the shape of the page's cards."""
 
 IDLE = 600.0
 """Seconds without a request after which the process ends."""
@@ -129,7 +129,7 @@ def make_picture(
 
     Args:
         source: Scene file or run folder.
-        camera: As `gsplat_edu.viewer.live.picture_camera` takes it; None for the start view, at most `COVER` px.
+        camera: As `gsplat_edu.viewer.live.picture_camera` takes it; None for the start view, fitted to its subject.
         live: Whether to draw the newest snapshot of the run's training.
         threads: Threads to render with; 0 for all.
         applied: File of edits to apply; empty for none.
@@ -189,21 +189,20 @@ def _opened(source: str, applied: str) -> tuple[Any, Any, Any, bool]:
     """
     from dataclasses import replace
 
-    from gsplat_edu.paths.orbits import resized
     from gsplat_edu.runs.source import open_source
     from gsplat_edu.scene.rig import through_lenses
-    from gsplat_edu.viewer.page_start import start_of
+    from gsplat_edu.viewer.page import cover_view
 
     if (key := f"{_state_of(source)} {_state_of(applied) if applied else ''}") not in _scenes:
         found, start = open_source(source), None
         if applied:
             found, tour = _edited(found, applied)
             start = tour.start
-        camera = (start or start_of(found.scene, [camera for _, camera in found.cameras])).camera
+        camera = cover_view(found.scene, found.cameras, found.held_out, start, COVER)
         _scenes.clear()
         lenses = through_lenses(own for _, own in found.cameras)
         settings = replace(found.settings, depth=False)
-        _scenes[key] = found.scene.gaussians, settings, resized(camera, COVER), lenses
+        _scenes[key] = found.scene.gaussians, settings, camera, lenses
     gaussians, settings, camera, lenses = _scenes[key]
     return gaussians, settings, camera, lenses
 
@@ -310,7 +309,7 @@ def certain(capture: str) -> dict[str, Any]:
     from gsplat_edu.base.errors import DatasetError
     from gsplat_edu.data.reader import CaptureReader
     from gsplat_edu.doctor.certain import certain_findings
-    from gsplat_edu.doctor.finding import event_of
+    from gsplat_edu.doctor.diagnosis import event_of
 
     try:
         return {"findings": [asdict(event_of(one)) for one in certain_findings(CaptureReader(capture))]}

@@ -10,7 +10,6 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint
-from pathlib import Path
 from typing import Any, ClassVar
 
 from gsplat_edu.base.errors import ArgumentError
@@ -44,14 +43,49 @@ class Part:
         """
         return {}
 
-    def findings(self, settings: Any, run: Path) -> Sequence[tuple[str, str]]:  # noqa: ANN401
-        """Return what the doctor has to say of a run: sentences, each with what to do about it.
+    def examine(self, survey: Any) -> Any:  # noqa: ANN401
+        """Return what the doctor has to say of a capture, a `gsplat_edu.survey.finding.Examined`; None for nothing.
+
+        Args:
+            survey: The capture, a `gsplat_edu.survey.capture.Survey`, perhaps without a readable photo.
+        """
+        return None
+
+    def choose(self, setting: str, capture: Any) -> Any:  # noqa: ANN401
+        """Return the value of a setting that is auto, a `gsplat_edu.survey.finding.Remedy`; None if another has it.
+
+        Args:
+            setting: Its name.
+            capture: The capture, a `gsplat_edu.survey.capture.Undecided`.
+
+        Raises:
+            DatasetError: the capture cannot be read.
+        """
+        return None
+
+    def judge(self, settings: Any, run: Any) -> Any:  # noqa: ANN401
+        """Return what the doctor has to say of a run, a `gsplat_edu.survey.finding.Examined`; None for nothing.
 
         Args:
             settings: The run's `Settings`.
-            run: The run's folder.
+            run: The run, a `gsplat_edu.survey.trained.Trained`.
+
+        Raises:
+            DatasetError: a photo cannot be read.
         """
-        return ()
+        return None
+
+    def remark(self, settings: Any, run: Any) -> str:  # noqa: ANN401
+        """Return a sentence to say at the end of a training; empty for none.
+
+        Args:
+            settings: The run's `Settings`.
+            run: The run, a `gsplat_edu.parts.run_values.Ended`.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+        """
+        return ""
 
     def section(self, settings: Any, run: Any) -> Any:  # noqa: ANN401
         """Return the part's section in the report, a `gsplat_edu.evaluate.report_parts.Section`; None for none.

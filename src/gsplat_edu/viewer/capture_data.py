@@ -31,14 +31,14 @@ from gsplat_edu.data.panorama import PANORAMIC
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.region import document_of
 from gsplat_edu.doctor.cameras import SUPPORT, SUPPORT_SHARE
-from gsplat_edu.doctor.finding import Finding
 from gsplat_edu.doctor.gap import gap_sentence, widest_gap
-from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.subject import subject_region
-from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.paths.orbits import common_up
 from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.rig import stand_in
+from gsplat_edu.survey.finding import Finding
+from gsplat_edu.survey.geometry import Geometry
+from gsplat_edu.survey.support import observed_points
 from gsplat_edu.viewer.capture_matches import matches_of
 
 MOST_POINTS = 200_000

@@ -38,7 +38,7 @@ def matches_of(capture: Path, frames: Sequence[Frame]) -> tuple[dict[str, Any], 
     """Return the matched points of a capture's photos: their facts, for JSON, and their numbers.
 
     Args:
-        capture: The capture, whose tracks a mapper has measured (`gsplat_edu.doctor.support.observed_points`).
+        capture: The capture, whose tracks a mapper has measured (`gsplat_edu.survey.support.observed_points`).
         frames: Its photos, in the order of the page's cameras.
 
     Returns:

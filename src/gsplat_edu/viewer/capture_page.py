@@ -15,6 +15,7 @@ import json
 import re
 
 from gsplat_edu.base.content_policy import content_policy, policy_element
+from gsplat_edu.base.styles import tokens
 from gsplat_edu.viewer.capture_data import CaptureFacts
 from gsplat_edu.viewer.modules import script, web
 
@@ -68,4 +69,4 @@ def _packed(name: str, data: bytes) -> str:
 
 
 def _style() -> str:
-    return "".join(web(name) for name in STYLES)
+    return tokens() + "".join(web(name) for name in STYLES)

@@ -206,7 +206,7 @@ class Examination(threading.Thread):
         """Examine the capture; a failure becomes the server's `trouble`."""
         from gsplat_edu.data.reader import CaptureReader
         from gsplat_edu.doctor.before import examine
-        from gsplat_edu.doctor.survey import prepare
+        from gsplat_edu.survey.capture import prepare
         from gsplat_edu.viewer.capture_data import marks_of
 
         try:

@@ -45,6 +45,7 @@ from gsplat_edu.viewer.page_start import (
     Start,
     contents_of,
     first_camera,
+    framed,
     start_among,
     start_of,
     subjects_of,
@@ -364,6 +365,31 @@ def usual_start(scene: Scene, views: Sequence[NamedCamera], held_out: Collection
     cameras = [stand_in(camera) for _, camera in views]
     trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
     return start_of(scene, cameras, first_camera(cameras, trained or range(len(views))) if views else 0)
+
+
+def cover_view(
+    scene: Scene,
+    views: Sequence[NamedCamera],
+    held_out: Collection[str],
+    chosen: Start | None,
+    size: tuple[int, int],
+) -> Camera:
+    """Return the view for a small picture of a scene: the start view, fitted to what it shows.
+
+    Args:
+        scene: As for `write`.
+        views: As for `write`.
+        held_out: As for `write`.
+        chosen: The start view that somebody has chosen; None if nobody has.
+        size: Width and height of the picture, px.
+    """
+    if chosen is not None:
+        (content,) = contents_of([chosen.camera], _opaque(scene))
+        return framed(chosen.camera, content, *size)
+    camera = usual_start(scene, views, held_out).camera
+    cameras = [stand_in(one) for _, one in views]
+    (subject,) = subjects_of(cameras, [camera], _opaque(scene))
+    return framed(camera, subject, *size)
 
 
 def _opaque(scene: Scene) -> Float[np.ndarray, "N 3"]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from gsplat_edu.base import constants
 from gsplat_edu.base.content_policy import content_policy, policy_element
+from gsplat_edu.base.styles import tokens
 from gsplat_edu.viewer.modules import script, web
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "mesh.vert", "mesh.frag")
@@ -93,7 +94,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
         "title": html_text.escape(title),
         "policy": policy_element(policy(kind)),
         "style": _style(kind),
-        "body": "visitor" if "shared" in facts else "",
+        "body": "visitor glass" if "shared" in facts else "",
         "poster": _poster(poster),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
@@ -110,7 +111,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
 
 
 def _style(kind: Kind) -> str:
-    return "".join(web(name) for name in ("style.css", "visitor.css", *kind.styles))
+    return tokens() + "".join(web(name) for name in ("style.css", "visitor.css", *kind.styles))
 
 
 def _text_element(name: str, text: str) -> str:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.paths.orbits import common_up, orbit_of_scene
 from gsplat_edu.scene.camera import WORLD_UP, Camera
 from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.survey.geometry import FORWARD, INWARD, Geometry
 
 SIDE = 800
 """Size of the initial image if there is no camera, px; the page replaces it by the window's size."""
@@ -46,6 +46,9 @@ A head is a small part of a person."""
 AT_EDGE = 0.1
 """A subject that comes as near as this fraction of the height to the top or bottom of an image reaches it: what most
 cameras see ends at `SUBJECT_PART`, but a person does not."""
+
+MARGIN = 0.08
+"""Space around the subject on each side of a picture that is fitted to it, as a fraction of the picture."""
 
 LEAST_PART, LEAST_POINTS = 0.1, 16
 """A subject is at least this fraction of the image wide and high, and has at least this number of points."""
@@ -117,6 +120,29 @@ def subjects_of(
         share = np.mean([_is_inside(camera, near, SUBJECT_PART) for camera in some], axis=0)
         near = near[share >= SEEN_BY * share.max()] if share.max() >= SEEN_BY else near[:0]
     return [_edges(camera, near) for camera in shown]
+
+
+def framed(camera: Camera, subject: Sequence[float] | None, W: int, H: int) -> Camera:
+    """Return a camera at the same place whose image shows the subject whole, in the middle, with a margin around it.
+
+    It shows at least as much as the largest part of the given image that has its shape.
+
+    Args:
+        camera: A pinhole.
+        subject: Left, top, right and bottom edge of the subject in its image, px; None for the middle of the image.
+        W: Width of the image, px.
+        H: Its height, px.
+    """
+    scale = max(W / camera.W, H / camera.H)
+    u, v = 0.5 * camera.W, 0.5 * camera.H
+    if subject is not None:
+        left, top, right, bottom = subject
+        share = 1.0 - 2.0 * MARGIN
+        scale = min(scale, share * W / (right - left), share * H / (bottom - top))
+        u, v = 0.5 * (left + right), 0.5 * (top + bottom)
+    cx = (camera.cx + 0.5 - u) * scale + 0.5 * W - 0.5  # pixel centres are whole numbers
+    cy = (camera.cy + 0.5 - v) * scale + 0.5 * H - 0.5
+    return Camera(camera.R, camera.eye, camera.fx * scale, camera.fy * scale, cx, cy, H, W)
 
 
 def contents_of(shown: Sequence[Camera], points: Float[np.ndarray, "N 3"]) -> list[list[float]]:

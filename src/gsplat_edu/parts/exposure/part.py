@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
+from gsplat_edu.parts.exposure.findings import (
+    EXPOSURE as CHECK,
+    check_exposure,
+    compares_exposure,
+    correction_of,
+    judged_exposure,
+)
 from gsplat_edu.parts.exposure.model import Exposure
+from gsplat_edu.survey.capture import Survey, Undecided
+from gsplat_edu.survey.finding import Examined, Remedy
+from gsplat_edu.survey.trained import Trained
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
 from gsplat_edu.train.part_values import Begun, Setup
@@ -10,6 +20,19 @@ from gsplat_edu.train.part_values import Begun, Setup
 
 class ExposurePart(Part):
     """Measures the exposure of each photo, and its vignetting if asked for."""
+
+    def examine(self, survey: Survey) -> Examined:
+        """Report photos that differ from their neighbours; nothing if they cannot be compared."""
+        found = check_exposure(survey) if len(survey.shots) > 1 else []
+        return Examined({CHECK: found} if found or compares_exposure(survey) else {})
+
+    def choose(self, setting: str, capture: Undecided) -> Remedy | None:
+        """Choose `appearance` by what the photos show."""
+        return correction_of(capture.survey) if setting == "appearance" else None
+
+    def judge(self, settings: TrainConfig, run: Trained) -> Examined:
+        """Report photos that differ from the scene, or from their neighbours if the training corrected nothing."""
+        return judged_exposure(run, settings.appearance)
 
     def begin(self, settings: TrainConfig, setup: Setup) -> Begun | None:
         """Return the view model that corrects the images."""

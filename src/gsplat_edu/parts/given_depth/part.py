@@ -5,9 +5,12 @@ from __future__ import annotations
 import hashlib
 
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.data.depths import DepthSource, with_depth
+from gsplat_edu.data.depths import DepthReport, DepthSource, with_depth
+from gsplat_edu.parts.given_depth.findings import NAME, depth_findings
 from gsplat_edu.parts.given_depth.term import DEPTH, DepthTerm
 from gsplat_edu.parts.run_values import Captured
+from gsplat_edu.survey.capture import Survey
+from gsplat_edu.survey.finding import Examined
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
 from gsplat_edu.train.part_values import Begun, Setup
@@ -16,6 +19,14 @@ from gsplat_edu.train.rendered import Turns
 
 class GivenDepthPart(Part):
     """Pulls the rendered depth to the given one."""
+
+    def examine(self, survey: Survey) -> Examined:
+        """Report what is wrong with the depth, if it was looked at."""
+        depth = survey.depth
+        if depth is None:
+            return Examined()
+        facts = [(NAME, depth.lines()[0])] if isinstance(depth, DepthReport) else []
+        return Examined({NAME: depth_findings(depth)}, facts)
 
     def captured(self, settings: TrainConfig, capture: Captured) -> Dataset:
         """Give the training views the depth that the run's options name, and say what was found.

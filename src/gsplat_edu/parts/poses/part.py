@@ -8,9 +8,12 @@ from typing import Any
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.evaluate.report_parts import Section
 from gsplat_edu.parts.poses.capture import aligned_score, with_refined_cameras, write_refined
+from gsplat_edu.parts.poses.findings import check_fit
 from gsplat_edu.parts.poses.refinement import NEED_LENSES, Refinement, refinement_of
 from gsplat_edu.parts.poses.trials import RefineTrials
 from gsplat_edu.parts.run_values import Finished, Reported
+from gsplat_edu.survey.finding import Examined
+from gsplat_edu.survey.trained import Trained
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
 from gsplat_edu.train.part_values import Begun, Setup
@@ -19,6 +22,10 @@ from gsplat_edu.train.trainer import Trainer
 
 class PosesPart(Part):
     """Refines poses, lenses and rolling shutters with the scene."""
+
+    def judge(self, settings: TrainConfig, run: Trained) -> Examined:
+        """Report training views that the scene does not fit."""
+        return Examined({"training views": check_fit(run)})
 
     def begin(self, settings: TrainConfig, setup: Setup) -> Begun | None:
         """Return the view model that moves the cameras.

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.parts.run_values import Added, Captured
+from gsplat_edu.parts.sky.findings import check_haze, check_sky, sky_of
 from gsplat_edu.parts.sky.start import shell_around, start_sky
+from gsplat_edu.survey.capture import Survey, Undecided
+from gsplat_edu.survey.finding import Examined, Remedy
+from gsplat_edu.survey.trained import Trained
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
 from gsplat_edu.train.part_values import Setup
@@ -12,6 +16,18 @@ from gsplat_edu.train.part_values import Setup
 
 class SkyPart(Part):
     """Starts a run with a shell of splats far behind the scene."""
+
+    def examine(self, survey: Survey) -> Examined:
+        """Report a sky if there are photos to compare."""
+        return Examined({"sky": check_sky(survey)} if len(survey.shots) > 1 else {})
+
+    def choose(self, setting: str, capture: Undecided) -> Remedy | None:
+        """Choose `sky` by what the photos show."""
+        return sky_of(capture.survey) if setting == "sky" else None
+
+    def judge(self, settings: TrainConfig, run: Trained) -> Examined:
+        """Report splats that stand for a sky that the scene does not have."""
+        return Examined({"splats": check_haze(run)})
 
     def start(self, settings: TrainConfig, capture: Captured) -> Added | None:
         """Return the splats of the sky and the shell where they lie.

@@ -7,8 +7,16 @@ export class ApiError extends Error {
   }
 }
 
-const GONE = "The studio does not answer. Start it again with: gsplat-edu studio";
-const LOCKED = "This page belongs to an earlier start of the studio. Open the URL that it printed last.";
+let start = ""; // the command that starts the studio again, which only the studio knows
+const LOCKED = "The studio was started again. Open the address that it printed last in its terminal.";
+
+export const startsBy = (command) => (start = command);
+
+// What to do while the studio does not answer.
+export const gone = () => {
+  const how = start ? `this command and open the address that it prints: ${start}` : "the same command as before.";
+  return `The studio does not answer. If it has ended, start it again in a terminal with ${how}`;
+};
 
 // "captures/NAME" or parts of a path as an address.
 export const at = (...parts) => `/api/${parts.join("/").split("/").map(encodeURIComponent).join("/")}`;
@@ -16,7 +24,8 @@ export const at = (...parts) => `/api/${parts.join("/").split("/").map(encodeURI
 const lineOf = (status, text) => {
   if (status === 403) return text.includes("token") ? LOCKED : text.trim();
   try {
-    return JSON.parse(text).error;
+    const { plain, error } = JSON.parse(text);
+    return plain ?? error;
   } catch {
     return text.trim().split("\n")[0] || `The studio answered ${status}.`;
   }
@@ -26,7 +35,7 @@ async function ask(method, address, body) {
   const given =
     body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
   const answer = await fetch(address, { method, ...given }).catch(() => {
-    throw new ApiError(GONE, 0);
+    throw new ApiError(gone(), 0);
   });
   const isJson = (answer.headers.get("content-type") ?? "").startsWith("application/json");
   const text = method === "HEAD" && isJson ? await fetch(address).then((other) => other.text()) : await answer.text();
@@ -42,7 +51,7 @@ async function quietly(method, address) {
     if (error instanceof SyntaxError) return ""; // it has come in between, and is no JSON
     throw error;
   });
-  if (typeof found?.error === "string") throw new ApiError(found.error, found.status);
+  if (typeof found?.error === "string") throw new ApiError(found.plain ?? found.error, found.status);
   return found;
 }
 

@@ -1,6 +1,7 @@
 // The page: which screen the address names, keys, and what every screen shares.
 
 import { keepPresses } from "../../viewer/web/patch.js";
+import { gone } from "./api.js";
 import { announce, keptFocus, patch, put } from "./dom.js";
 import { Store } from "./store.js";
 import { library } from "./library.js";
@@ -55,7 +56,7 @@ function route() {
 }
 
 function update() {
-  const lost = store.connected === false ? "The studio does not answer; this page tries again." : "";
+  const lost = store.connected === false ? gone() : "";
   put(document.getElementById("trouble"), store.trouble || lost);
   const active = [...store.jobs.values()].filter(({ active }) => active).length;
   put(document.getElementById("job-count"), active ? String(active) : "");

@@ -4,7 +4,7 @@ import { at, get } from "./api.js";
 import { attempt, button, errorLine, forecastText, h, heading, link, patch, put, want } from "./dom.js";
 import { choices } from "./choices.js";
 import { doctor } from "./doctor.js";
-import { gallery } from "./gallery.js";
+import { gallery, unplaced } from "./gallery.js";
 import { startJob } from "./jobs.js";
 import { addressOf, entryHead, factsOf, management, withEntry } from "./library.js";
 import { places } from "./places.js";
@@ -84,14 +84,26 @@ function training({ main, store }, entry) {
   );
   const start = startForm(store, entry, () => taken.draw());
   const later = h("div", { class: "later", hidden: true }, management(store, entry));
+  const missing = h("div", {});
   const runs = h("ul", { class: "plain" });
   const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
-  main.append(head.element, start.element, past, taken.element, checked.element, pictures.element, line, later);
+  main.append(
+    head.element,
+    missing,
+    taken.element,
+    start.element,
+    past,
+    checked.element,
+    pictures.element,
+    line,
+    later,
+  );
   let version = entry.modified;
   return {
     close: () => taken.close(),
     update(now) {
       head.update(now);
+      patch(missing, unplaced(now, now.made_from));
       checked.update(now);
       start.update(now);
       if (now.modified !== version) taken.changed();
@@ -124,7 +136,14 @@ function startForm(store, entry, draw) {
     const facts = h("span", { class: "forecast quiet" }, "\u00a0");
     said.set(value, facts);
     const input = h("input", { type: "radio", name: "quality", value, checked: index === 1 });
-    return h("label", { class: "choice" }, input, h("strong", {}, title), h("span", { class: "quiet" }, hint), facts);
+    return h(
+      "label",
+      { class: "choice card" },
+      input,
+      h("strong", {}, title),
+      h("span", { class: "quiet" }, hint),
+      facts,
+    );
   });
   const more = choices(draw);
   const name = h("input", {

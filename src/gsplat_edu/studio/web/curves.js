@@ -21,7 +21,7 @@ export function curve(title, shown) {
   );
   const element = h(
     "figure",
-    { class: "curve" },
+    { class: "curve card" },
     h("figcaption", {}, name, value),
     h("div", { class: "plot" }, high, low, drawing),
     axis,

@@ -10,6 +10,19 @@ export const link = (text, href, more = {}) => h("a", { href, ...more }, text);
 
 export const heading = (level, text, more = {}) => h(`h${level}`, more, text);
 
+const TONES = Object.entries({
+  busy: ["queued", "running", "paused", "stopping"],
+  good: ["done"],
+  fair: ["held", "cancelled", "warning"],
+  poor: ["failed", "interrupted", "damaged", "fatal"],
+});
+
+// A badge in the colour of a job's state or a finding's severity, for patch().
+export function toned(state, text) {
+  const [tone] = TONES.find(([, states]) => states.includes(state)) ?? [""];
+  return want("span", { class: `badge ${tone}` }, text);
+}
+
 // Shows a text, or hides the element if there is none. Screen readers hear the same text only once.
 export function put(element, text) {
   patch(element, text);
@@ -89,7 +102,6 @@ export async function attempt(pressed, line, act) {
 export function versioned(line, ask, show, after = () => {}) {
   let [asked, failed] = [null, false];
   return {
-    forget: () => (asked = null),
     read(version) {
       if (version === asked) return;
       asked = version;

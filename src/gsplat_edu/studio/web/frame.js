@@ -5,6 +5,7 @@ import { button, h, patch, put, want } from "./dom.js";
 
 const RETRY = 3000; // milliseconds until a page that is not there yet is asked for again
 const LOOK = 250; // milliseconds between two looks at what the frame shows
+const GLANCE = 50; // milliseconds between two looks at whether a chosen view is drawn
 const MOST_SIDE = 1024; // px of a picture beside a photo
 
 // A frame that shows a page as soon as the server has it; until then, what it showed before.
@@ -86,6 +87,17 @@ function photoOf(photos, name) {
   return photos.find((photo) => stemOf(photo.name) === stem || stemOf(photo.name).endsWith(`/${stem}`))?.name ?? null;
 }
 
+// Resolves once the frame shows a view whole; to false if another one was chosen meanwhile.
+const drawn = (viewer, view) =>
+  new Promise((resolve) => {
+    const look = () => {
+      if (viewer.exact !== view) resolve(false);
+      else if (viewer.isWhole) resolve(true);
+      else setTimeout(look, GLANCE);
+    };
+    look();
+  });
+
 // Under a frame: choose one of the capture's views, and slide between its photo and the render.
 export function beside(scene, captureOf) {
   const select = h("select", { id: "beside-view" }, h("option", { value: "" }, "free view"));
@@ -131,19 +143,26 @@ export function beside(scene, captureOf) {
     scene.bare(true);
     viewer.goTo(Number(select.value));
     const view = (viewer.exact = chosen = { ...camera, ...lens, ...size });
+    viewer.isWhole = false; // the screen still shows another view
     viewer.askFrame();
+    scene.photo.hidden = range.disabled = true;
+    note.textContent = "Drawing this view ...";
     const entry = captureOf();
     photos ??= entry ? (await get(at(entry.entry, "photos")).catch(() => ({ photos: [] }))).photos : [];
     if (chosen !== view) return; // another view was chosen meanwhile, or the user moved
     const name = photoOf(photos, camera.name);
-    range.disabled = scene.photo.hidden = !name;
-    note.textContent = name
-      ? camera.held_out
-        ? "held out of the training"
-        : ""
-      : "The photo of this view is not in the library.";
-    if (!name) return;
+    if (!name) {
+      note.textContent = "The photo of this view is not in the library.";
+      return;
+    }
     scene.photo.src = `${at(entry.entry, "thumbs", name)}?side=1024`;
+    const isThere = await scene.photo.decode().then(
+      () => true,
+      () => false,
+    );
+    if (!(await drawn(viewer, view))) return;
+    note.textContent = isThere ? (camera.held_out ? "held out of the training" : "") : "The photo cannot be read.";
+    range.disabled = scene.photo.hidden = !isThere;
     cut();
   }
 

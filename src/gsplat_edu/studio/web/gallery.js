@@ -1,9 +1,10 @@
 // Previews of photos, and what the doctor says about them.
 
 import { at, get, post } from "./api.js";
-import { announce, attempt, bytes, count, errorLine, h, heading, patch, want } from "./dom.js";
+import { announce, attempt, bytes, count, errorLine, h, heading, patch, toned, want } from "./dom.js";
 import { drawMask } from "./mask.js";
 
+const FEW = 8; // pictures of photos that were not placed
 const FIRST = 60; // previews at once; more come by a button
 
 const thumbOf = (entry, name, side = 256) => `${at(entry, "thumbs", name)}?side=${side}`;
@@ -131,6 +132,27 @@ export function gallery(entry, changed = () => {}, masked = () => {}, store = nu
   };
 }
 
+// Photos of a capture that could not be placed, with what to do: nothing of what only they show will be in the scene.
+// photos: the entry that they lie in, or null.
+export function unplaced({ search }, photos) {
+  const names = search?.unplaced ?? [];
+  if (!names.length) return null;
+  const whole = search.photos === null ? "" : ` of ${search.photos}`;
+  const [were, each] = names.length === 1 ? ["was", "it"] : ["were", "each of them"];
+  const figure = (name) => {
+    const image = photos && want("img", { src: thumbOf(photos, name, 128), alt: "", width: 96, height: 72 });
+    return want("figure", { "data-key": name }, image, want("figcaption", {}, name));
+  };
+  const advice = `Take two more photos beside ${each}, which share most of what they show, add them to the photos, and find the poses again. What only ${names.length === 1 ? "this photo shows" : "these photos show"} will be missing.`;
+  return want(
+    "div",
+    { class: "notice unplaced", role: "group", "aria-label": "photos that were not placed" },
+    want("p", {}, want("strong", {}, `${names.length}${whole} photos ${were} not placed. `), advice),
+    want("div", { class: "figures" }, names.slice(0, FEW).map(figure)),
+    names.length > FEW && want("p", {}, `And ${names.length - FEW} more.`),
+  );
+}
+
 const SEVERITIES = { note: "note", warning: "warning", fatal: "serious" };
 
 // What the doctor found, with the photos that each finding means. Returns the marks of a gallery.
@@ -150,7 +172,7 @@ export function showFindings(
         const path = photos?.[index] ?? "";
         const [kind, entry, ...rest] = path.split("/");
         const photo = rest.join("/");
-        if (photo) marks.set(photo, [...(marks.get(photo) ?? []), name]);
+        if (kind === "captures") marks.set(photo, [...(marks.get(photo) ?? []), name]);
         const caption = want("figcaption", {}, values[index] ? `${image}: ${values[index]}` : image);
         if (!photo) return want("figure", {}, caption);
         const src = thumbOf(`${kind}/${entry}`, photo, 128);
@@ -160,20 +182,16 @@ export function showFindings(
           { class: out ? "left-out" : null },
           want("img", { src, alt: "", loading: "lazy", width: 96, height: 72 }),
           caption,
-          leaving(`${kind}/${entry}`, photo, { out, label: image, line, changed: (now) => left(path, photo, now) }),
-          masking(store, `${kind}/${entry}`, photo, { is, label: image, line, changed: (now) => drawn(path, now) }),
+          kind === "captures" && [
+            leaving(`${kind}/${entry}`, photo, { out, label: image, line, changed: (now) => left(path, photo, now) }),
+            masking(store, `${kind}/${entry}`, photo, { is, label: image, line, changed: (now) => drawn(path, now) }),
+          ],
         );
       });
       return want(
         "li",
-        { class: `finding ${severity}`, "data-key": name },
-        want(
-          "p",
-          {},
-          want("span", { class: `badge ${severity}` }, SEVERITIES[severity] ?? severity),
-          " ",
-          want("strong", {}, name),
-        ),
+        { class: "finding card", "data-key": name },
+        want("p", {}, toned(severity, SEVERITIES[severity] ?? severity), " ", want("strong", {}, name)),
         want("p", {}, sentence),
         what && want("p", { class: "quiet" }, what),
         pictures.length ? want("div", { class: "figures" }, pictures) : null,
@@ -185,9 +203,8 @@ export function showFindings(
   patch(
     place,
     stale && want("p", { class: "error" }, "This has changed since the doctor looked; examine it again."),
-    state === "done" && !findings.length && want("p", { class: "good" }, "The doctor found nothing wrong."),
+    state === "done" && !findings.length && want("p", { class: "banner good" }, "The doctor found nothing wrong."),
     line,
-    want("ul", { class: "findings" }, items),
     advice.length > 1 && [
       want("p", {}, "Most useful first:"),
       want(
@@ -196,6 +213,7 @@ export function showFindings(
         advice.map((one) => want("li", {}, one)),
       ),
     ],
+    want("ul", { class: "findings" }, items),
     facts.length > 0 &&
       want(
         "details",

@@ -80,9 +80,9 @@ class Batch {
     this.stop = button("Stop", () => this.stopping.abort());
     this.element = h(
       "article",
-      { class: "job" },
+      { class: "job card" },
       heading(3, `${kind}/${name}`),
-      h("div", { class: "row progress" }, this.bar, this.text, this.stop),
+      h("div", { class: "progress" }, this.bar, this.text, this.stop),
       this.errors,
     );
   }
@@ -95,8 +95,9 @@ class Batch {
 
   refuse(name, error) {
     this.refused += 1;
-    const repeated = `file: '${name}' `; // some of the server's lines begin so
-    const what = error.message.startsWith(repeated) ? error.message.slice(repeated.length) : error.message;
+    const base = name.split("/").at(-1); // some of the server's sentences begin with it
+    const repeated = [`'${base}' `, `“${base}” `].find((start) => error.message.startsWith(start)) ?? "";
+    const what = error.message.slice(repeated.length);
     this.errors.append(h("li", { class: "error" }, h("strong", {}, name), ": ", what));
   }
 

@@ -1,7 +1,7 @@
 // Jobs: how far each one is, its buttons, and the command that repeats it.
 
 import { at, get, post, remove } from "./api.js";
-import { attempt, button, commandLine, duration, errorLine, h, heading, link, patch, put, want } from "./dom.js";
+import { attempt, button, commandLine, duration, errorLine, h, heading, link, patch, put, toned, want } from "./dom.js";
 
 const STATES = {
   held: "waits for you",
@@ -18,7 +18,7 @@ const STATES = {
 const REMOVE = "Remove from the list";
 
 // For patch().
-export const badge = (state) => want("span", { class: `badge ${state}` }, STATES[state] ?? state);
+export const badge = (state) => toned(state, STATES[state] ?? state);
 
 // Starts a job; its answer is in the store when this returns.
 export async function startJob(store, request) {
@@ -71,10 +71,10 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const command = h("div", {});
   const element = h(
     "article",
-    { class: "job", "aria-label": view.job.title },
+    { class: "job card", "aria-label": view.job.title },
     h("div", { class: "row" }, heading(level, view.job.title), state),
     stages,
-    h("div", { class: "row progress" }, bar, left),
+    h("div", { class: "progress" }, bar, left),
     said,
     waits,
     line,
@@ -113,7 +113,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     waits.textContent = job.state === "queued" ? waitingFor(store, job.waits_for) : "";
     waits.hidden = !waits.textContent;
     line.classList.toggle("error", job.state !== "cancelled"); // stopping is no error
-    if (job.line) put(line, job.line);
+    if (job.line) put(line, job.plain ?? job.line);
     pause.hidden = job.state !== "running" || job.cancelling;
     resume.hidden = !(job.state === "paused" || (job.resumable && !found.active));
     resume.textContent = { failed: "Try again", held: "Start" }[job.state] ?? "Resume";
@@ -146,6 +146,14 @@ export function leftOf({ done, total, seconds_left: left, is_least: isLeast }, i
   return left === null || left === undefined
     ? share
     : `${share}, ${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
+}
+
+// Why there is no picture of a training yet.
+export function waitsFor(view) {
+  if (view?.job.state === "queued") return "This training waits for other jobs.";
+  const { progress, stage } = view ?? {};
+  const share = progress?.total ? `, ${Math.floor((100 * progress.done) / progress.total)} %` : "";
+  return stage ? `The picture comes with the training. First: ${stage}${share}.` : "The training is starting.";
 }
 
 // The newest job about an entry; the card is replaced when another job begins.

@@ -39,7 +39,7 @@ export function slider(left, right, names, label, { W, H }) {
 export function verdictOf({ verdict: found }) {
   if (!found) return [];
   const { grade, sentence, details } = found;
-  const said = want("p", { class: `verdict ${grade.toLowerCase()}` }, sentence);
+  const said = want("p", { class: `verdict banner ${grade.toLowerCase()}` }, sentence);
   return details ? [said, want("details", {}, want("summary", {}, "Details"), want("p", {}, details))] : [said];
 }
 

@@ -1,25 +1,12 @@
 // The library: everything in the folder, with pictures and states.
 
-import { at, get, post, remove } from "./api.js";
-import {
-  announce,
-  attempt,
-  bytes,
-  button,
-  count,
-  errorLine,
-  h,
-  heading,
-  link,
-  patch,
-  put,
-  want,
-  whole,
-} from "./dom.js";
+import { at, get, post } from "./api.js";
+import { attempt, bytes, button, count, errorLine, h, heading, link, patch, put, want, whole } from "./dom.js";
 import { follow } from "./draft.js";
 import { intake } from "./intake.js";
-import { badge } from "./jobs.js";
+import { badge, leftOf } from "./jobs.js";
 import { nextStep, timeline } from "./project.js";
+import { discard } from "./undo.js";
 
 const KINDS = { photos: "Photos", captures: "Capture", runs: "Run", scenes: "Scene" };
 
@@ -66,13 +53,8 @@ export function searchOf({ search }) {
   return [all, `mean error ${search.error.toFixed(2)} px`].filter(Boolean).join(", ");
 }
 
-// Address of a small picture of an entry; null if there is none.
+// Address of a small picture of photos; null if there is none.
 async function pictureOf(entry) {
-  if (entry.kind === "runs") {
-    if (entry.psnr === null) return null; // nothing is rendered yet
-    const { views } = await get(at(entry.entry, "views"));
-    return views.length ? at(entry.entry, "views", String(views.at(-1).index), "render.jpg") : null;
-  }
   if (!entry.photos) return null;
   const { photos } = await get(at(entry.entry, "photos"));
   const good = photos.find(({ problem }) => !problem);
@@ -87,6 +69,8 @@ function card(store, project) {
     h("span", { class: "facts quiet" }),
     h("span", { class: "states" }),
   ];
+  const [bar, left] = [h("progress", { max: 1, value: 0 }), h("span", { class: "left quiet" })];
+  const running = h("div", { class: "progress", hidden: true }, bar, left);
   const top = h(
     "a",
     { class: "card" },
@@ -100,8 +84,9 @@ function card(store, project) {
   const [summary, list] = [h("summary", {}), h("ul", { class: "plain" })];
   const element = h(
     "article",
-    { class: "project" },
+    { class: "project card" },
     top,
+    running,
     stages.element,
     next.element,
     h("details", {}, summary, list),
@@ -116,6 +101,15 @@ function card(store, project) {
     facts.textContent = factsOf(present).filter(Boolean).join(" · ");
     const all = entries.map((entry) => stateOf(store, entry));
     patch(states, badges(all.findLast(Boolean)));
+    const view = entries.flatMap((entry) => store.jobsOf(entry.entry)).find(({ job }) => job.state === "running");
+    running.hidden = !view;
+    if (view) {
+      const { progress, stage, job } = view;
+      bar.setAttribute("aria-label", `progress of ${job.title}`);
+      if (progress?.total) [bar.max, bar.value] = [progress.total, progress.done];
+      else bar.removeAttribute("value");
+      left.textContent = `${stage || job.title}${progress?.total ? `: ${leftOf(progress, view.stages.length > 1)}` : ""}`;
+    }
     stages.update(now);
     next.update(now, now.next);
     summary.textContent = `Everything in it (${entries.length})`;
@@ -159,8 +153,9 @@ function picture(element, entry) {
   const version = `${entry.entry} ${entry.modified} ${entry.files} ${entry.finished}`;
   if (element.version === version) return;
   element.version = version;
-  if (entry.kind === "scenes") {
-    element.cover = entry.file && `${at(entry.entry, "cover")}?of=${entry.modified}`;
+  if (entry.kind === "scenes" || entry.kind === "runs") {
+    const isThere = entry.kind === "runs" ? entry.psnr !== null : entry.file;
+    element.cover = isThere && `${at(entry.entry, "cover")}?of=${entry.modified}`;
     covers.unobserve(element);
     covers.observe(element); // tells at once if it is seen
     return;
@@ -227,9 +222,7 @@ export function management(store, entry) {
   const too = h("label", { class: "check", hidden: true }, all, said);
   const away = button("Move to the trash", () =>
     attempt(away, line, async () => {
-      await remove(at(entry.entry));
-      announce(`Moved ${entry.name} to the trash`);
-      await store.refresh();
+      await discard(store, at(entry.entry), entry.name);
       location.hash = "#/";
     }),
   );

@@ -208,7 +208,7 @@ function sheet(src, name, { W, H, shapes: given }, changed) {
   });
   show();
   const photo = h("img", { src, alt: "", width: W, height: H });
-  const element = h("div", { class: "sheet" }, photo, svg);
+  const element = h("div", { class: "painted" }, photo, svg);
   element.style.setProperty("--ratio", W / H); // its size does not wait for the photo
   return {
     element,

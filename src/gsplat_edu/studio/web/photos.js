@@ -1,7 +1,7 @@
 // The screen of photos without poses: previews, and the first step, which finds the poses.
 
 import { attempt, errorLine, h, heading, patch, put, want } from "./dom.js";
-import { gallery } from "./gallery.js";
+import { gallery, unplaced } from "./gallery.js";
 import { intake } from "./intake.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf, entryHead, management, searchOf, withEntry } from "./library.js";
@@ -61,8 +61,10 @@ export function photos(given) {
       entry.adopted ? null : intake(store, { kind: "photos", name: entry.name }),
       management(store, entry),
     );
+    const missing = h("div", {}); // the photos that its capture lacks
     main.append(
       head.element,
+      missing,
       h(
         "section",
         { "aria-label": "poses" },
@@ -90,6 +92,7 @@ export function photos(given) {
         if (made) {
           const open = want("a", { href: addressOf(made), class: "button" }, `Continue with the capture ${made.name}`);
           patch(next, open, " ", want("span", {}, searchOf(made)));
+          patch(missing, unplaced(made, entry.entry));
         }
         next.hidden = !made;
         find.textContent = made ? "Find the poses again" : "Find the poses";

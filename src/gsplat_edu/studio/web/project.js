@@ -1,7 +1,7 @@
 // A project: its timeline, and the one next step.
 
-import { at, get } from "./api.js";
-import { announce, attempt, errorLine, forecastText, h, patch, put, want } from "./dom.js";
+import { at } from "./api.js";
+import { attempt, errorLine, h, patch, put, want } from "./dom.js";
 import { startJob } from "./jobs.js";
 
 const STAGES = { photos: "Photos", poses: "Poses", training: "Training", look: "Look and edit", share: "Share" };
@@ -54,8 +54,7 @@ export function nextStep(store, of = "") {
   const line = errorLine();
   const place = h("div", { class: "row" });
   const note = want("span", { class: "quiet" }, "The next step comes when the job has ended.");
-  const takes = h("p", { class: "forecast quiet", hidden: true });
-  const element = h("div", { class: "next-step" }, place, takes, line);
+  const element = h("div", { class: "next-step" }, place, line);
   let shown = "";
 
   const ask = (request, pressed) =>
@@ -65,57 +64,14 @@ export function nextStep(store, of = "") {
       location.hash = hashOf(request.command === "convert" ? `${job.subject}/share` : job.subject);
     });
 
-  // A training that is started from a card says first what it takes; a button beside that then starts it.
-  function tellFirst(request, pressed, offered) {
-    const step = shown;
-    return attempt(pressed, line, async () => {
-      put(takes, "Measuring time and memory ...");
-      const { qualities, trouble } = await get(at(request.subject, "forecast")).catch((error) => ({ trouble: error }));
-      if (shown !== step) return; // there is another step by now
-      put(takes, trouble ? "There is no forecast." : `It takes ${forecastText(qualities[request.options.quality])}.`);
-      if (trouble) put(line, trouble.message);
-      else announce(takes.textContent);
-      const begin = "Next: Start it";
-      offer(
-        want(
-          "button",
-          {
-            type: "button",
-            class: "button primary",
-            "aria-label": `${begin}, ${of}`,
-            "data-key": "begin",
-            onclick: ({ currentTarget }) => ask(request, currentTarget),
-          },
-          begin,
-        ),
-        want("button", { type: "button", "data-key": "later", onclick: () => later(offered) }, "Not now"),
-      );
-    });
-  }
-
-  function later(offered) {
-    put(takes, "");
-    put(line, "");
-    offer(offered);
-  }
-
-  // Shows buttons in place of the one that was pressed.
-  function offer(...buttons) {
-    patch(place, buttons);
-    place.firstElementChild.focus();
-  }
-
   function made({ label, place: to, request, entry, file }, form) {
     const text = `Next: ${label}`;
     const more = { class: "button primary", "aria-label": of ? `${text}, ${of}` : null };
     if (to) return want("a", { ...more, href: hashOf(to) }, text);
     if (file) return want("a", { ...more, href: at(entry, "exports", file), download: file }, text);
     if (form) return want("button", { ...more, type: "submit", form: form.id }, text);
-    const isToTell = of && request.command === "train" && request.options?.quality;
-    const onclick = ({ currentTarget: pressed }) =>
-      isToTell ? tellFirst(request, pressed, offered) : ask(request, pressed);
-    const offered = want("button", { ...more, type: "button", onclick }, text);
-    return offered;
+    const onclick = ({ currentTarget: pressed }) => ask(request, pressed);
+    return want("button", { ...more, type: "button", onclick }, text);
   }
 
   return {
@@ -143,7 +99,6 @@ export function nextStep(store, of = "") {
       if (shown === text) return;
       shown = text;
       put(line, "");
-      put(takes, "");
       patch(place, found ? made(found, form) : active && !of && note);
     },
   };

@@ -1,6 +1,6 @@
 // Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
 
-import { at, get, remove } from "./api.js";
+import { at, get } from "./api.js";
 import {
   attempt,
   bytes,
@@ -20,6 +20,7 @@ import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./library.js";
 import { meshes, newestOf } from "./mesh.js";
+import { discard } from "./undo.js";
 
 const FORMATS = [
   ["html", "HTML page", "one file that shows the scene in any browser, also offline"],
@@ -35,7 +36,15 @@ const isVideo = (file) => /\.mp4$/i.test(file);
 
 export function share({ place, store, entry }) {
   const line = errorLine();
-  const title = h("input", { id: "title", type: "text", required: true, value: entry.name, autocomplete: "off" });
+  const known = `title of ${entry.entry}`; // the browser remembers what was typed
+  const title = h("input", {
+    id: "title",
+    type: "text",
+    required: true,
+    value: localStorage.getItem(known) ?? entry.name,
+    autocomplete: "off",
+    onchange: () => (title.value ? localStorage.setItem(known, title.value) : localStorage.removeItem(known)),
+  });
   const edits = h("input", { type: "checkbox", checked: true });
   const withEdits = h("label", { class: "check", hidden: true }, edits, " apply the edits");
   const surface = h("input", { type: "checkbox" });
@@ -57,7 +66,7 @@ export function share({ place, store, entry }) {
   const note = h("p", { class: "quiet" });
   const choices = FORMATS.map(([value, name, hint], index) => {
     const input = h("input", { type: "radio", name: "format", value, checked: index === 0, onchange: () => explain() });
-    return h("label", { class: "choice" }, input, h("strong", {}, name), h("span", { class: "quiet" }, hint));
+    return h("label", { class: "choice card" }, input, h("strong", {}, name), h("span", { class: "quiet" }, hint));
   });
   const form = h("form", { id: "export", "data-next": `convert ${entry.entry}` });
   const make = h("button", {}, "Export");
@@ -123,22 +132,20 @@ export function share({ place, store, entry }) {
   function item({ file, command, modified, job: by, bytes: size, psnr }) {
     const onclick = ({ currentTarget }) =>
       attempt(currentTarget, line, async () => {
-        await remove(at(entry.entry, "exports", file));
-        exported.forget();
-        store.refresh();
+        await discard(store, at(entry.entry, "exports", file), file);
       });
     const href = at(entry.entry, "exports", file);
     const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
     return want(
       "li",
-      { "data-key": `${file} ${modified} ${by}` },
+      { "data-key": `${file} ${modified} ${by}`, class: "card" },
       want(
         "div",
         { class: "row" },
         want("strong", { class: "name" }, file),
         want("span", { class: "quiet facts" }, [bytes(size), isVideo(file) ? "" : exact].filter(Boolean).join(" · ")),
         want("a", { href, class: "button", download: file }, "Download"),
-        want("button", { type: "button", onclick }, "Remove"),
+        want("button", { type: "button", onclick }, "Move to the trash"),
       ),
       command ? want("details", {}, want("summary", {}, "The same as a command"), commandLine(command)) : null,
     );

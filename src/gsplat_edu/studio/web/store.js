@@ -1,6 +1,6 @@
 // What the studio knows: the library, and jobs with their events as they happen.
 
-import { at, get } from "./api.js";
+import { at, get, startsBy } from "./api.js";
 
 export const ACTIVE = new Set(["queued", "running", "paused"]);
 
@@ -165,7 +165,10 @@ export class Store extends EventTarget {
     );
     if (question < this.latest) return;
     this.latest = question;
-    if (library) this.library = library;
+    if (library) {
+      this.library = library;
+      startsBy(library.start);
+    }
     this.trouble = trouble;
     this.changed();
   }

@@ -25,7 +25,7 @@ export function trash({ main, store }) {
     clear.hidden = !found.length;
     patch(
       list,
-      found.map(({ id, kind, name, removed }) => {
+      found.map(({ id, kind, name, entry, removed }) => {
         const onclick = ({ currentTarget }) =>
           attempt(currentTarget, line, async () => {
             await post(at("trash", id, "restore"));
@@ -36,7 +36,7 @@ export function trash({ main, store }) {
         return want(
           "li",
           { class: "row", "data-key": id },
-          want("span", {}, `${kind}/${name}`),
+          want("span", {}, entry ? `${name}, a file of ${entry}` : `${kind}/${name}`),
           want("span", { class: "quiet" }, `removed ${when}`),
           want("button", { type: "button", onclick }, "Restore"),
         );
@@ -44,7 +44,14 @@ export function trash({ main, store }) {
     );
   }
 
-  main.append(heading(1, "Trash"), empty, list, clear, line, h("p", {}, link("Back to the library", "#/")));
+  main.append(
+    heading(1, "Trash"),
+    empty,
+    list,
+    h("p", { class: "row" }, clear),
+    line,
+    h("p", {}, link("Back to the library", "#/")),
+  );
   attempt(null, line, read);
   return {};
 }

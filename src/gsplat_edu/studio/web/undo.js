@@ -1,8 +1,9 @@
-// Undo of a training that a proposal of the doctor began: it is stopped, its run goes to the trash, and the page shows
-// again what was shown before. The studio knows what began it, so every tab offers it until the result is kept or undone.
+// Undo of what went to the trash, and of a training that a proposal of the doctor began: it is stopped, its run goes to the
+// trash, and the page shows again what was shown before. The studio knows what began it, so every tab offers it until the
+// result is kept or undone.
 
-import { at, post } from "./api.js";
-import { announce, attempt, button, errorLine, h, put } from "./dom.js";
+import { at, post, remove } from "./api.js";
+import { announce, attempt, button, errorLine, h, patch, put } from "./dom.js";
 
 const PATIENCE = 120000; // milliseconds; a training writes a checkpoint before it ends
 
@@ -23,6 +24,30 @@ function ended(store, id) {
     store.addEventListener("change", look);
     look();
   });
+}
+
+// Moves what an address names to the trash, and offers to undo that above every screen until something else is removed.
+export async function discard(store, address, name) {
+  const { trash } = await remove(address);
+  const place = document.getElementById("removed");
+  const line = errorLine();
+  const hide = () => {
+    patch(place);
+    place.hidden = true;
+  };
+  const undo = button("Undo", () =>
+    attempt(undo, line, async () => {
+      const { entry } = await post(at("trash", trash, "restore"));
+      await store.refresh();
+      hide();
+      announce(`${name} is back`);
+      if (address === at(entry)) location.hash = `#/${entry.split("/").map(encodeURIComponent).join("/")}`;
+    }),
+  );
+  const away = button("Close", hide);
+  patch(place, h("p", { class: "row" }, h("span", {}, `${name} is in the trash.`), undo, away), line);
+  place.hidden = false;
+  await store.refresh();
 }
 
 // The screen on which the proposal was made; that of the capture if it is gone.
@@ -54,7 +79,7 @@ export function undoBegun(store, entry) {
     }),
   );
   const said = h("span", {});
-  const element = h("div", { class: "begun", hidden: true }, h("p", { class: "row" }, said, undo, keep), line);
+  const element = h("div", { class: "begun", hidden: true }, h("p", { class: "toast" }, said, undo, keep), line);
   return {
     element,
     update() {

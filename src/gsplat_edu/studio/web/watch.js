@@ -5,7 +5,7 @@ import { decibels, duration, h, heading, link, patch, put, want, whole } from ".
 import { verdictOf } from "./judge.js";
 import { curve } from "./curves.js";
 import { beside, frame } from "./frame.js";
-import { jobPlace } from "./jobs.js";
+import { jobPlace, waitsFor } from "./jobs.js";
 import { addressOf } from "./library.js";
 
 const EVERY = 2000; // milliseconds between two looks at the curves
@@ -55,7 +55,7 @@ export function watch({ place, store, entry }) {
   const slider = beside(scene, captureOf);
   const page = edited(store, entry);
   const job = jobPlace(store, entry.entry, ["train"], { main: true, level: 2 });
-  const figures = h("dl", { class: "figures-list" });
+  const figures = h("dl", { class: "figures-list card" });
   const curves = {
     loss: curve("Loss", (value) => value.toPrecision(3)),
     psnr: curve("PSNR", decibels),
@@ -68,7 +68,7 @@ export function watch({ place, store, entry }) {
       "div",
       { class: "watch" },
       h("div", { class: "left-side" }, scene.element, slider.element, page.element),
-      h("div", { class: "right-side" }, figures, verdict, next, job.element),
+      h("div", { class: "right-side" }, verdict, next, figures, job.element),
     ),
     h(
       "section",
@@ -141,8 +141,7 @@ export function watch({ place, store, entry }) {
         seen = phase;
         readCurves();
       }
-      const waits =
-        view?.job.state === "queued" ? "This training waits for other jobs." : "The training has not begun yet.";
+      const waits = waitsFor(view);
       page.element.hidden = active;
       if (active && view.job.state !== "queued" && now.files) scene.show(at(entry.entry, "live", "page"), waits);
       else if (active) scene.show(null, waits);

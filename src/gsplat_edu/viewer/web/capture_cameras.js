@@ -39,7 +39,7 @@ export class Cameras {
     const kinds = new Map();
     const add = (kind, name) => kinds.set(name, { kind, name, cameras: (kinds.get(name)?.cameras ?? 0) + 1 });
     const names = [...new Set(this.list.flatMap(({ marks }) => marks))];
-    const number = new Map(names.map((name, i) => [name, `found-${Math.min(i + 1, MOST_FINDINGS)}`]));
+    const number = new Map(names.map((name, i) => [name, `series-${Math.min(i + 1, MOST_FINDINGS)}`]));
     this.kindOf = ({ left_out: out, marks }) => (out ? "out" : marks.length ? number.get(marks[0]) : "camera");
     for (const camera of this.list) {
       const kind = this.kindOf(camera);

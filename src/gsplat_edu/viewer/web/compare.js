@@ -110,11 +110,11 @@ export class Compare {
     element("photo").hidden = element("photo-line").hidden = true;
   }
 
-  // Lays the photo over the picture of its camera.
+  // Lays the photo over the picture of its camera, once that is on the screen whole.
   place() {
     const { viewer } = this;
     const index = this.indices[this.at];
-    if (!this.on || viewer.exact || viewer.cameraIndex !== index) return this.hide();
+    if (!this.on || !viewer.isWhole || viewer.exact || viewer.cameraIndex !== index) return this.hide();
     const [camera, shown] = [viewer.facts.cameras[index], viewer.camera()];
     const { left, top, width } = viewer.canvas.getBoundingClientRect();
     const dense = shown.W / width;

@@ -60,7 +60,7 @@ class Editor {
     this.grid = null; // its lines, while it is shown
     this.follow();
     this.stateChanged();
-    document.body.classList.add("editing");
+    document.body.classList.add("editing", "glass");
     addEventListener("beforeunload", (event) => {
       if (this.text() !== this.stored) event.preventDefault();
     });

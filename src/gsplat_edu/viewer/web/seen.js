@@ -60,7 +60,7 @@ export class Seen {
     element("legend").hidden = !this.on;
     const percent = share > 0 && share < 0.01 ? "less than 1" : Math.round(100 * share);
     element("legend").lastElementChild.textContent = this.on
-      ? `no photo or only one saw these: ${percent} % of the splats. Grey: two or more did.`
+      ? `Orange: no photo shows this, or only one (${percent} % of the splats). Grey: two or more do.`
       : "";
     this.viewer.refresh();
   }

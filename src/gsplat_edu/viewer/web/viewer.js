@@ -119,6 +119,7 @@ export class Viewer {
     await this.sorter.sort(camera);
     this.draw(camera);
     this.isWhole = true;
+    this.compare?.place();
   }
 
   // Finds out how fast this computer draws the scene, by a coarse picture of it.
@@ -254,6 +255,7 @@ export class Viewer {
     this.exact = null;
     this.movedAt = performance.now();
     this.cameraIndex = cameraIndex;
+    this.isWhole = false; // the screen shows another view until the next frame
     this.panel.mark(cameraIndex);
     this.compare?.mark(cameraIndex);
     this.askFrame();
@@ -289,6 +291,7 @@ export class Viewer {
     this.measure();
     if (!this.sorter.running && !this.sorter.fits(camera)) this.sorter.sort(camera).then(() => this.askFrame(), fail);
     this.isWhole = this.sorter.fits(camera);
+    this.compare?.place(); // its photo waits for the picture
     if (this.isWhole) this.onRest?.();
     this.time(now, seconds);
   }
@@ -405,6 +408,7 @@ export class Viewer {
   rested(isWhole) {
     this.isWhole = isWhole;
     this.lastFrame = 0;
+    this.compare?.place();
     this.panel.atRest();
     this.onRest?.();
   }

@@ -2,59 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import Told
-from gsplat_edu.data.capture import is_folder
 from gsplat_edu.data.depth_fit import DepthMisfitError
-from gsplat_edu.data.depth_folder import GEOMETRIC_MAPS
-from gsplat_edu.data.depths import CAPTURE, FEW_POINTS, POINTS, DepthReport, DepthSource, judged_depths
-from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.doctor.finding import Finding, Severity
-from gsplat_edu.scene.camera import Camera
+from gsplat_edu.data.depths import FEW_POINTS, POINTS, DepthReport
+from gsplat_edu.survey.finding import Finding, Severity
 
 NAME = "depth"
-"""Name of the findings."""
+"""Name of the check, of its findings and of the fact."""
 
 FEW_SHARE = 0.2
 """Warn when more than this fraction of the photos have few points."""
 
 
-def own_depth(reader: CaptureReader) -> Path | None:
-    """Return the source of the depth maps that a capture brings along; None if it has none."""
-    named = any(frame.depth is not None for frame in reader.capture.frames)
-    return CAPTURE if named or is_folder(reader.path / GEOMETRIC_MAPS) else None
-
-
-def judge_depth(
-    reader: CaptureReader, cameras: Sequence[tuple[str, Camera]], path: Path
-) -> tuple[DepthReport | None, list[Finding]]:
-    """Read all depth of a capture, and report what is wrong with it.
+def depth_findings(depth: DepthReport | DatasetError) -> list[Finding]:
+    """Report what is wrong with the depth of a capture.
 
     Args:
-        reader: The capture.
-        cameras: Name and camera of each readable photo.
-        path: Where depth comes from; see `DepthSource`.
-
-    Returns:
-        What was found, None if nothing can be used; and the findings.
+        depth: What was found about it, or why it cannot be used.
     """
-    try:
-        report = judged_depths(reader, cameras, DepthSource(path)).report
-    except DepthMisfitError as error:
-        return None, [
-            Finding(NAME, Severity.WARNING, f"the depth maps do not fit: {error.reason}", error.advice)
-        ]
-    except DatasetError as error:
-        repair = "repair what the depth check names"
-        advice = Told(f"{repair}, or train without --depth", f"{repair}, or train without depth")
-        return None, [Finding(NAME, Severity.WARNING, str(error), advice)]
-    return report, check_depth(report)
+    if isinstance(depth, DepthReport):
+        return _check_report(depth)
+    if isinstance(depth, DepthMisfitError):
+        what = f"the depth maps do not fit: {depth.reason}"
+        return [Finding(NAME, Severity.WARNING, what, depth.advice)]
+    repair = "repair what the depth check names"
+    advice = Told(f"{repair}, or train without --depth", f"{repair}, or train without depth")
+    return [Finding(NAME, Severity.WARNING, str(depth), advice)]
 
 
-def check_depth(report: DepthReport) -> list[Finding]:
+def _check_report(report: DepthReport) -> list[Finding]:
     """Report what is missing from depth that can be used, and which maps are left out."""
     found = list[Finding]()
     if report.rejected:

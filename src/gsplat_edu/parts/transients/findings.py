@@ -1,19 +1,35 @@
-"""Find photos of a run that show objects which other photos do not, as `gsplat-edu train --transients mask` does."""
+"""Find photos of a run that show objects which other photos do not, as the masks of a training do."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from gsplat_edu.base.text import Told
-from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.doctor.finding import Finding, Severity, command, counted
 from gsplat_edu.evaluate.verdict import MOVING, NOTABLE
+from gsplat_edu.parts.run_values import Ended
 from gsplat_edu.parts.transients.masks import Compared, FeatureRenderer, find_masks
 from gsplat_edu.parts.transients.search import FEWEST, reduced
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.finding import Finding, Remedy, Severity, command, counted
+
+ENOUGH = 12
+"""`--transients auto` looks for moving objects from this number of training photos on. In smaller captures, fewer than
+four photos show most places, which are too few to compare."""
+
+
+def transients_for(count: int) -> Remedy:
+    """Choose `--transients` from the number of training photos. Only the training can find out what moved."""
+    if count < ENOUGH:
+        return Remedy(
+            "none",
+            f"{count} training photos are too few to tell what moved; from {ENOUGH} on, they are compared",
+        )
+    return Remedy(
+        "mask",
+        f"{count} training photos are enough to tell what moved; a photo where nothing did keeps every pixel",
+    )
 
 
 def moved_parts(
@@ -78,29 +94,19 @@ def check_moved(moved: Sequence[tuple[str, float]], photos: int) -> list[Finding
     return [Finding("moved", Severity.WARNING, what, advice, names, shares, (("transients", "mask"),))]
 
 
-def moved_line(
-    folder: Path,
-    gaussians: Gaussians,
-    dataset: Dataset,
-    render: FeatureRenderer | None,
-    settings: RenderSettings,
-) -> str:
+def moved_line(run: Ended) -> str:
     """Return a line about objects that moved: the photos that show them, or the command to find them.
 
     The comparison takes about 20 ms per photo on the CPU if photos are in memory. Otherwise reading them again would
     take longer, and the line only names the command.
 
     Args:
-        folder: The run.
-        gaussians: The trained scene.
-        dataset: Its capture.
-        render: Renders features; None to compare nothing and name the command.
-        settings: The run's render settings.
+        run: The run.
     """
-    doctor = command("doctor", folder)
-    if render is None or dataset.images.needed > dataset.images.budget:
+    doctor, images = command("doctor", run.path), run.dataset.images
+    if run.render is None or images.needed > images.budget:
         return Told(f"to find photos that do not fit the scene: {doctor}", "")
-    moved = moved_parts(gaussians, dataset.train, render, settings)
+    moved = moved_parts(run.gaussians, run.dataset.train, run.render, run.settings)
     if not moved:
         return ""
     (name, share), photos = moved[0], counted(len(moved), "photo")

@@ -1,66 +1,20 @@
-"""Findings of the doctor: what is wrong, how serious it is, and what to do about it."""
+"""The doctor's diagnosis: all findings in their order, with advice that does not contradict itself."""
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from pathlib import Path
 from typing import NamedTuple
 
 from gsplat_edu.base.text import plain_of
 from gsplat_edu.data.notes import Note
-from gsplat_edu.evaluate.verdict import RANKED
 from gsplat_edu.jobs.events import Found
+from gsplat_edu.survey.finding import Change, Finding, Severity, listed
+from gsplat_edu.survey.order import CAUSES, CHECKS, EXPLAINS
 
 ADVICE = 3
 """Number of pieces of advice at the end of a diagnosis; users do not follow more than three."""
-
-NAMED = 3
-"""Number of images that a finding names; the others are counted."""
-
-
-CAUSES = (
-    *("usable", "no parallax", "unusable", "missing", "wrong poses", "intrinsics", "sizes"),
-    *("doubtful poses", "facing away", "splats", "same photo", "duplicates", "same pose", "white balance"),
-    *RANKED,
-    *("far points", "unseen points", "few points", "depth", "unexplained"),
-    *("moved", "outside cut-outs", "floaters", "huge splats", "one side", "one height", "sky", "masks"),
-    *("resolution", "faint splats", "plug-in"),
-)
-"""Names of the findings, causes before what they cause; the verdict ranks those of a run. Of two pieces of advice that
-contradict each other, that of the more serious finding counts, and of equally serious ones that of the earlier in this
-order."""
-
-EXPLAINS = {
-    "wrong poses": ("facing away", "hole", "poor fit"),
-    "unfinished": ("short training", "poor fit", "unexplained", "overfitted", "floaters"),
-    "moving subject": ("unexplained", "overfitted", "moved", "floaters"),
-    "overfitted": ("short training",),
-    "few photos": ("short training",),
-}
-"""Findings that another one explains, so that their own advice is left out: what to do about the cause comes first."""
-
-
-class Severity(IntEnum):
-    """How serious a finding is."""
-
-    NOTE = 1
-    """Worth knowing; no action needed."""
-    WARNING = 2
-    """Training works, but the scene gets worse."""
-    FATAL = 3
-    """Training is pointless."""
-
-
-class Change(NamedTuple):
-    """What a piece of advice changes. Two pieces contradict each other if they turn one quantity in different ways."""
-
-    quantity: str
-    """For example photos used, photos taken, iterations, Gaussians, sky."""
-    direction: str
-    """For example more, fewer, all, on."""
 
 
 class Advice(NamedTuple):
@@ -70,66 +24,6 @@ class Advice(NamedTuple):
     """What to do."""
     changes: tuple[Change, ...] = ()
     """What it changes."""
-
-
-MORE_PHOTOS, FEWER_PHOTOS, ALL_PHOTOS = (
-    Change("photos taken", "more"),
-    Change("photos used", "fewer"),
-    Change("photos used", "all"),
-)
-LONGER, SHORTER, AS_LONG = (Change("iterations", direction) for direction in ("more", "fewer", "same"))
-MORE_SPLATS, FEWER_SPLATS = (Change("Gaussians", direction) for direction in ("more", "fewer"))
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One problem.
-
-    Args:
-        name: One or two words.
-        severity: How serious it is.
-        sentence: The problem, with numbers.
-        advice: What to do about it.
-        images: Names of the affected images; empty if the whole capture is affected.
-        values: A measured value for each of these images, as text; empty if there is none.
-        options: Options of `train`, by their names in Python, and the values that the advice proposes; empty if it
-            proposes none.
-        changes: What the advice changes.
-        certain: Whether the capture's lists, poses, headers and points alone prove it
-            (`gsplat_edu.doctor.certain.certain_findings`).
-        leaves_out: Whether a training leaves these images out by itself.
-    """
-
-    name: str
-    severity: Severity
-    sentence: str
-    advice: str
-    images: tuple[str, ...] = ()
-    values: tuple[str, ...] = ()
-    options: tuple[tuple[str, str], ...] = ()
-    changes: tuple[Change, ...] = ()
-    certain: bool = False
-    leaves_out: bool = False
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The names of the images, each followed by its value in brackets if there are values."""
-        if not self.values:
-            return self.images
-        return tuple(f"{name} ({value})" for name, value in zip(self.images, self.values, strict=True))
-
-
-@dataclass(frozen=True)
-class Remedy:
-    """A choice and its reason.
-
-    Args:
-        value: What to pass to the option.
-        reason: Why, as a clause that follows the option; "" if there is nothing to tell.
-    """
-
-    value: str
-    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -202,7 +96,7 @@ def reconciled(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """Return findings without the advice that another finding's advice contradicts or that another one explains.
 
     Args:
-        findings: Any, each with a name of `CAUSES`.
+        findings: Any.
     """
     grave = {finding.name for finding in findings if finding.severity > Severity.NOTE}
     explained = {name for cause in grave for name in EXPLAINS.get(cause, ())}
@@ -218,7 +112,27 @@ def reconciled(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 
 def _rank(finding: Finding) -> tuple[int, int]:
-    return -finding.severity, CAUSES.index(finding.name)
+    return -finding.severity, _place(CAUSES, finding.name)
+
+
+def _place(names: Sequence[str], name: str) -> int:
+    """Return the place of a name in an order; those of plug-ins come last."""
+    return names.index(name) if name in names else len(names)
+
+
+def in_order(
+    checks: Iterable[tuple[str, Sequence[Finding]]],
+) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
+    """Return the findings of checks in the order of `CHECKS`, and the names of the checks that found nothing.
+
+    Args:
+        checks: Name and findings of each; those of one name count as one check.
+    """
+    by_name: dict[str, list[Finding]] = {}
+    for name, findings in sorted(checks, key=lambda check: _place(CHECKS, check[0])):
+        by_name.setdefault(name, []).extend(findings)
+    found = tuple(finding for findings in by_name.values() for finding in findings)
+    return found, tuple(name for name, findings in by_name.items() if not findings)
 
 
 def event_of(finding: Finding) -> Found:
@@ -234,32 +148,12 @@ def event_of(finding: Finding) -> Found:
     )
 
 
-def command(*words: str | Path) -> str:
-    """Return a gsplat-edu command quoted for the shell, safe for any file name."""
-    # a file name that begins with a dash would be parsed as an option
-    spelled = [
-        f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word) for word in words
-    ]
-    return shlex.join(["gsplat-edu", *spelled])
-
-
 def new_run(name: str) -> Path:
     """Propose a new folder for a run: the first of out/NAME, out/NAME_2, ... that does not exist."""
     proposed, copy = Path("out") / name, 2
     while proposed.exists():
         proposed, copy = Path("out") / f"{name}_{copy}", copy + 1
     return proposed
-
-
-def counted(number: int, word: str) -> str:
-    """Return a number with its noun: 1 pair, 2 pairs."""
-    return f"{number} {word}" if number == 1 else f"{number} {word}s"
-
-
-def listed(names: Sequence[str]) -> str:
-    """Name the first images of a list and count the others."""
-    shown = ", ".join(names[:NAMED])
-    return shown if len(names) <= NAMED else f"{shown} and {len(names) - NAMED} more"
 
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:

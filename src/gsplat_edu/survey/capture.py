@@ -1,4 +1,4 @@
-"""Prepare a capture for the checks: read its poses, measure every photo once, and collect unusable photos."""
+"""The survey of a capture: read its poses, measure every photo once, and collect unusable photos."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
-from gsplat_edu.data.depths import DepthReport
-from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.depths import DepthReport, DepthSource, judged_depths
+from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out, without_pose
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import LeftOutPhotos, Note, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.doctor.depth import judge_depth
-from gsplat_edu.doctor.finding import Finding
-from gsplat_edu.doctor.geometry import Geometry
-from gsplat_edu.doctor.photos import PhotoStats, measure_photo, unmeasured
-from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.photos.decoding import PhotoHeaders, recorded_exposure
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.survey.geometry import Geometry
+from gsplat_edu.survey.photos import PhotoStats, measure_photo, unmeasured
+from gsplat_edu.survey.support import observed_points
 
 WORKERS = 2
 """Photos decoded at the same time: a JPEG briefly takes up to 40 MB, other formats their full size."""
@@ -69,15 +68,6 @@ class Refused(NamedTuple):
     """The reason in a few words: `DatasetError.reason`."""
 
 
-class JudgedDepth(NamedTuple):
-    """What was found about depth that the user has."""
-
-    report: DepthReport | None
-    """Depth that can be used; None if there is none."""
-    findings: Sequence[Finding]
-    """What is wrong with it."""
-
-
 @dataclass(frozen=True, eq=False)
 class Survey:
     """Input of the checks.
@@ -87,11 +77,11 @@ class Survey:
         layout: "COLMAP", "transforms.json" or "Blender".
         shots: Readable photos, sorted by name.
         refused: Unusable photos, sorted by name.
-        unposed: Names of photos in the same folders that have no pose.
+        unposed: Names of photos that have no pose: those in the same folders, and those that the search left out.
         points: (N, 3) the capture's own points, world units; N is 0 if it has none.
         notes: Notes of the capture's reader.
         observed: Number of points observed in each photo, by shot name; empty if unknown.
-        depth: Sentences about depth that can be used, and findings about it; None if it was not looked at.
+        depth: What was found about depth that the user has, or why it cannot be used; None if it was not looked at.
     """
 
     path: Path
@@ -102,7 +92,7 @@ class Survey:
     points: Float64[np.ndarray, "N 3"]
     notes: tuple[Note, ...]
     observed: Mapping[str, int] = field(default_factory=dict)
-    depth: JudgedDepth | None = None
+    depth: DepthReport | DatasetError | None = None
 
     @property
     def names(self) -> list[str]:
@@ -149,10 +139,48 @@ def prepare(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    judged = None
+    judged: DepthReport | DatasetError | None = None
     if depth is not None and shots:
-        judged = JudgedDepth(*judge_depth(reader, [(shot.name, shot.camera) for shot in shots], depth))
+        judged = _judged_depth(reader, [(shot.name, shot.camera) for shot in shots], depth)
     return _survey(reader, shots, refused, left, judged)
+
+
+class Undecided:
+    """The capture of a run that leaves settings open. What a choice needs is read when it is first asked for.
+
+    Args:
+        reader: The capture.
+        settings: How the run reads it.
+        points: The run's file of start points; None if it has none.
+        progress: Called with (photos done, total) while photos are read.
+    """
+
+    def __init__(
+        self,
+        reader: CaptureReader,
+        settings: DataSettings,
+        points: Path | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self._reader, self._settings, self._points, self._progress = reader, settings, points, progress
+
+    @cached_property
+    def survey(self) -> Survey:
+        """The capture with its photos, whose sharpness is not measured.
+
+        Raises:
+            DatasetError: the capture or its poses cannot be read. Unreadable photos raise no error.
+        """
+        return prepare(self._reader, self._progress, sharpness=False, left_out=self._settings.left_out)
+
+    @cached_property
+    def training_photos(self) -> int:
+        """Number of the training's photos.
+
+        Raises:
+            DatasetError: the capture cannot be read.
+        """
+        return len(Dataset.of(self._reader, self._settings, points=self._points).train)
 
 
 def survey_of_poses(reader: CaptureReader, left_out: Sequence[str] | None = None) -> Survey:
@@ -196,7 +224,7 @@ def _survey(
     shots: Sequence[Shot],
     refused: Sequence[Refused],
     left: Sequence[LeftOutPhotos],
-    judged: JudgedDepth | None = None,
+    judged: DepthReport | DatasetError | None = None,
 ) -> Survey:
     """Add to the photos of a survey what the capture has besides."""
     capture = reader.capture
@@ -205,7 +233,7 @@ def _survey(
         capture.layout,
         tuple(shots),
         tuple(refused),
-        _unposed(capture),
+        tuple(dict.fromkeys((*_unposed(capture), *without_pose(reader.path)))),
         _points(capture),
         (*capture.notes, *left, *UnreadColors.of([(shot.name, shot.colors) for shot in shots])),
         observed_points(reader.path) if capture.layout == "COLMAP" else {},
@@ -225,6 +253,16 @@ def _shot(headers: PhotoHeaders, sharpness: bool, frame: Frame) -> Shot | Refuse
     small = camera.scaled(w, h)
     exposure = recorded_exposure(source.path)
     return Shot(frame.name, frame.lens, (camera.W, camera.H), small, stats, colors, exposure)
+
+
+def _judged_depth(
+    reader: CaptureReader, cameras: Sequence[tuple[str, Camera]], path: Path
+) -> DepthReport | DatasetError:
+    """Read all depth of a capture; return what was found, or why nothing can be used."""
+    try:
+        return judged_depths(reader, cameras, DepthSource(path)).report
+    except DatasetError as error:
+        return error
 
 
 def _points(capture: Capture) -> Float64[np.ndarray, "N 3"]:

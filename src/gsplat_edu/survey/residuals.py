@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.base.validation import ArrayLike
-from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
 from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, outside_cut_out, photo_psnr, transparency_of
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.photos import BRIGHT, DARK, GAMMA
 
 SOLID = 0.5
 """A pixel has a depth if its splats block more than this share of the light."""
