@@ -62,7 +62,7 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     resize(late, 1000, 620)
     older = opened(late)  # opened before the first tab saves
 
-    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    select_and_delete(tab, frame, ((0.15, 0.35), (0.5, 0.75)))
     left = frame.inner_text("#edit-count")
     assert (frame.inner_text("#edit-saved"), re.search(r"([\d,]+) of 176 left", left)[1]) != ("", "176")
     frame.get_by_role("button", name="save", exact=True).click()
@@ -71,7 +71,7 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     assert [entry["op"] for entry in json.loads(stored.read_text())["operations"]] == ["select", "delete"]
 
     mine = stored.read_bytes()
-    select_and_delete(late, older, ((0.3, 0.1), (0.7, 0.3)))
+    select_and_delete(late, older, ((0.3, 0.35), (0.6, 0.5)))
     older.get_by_role("button", name="save", exact=True).click()
     older.locator("#edit-message:not(:empty)").wait_for()
     said = "edits.json was changed elsewhere; download these edits, then reload the page"
@@ -107,7 +107,7 @@ def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     tab.add_init_script(HELD)
     tab.reload()
     frame = opened(tab)
-    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    select_and_delete(tab, frame, ((0.15, 0.35), (0.5, 0.75)))
     tab.evaluate("hold()")
     until_in(tab, tab, "unanswered === 0")  # an answer on its way would tell of the edits
     frame.get_by_role("button", name="save", exact=True).click()
@@ -130,7 +130,7 @@ def test_two_saves_at_once_are_no_conflict(visitor, wall_entry):
     resize(tab, 1000, 620)
     stored.unlink(missing_ok=True)
     frame = opened(tab)
-    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    select_and_delete(tab, frame, ((0.15, 0.35), (0.5, 0.75)))
     held = []
     tab.route(
         "**/edits*", lambda route: held.append(route) if route.request.method == "PUT" else route.continue_()
@@ -202,7 +202,7 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     resize(tab, 1000, 620)
     stored.unlink(missing_ok=True)
     frame = opened(tab)
-    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    select_and_delete(tab, frame, ((0.15, 0.35), (0.5, 0.75)))
     left = frame.inner_text("#edit-count")
     tabs = tab.locator("nav.tabs")
     tabs.get_by_role("link", name="Share").click()
@@ -248,7 +248,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     until_in(tab, tab, "document.querySelector('a.card[href*=wall] img').naturalWidth > 0")
     before = card.get_attribute("src")
     frame = opened(tab)
-    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    select_and_delete(tab, frame, ((0.15, 0.35), (0.5, 0.75)))
     left = int(re.search(r"([\d,]+) of 176 left", frame.inner_text("#edit-count"))[1])
     frame.get_by_role("button", name="save", exact=True).click()
     frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
@@ -295,7 +295,7 @@ def test_unsaved_edits_survive_a_closed_tab_and_fit_their_scene_only(visitor, wa
         tab = visitor_of(person, person.tab.url)
         resize(tab, 1000, 620)
         frame = opened(tab)
-        select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+        select_and_delete(tab, frame, ((0.15, 0.35), (0.5, 0.75)))
         until_in(tab, tab, "localStorage.length === 1")
         tab.evaluate("for (let i = 0; i < 10000; ++i) clearInterval(i)")
         frame.get_by_role("button", name="invert", exact=True).click()

@@ -337,7 +337,7 @@ def editor_of(visit, tmp_path, gaussians, mesh):
     tour, settings = page.Tour(meshes=Meshes(mesh, mesh)), replace(source.settings, background=BACKGROUND)
     html = page.html(scene, source.cameras, settings, "scene", (), tour, editing)
     (tmp_path / "edit.html").write_bytes(html)
-    shown = visit(width=1200, height=600).open(tmp_path / "edit.html").ready()
+    shown = visit(width=1400, height=900).open(tmp_path / "edit.html").ready()
     shown.tab.wait_for_selector("#edit-side")
     return shown, source
 
@@ -374,7 +374,7 @@ def test_a_mesh_follows_a_move_of_all_splats(visit, opened, tmp_path, random_gau
     assert apart.stays and (apart.surface.vertices == moved.surface.vertices).all()
     assert opened(apart.surface).tab.locator("#mesh-stays").is_hidden()
     path = written(tmp_path, random_gaussians, apart)
-    assert visit().open(path).ready().open_controls().tab.locator("#mesh-stays").is_visible()
+    assert visit().open(path).ready().tab.locator("#mesh-stays").is_visible()
     tab.evaluate("(count) => { for (let i = 0; i < count; ++i) editor.undo(); }", len(WHOLE) + len(PART))
     assert note.is_hidden() and (drawn(shown) == before).all()
 

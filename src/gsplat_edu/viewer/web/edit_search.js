@@ -19,7 +19,7 @@ export class EditSearch {
     this.field = this.dialog.querySelector("input");
     this.field.addEventListener("input", () => this.list(0));
     this.dialog.addEventListener("keydown", (event) => this.key(event));
-    this.dialog.addEventListener("click", ({ target }) => target === this.dialog && this.dialog.close()); // beside it
+    this.dialog.addEventListener("click", ({ target }) => this.clicked(target));
   }
 
   open() {
@@ -37,14 +37,13 @@ export class EditSearch {
       .filter(({ words: text }) => words.every((word) => text.includes(word)))
       .slice(0, MOST_FOUND);
     this.at = Math.min(Math.max(at, 0), this.found.length - 1);
-    const rows = this.found.map(({ button, name, what, key }, i) =>
+    const rows = this.found.map(({ name, what, key }, i) =>
       want(
         "li",
         {
           id: `edit-found-${i}`,
           role: "option",
           "aria-selected": String(i === this.at),
-          onclick: () => this.press(button),
         },
         want("span", {}, name),
         want("small", {}, what),
@@ -61,14 +60,25 @@ export class EditSearch {
     const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
     if (step) this.list(this.at + step);
     else if (event.key === "Enter" && this.found[this.at]) this.press(this.found[this.at].button);
+    else if (event.key === "Escape") this.close();
     else return;
     event.preventDefault();
   }
 
+  clicked(target) {
+    const row = target.closest("li");
+    if (row) this.press(this.found[[...row.parentElement.children].indexOf(row)].button);
+    else if (target === this.dialog) this.close(); // beside it
+  }
+
   press(button) {
+    this.close();
+    button.click();
+  }
+
+  close() {
     this.field.blur(); // a closed dialog keeps the focus until the next frame
     this.dialog.close();
-    button.click();
   }
 }
 
