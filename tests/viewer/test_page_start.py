@@ -1,6 +1,5 @@
 """What a page shows at first, in windows of any shape: nothing that matters is cropped or lies under the panel."""
 
-
 import numpy as np
 import pytest
 import torch

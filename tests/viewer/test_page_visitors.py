@@ -118,7 +118,9 @@ CHROME = ("#titles", "#bar", "#tools", "#help", "#guide", "#compare-card", "#leg
 @pytest.mark.parametrize("size", WIDTHS)
 def test_nothing_lies_over_another_and_nothing_is_cut_off(toured, size):
     seen = toured(*size)
-    presses = "#fold #help-button #fold #seen #begin #fold #fold Escape #fold c #help-button #help-button Escape"
+    presses = (
+        "#fold #help-button #fold #seen #begin #fold #fold Escape #fold c #help-button #help-button Escape"
+    )
     for press in ("", *presses.split()):
         if not press.startswith("#"):
             seen.press(*filter(None, [press]))
