@@ -14,7 +14,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.rig import stand_in
 from gsplat_edu.scene.views import View
-from gsplat_edu.viewer.page_proof import PHOTO_SIDE, photo_jpeg
+from gsplat_edu.viewer.page_proof import PHOTO_SIDE, shown_photo
 
 SETTINGS = RenderSettings(depth=False)
 
@@ -46,7 +46,7 @@ def psnr(a, b):
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_photo_shows_what_the_pinhole_sees(random_gaussians, lens):
     gaussians, camera = random_gaussians(150, rest=0), LENSES[lens]
-    jpeg = photo_jpeg(View(camera, photographed(gaussians, camera)), (0.0, 0.0, 0.0))
+    jpeg = shown_photo(0, View(camera, photographed(gaussians, camera)), (0.0, 0.0, 0.0)).jpeg
     found = np.asarray(Image.open(io.BytesIO(jpeg)))
     pinhole = stand_in(camera)
     small = pinhole if max(pinhole.W, pinhole.H) <= PHOTO_SIDE else resized(pinhole, PHOTO_SIDE)
@@ -61,8 +61,9 @@ def test_a_photo_shows_what_the_pinhole_sees(random_gaussians, lens):
 def test_what_the_lens_did_not_see_is_black():
     narrow = Camera(R, EYE, 380.0, 380.0, 400.0, 300.0, 600, 800)
     lens = narrow.through(Projection("perspective", Distortion.of(k1=0.4)))
-    jpeg = photo_jpeg(View(lens, np.full((600, 800, 3), 255, np.uint8)), (0.0, 0.0, 0.0))
-    found = np.asarray(Image.open(io.BytesIO(jpeg)))
+    shown = shown_photo(0, View(lens, np.full((600, 800, 3), 255, np.uint8)), (0.0, 0.0, 0.0))
+    found = np.asarray(Image.open(io.BytesIO(shown.jpeg)))
+    assert max(shown.border) < 0.5, "most of the border saw nothing"
     assert found[0, 0].max() < 16 and found[180, 240].min() > 240
 
 
@@ -72,8 +73,8 @@ def test_masked_parts_stay_and_transparent_parts_show_the_background():
     alpha = np.zeros((150, 200), np.uint8)
     alpha[:, :100] = 255
     mask = np.zeros((150, 200), bool)
-    found = np.asarray(
-        Image.open(io.BytesIO(photo_jpeg(View(camera, image, alpha=alpha, mask=mask), (1.0, 0.0, 0.0))))
-    )
+    shown = shown_photo(0, View(camera, image, alpha=alpha, mask=mask), (1.0, 0.0, 0.0))
+    found = np.asarray(Image.open(io.BytesIO(shown.jpeg)))
+    np.testing.assert_allclose(shown.border, ((90 + 255) / 510, 90 / 510, 90 / 510), atol=0.02)
     np.testing.assert_allclose(found[75, 40].astype(int), (90, 90, 90), atol=6)
     np.testing.assert_allclose(found[75, 160].astype(int), (255, 0, 0), atol=6)

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float64, Int32, UInt8
+from jaxtyping import Int32, UInt8
 from PIL import Image
 
 from gsplat_edu.base.errors import ArgumentError
@@ -67,10 +67,12 @@ class ShownPhoto:
     Args:
         index: Index of its camera among the views of the page's scene.
         jpeg: The photo, upright, through the pinhole of the page's camera.
+        border: Mean colour of the photo's border, RGB from 0 to 1.
     """
 
     index: int
     jpeg: bytes
+    border: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +105,7 @@ class Proof:
 
     def border(self) -> tuple[float, float, float]:
         """Return the mean colour of the photos at their borders, RGB from 0 to 1; black without photos."""
-        means = [_border_mean(photo.jpeg) for photo in self.photos]
-        red, green, blue = np.mean(means or [np.zeros(3)], axis=0).round(4).tolist()
+        red, green, blue = np.mean([photo.border for photo in self.photos] or [np.zeros(3)], axis=0).tolist()
         return red, green, blue
 
     def share(self) -> float:
@@ -189,15 +190,16 @@ def photos_of(source: Source, dataset: Path | None, most: int) -> list[ShownPhot
         raise ArgumentError(f"{capture.path} is not the capture of {run.path}: {found}")
     views = {view.name: view for view in (*capture.train, *capture.test)}
     return [
-        ShownPhoto(index, photo_jpeg(views[source.cameras[index][0]], source.settings.background))
+        shown_photo(index, views[source.cameras[index][0]], source.settings.background)
         for index in chosen_views(source, most)
     ]
 
 
-def photo_jpeg(view: View, background: Sequence[float]) -> bytes:
+def shown_photo(index: int, view: View, background: Sequence[float]) -> ShownPhoto:
     """Return a view's photo through the pinhole of the page's camera, as a JPEG without metadata.
 
     Args:
+        index: Index of its camera among the views of the page's scene.
         view: The view. Parts of the photo that its mask excludes stay as they are; where the lens saw nothing, the
             JPEG is black.
         background: Colour behind a photo that is not opaque.
@@ -213,7 +215,7 @@ def photo_jpeg(view: View, background: Sequence[float]) -> bytes:
         pixels = _through_pinhole(pixels, lens.scaled(reduced.camera.W, reduced.camera.H), target)
     else:
         pixels = area_mean(pixels, target.W, target.H)
-    return _jpeg(pixels, PHOTO_QUALITY)
+    return ShownPhoto(index, _jpeg(pixels, PHOTO_QUALITY), _border_mean(pixels))
 
 
 def poster_jpeg(source: Source, camera: Camera, proof: Proof | None = None) -> bytes:
@@ -255,15 +257,13 @@ def _through_pinhole(
     return found
 
 
-def _border_mean(jpeg: bytes) -> Float64[np.ndarray, "3"]:
-    """Return the mean colour of a JPEG's border, RGB from 0 to 1."""
-    with Image.open(io.BytesIO(jpeg)) as image:
-        pixels = np.asarray(image.convert("RGB")) / 255.0
+def _border_mean(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[float, float, float]:
+    """Return the mean colour of an image's border, RGB from 0 to 1."""
     width = max(1, round(BORDER_PART * min(pixels.shape[:2])))
-    inside = np.zeros(pixels.shape[:2], dtype=bool)
-    inside[width:-width, width:-width] = True
-    found: Float64[np.ndarray, "3"] = pixels[~inside].mean(axis=0)
-    return found
+    outside = np.ones(pixels.shape[:2], dtype=bool)
+    outside[width:-width, width:-width] = False
+    red, green, blue = (pixels[outside].mean(axis=0) / 255.0).round(4).tolist()
+    return red, green, blue
 
 
 def _spread(indices: Sequence[int], count: int) -> list[int]:
