@@ -196,8 +196,9 @@ def test_a_photo_is_slid_by_keys_and_touch(shown):
 
 def test_a_photo_waits_until_the_picture_of_its_camera_is_on_the_screen(shown):
     tab = shown().tab
-    for index in (2, 0):
-        before = f"viewer.compare.on || viewer.compare.toggle(), viewer.goTo({index}), viewer.exact = null"
+    tab.evaluate("viewer.compare.toggle()")
+    for index in tab.evaluate("viewer.compare.indices.toReversed()"):
+        before = f"viewer.goTo({index}), viewer.exact = null"
         assert tab.evaluate(f"({before}, document.getElementById('photo').hidden)"), index
         until(
             tab,

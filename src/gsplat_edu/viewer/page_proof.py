@@ -105,7 +105,8 @@ class Proof:
 
     def border(self) -> tuple[float, float, float]:
         """Return the mean colour of the photos at their borders, RGB from 0 to 1; black without photos."""
-        red, green, blue = np.mean([photo.border for photo in self.photos] or [np.zeros(3)], axis=0).tolist()
+        borders = [photo.border for photo in self.photos] or [(0.0, 0.0, 0.0)]
+        red, green, blue = np.mean(borders, axis=0).tolist()
         return red, green, blue
 
     def share(self) -> float:
