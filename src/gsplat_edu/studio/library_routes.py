@@ -33,6 +33,7 @@ def routes() -> list[BaseRoute]:
     return [
         act("/api/library", "GET", _library),
         act("/api/adopt", "POST", _adopt),
+        act("/api/example", "POST", lambda studio, request, body: studio.uploads.add_example()),
         act("/api/names", "POST", _promise),
         act("/api/names/{kind}/{name}", "DELETE", _release),
         act("/api/trash", "GET", lambda studio, request, body: {"trash": studio.library.trash()}),

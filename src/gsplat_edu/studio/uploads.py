@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
+from importlib.resources import as_file, files
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -26,6 +27,9 @@ from gsplat_edu.studio.unpack import ZipLimits, unpack
 
 COUNTED_FOR = 5.0
 """Time for which a count of the library's bytes holds, s: jobs write to it too."""
+
+EXAMPLE_NAME = "Example garden"
+"""Name of the capture that the studio brings along; `tools/build_example.py` makes it."""
 
 AT_ONCE = 16
 """Uploads that are received at the same time."""
@@ -180,6 +184,21 @@ class Uploads:
             await run_in_threadpool(part.unlink, missing_ok=True)
             await run_in_threadpool(partial(shutil.rmtree, folder, ignore_errors=True))
         return done
+
+    def add_example(self) -> dict[str, Any]:
+        """Unpack the example to a new capture; return what `receive_zip` returns.
+
+        Raises:
+            RefusedError: there is no room for it.
+        """
+        folder = self.library.part()
+        name = self.library.promise("captures", EXAMPLE_NAME)
+        try:
+            with as_file(files("gsplat_edu.studio") / "example.zip") as packed:
+                return self._unpack(packed, folder, "captures", name)
+        finally:
+            self.library.release("captures", name)
+            shutil.rmtree(folder, ignore_errors=True)
 
     def _unpack(self, part: Path, folder: Path, kind: str, name: str) -> dict[str, Any]:
         free = max(self._room(), 0)

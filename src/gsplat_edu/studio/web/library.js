@@ -172,10 +172,24 @@ function picture(element, entry) {
 export function library({ main, store }) {
   const list = h("div", { class: "projects" });
   const section = h("section", { "aria-label": "Projects" }, list);
+  const line = errorLine();
+  const example = button("Try the example", () =>
+    attempt(example, line, async () => {
+      const { entry } = await post("/api/example", {});
+      await store.refresh();
+      location.hash = `#/${entry.split("/").map(encodeURIComponent).join("/")}`;
+    }),
+  );
   const first = h(
-    "p",
+    "div",
     { class: "first" },
-    "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then press Next.",
+    h(
+      "p",
+      {},
+      "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then press Next.",
+    ),
+    h("p", { class: "row" }, example, h("span", { class: "quiet" }, "40 photos of a house in a garden, ready to train")),
+    line,
   );
   first.hidden = true;
   const trash = link("Trash", "#/trash");
