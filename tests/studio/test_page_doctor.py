@@ -303,7 +303,7 @@ def test_pause_and_stop_name_no_files_and_no_options(visitor, runs):
     card.get_by_role("button", name="Stop", exact=True).click()
     card.locator(".state", has_text="stopped").wait_for()
     seen.append([text for text in card.locator("p:visible").all_inner_texts() if "command" not in text])
-    assert any(re.match("stopped after [0-9,]+ iterations; it can be continued", text) for text in seen[1]), (
+    assert any(re.match("Stopped after [0-9,]+ iterations. It can be continued", text) for text in seen[1]), (
         seen
     )
     assert not any(COMMANDS.search(text) for texts in seen for text in texts), seen

@@ -10,7 +10,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.views import View
 from studio.pages import capture_frame, go
-from waiting import until_in
+from waiting import resize, until_in
 
 STYLES = "viewer.cameras.list.map((_, i) => [...viewer.cameras.styles.slice(8 * viewer.cameras.firsts[i]).slice(0, 3)])"
 """Colour of each camera's lines."""
@@ -66,6 +66,7 @@ def test_findings_color_the_cameras(visitor, library, dimmed):
 
 def test_a_photo_is_left_out_in_the_frame_and_taken_back_in_the_gallery(visitor, dimmed):
     tab = go(visitor().tab, "captures/dimmed")
+    resize(tab, 900, 900)  # the whole frame is in view
     gallery = tab.get_by_role("region", name="photos")
     gallery.locator(".thumbs li").first.wait_for()
     frame = capture_frame(tab, "dimmed")

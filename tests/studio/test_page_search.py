@@ -23,7 +23,7 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     person.reach("#/photos/photos")
     tab.get_by_role("button", name="Find the poses").click()
     card = tab.get_by_role("article", name="poses of photos")
-    card.locator(".badge.failed").wait_for()
+    card.locator(".badge.poor").wait_for()
     (work,) = (job.work for job in studio.queue.jobs())
     assert (studio.library.root / work.outputs[0] / "sfm").is_dir(), "a search that can be resumed is kept"
     assert not card.locator("progress").is_visible(), (

@@ -122,7 +122,7 @@ def test_buttons_change_the_order_of_views_with_undo(opened):
 
 def test_all_panels_of_the_editor_are_accessible(opened):
     """Every tool's panel, with all that can be opened, in light and dark, wide and narrow."""
-    shown = opened()
+    shown = opened().open_controls()
     shown.evaluate(
         """() => {
           for (let i = 0; i < 3; ++i) { viewer.keyframes.save(); viewer.view.orbit(0.2, 0); viewer.moved(-1); }

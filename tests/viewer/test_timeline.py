@@ -271,7 +271,7 @@ def test_a_path_without_times_keeps_its_speed_until_a_time_is_set(opened):
 def test_a_visitor_arranges_the_path_but_replaces_no_view_of_the_author(visit, tmp_path, random_gaussians):
     tour = page.Tour(path(ease="ends"))
     page.write(tmp_path / "scene.html", Scene(random_gaussians(40)), (), tour=tour)
-    shown = visit(900, 700, fresh=True).open(tmp_path / "scene.html").ready()
+    shown = visit(900, 700, fresh=True).open(tmp_path / "scene.html").ready().open_controls()
     shown.tab.click("#path summary")
     assert shown.tab.input_value("#path-ease") == "ends" and not shown.tab.is_visible("#replace-view")
     shown.tab.fill("#view-rest", "1.5")

@@ -24,8 +24,8 @@ LARGEST_NUMBER = 1e300
 Number = Annotated[float, Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 """A finite number."""
 
+# a text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)
 Text = Annotated[str, Meta(pattern=r"^[^\x00\ud800-\udc7f\udd00-\udfff]*\Z(?#the name or path of a file)")]
-"""A text that can be the name or path of a file (`gsplat_edu.base.text.names_a_file`)."""
 
 ONE_LINE = r"^[^\x00-\x1f\x7f]*\Z(?#free of control characters)"
 """Pattern of a text without control characters; the comment at its end says in messages what a text has to be."""
