@@ -22,10 +22,10 @@ def test_it_is_small_and_its_photos_are_traced():
 
 def test_it_becomes_a_capture_of_the_library_each_time(page, studio):
     first, second = (page.post("/api/example", json={}).json() for _ in range(2))
-    assert first["entry"] == "captures/Example garden" and second["entry"] == "captures/Example garden-2"
-    facts = page.get("/api/captures/Example garden").json()
+    assert first["entry"] == "captures/garden" and second["entry"] == "captures/garden-2"
+    facts = page.get("/api/captures/garden").json()
     assert facts["photos"] == PHOTOS and not facts.get("problem")
-    capture = CaptureReader(studio.library.root / "captures" / "Example garden").capture
+    capture = CaptureReader(studio.library.root / "captures" / "garden").capture
     for frame, index in ((capture.frames[0], 0), (capture.frames[-1], PHOTOS - 1)):
         camera = example_camera(index)
         np.testing.assert_allclose(frame.eye, camera.eye, atol=1e-5)

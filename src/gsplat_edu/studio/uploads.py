@@ -28,7 +28,7 @@ from gsplat_edu.studio.unpack import ZipLimits, unpack
 COUNTED_FOR = 5.0
 """Time for which a count of the library's bytes holds, s: jobs write to it too."""
 
-EXAMPLE_NAME = "Example garden"
+EXAMPLE_NAME = "garden"
 """Name of the capture that the studio brings along; `tools/build_example.py` makes it."""
 
 AT_ONCE = 16

@@ -188,7 +188,12 @@ export function library({ main, store }) {
       {},
       "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then press Next.",
     ),
-    h("p", { class: "row" }, example, h("span", { class: "quiet" }, "40 photos of a house in a garden, ready to train")),
+    h(
+      "p",
+      { class: "row" },
+      example,
+      h("span", { class: "quiet" }, "40 photos of a house in a garden, ready to train"),
+    ),
     line,
   );
   first.hidden = true;
