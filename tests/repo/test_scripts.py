@@ -32,6 +32,7 @@ SMALLEST = {"surfaces.py": ("--captures", "box")}
 
 ELSEWHERE = {
     "build_cli_reference.py": "tests/repo/test_cli_reference.py",
+    "build_example.py": "tests/studio/test_example.py",
     "build_recipe_table.py": "tests/repo/test_recipe_document.py",
     "build_notebooks.py": "tests/repo/test_notebooks.py",
     "build_site.py": "tests/repo/test_site.py",
