@@ -81,7 +81,7 @@ class Survey:
         points: (N, 3) the capture's own points, world units; N is 0 if it has none.
         notes: Notes of the capture's reader.
         observed: Number of points observed in each photo, by shot name; empty if unknown.
-        depth: What was found about depth that the user has, or why it cannot be used; None if it was not looked at.
+        depth: What was found about depth that the user has, or why it cannot be used; None if it was not read.
     """
 
     path: Path

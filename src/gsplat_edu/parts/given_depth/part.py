@@ -21,7 +21,7 @@ class GivenDepthPart(Part):
     """Pulls the rendered depth to the given one."""
 
     def examine(self, survey: Survey) -> Examined:
-        """Report what is wrong with the depth, if it was looked at."""
+        """Report what is wrong with the depth maps, if the survey has read them."""
         depth = survey.depth
         if depth is None:
             return Examined()
