@@ -203,6 +203,14 @@ def test_the_view_slows_down_beyond_the_photos_unless_switched_off(toured):
     assert seen.evaluate(away) > 2.5
 
 
+def test_a_scene_without_photos_does_not_slow_the_view_down(show, random_gaussians):
+    seen = show(random_gaussians(20), width=640, height=480).open_controls()
+    assert not seen.tab.is_visible("#keep")
+    far = "Math.hypot(...viewer.view.camera.eye.map((x, i) => x - viewer.view.pivot[i])) / viewer.view.reach"
+    seen.evaluate("() => { for (let i = 0; i < 40; ++i) viewer.view.zoom(1.1); viewer.moved(-1); }")
+    assert seen.evaluate(far) > 2.5
+
+
 @pytest.mark.parametrize("ground", [0, 255])
 def test_the_glass_keeps_texts_and_icons_legible_over_any_scene(toured, ground):
     seen = toured(640, 480).open_controls()

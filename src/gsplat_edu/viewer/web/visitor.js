@@ -57,7 +57,8 @@ export class Visitor {
     const { viewer } = this;
     const { border, cameras } = viewer.facts;
     const plain = viewer.settings.background;
-    element("keep").hidden = !cameras.length;
+    if (cameras.every(({ saved }) => saved)) return; // there are no photos to keep to
+    element("keep").hidden = false;
     const follow = () => {
       const { checked } = element("kept");
       viewer.view.bounds = checked ? "photos" : "none";
