@@ -3,6 +3,8 @@ import { test } from "node:test";
 
 import { EditWork, MOST_TESTS } from "../../src/gsplat_edu/viewer/web/edit_cells.js";
 import { members } from "../../src/gsplat_edu/viewer/web/edit_member.js";
+import { DELETED } from "../../src/gsplat_edu/viewer/web/edit_flags.js";
+import { newBox } from "../../src/gsplat_edu/viewer/web/edit_shapes.js";
 import { applyOperation, EditHistory } from "../../src/gsplat_edu/viewer/web/edit_state.js";
 import { movedTogether } from "../../src/gsplat_edu/viewer/web/edit_move.js";
 import { arrayOf, assertClose, vectors } from "./vectors.js";
@@ -89,4 +91,26 @@ test("what moves together is what Python says", () => {
   }
   assert.ok(cases.some(({ stays, partly }) => !stays && partly));
   assert.ok(cases.some(({ stays, partly }) => !stays && !partly));
+});
+
+test("a new box starts around what most cameras look at while something is left there", () => {
+  const count = 200;
+  const means = Float32Array.from({ length: 3 * count }, (_, i) => 10 + (i % 7)); // far away
+  means.set([0, 0, 0], 0);
+  const flags = new Uint8Array(count);
+  const rotation = [
+    [0, 1, 0],
+    [1, 0, 0],
+    [0, 0, -1],
+  ];
+  const subject = { center: [0.5, 0, 0], rotation, half: [0.1, 0.6, 0.1] };
+  const up = [0, -1, 0];
+  assert.equal(newBox({ count, means }, flags, up, subject), subject);
+  assert.equal(newBox({ count, means }, flags, up, { ...subject, half: [0.1, 0.4, 0.1] }).center[0] > 9, true);
+  flags[0] = DELETED;
+  const around = newBox({ count, means }, flags, up, subject);
+  for (const [j, middle] of around.center.entries()) {
+    assert.ok(middle - around.half[j] > 9 && middle + around.half[j] < 17);
+  }
+  assert.deepEqual(newBox({ count, means }, flags, up, null), around);
 });

@@ -1,13 +1,19 @@
 """What a page shows at first, in windows of any shape: nothing that matters is cropped or lies under the panel."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from accessibility import contrast, numbers
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.source import Source
 from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
+from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.page_start import Start
 
 DESKTOP, PHONE = (1440, 900), (390, 844)
@@ -54,6 +60,23 @@ def test_no_head_is_cut_off_in_a_wide_window(visit, tmp_path, random_gaussians):
     seen = visit(*DESKTOP).open(tmp_path / "figure.html").ready()
     _, rows = on_the_screen(seen, head)
     assert rows.min() > 0, f"the head begins {-rows.min():.0f} px above the window"
+
+
+def test_the_editors_box_starts_around_the_subject_and_not_around_a_large_floor(random_gaussians, tmp_path):
+    body, _ = figure(random_gaussians)
+    floor = random_gaussians(4000)
+    floor.means.copy_(
+        torch.tensor(np.random.default_rng(6).uniform(-40.0, 40.0, (4000, 3)) * (1, 0, 1) + (0, 3, 0))
+    )
+    floor.logit_opacities.fill_(4.0)
+    scene = Scene(Gaussians.concatenated([body, floor]))
+    source = Source(tmp_path / "scene.ply", scene, around(640, 480, 300.0), RenderSettings())
+    box = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json").facts["subject"]
+    low, high = (np.array(box["center"]) + sign * np.abs(box["rotation"]) @ box["half"] for sign in (-1, 1))
+    assert (low < body.means.numpy().min(0) + 0.1).all() and (high > body.means.numpy().max(0) - 0.1).all()
+    assert (high - low < 2.5 * np.array([0.6, 1.8, 0.4])).all()
+    bare = replace(source, cameras=())
+    assert editing_of(bare, tmp_path / "scene.ply", tmp_path / "edits.json").facts["subject"] is None
 
 
 @pytest.mark.parametrize(("W", "H"), [(640, 480), (480, 640), (900, 300)])

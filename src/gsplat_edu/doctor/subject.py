@@ -1,4 +1,4 @@
-"""The box around what most photos look at, from which a user draws the region of interest."""
+"""The box around what most photos look at: where the region of interest and the editor's box start."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ ELSEWHERE = 0.25
 """Half extent without such points, as a fraction of the distance between the cameras and what they look at."""
 
 
-def subject_region(geometry: Geometry) -> Region:
+def subject_region(geometry: Geometry, up: Float64[np.ndarray, "3"] | None = None) -> Region:
     """Return an upright box around the points that most photos show in their middle.
 
     Args:
         geometry: The cameras and points, in whose coordinates the box is.
+        up: (3,) up direction; None takes that of the cameras.
     """
-    rotation = _upright(common_up(geometry.cameras))
+    rotation = _upright(common_up(geometry.cameras) if up is None else up)
     points = geometry.some_points
     chosen = points[_in_the_middle(geometry, points)]
     if len(chosen) >= FEWEST:

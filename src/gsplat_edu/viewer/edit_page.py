@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import shlex
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
 
 from gsplat_edu.base.reading import open_file
+from gsplat_edu.data.region import document_of
+from gsplat_edu.doctor.subject import subject_region
 from gsplat_edu.edits.apply import Views, placed_view
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.edits.stored import MOST_BYTES
@@ -17,6 +20,9 @@ from gsplat_edu.io.edit import Similarity
 from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.runs.source import Source
 from gsplat_edu.scene.camera import WORLD_UP, Camera
+from gsplat_edu.scene.rig import stand_in
+from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.survey.geometry import Geometry
 from gsplat_edu.viewer.page import Editing, Tour
 from gsplat_edu.viewer.page_start import SIDE, Start
 from gsplat_edu.viewer.proposing import NAME as FLOATERS
@@ -45,8 +51,20 @@ def editing_of(source: Source, named: Path, file: Path, url: str | None = None) 
         "commands": {"convert": convert, "render": render},
         "url": url,
         "floaters": None if url is None else str(PurePosixPath(url).with_name(FLOATERS)),
+        "subject": _subject_box(source),
     }
     return Editing(facts, _values(source))
+
+
+def _subject_box(source: Source) -> dict[str, Any] | None:
+    """Return the box around what most cameras look at, as region.json writes one; None without cameras."""
+    if not source.cameras:
+        return None
+    gaussians = source.scene.gaussians
+    points = gaussians.means[gaussians.logit_opacities > 0].double().numpy(force=True)
+    geometry = Geometry([stand_in(camera) for _, camera in source.cameras], points[~far_shell(points)])
+    up = None if source.scene.up is None else np.array(source.scene.up, dtype=np.float64)
+    return document_of(subject_region(geometry, up))
 
 
 def read_content(file: Path) -> bytes | None:

@@ -74,8 +74,18 @@ export function uprightAxes(up) {
   return transposed(shortestTurn(up, EDIT_UP));
 }
 
+// Where a new box starts: around what most cameras look at, unless nothing is left there, or no cameras are known.
+export function newBox(values, flags, up, subject) {
+  const isInside = (i) => {
+    const away = plus(values.means.subarray(3 * i, 3 * i + 3), subject.center, -1);
+    return transposed(subject.rotation).every((axis, j) => Math.abs(dot(axis, away)) <= subject.half[j]);
+  };
+  for (let i = 0; subject && i < values.count; ++i) if (flags[i] <= SELECTED && isInside(i)) return subject;
+  return boxAround(values, flags, up);
+}
+
 // A box around most of the splats that are there.
-export function boxAround({ count, means }, flags, up) {
+function boxAround({ count, means }, flags, up) {
   const rotation = uprightAxes(up);
   const axes = transposed(rotation);
   const places = [[], [], []];

@@ -39,14 +39,14 @@ class EditFile {
 }
 
 addEventListener("viewer", async ({ detail: { viewer, splats } }) => {
-  const { scene, file, commands, url, floaters } = FACTS.edit;
+  const { scene, file, commands, url, floaters, subject } = FACTS.edit;
   const { means, log_scales, quats } = splats;
   const values = { count: FACTS.count, means, log_scales, quats, ...(await unpackValues(FACTS.count)) };
   const stored = url && new EditFile(url);
   const edits = stored ? await stored.read() : null;
   window.editor = startEditor({
     viewer,
-    scene: { ...scene, values, file, commands, floaters },
+    scene: { ...scene, values, file, commands, floaters, subject },
     edits,
     save: stored && ((text) => stored.write(text)),
   });

@@ -6,13 +6,13 @@ import { CURSOR_STEP, Gizmo } from "./edit_gizmo.js";
 import { depthAtPixel } from "./edit_pixel.js";
 import { EditPolygon } from "./edit_polygon.js";
 import {
-  boxAround,
   boxHandles,
   boxLines,
   hundredths,
   LEAST_DRAG,
   length3,
   MOST_STROKE,
+  newBox,
   pictureOf,
   sideAt,
   sideDragged,
@@ -54,8 +54,13 @@ export class EditTools {
     this.cursor = this.hover = this.gizmo.chosen = null;
     this.editor.leveller.reset();
     if (tool === "move") this.editor.mover.begin();
-    if (tool === "box") this.shape = boxAround(this.editor.values, this.editor.history.flags, this.viewer.view.up);
+    if (tool === "box") this.shape = this.firstBox();
     this.editor.changed();
+  }
+
+  firstBox() {
+    const { values, history, scene } = this.editor;
+    return newBox(values, history.flags, this.viewer.view.up, scene.subject);
   }
 
   // Forgets what is being drawn; returns whether there was anything.
