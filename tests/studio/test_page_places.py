@@ -81,7 +81,7 @@ def test_a_photo_is_left_out_in_the_frame_and_taken_back_in_the_gallery(visitor,
     item.wait_for(state="detached")
     until_in(tab, frame, "!viewer.cameras.list[2].left_out")
     assert not (dimmed / LEFT_OUT).exists()
-    assert frame.locator("#leave").inner_text() == "leave out"
+    assert frame.locator("#leave").inner_text() == "Leave out"
 
 
 def test_the_page_follows_the_capture(page, studio, tmp_path):

@@ -57,8 +57,8 @@ class Tab:
         self.page.get_by_role("button", name=label, exact=True).click()
 
     def says(self, pattern):
-        """Wait for a text in the panel; return the number in it."""
-        found = until(lambda: re.search(pattern, self.page.inner_text("#panel")), pattern)
+        """Wait for a text in the panel, whether its controls are open or not; return the number in it."""
+        found = until(lambda: re.search(pattern, self.page.text_content("#panel")), pattern)
         return int(found[1].replace(",", ""))
 
     def picture(self):
@@ -76,9 +76,9 @@ def test_a_page_shows_and_pauses_a_training_and_may_be_closed(capture, tmp_path,
             first = tab.says(r"splats after ([\d,]+) iteration")
             begun = tab.picture()
             assert begun.std() > 5, "the picture is not blank"
-            tab.press("pause")
+            tab.press("Pause")
             held = tab.says(r"paused, iteration ([\d,]+) of 100,000")
-            tab.press("step")
+            tab.press("Step")
             tab.says(rf"paused, iteration ({held + 1:,}) of")
             tab.says(rf"splats after ({held + 1:,}) iterations")
             assert made.iteration == held + 1 > first
@@ -92,9 +92,9 @@ def test_a_page_shows_and_pauses_a_training_and_may_be_closed(capture, tmp_path,
             assert "token" not in tab.page.url
             tab.page.reload()  # the cookie is enough
             tab.says(rf"paused, iteration ({held + 1:,}) of")
-            tab.press("resume")
+            tab.press("Resume")
             until(lambda: made.iteration > held + 20, "more iterations")
-            tab.press("pause")
+            tab.press("Pause")
             held = tab.says(r"paused, iteration ([\d,]+) of 100,000")
             assert tab.complaints == []
             own = made.view.url.partition("?")[0]
@@ -103,13 +103,13 @@ def test_a_page_shows_and_pauses_a_training_and_may_be_closed(capture, tmp_path,
 
 
 def test_a_press_on_pause_pauses_although_another_page_does_meanwhile(capture, tmp_path, browser):
-    """Its button says "resume" before it is released."""
+    """Its button says "Resume" before it is released."""
     with (
         training(capture, tmp_path / "run", "--iterations", "100000") as made,
         Tab(browser, made.view.url) as tab,
     ):
         tab.says(r"training, iteration ([\d,]+) of")
-        tab.page.get_by_role("button", name="pause", exact=True).hover()
+        tab.page.get_by_role("button", name="Pause", exact=True).hover()
         tab.page.mouse.down()
         client = Client(made.view.url)
         client.control("pause")
@@ -126,7 +126,7 @@ def test_without_webgl2_the_page_shows_our_own_renders(capture, tmp_path, browse
         training(capture, tmp_path / "run", "--iterations", "100000") as made,
         Tab(browser, made.view.url, NO_WEBGL2) as tab,
     ):
-        tab.press("pause")
+        tab.press("Pause")
         tab.says(r"paused, iteration ([\d,]+) of")
         assert "no WebGL2, so the training's computer draws" in tab.page.inner_text("#live")
         until(lambda: tab.picture().std() > 5, "a picture")

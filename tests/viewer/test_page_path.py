@@ -24,7 +24,7 @@ def opened(visit, tmp_path, random_gaussians, three_views):
     def make(path=None, **options):
         scene, tour = Scene(random_gaussians(60), origin=ORIGIN), page.Tour(path)
         (tmp_path / "scene.html").write_bytes(page.html(scene, three_views, title="scene", tour=tour))
-        return visit(width=640, height=480, **options).open(tmp_path / "scene.html").ready()
+        return visit(width=640, height=480, **options).open(tmp_path / "scene.html").ready().open_controls()
 
     return make
 
@@ -51,7 +51,7 @@ def test_an_embedded_path_is_played_to_its_end_and_stops_when_somebody_moves(ope
     shown.press("p")
     shown.tab.wait_for_selector('#play[aria-pressed="true"]')
     until(shown.tab, "viewer.journey.began !== null")
-    shown.tab.mouse.move(450, 300)
+    shown.tab.mouse.move(100, 150)
     shown.tab.mouse.wheel(0, 100)
     shown.tab.wait_for_selector('#play[aria-pressed="false"]')
     still = shown.evaluate("viewer.view.camera.eye")

@@ -19,8 +19,9 @@ from gsplat_edu.viewer.page_start import Start
 DESKTOP, PHONE = (1440, 900), (390, 844)
 UP = np.array([0.0, -1.0, 0.0])
 
-EDGES = """[...document.querySelectorAll('button, select')].filter((one) => one.checkVisibility()).map((one) => {
-  const sheet = one.closest('#panel, #help, #edit');
+EDGES = """[...document.querySelectorAll('#tools :is(button, select)')].filter((one) => one.checkVisibility()).map(
+(one) => {
+  const sheet = one.closest('#tools, #help, #edit');
   const { borderTopWidth, borderTopColor, backgroundColor } = getComputedStyle(one);
   const edge = parseFloat(borderTopWidth) ? borderTopColor : backgroundColor;
   return [one.id, edge, getComputedStyle(sheet).backgroundColor];
@@ -94,17 +95,17 @@ def test_a_cover_shows_the_whole_subject_in_the_middle(random_gaussians, W, H):
     assert np.allclose(page.cover_view(Scene(body), views, set(), chosen, (512, 384)).eye, views[5][1].eye)
 
 
-def test_the_panel_of_a_phone_lies_above_the_subject(visit, tmp_path, random_gaussians):
+def test_no_head_is_cut_off_on_a_phone_and_the_picture_stays_when_the_controls_open(
+    visit, tmp_path, random_gaussians
+):
     body, head = figure(random_gaussians)
     (tmp_path / "figure.html").write_bytes(page.html(Scene(body), around(480, 640, 940.0)))
     seen = visit(*PHONE).open(tmp_path / "figure.html").ready()
-    below = seen.evaluate("element('panel').getBoundingClientRect().bottom")
     columns, rows = on_the_screen(seen, head)
-    assert rows.min() > below, f"the head begins at {rows.min():.0f} px, the panel ends at {below:.0f} px"
+    assert rows.min() > 0 and columns.min() > 0 and columns.max() < PHONE[0]
     before = rows.min()
-    seen.tab.click("#fold")
-    assert on_the_screen(seen, head)[1].min() == before, "the picture does not jump when the panel opens"
-    assert columns.min() > 0 and columns.max() < PHONE[0]
+    seen.open_controls()
+    assert on_the_screen(seen, head)[1].min() == before
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE, (844, 390)])
@@ -136,8 +137,8 @@ def test_buttons_are_seen_over_a_scene_of_any_brightness(
     visit, tmp_path, random_gaussians, three_views, scheme, scene
 ):
     (tmp_path / "a.html").write_bytes(page.html(Scene(random_gaussians(9)), three_views))
-    seen = visit(640, 480, color_scheme=scheme).open(tmp_path / "a.html").ready()
-    seen.press("h")
+    seen = visit(640, 480, color_scheme=scheme).open(tmp_path / "a.html").ready().open_controls()
+    seen.tab.click("#path summary")
     found = seen.evaluate(EDGES)
     assert len(found) >= 5
     for name, edge, sheet in found:

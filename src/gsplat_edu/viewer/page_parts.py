@@ -94,7 +94,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
         "title": html_text.escape(title),
         "policy": policy_element(policy(kind)),
         "style": _style(kind),
-        "body": "visitor glass" if "shared" in facts else "",
+        "body": "glass" if kind is EDITOR else "visitor glass",
         "poster": _poster(poster),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),

@@ -261,7 +261,7 @@ class CaptureView {
 
   // Colours, findings or what is shown have changed.
   paint() {
-    const style = getComputedStyle(document.documentElement);
+    const style = getComputedStyle(document.body);
     this.colors = (name) => rgbOf(style.getPropertyValue(`--${name}`).trim());
     this.panel.tell();
     this.restyle();

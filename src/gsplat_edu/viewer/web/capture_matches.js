@@ -104,7 +104,7 @@ export class MatchPanel {
     context.scale(dense, dense);
     const scale = Math.min(width / photo.naturalWidth, height / photo.naturalHeight);
     const [w, h] = [scale * photo.naturalWidth, scale * photo.naturalHeight];
-    context.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--match");
+    context.fillStyle = getComputedStyle(document.body).getPropertyValue("--match");
     const [from, to] = this.pairsOf(this.chosen);
     for (let k = from; k < to; ++k) {
       const [x, y] = [this.matches.places[2 * k], this.matches.places[2 * k + 1]].map((place) => place / WIDEST_PLACE);

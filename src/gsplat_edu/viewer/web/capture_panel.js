@@ -55,7 +55,7 @@ export class CapturePanel {
     this.buttons = this.cameras.list.map(({ name }, index) => {
       return h("button", { onclick: () => this.actions.choose(index) }, name, " ", h("small"));
     });
-    element("cameras").querySelector("summary").textContent = `photos (${this.buttons.length})`;
+    element("cameras").querySelector("summary").textContent = `Photos (${this.buttons.length})`;
     patch(
       element("cameras").querySelector("ol"),
       this.buttons.map((button) => want("li", {}, button)),
@@ -124,7 +124,7 @@ export class CapturePanel {
     const parts = points === null ? [] : [`${points.toLocaleString("en")} matched points`];
     parts.push(`${camera.W} × ${camera.H} px`, ...marks, ...(out ? ["left out"] : []));
     element("facts-of").textContent = parts.join(" · ");
-    element("leave").textContent = out ? "use again" : "leave out";
+    element("leave").textContent = out ? "Use again" : "Leave out";
   }
 
   // Shows the photo of the camera under the pointer beside it; -1 hides it.

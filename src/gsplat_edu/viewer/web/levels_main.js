@@ -4,8 +4,13 @@ import { say, startPage } from "./common.js";
 import { FACTS } from "./facts.js";
 import { Levels, machineBudget } from "./levels.js";
 import { showScene, Viewer } from "./viewer.js";
+import { Visitor } from "./visitor.js";
 
-startPage(() => showScene(streamed(FACTS), null));
+startPage(async () => {
+  const viewer = streamed(FACTS);
+  await showScene(viewer, null);
+  new Visitor(viewer);
+});
 
 // A viewer that loads levels of detail from the folder of this page's server.
 function streamed(facts) {

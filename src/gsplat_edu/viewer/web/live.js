@@ -69,7 +69,8 @@ class Live {
 
   // Shows the buttons. What the first one does is what it said when it was pressed.
   offer(what, disabled = false) {
-    const button = (text, more) => want("button", { disabled, onclick: () => this.control(text), ...more }, text);
+    const button = (text, more) =>
+      want("button", { disabled, onclick: () => this.control(text), ...more }, text[0].toUpperCase() + text.slice(1));
     patch(
       this.buttons,
       button(what, { title: "Wait after this iteration, or continue" }),

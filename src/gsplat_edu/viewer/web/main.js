@@ -13,5 +13,5 @@ startPage(async () => {
   const splats = await unpackSplats(FACTS, tellUnpacked);
   const viewer = new Viewer(FACTS, splats);
   await showScene(viewer, splats);
-  if (FACTS.shared) new Visitor(viewer);
+  if (!FACTS.edit) new Visitor(viewer);
 });

@@ -5,8 +5,6 @@ import { h } from "./patch.js";
 
 const POINT_SHOWN = 800; // milliseconds
 
-const SMALL = "(max-width: 600px) and (orientation: portrait)"; // as in style.css
-
 export class Panel {
   // actions: fly(), reset(), goTo(index), degree(value).
   constructor(facts, actions) {
@@ -15,18 +13,10 @@ export class Panel {
     element("fly").addEventListener("click", () => actions.fly());
     element("reset").addEventListener("click", () => actions.reset());
     element("help-button").addEventListener("click", () => this.help());
-    this.folded = new Fold(facts.shared || facts.edit ? "all" : SMALL); // visitors and the editor have the picture first
+    this.folded = new Fold("all"); // the picture comes first
     this.fillDegrees(actions);
     this.fillCameras(actions);
     this.atRest();
-  }
-
-  // How much of the window the closed panel covers at the top, CSS px: on a phone it is as wide as the window.
-  covered() {
-    if (this.facts.shared || !matchMedia(SMALL).matches) return 0;
-    const { top, width } = element("panel").getBoundingClientRect();
-    const { bottom } = element("bar").getBoundingClientRect();
-    return width ? bottom + 2 * top : 0; // with as much space inside and below as above it
   }
 
   counted(count) {

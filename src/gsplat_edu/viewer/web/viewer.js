@@ -100,7 +100,7 @@ export class Viewer {
     if (this.exact) return this.exact;
     const side = (length) => Math.max(1, Math.round(length * (window.devicePixelRatio || 1)));
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map(side);
-    return fitted(this.view.camera, width, height, Math.round(this.panel.covered() * (window.devicePixelRatio || 1)));
+    return fitted(this.view.camera, width, height);
   }
 
   // For programs: draws with exactly this camera, regardless of the window's size, and returns float32 RGB with the

@@ -1,4 +1,5 @@
-// The page that a visitor sees: title, hint and a bar of icons over the picture. Numbers and controls open from the bar.
+// The page of a scene, as its owner and visitors see it: title, hint and a bar of icons over the picture. Numbers and
+// controls open from the bar.
 
 import { element } from "./common.js";
 
@@ -55,9 +56,9 @@ export class Visitor {
   // What no photo saw fades into the colour that most photos have at their border; a switch shows all of the scene.
   offerBounds() {
     const { viewer } = this;
-    const { border, cameras } = viewer.facts;
+    const { border, cameras, shared } = viewer.facts;
     const plain = viewer.settings.background;
-    if (cameras.every(({ saved }) => saved)) return; // there are no photos to keep to
+    if (!shared || cameras.every(({ saved }) => saved)) return; // owners look everywhere; or there are no photos to keep to
     element("keep").hidden = false;
     const follow = () => {
       const { checked } = element("kept");
