@@ -277,6 +277,15 @@ def test_the_page_does_not_draw_during_vr(worn):
     assert seen.evaluate("[viewer.frameAsked, viewer.canvas.width]") == [0, 222]
 
 
+def test_the_page_that_view_serves_has_vr_too(shared, tmp_path, scene, three_views):
+    seen = shared()
+    (tmp_path / "own.html").write_bytes(page.html(Scene(scene), three_views))
+    seen.open(tmp_path / "own.html").ready()
+    stand = Stand(seen)
+    seen.tab.get_by_role("button", name="VR").click()
+    check_eyes(seen, scene, stand)
+
+
 def test_what_the_headset_refuses_is_said_until_something_is_pressed(shared):
     refusing = (
         "navigator.xr.requestSession = () => Promise.reject(new DOMException('no', 'NotAllowedError'));"

@@ -48,7 +48,7 @@ export class Headset {
       session.updateRenderState({ baseLayer: new XRWebGLLayer(session, gl, layer) });
       this.begin(session, await session.requestReferenceSpace("local")); // every headset has this space
     } catch {
-      tell(REFUSED);
+      if (!this.viewer.lost) tell(REFUSED); // else that is said
       await session?.end().catch(() => {}); // it may have ended by itself, which was the reason
     }
   }
@@ -73,9 +73,9 @@ export class Headset {
     session.requestAnimationFrame((now, frame) => this.frame(now, frame));
   }
 
-  // Ends the session, if there is one.
+  // Ends the session, if there is one that has not just ended by itself.
   end() {
-    return this.session?.end();
+    return this.session?.end().catch(() => {});
   }
 
   // The page draws again.
