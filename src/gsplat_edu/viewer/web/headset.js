@@ -58,6 +58,7 @@ export class Headset {
     viewer.stop();
     cancelAnimationFrame(viewer.frameAsked);
     viewer.frameAsked = 0;
+    viewer.isWhole = false;
     Object.assign(this, {
       session,
       space,
