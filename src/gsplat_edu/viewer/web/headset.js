@@ -7,7 +7,7 @@ import { eyeCamera, headOf, metreOf, placed, Push, pushes, standAt, turnedStand,
 
 const MODE = "immersive-vr";
 const SHARE = 0.5; // of the headset's pixels on each side: what splats cost is mostly by pixel
-const MOST_DRAWN = 500000; // splats, of which a headset of 2023 draws 72 pictures per second
+const MOST_DRAWN = 500000; // splats: gsplat-unity draws so many 72 times per second on a Quest 3
 const LONGEST_GLIDE = 0.1; // seconds that one frame moves, however long it took
 const REFUSED =
   "VR did not start. Check that the headset is on, let this page use it if the browser asks, and press VR again.";
