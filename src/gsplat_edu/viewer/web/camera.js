@@ -179,9 +179,9 @@ export class View {
   }
 
   // Fraction of a move of the eye that is applied: all of it among the photos' cameras, and towards them.
-  share(next) {
-    const away = (eye) => Math.hypot(...plus(eye, this.pivot, -1)) / this.reach;
-    const now = away(this.camera.eye);
+  share(next, eye = this.camera.eye) {
+    const away = (point) => Math.hypot(...plus(point, this.pivot, -1)) / this.reach;
+    const now = away(eye);
     return this.bounds === "photos" && away(next) > now ? Math.exp(-Math.max(0, now - AMONG) / YIELD) : 1;
   }
 

@@ -24,7 +24,7 @@ const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 const TURN = 0.8; // radians per second
 const NUDGE = 0.03; // radians at once, so that a short press is seen
 
-const ONCE = ["f", "h", "k", "p", "t", "c", "v"]; // keys that act once, however long they are held
+const ONCE = ["f", "h", "k", "p", "t", "c", "v", "x"]; // keys that act once, however long they are held
 
 // In a document that shows the page as a figure (scene.html#embedded), wheel and vertical drags scroll that document
 // until the canvas has the focus.
@@ -34,7 +34,7 @@ if (EMBEDDED) document.documentElement.classList.add("embedded");
 export class Controls {
   // actions: moved() after every move, awake() when a held key starts to move, shown() for the camera on the screen,
   // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by), saveView(),
-  // playPath(), guide(), compare(), seen(), slide(by), dismiss(). `cameras` is how many cameras the horizontal arrows
+  // playPath(), guide(), compare(), seen(), headset(), slide(by), dismiss(). `cameras` is how many cameras the horizontal arrows
   // step through.
   constructor(canvas, view, actions, cameras = 0) {
     Object.assign(this, {
@@ -141,6 +141,7 @@ export class Controls {
       t: () => this.actions.guide?.(),
       c: () => this.actions.compare?.(),
       v: () => this.actions.seen?.(),
+      x: () => this.actions.headset?.(),
       ",": () => this.actions.slide?.(-1),
       ".": () => this.actions.slide?.(1),
       escape: () => this.actions.dismiss?.(),

@@ -242,24 +242,26 @@ export class Renderer {
     return half >= SOLID ? high : null;
   }
 
-  // Copies the image onto the canvas, enlarged if the canvas is larger.
-  show() {
+  // Copies the image onto the canvas, or elsewhere; see copy().
+  show(place) {
     this.gl.disable(this.gl.BLEND);
-    this.copy(this.image, this.width, this.height);
+    this.copy(this.image, this.width, this.height, place);
   }
 
-  // Copies a texture of a size onto the canvas, enlarged if the canvas is larger.
-  copy(texture, imageWidth, imageHeight) {
+  // Copies a texture of a size onto the canvas, or onto a part {framebuffer, x, y, width, height} of a framebuffer, enlarged
+  // if that is larger.
+  copy(texture, imageWidth, imageHeight, place = null) {
     const gl = this.gl;
-    const { width, height } = gl.canvas;
+    const { framebuffer = null, x = 0, y = 0, width, height } = place ?? gl.canvas;
     const enlarged = width !== imageWidth || height !== imageHeight;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(x, y, width, height);
     gl.useProgram(this.screen);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, enlarged ? gl.LINEAR : gl.NEAREST);
     gl.uniform1i(gl.getUniformLocation(this.screen, "enlarged"), enlarged ? 1 : 0);
+    gl.uniform2f(gl.getUniformLocation(this.screen, "corner"), x, y);
     gl.uniform2f(gl.getUniformLocation(this.screen, "size"), width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

@@ -2,6 +2,7 @@
 
 import { startPage } from "./common.js";
 import { FACTS } from "./facts.js";
+import { Headset } from "./headset.js";
 import { unpackSplats } from "./scene.js";
 import { showScene, Viewer } from "./viewer.js";
 import { tellUnpacked, Visitor } from "./visitor.js";
@@ -14,4 +15,5 @@ startPage(async () => {
   const viewer = new Viewer(FACTS, splats);
   await showScene(viewer, splats);
   if (!FACTS.edit) new Visitor(viewer);
+  if (!FACTS.edit && !FACTS.live) await Headset.look(viewer);
 });

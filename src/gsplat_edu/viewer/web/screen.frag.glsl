@@ -4,11 +4,13 @@ precision highp float;
 
 uniform highp sampler2D image;
 uniform bool enlarged;
-uniform vec2 size;  // of the canvas
+uniform vec2 corner;  // of the part that is covered
+uniform vec2 size;    // of that part
 
 out vec4 color;
 
 void main() {
-    vec4 light = enlarged ? textureLod(image, gl_FragCoord.xy / size, 0.0) : texelFetch(image, ivec2(gl_FragCoord.xy), 0);
+    vec2 at = gl_FragCoord.xy - corner;
+    vec4 light = enlarged ? textureLod(image, at / size, 0.0) : texelFetch(image, ivec2(at), 0);
     color = clamp(light, 0.0, 1.0);
 }

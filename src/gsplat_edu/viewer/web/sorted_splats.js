@@ -1,4 +1,4 @@
-// The order of splats by camera depth of the mean, far to near.
+// The order of splats by camera depth of the mean, or by its distance, far to near.
 //
 // Positive float32 values sort like their bits, so two counting sorts of 16 bits each, low half first, give the exact
 // order. Among equal depths the last index comes first: drawn far to near, this matches the renderer's near-to-far
@@ -21,7 +21,7 @@ export class SortedSplats {
   }
 
   // Fills the first `count` entries of `order` with the splats in front of the camera: of all, or of a sample of `most`,
-  // whose thinning is not 0.
+  // whose thinning is not 0. Without an axis, they are sorted by distance, in all directions.
   sort(axis, eye, order, most) {
     const thins = most < this.keys.length;
     if (thins && !this.ranked) this.rank();
@@ -34,12 +34,13 @@ export class SortedSplats {
   byDepth(axis, eye, order, some) {
     const { keys, means, near } = this;
     const depths = new Float32Array(keys.buffer);
-    const [ax, ay, az] = axis;
+    const [ax, ay, az] = axis ?? [];
     const [ex, ey, ez] = eye;
     const total = some ? some.length : keys.length;
     for (let j = 0; j < total; ++j) {
       const k = 3 * (some ? some[j] : j);
-      const depth = ax * (means[k] - ex) + ay * (means[k + 1] - ey) + az * (means[k + 2] - ez);
+      const [x, y, z] = [means[k] - ex, means[k + 1] - ey, means[k + 2] - ez];
+      const depth = axis ? ax * x + ay * y + az * z : Math.sqrt(x * x + y * y + z * z);
       depths[j] = depth > near ? depth : 0;
     }
     return this.byKeys(total, order, some);

@@ -42,9 +42,13 @@ export class Sorter {
     return `${this.version} ${this.ranks ? most : Infinity} ${Sorter.key(camera)}`;
   }
 
-  // An order depends only on depth.
+  // An order depends only on depth, or on distance for a head, which is a camera whose R is null.
   static key(camera) {
-    return JSON.stringify([camera.R[2], camera.eye]);
+    return JSON.stringify([Sorter.axis(camera), camera.eye]);
+  }
+
+  static axis({ R }) {
+    return R?.[2];
   }
 
   // Replaces means, beginning with splat `at`.
@@ -80,7 +84,9 @@ export class Sorter {
       };
     });
     const wanted = this.ranks ? most : Infinity;
-    this.worker.postMessage({ axis: camera.R[2], eye: camera.eye, order: this.order, most: wanted }, [this.order]);
+    this.worker.postMessage({ axis: Sorter.axis(camera), eye: camera.eye, order: this.order, most: wanted }, [
+      this.order,
+    ]);
     await this.running;
   }
 }

@@ -36,7 +36,7 @@ export class Viewer {
     this.exact = null; // the camera given to setCamera, until the user moves
     this.lost = false;
     this.meshes = null; // beside the splats
-    this.seen = this.compare = this.guide = null; // see seen.js, compare.js and guide.js
+    this.seen = this.compare = this.guide = this.headset = null; // see the modules of these names
     this.pace = new Pace();
     this.movedAt = -Infinity;
     this.gauged = false;
@@ -86,6 +86,7 @@ export class Viewer {
       guide: () => this.guide?.toggle(),
       compare: () => this.compare?.toggle(),
       seen: () => this.seen?.toggle(),
+      headset: () => this.headset?.toggle(),
       slide: (by) => this.compare?.slide(by),
       dismiss: () => this.dismiss(),
       degree: (degree) => {
@@ -209,8 +210,9 @@ export class Viewer {
     return this.askFrame();
   }
 
-  // Ends the tour, or the comparison with photos.
+  // Ends the tour, the comparison with photos, or VR.
   dismiss() {
+    this.headset?.end();
     this.guide?.close();
     if (this.compare?.on) this.compare.toggle();
   }
@@ -267,7 +269,13 @@ export class Viewer {
     this.askFrame();
   }
 
+  // Whether the page draws nothing: it cannot, or a headset shows the scene.
+  get paused() {
+    return this.lost || Boolean(this.headset?.session);
+  }
+
   askFrame() {
+    if (this.headset?.session) return;
     this.frameAsked ||= requestAnimationFrame((now) => this.frame(now));
   }
 
@@ -297,7 +305,7 @@ export class Viewer {
   }
 
   draw(camera) {
-    if (this.lost) return;
+    if (this.paused) return;
     this.renderer.draw(camera, this.settings);
     this.put(camera);
   }
@@ -315,13 +323,13 @@ export class Viewer {
 
   // Shows the picture again, after a change of what lies over the splats.
   repaint() {
-    if (this.isWhole && !this.lost) this.put(this.camera());
+    if (this.isWhole && !this.paused) this.put(this.camera());
     else this.refresh();
   }
 
   // Draws with less detail.
   coarse(camera, { share }) {
-    if (this.lost) return;
+    if (this.paused) return;
     this.renderer.draw(reduced(camera, share), this.settings);
     this.put(camera);
   }
@@ -332,7 +340,7 @@ export class Viewer {
     this.timing = true;
     const taken = await this.renderer.drawn();
     this.timing = false;
-    if (document.hidden || this.lost) return;
+    if (document.hidden || this.paused) return;
     this.pace.took(taken, this.renderer.count);
     if (this.pace.slow) this.askFrame();
   }
@@ -342,7 +350,7 @@ export class Viewer {
     if (this.catching) return;
     this.catching = true;
     try {
-      while (this.outdated && !this.lost) {
+      while (this.outdated && !this.paused) {
         this.outdated = false;
         if (this.isMoving()) await this.drawCoarse();
         else if (this.isTraining) await this.drawSparing();
@@ -396,7 +404,7 @@ export class Viewer {
       const to = Math.min(from + this.pace.part, renderer.count);
       renderer.drawPart(camera, this.settings, from, to);
       this.pace.partTook(await renderer.drawn());
-      if (this.lost || this.outdated || renderer.begun !== begun) return false;
+      if (this.paused || this.outdated || renderer.begun !== begun) return false;
       from = to;
     }
     this.put(camera);
@@ -435,6 +443,7 @@ export class Viewer {
 
   lose() {
     this.lost = true;
+    this.headset?.end();
     if (this.levels) this.levels.stopped = true;
     say("The graphics processor stopped drawing this page; reload it.");
   }
