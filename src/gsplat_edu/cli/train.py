@@ -39,12 +39,11 @@ from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.settings import given
 from gsplat_edu.options.train import AUTO, left_open, options_from
-from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.pilot import NEED_TRIALS, TRIED, chosen_by_pilots
 from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
-from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
+from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.server.address import PORT, free_port, warning_for
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
@@ -175,9 +174,8 @@ def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], N
                 broadcast.update("evaluating")
 
             export = functools.partial(export_all, arguments.export, bar, options.backend, say)
-            clean = _cleaner(capture, say) if arguments.clean else None
             exporting = export if arguments.export else None
-            result = capture.finish(scored, exporting, clean, chosen.full_length)
+            result = capture.finish(scored, exporting, chosen.full_length)
         tell_result(capture, result, say, limited=deadline is not None)
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
@@ -234,11 +232,6 @@ def _is_over(options: RunOptions, team: Member, say: Callable[[str], None]) -> b
     if finished:
         say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")
     return finished
-
-
-def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:
-    options = capture.options
-    return cleaner(options.render_settings, say, options.config.appearance)
 
 
 def with_poses(

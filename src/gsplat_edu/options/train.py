@@ -388,6 +388,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
         resume=arguments.resume,
+        asked=("floaters",) if arguments.clean else (),
     )
 
 

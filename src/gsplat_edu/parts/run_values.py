@@ -57,6 +57,38 @@ class Added:
 
 
 @dataclass(frozen=True, eq=False)
+class Unwritten:
+    """A scene that is trained and not written yet.
+
+    Args:
+        gaussians: The scene, as the parts before left it.
+        dataset: The capture as the parts' `learned` returned it.
+        settings: The run's render settings.
+        is_asked: Whether `gsplat_edu.runs.options.RunOptions.asked` names the part.
+        say: Receives sentences for the user.
+    """
+
+    gaussians: Gaussians
+    dataset: Dataset
+    settings: RenderSettings
+    is_asked: bool
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Revised:
+    """What a part makes of a trained scene.
+
+    Args:
+        gaussians: The scene.
+        facts: Entries of metrics.json.
+    """
+
+    gaussians: Gaussians
+    facts: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
 class Finished:
     """A run whose training is over and whose scene is written.
 

@@ -28,7 +28,7 @@ from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.evaluate.verdict import FULL_LENGTH, USUAL
 from gsplat_edu.io.formats import write_scene
-from gsplat_edu.parts.run_values import Captured, Finished
+from gsplat_edu.parts.run_values import Captured, Finished, Unwritten
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
@@ -89,9 +89,6 @@ def document(options: RunOptions) -> dict[str, Any]:
 
 Export = Callable[[Source], list[dict[str, Any]]]
 """Writes a scene in further formats and returns a record of each file: "path", "psnr" and more."""
-
-Clean = Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]
-"""Removes splats from a scene, and returns the others and a record of the removal."""
 
 
 def _with_own_files(options: RunOptions) -> RunOptions:
@@ -441,7 +438,6 @@ class CaptureRun:
         self,
         progress: Progress | None = None,
         export: Export | None = None,
-        clean: Clean | None = None,
         full_length: int | None = None,
     ) -> Evaluation:
         """Write the scene, in other formats too if `export` is given, and score it on the test and training views.
@@ -451,7 +447,6 @@ class CaptureRun:
         Args:
             progress: Called for every scored view.
             export: Called with the written scene; metrics.json and the report get its result as "exports".
-            clean: Called with the scene and the capture first; metrics.json gets its record as "cleaning".
             full_length: Iterations that the run would have without a time limit; None for those of its configuration.
         """
         trainer, dataset, config = self.trainer, self.dataset, self.options.config
@@ -464,8 +459,12 @@ class CaptureRun:
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         facts[FULL_LENGTH] = full_length or config.iterations
         facts[USUAL] = usual_size(config, dataset)
-        if clean is not None:
-            gaussians, facts["cleaning"] = clean(gaussians, learned)
+        for name, part in parts().items():
+            scene = Unwritten(
+                gaussians, learned, self.options.render_settings, name in self.options.asked, self._say
+            )
+            if (revised := part.revise(config.settings_of(name), scene)) is not None:
+                gaussians, facts = revised.gaussians, {**facts, **revised.facts}
         path = self.folder.scene(trainer.iteration)
         write_scene(path, capture_scene(gaussians, dataset, self.options.render_settings.antialiased))
         if export is not None:

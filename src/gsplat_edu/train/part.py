@@ -149,6 +149,20 @@ class Part:
         """
         return dataset
 
+    def revise(self, settings: Any, scene: Any) -> Any:  # noqa: ANN401
+        """Return what the part makes of the scene before it is written, a `gsplat_edu.parts.run_values.Revised`.
+
+        None leaves the scene as it is.
+
+        Args:
+            settings: The run's `Settings`.
+            scene: The scene, a `gsplat_edu.parts.run_values.Unwritten`.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+        """
+        return None
+
     def finish(self, settings: Any, run: Any) -> Mapping[str, Any]:  # noqa: ANN401
         """Write what the part has to write into a run's folder; return entries of metrics.json.
 
@@ -184,6 +198,7 @@ OWN_PARTS = {
     "transients": "gsplat_edu.parts.transients.part:TRANSIENTS",
     "surface": "gsplat_edu.parts.surface.part:SURFACE",
     "given_depth": "gsplat_edu.parts.given_depth.part:GIVEN_DEPTH",
+    "floaters": "gsplat_edu.parts.floaters.part:FLOATERS",
 }
 """Entry points of our own parts, in the order in which they act: poses move a camera before its image is corrected."""
 
