@@ -459,12 +459,8 @@ class CaptureRun:
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         facts[FULL_LENGTH] = full_length or config.iterations
         facts[USUAL] = usual_size(config, dataset)
-        for name, part in parts().items():
-            scene = Unwritten(
-                gaussians, learned, self.options.render_settings, name in self.options.asked, self._say
-            )
-            if (revised := part.revise(config.settings_of(name), scene)) is not None:
-                gaussians, facts = revised.gaussians, {**facts, **revised.facts}
+        gaussians, revisions = self._revised(gaussians, learned)
+        facts |= revisions
         path = self.folder.scene(trainer.iteration)
         write_scene(path, capture_scene(gaussians, dataset, self.options.render_settings.antialiased))
         if export is not None:
@@ -495,6 +491,15 @@ class CaptureRun:
             facts,
             progress,
         )
+
+    def _revised(self, gaussians: Gaussians, learned: Dataset) -> tuple[Gaussians, dict[str, Any]]:
+        """Return the scene as the parts revise it, and entries of metrics.json."""
+        options, facts = self.options, dict[str, Any]()
+        for name, part in parts().items():
+            scene = Unwritten(gaussians, learned, options.render_settings, name in options.asked, self._say)
+            if (revised := part.revise(options.config.settings_of(name), scene)) is not None:
+                gaussians, facts = revised.gaussians, {**facts, **revised.facts}
+        return gaussians, facts
 
     @contextmanager
     def clock_stopped(self) -> Iterator[None]:
