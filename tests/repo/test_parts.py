@@ -35,6 +35,14 @@ def test_the_source_names_no_part(module):
     assert not named
 
 
+@pytest.mark.parametrize(
+    "module", ["train/compose.py", "runs/training.py", "runs/options.py", "runs/dataset.py", "cli/train.py"]
+)
+def test_a_training_does_not_name_the_files_of_a_capture(module):
+    """What they say of the photos comes with the data settings: which photos are left out, which pixels count."""
+    assert not re.findall("region|left_out", (SOURCE / module).read_text())
+
+
 @pytest.mark.parametrize("module", sorted(path.name for path in SOURCE.glob("doctor/*.py")))
 def test_the_doctor_names_no_setting_of_a_part(module):
     """It may speak of the poses and the exposure of photos, but what a part changes is for the part to advise."""

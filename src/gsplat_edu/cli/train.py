@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
@@ -105,12 +105,11 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
     told = team.shared(None)
     if told["finished"]:
         return
-    data, train = ({name: _tuple(value) for name, value in told[part].items()} for part in ("data", "train"))
     options = RunOptions(
         arguments.data,
         arguments.out,
-        TrainConfig().changed(**train),
-        DataSettings(**data),
+        TrainConfig.of_record(told["train"]),
+        DataSettings.of_record(told["data"]),
         depth=arguments.depth,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
@@ -119,10 +118,6 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
         CaptureRun(options, team=team).train(interrupted)
     if interrupted():
         raise KeyboardInterrupt
-
-
-def _tuple(value: Any) -> Any:  # noqa: ANN401
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], None], team: Member) -> None:

@@ -375,6 +375,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         background=config.background if flattened else None,
         image_memory=DataSettings.image_memory if arguments.image_memory is None else arguments.image_memory,
         lens=arguments.lens or DataSettings.lens,
+        region=() if config.region == "none" else None,
     )
     return RunOptions(
         data=arguments.data,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +60,6 @@ class RunOptions:
             whole_number(name, getattr(self, name), 0)
         for name in self.asked:
             one_of("asked", name, (*OWN_PARTS, *PLUGGED_PARTS))
-        if self.config.region == "none":
-            object.__setattr__(self, "data_settings", replace(self.data_settings, region=()))
 
     @property
     def folder(self) -> RunFolder:

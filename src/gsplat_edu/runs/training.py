@@ -19,11 +19,9 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.files import check_folder, remove_leftovers
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import stored_path
-from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.dataset import Dataset, with_own_files
 from gsplat_edu.data.depths import depth_name
-from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.data.region import read_region
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.evaluate.verdict import FULL_LENGTH, USUAL
@@ -66,14 +64,11 @@ from gsplat_edu.train.trainer import Callback, Trainer
 
 def document(options: RunOptions) -> dict[str, Any]:
     """Return the part of config.json that a run's options determine."""
-    data = dataclasses.asdict(options.data_settings)
-    if not data["region"]:
-        del data["region"]  # as in the runs of older versions
     return {
         "version": version("gsplat-edu"),
         "data": {
             "path": str(options.data.resolve()),
-            **data,
+            **options.data_settings.record(),
             "points": None if options.points is None else str(options.points.resolve()),
             "scene": None if options.scene is None else str(scene_file(options.scene).resolve()),
             **({} if options.depth is None else {"depth": depth_name(options.depth)}),
@@ -92,17 +87,13 @@ Export = Callable[[Source], list[dict[str, Any]]]
 
 
 def _with_own_files(options: RunOptions) -> RunOptions:
-    """Return the options with the left-out photos and the region of config.json, else of the capture's own files."""
-    settings, folder, changes = options.data_settings, options.folder, dict[str, Any]()
-    stored = data_settings(folder.read_config()) if folder.exists() else None
-    is_here = options.data.exists()
-    if settings.left_out is None and settings.train_views is None:
-        here = read_left_out(options.data) if stored is None and is_here else None
-        changes["left_out"] = here if stored is None else stored.left_out
-    if settings.region is None:
-        region = read_region(options.data) if stored is None and is_here else None
-        changes["region"] = (() if region is None else region.numbers) if stored is None else stored.region
-    return dataclasses.replace(options, data_settings=dataclasses.replace(settings, **changes))
+    """Return the options with what the files of the capture say of its photos: as in config.json, else as it is now."""
+    settings, folder = options.data_settings, options.folder
+    if folder.exists():
+        settings = settings.completed(data_settings(folder.read_config()))
+    elif options.data.exists():
+        settings = with_own_files(settings, options.data)
+    return dataclasses.replace(options, data_settings=settings)
 
 
 def _checked_folder(options: RunOptions) -> RunOptions:
