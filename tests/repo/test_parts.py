@@ -30,7 +30,7 @@ SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
 )
 def test_the_source_names_no_part(module):
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", (SOURCE / module).read_text()).lower().replace(" ", "_")
-    assert len(OWN_PARTS) >= 7
+    assert len(OWN_PARTS) >= 8
     named = [name for name in OWN_PARTS if re.search(rf"(?<![a-z]){name}(?![a-z])", text)]
     assert not named
 
@@ -46,7 +46,7 @@ def test_a_training_does_not_name_the_files_of_a_capture(module):
 @pytest.mark.parametrize("module", sorted(path.name for path in SOURCE.glob("doctor/*.py")))
 def test_the_doctor_names_no_setting_of_a_part(module):
     """It may speak of the poses and the exposure of photos, but what a part changes is for the part to advise."""
-    settings = "sky|appearance|refine|transients|surface|depth"
+    settings = "sky|appearance|refine|transients|outside[-_]masks|surface|depth"
     text = (SOURCE / "doctor" / module).read_text()
     assert not re.findall(rf"--(?:{settings})\b|[\"'](?:{settings})[\"']", text)
 

@@ -196,6 +196,7 @@ OWN_PARTS = {
     "poses": "gsplat_edu.parts.poses.part:POSES",
     "exposure": "gsplat_edu.parts.exposure.part:EXPOSURE",
     "transients": "gsplat_edu.parts.transients.part:TRANSIENTS",
+    "empty_outside": "gsplat_edu.parts.empty_outside.part:EMPTY_OUTSIDE",
     "surface": "gsplat_edu.parts.surface.part:SURFACE",
     "given_depth": "gsplat_edu.parts.given_depth.part:GIVEN_DEPTH",
     "floaters": "gsplat_edu.parts.floaters.part:FLOATERS",
