@@ -43,11 +43,20 @@ def test_a_training_does_not_name_the_files_of_a_capture(module):
     assert not re.findall("region|left_out", (SOURCE / module).read_text())
 
 
-@pytest.mark.parametrize("module", sorted(path.name for path in SOURCE.glob("doctor/*.py")))
-def test_the_doctor_names_no_setting_of_a_part(module):
+@pytest.mark.parametrize(
+    "module",
+    sorted(
+        str(path.relative_to(SOURCE))
+        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", "cli/train.py")
+        for path in SOURCE.glob(place)
+    ),
+)
+def test_the_source_names_no_setting_of_a_part(module):
     """It may speak of the poses and the exposure of photos, but what a part changes is for the part to advise."""
     settings = "sky|appearance|refine|transients|outside[-_]masks|surface|depth"
-    text = (SOURCE / "doctor" / module).read_text()
+    if module.startswith("studio/"):  # a mesh is a surface, and a folder of a run has the masks of transients
+        settings = "sky|appearance|refine|outside[-_]masks|depth"
+    text = (SOURCE / module).read_text()
     assert not re.findall(rf"--(?:{settings})\b|[\"'](?:{settings})[\"']", text)
 
 

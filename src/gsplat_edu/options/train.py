@@ -83,7 +83,10 @@ OFFERED = {
     "time_limit": Plain("Time instead of a quality", group=LENGTH, example="30m"),
     "max_memory": Plain("Memory limit", group=LENGTH, example="8GiB"),
     "resolution": Plain(
-        "Size of the photos: 2 for half, longest side in px, or auto", group=LENGTH, example="full size"
+        "Size of the photos: 2 for half, longest side in px, or auto",
+        group=LENGTH,
+        example="full size",
+        again="Train with smaller photos",
     ),
     "lens": Plain(
         "Lens",
