@@ -13,7 +13,6 @@ IMPORTERS = {
     "runs/lod_refinement.py",
     "runs/meshes.py",
     "runs/painting.py",
-    "runs/pilot.py",
 }
 """Modules that use what a part offers beside its hooks, for example how a sky is found; no other may."""
 
@@ -25,6 +24,7 @@ SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
     [
         *("train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"),
         *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py", "runs/dataset.py"),
+        "runs/pilot.py",
         *("evaluate/report.py", "doctor/diagnosis.py", "survey/trained.py", "cli/result.py"),
     ],
 )

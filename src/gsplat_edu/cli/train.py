@@ -11,7 +11,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
 
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
@@ -39,7 +39,7 @@ from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.settings import given
 from gsplat_edu.options.train import AUTO, left_open, options_from
-from gsplat_edu.runs.pilot import NEED_TRIALS, TRIED, chosen_by_pilots
+from gsplat_edu.runs.pilot import chosen_by_pilots
 from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
@@ -52,6 +52,7 @@ from gsplat_edu.survey.finding import Remedy
 from gsplat_edu.train.capacity import advised_side
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.part import parts
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
@@ -353,7 +354,7 @@ def with_choices(
     say: Callable[[str], None],
     time: TrialTime | None = None,
 ) -> RunOptions:
-    """Choose the settings whose option is auto, judge a lens or shutter to learn, and say what was found.
+    """Choose the settings whose option is auto, judge what parts want tried out, and say what was found.
 
     Short trainings end when `time` is over.
     """
@@ -363,7 +364,8 @@ def with_choices(
             say(Told(f"{option_flag(name)} {remedy.value}: {remedy.reason}", remedy.reason))
         return replace(options, config=options.config.changed(**{name: remedy.value}))
 
-    if undecided := [name for name in names if name != TRIED]:
+    tried = {part.tried: part for part in parts().values() if part.tried}
+    if undecided := [name for name in names if name not in tried]:
         with progress_bar(console, "") as bar:
             progress = photos_read(bar, lambda: False)
             remedies = remedies_for(
@@ -371,23 +373,22 @@ def with_choices(
             )
         for name, remedy in remedies.items():
             options = take(options, name, remedy)
-    asked = "" if TRIED in names else getattr(options.config, TRIED)
-    if TRIED in names or (asked in NEED_TRIALS and not (options.resume and options.folder.exists())):
+    is_new = not (options.resume and options.folder.exists())
+    for name, part in tried.items():
+        asked = "" if name in names else options.config.flat()[name]
+        if asked and not (is_new and part.needs_trial(asked)):
+            continue
         with progress_bar(console, "") as bar:
-            task = bar.add_task("short trainings", total=None)
-            chosen = chosen_by_pilots(
-                options,
-                reader,
-                lambda total: bar.update(task, advance=1, total=total),
-                asked,
-                *(() if time is None else (time.is_over,)),
-            )
-        options = take(
-            replace(options, records={**options.records, **chosen.record}),
-            TRIED,
-            Remedy(chosen.value, chosen.reason),
-        )
+            advance = functools.partial(_advance, bar, bar.add_task("short trainings", total=None))
+            limit = () if time is None else (time.is_over,)
+            chosen = chosen_by_pilots(part, options, reader, advance, asked, *limit)
+        options = replace(options, records={**options.records, **chosen.record})
+        options = take(options, name, Remedy(chosen.value, chosen.reason))
     return options
+
+
+def _advance(bar: Bar, task: TaskID, total: int) -> None:
+    bar.update(task, advance=1, total=total)
 
 
 def _either(first: Callable[[], bool], second: Callable[[], bool]) -> bool:

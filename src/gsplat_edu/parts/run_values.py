@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,21 @@ class Captured:
     starts_from_scene: bool
     is_new: bool
     say: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """The value of a setting that short trainings chose or judged.
+
+    Args:
+        value: The value.
+        reason: Why, as a clause.
+        record: Entries of config.json; empty if no training was judged.
+    """
+
+    value: str
+    reason: str
+    record: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,6 +63,29 @@ class Part:
         """
         return None
 
+    tried: ClassVar[str] = ""
+    """The setting that short trainings choose if it is auto; empty for none."""
+
+    def needs_trial(self, value: str) -> bool:
+        """Return whether short trainings also judge a value of `tried` that the user gave."""
+        return False
+
+    def try_out(self, asked: str, bench: Any) -> Any:  # noqa: ANN401
+        """Choose the value of `tried` by short trainings, or judge the value that the user gave.
+
+        Args:
+            asked: That value; "" chooses.
+            bench: Trains and scores, a `gsplat_edu.parts.bench.Bench`.
+
+        Returns:
+            A `gsplat_edu.parts.run_values.Tried`.
+
+        Raises:
+            ArgumentError: the backend cannot learn what was asked for.
+            OutOfTimeError: the bench's time is over (`gsplat_edu.parts.bench`).
+        """
+        raise NotImplementedError(f"{type(self).__name__}: tried is {self.tried!r}, but nothing tries it out")
+
     def judge(self, settings: Any, run: Any) -> Any:  # noqa: ANN401
         """Return what the doctor has to say of a run, a `gsplat_edu.survey.finding.Examined`; None for nothing.
 
