@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.doctor.cut_out import outside_masks_for, shape_of
+from gsplat_edu.parts.empty_outside.findings import outside_masks_for, shape_of
 from gsplat_edu.scene.views import View
 from masked_object import masked_object
 

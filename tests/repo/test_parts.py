@@ -13,7 +13,6 @@ IMPORTERS = {
     "runs/lod_refinement.py",
     "runs/meshes.py",
     "runs/painting.py",
-    "runs/pilot.py",
 }
 """Modules that use what a part offers beside its hooks, for example how a sky is found; no other may."""
 
@@ -24,22 +23,40 @@ SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
     "module",
     [
         *("train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"),
-        *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py"),
+        *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py", "runs/dataset.py"),
+        "runs/pilot.py",
         *("evaluate/report.py", "doctor/diagnosis.py", "survey/trained.py", "cli/result.py"),
     ],
 )
 def test_the_source_names_no_part(module):
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", (SOURCE / module).read_text()).lower().replace(" ", "_")
-    assert len(OWN_PARTS) >= 6
+    assert len(OWN_PARTS) >= 8
     named = [name for name in OWN_PARTS if re.search(rf"(?<![a-z]){name}(?![a-z])", text)]
     assert not named
 
 
-@pytest.mark.parametrize("module", sorted(path.name for path in SOURCE.glob("doctor/*.py")))
-def test_the_doctor_names_no_setting_of_a_part(module):
+@pytest.mark.parametrize(
+    "module", ["train/compose.py", "runs/training.py", "runs/options.py", "runs/dataset.py", "cli/train.py"]
+)
+def test_a_training_does_not_name_the_files_of_a_capture(module):
+    """What they say of the photos comes with the data settings: which photos are left out, which pixels count."""
+    assert not re.findall("region|left_out", (SOURCE / module).read_text())
+
+
+@pytest.mark.parametrize(
+    "module",
+    sorted(
+        str(path.relative_to(SOURCE))
+        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", "cli/train.py")
+        for path in SOURCE.glob(place)
+    ),
+)
+def test_the_source_names_no_setting_of_a_part(module):
     """It may speak of the poses and the exposure of photos, but what a part changes is for the part to advise."""
-    settings = "sky|appearance|refine|transients|surface|depth"
-    text = (SOURCE / "doctor" / module).read_text()
+    settings = "sky|appearance|refine|transients|outside[-_]masks|surface|depth"
+    if module.startswith("studio/"):  # a mesh is a surface, and a folder of a run has the masks of transients
+        settings = "sky|appearance|refine|outside[-_]masks|depth"
+    text = (SOURCE / module).read_text()
     assert not re.findall(rf"--(?:{settings})\b|[\"'](?:{settings})[\"']", text)
 
 

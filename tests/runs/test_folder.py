@@ -162,11 +162,12 @@ def test_a_cameras_file_without_our_keys_is_read(folder):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"rotation": None}, "entry 0: R: "),
+        ({"rotation": None}, "entry 0: rotation: is null, but has to be a list"),
         ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "entry 0: R: is not a rotation"),
-        ({"position": [1, 2]}, r"entry 0: position: expected shape \(3,\)"),
-        ({"fx": "wide"}, "entry 0: fx: cannot be read"),
-        ({"height": 2.5}, "entry 0: H: is 2.5"),
+        ({"position": [1, 2]}, r"entry 0: position: is \[1, 2\], but has to have 3 entries"),
+        ({"fx": "wide"}, 'entry 0: fx: is "wide", but has to be a number'),
+        ({"height": 2.5}, "entry 0: height: is 2.5, but has to be a whole number"),
+        ({"split": "val"}, 'entry 0: split: is "val", but has to be one of test, train'),
         ({"width": ...}, "entry 0: lacks 'width'"),
     ],
 )

@@ -13,11 +13,15 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.parts.poses.trials import CONTROL
+from gsplat_edu.parts import bench
+from gsplat_edu.parts.poses import choice
+from gsplat_edu.parts.poses.choice import LEAST_GAIN
+from gsplat_edu.parts.poses.part import POSES
+from gsplat_edu.parts.poses.trials import CONTROL, RefineTrials
+from gsplat_edu.parts.run_values import Tried
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.runs import pilot
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.runs.pilot import LEAST_GAIN, chosen_by_pilots
+from gsplat_edu.runs.pilot import chosen_by_pilots
 from gsplat_edu.scene.projection import Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.scene.views import View
@@ -67,9 +71,11 @@ def write_moving_room(folder, pixels):
 def chosen_for(folder, tmp_path, lens):
     """Return the choice for a capture, and how many pilots were trained."""
     steps = []
-    chosen = chosen_by_pilots(options(folder, tmp_path, lens=lens), CaptureReader(folder), steps.append)
-    assert len(steps) % pilot.PILOT_STEPS == 0
-    return *chosen, len(steps) // pilot.PILOT_STEPS
+    chosen = chosen_by_pilots(
+        POSES, options(folder, tmp_path, lens=lens), CaptureReader(folder), steps.append
+    )
+    assert len(steps) % bench.PILOT_STEPS == 0
+    return chosen.value, chosen.reason, RefineTrials.of(chosen.record), len(steps) // bench.PILOT_STEPS
 
 
 @pytest.mark.slow
@@ -101,21 +107,22 @@ def test_a_shutter_is_learned_if_photos_have_one(tmp_path, pixels):
     chosen, reason, trials, trained = chosen_for(tmp_path / "capture", tmp_path, "undistort")
     assert chosen == ("shutter" if pixels else "none"), reason
     assert ("shutter" in trials.moving) == bool(pixels)
-    assert set(trials.posed) >= set(pilot.ORDER) and "lens" not in trials.posed
+    assert set(trials.posed) >= set(choice.ORDER) and "lens" not in trials.posed
     assert trained == len(trials.posed)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [False, True])
 def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
-    monkeypatch.setattr(pilot, "PILOT_STEPS", 250)
+    monkeypatch.setattr(bench, "PILOT_STEPS", 250)
     views, points, colors = procedural_capture(48, 24, splats=150)
     rng = np.random.default_rng(0)
     views = [shaken(view, rng) for view in views] if wrong else views
     write_colmap(tmp_path / "capture", views, points, colors)
     steps = []
     reader = CaptureReader(tmp_path / "capture")
-    chosen, reason, trials = chosen_by_pilots(options(reader.path, tmp_path), reader, steps.append)
+    found = chosen_by_pilots(POSES, options(reader.path, tmp_path), reader, steps.append)
+    chosen, reason, trials = found.value, found.reason, RefineTrials.of(found.record)
     assert len(steps) == len(trials.posed) * 250 and steps[0] == 3 * 250
     assert (chosen != "none") == wrong, reason
     assert "dB with none" in reason and "dB with both" in reason
@@ -124,7 +131,7 @@ def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
 
 def test_the_smallest_refinement_without_a_clearly_better_one_is_chosen():
     def chosen(none, poses, both):
-        return pilot._smallest({"none": none, "poses": poses, "both": both}, pilot.ORDER)
+        return choice._smallest({"none": none, "poses": poses, "both": both}, choice.ORDER)
 
     assert chosen(20.0, 20.0 + 0.9 * LEAST_GAIN, 20.0) == "none"
     assert chosen(20.0, 20.0 + 1.1 * LEAST_GAIN, 20.0) == "poses"
@@ -139,14 +146,15 @@ def test_pilots_end_early_if_they_would_take_too_much_of_a_time_limit(tmp_path, 
     write_colmap(tmp_path / "capture", *procedural_capture(32, 8, splats=60))
     reader, steps = CaptureReader(tmp_path / "capture"), []
     time = TrialTime(Deadline(1_000.0, lambda: float(len(steps))))
-    found = chosen_by_pilots(options(reader.path, tmp_path), reader, steps.append, asked, time.is_over)
-    assert (found.value, found.trials) == (asked or "none", None)
+    found = chosen_by_pilots(POSES, options(reader.path, tmp_path), reader, steps.append, asked, time.is_over)
+    assert (found.value, found.record) == (asked or "none", {})
     assert "more than a quarter of the time that is left" in found.reason
     assert 0 < len(steps) < 50, "the pace tells long before 250 s"
     late = TrialTime(Deadline(1_000.0, lambda: 1_001.0))
     steps.clear()
     assert (
-        chosen_by_pilots(options(reader.path, tmp_path), reader, steps.append, asked, late.is_over) == found
+        chosen_by_pilots(POSES, options(reader.path, tmp_path), reader, steps.append, asked, late.is_over)
+        == found
     )
     assert not steps
 
@@ -154,20 +162,18 @@ def test_pilots_end_early_if_they_would_take_too_much_of_a_time_limit(tmp_path, 
 def test_without_held_out_photos_nothing_is_refined(tmp_path):
     write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=60))
     reader = CaptureReader(tmp_path / "capture")
-    assert chosen_by_pilots(options(reader.path, tmp_path, test_every=0), reader) == (
-        "none",
-        "no photos are held out to judge by",
-        None,
+    assert chosen_by_pilots(POSES, options(reader.path, tmp_path, test_every=0), reader) == Tried(
+        "none", "no photos are held out to judge by"
     )
 
 
 def test_pilots_have_the_settings_of_the_run():
     config = replace(recipe(100), background=(1.0, 1.0, 1.0), antialiased=True, max_gaussians=500, seed=3)
-    made = pilot._config(config, "poses")
+    made = bench.pilot_config(config, refine="poses")
     assert (made.background, made.antialiased, made.max_gaussians, made.seed) == (
         (1.0, 1.0, 1.0),
         True,
         500,
         3,
     )
-    assert (made.strategy, made.refine, made.iterations) == ("fast", "poses", pilot.PILOT_STEPS)
+    assert (made.strategy, made.refine, made.iterations) == ("fast", "poses", bench.PILOT_STEPS)

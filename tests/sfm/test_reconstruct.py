@@ -285,7 +285,7 @@ def test_a_job_that_fails_names_its_log(tmp_path):
 def test_a_damaged_list_of_stages_is_reported_in_one_line(done, tmp_path):
     (tmp_path / "sfm").mkdir()
     (tmp_path / "sfm" / "stages.json").write_text(json.dumps({"stages": {"photos": 3}}))
-    with pytest.raises(DatasetError, match="is damaged; remove .*sfm"):
+    with pytest.raises(DatasetError, match=r"stages\.photos: is 3, but has to be an object; remove .*sfm"):
         reconstruct(replace(done.options, out=tmp_path))
 
 

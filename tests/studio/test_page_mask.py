@@ -254,21 +254,21 @@ def test_requests_that_are_no_drawing_change_nothing(page, studio):
     for body, status, line in (
         ({"photo": "../../etc/passwd", "shapes": []}, 404, "passwd"),
         ({"photo": photo, "shapes": [[1, 2, 3]]}, 400, "has 3 numbers"),
-        ({"photo": photo, "shapes": [[1, 2, 3, "4"]]}, 400, "whole numbers"),
-        ({"photo": photo, "shapes": [[1, 2, 3, 1e9]]}, 400, "whole numbers"),
-        ({"photo": photo, "shapes": ["0,0,4,4"]}, 400, "whole numbers"),
+        ({"photo": photo, "shapes": [[1, 2, 3, "4"]]}, 400, "has to be a whole number"),
+        ({"photo": photo, "shapes": [[1, 2, 3, 1e9]]}, 400, "has to be a whole number"),
+        ({"photo": photo, "shapes": ["0,0,4,4"]}, 400, "has to be an object or a list"),
         ({"photo": photo, "shapes": [[0, 0, 32, 24]]}, 400, "leave the photo out instead"),
         (
             {"photo": photo, "shapes": [{"brush": 1e300, "points": [1, 1]}]},
             400,
-            "brush: has to be a whole number",
+            "brush: is 1e+300, but has to be a whole number",
         ),
         (
             {"photo": photo, "shapes": [{"brush": 2, "points": [1, 2.5]}]},
             400,
-            "points: has to be whole numbers",
+            "points[1]: is 2.5, but has to be a whole number",
         ),
-        ({"photo": photo, "shapes": [{"brush": 2}]}, 400, "a stroke has to have brush"),
+        ({"photo": photo, "shapes": [{"brush": 2}]}, 400, "shape: lacks 'points'"),
         ({"photo": photo}, 400, "shapes: is missing"),
     ):
         answer = page.post(address, json=body | {"version": version})

@@ -12,6 +12,7 @@ import torch
 from gsplat_edu import build_cov3d_batch, quat_to_R_batch, render_gaussians
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.clean.guard import clean
+from gsplat_edu.clean.report import report_lines
 from gsplat_edu.data import procedural
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.settings import DataSettings
@@ -21,7 +22,6 @@ from gsplat_edu.evaluate.metrics import score_views
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.cleaning import report_lines
 from gsplat_edu.scene.views import View
 from gsplat_edu.survey.residuals import residuals
 from gsplat_edu.survey.trained import Trained

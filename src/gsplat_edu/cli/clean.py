@@ -16,6 +16,7 @@ from gsplat_edu.base.locks import locked_file
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import write_text
 from gsplat_edu.clean.guard import clean
+from gsplat_edu.clean.report import report_lines
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.edits.carry import for_part
 from gsplat_edu.edits.document import parse_edits
@@ -23,7 +24,7 @@ from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.edits.stored import MOST_BYTES
 from gsplat_edu.jobs import emitter
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.runs.cleaning import SIGNALS, default_target, open_subject, preview, report_lines
+from gsplat_edu.runs.cleaning import SIGNALS, default_target, open_subject, preview
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
 

@@ -8,10 +8,10 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
 
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
@@ -39,12 +39,11 @@ from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.settings import given
 from gsplat_edu.options.train import AUTO, left_open, options_from
-from gsplat_edu.runs.cleaning import cleaner
-from gsplat_edu.runs.pilot import NEED_TRIALS, TRIED, chosen_by_pilots
+from gsplat_edu.runs.pilot import chosen_by_pilots
 from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
 from gsplat_edu.runs.thin import LENGTHS
-from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
+from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.server.address import PORT, free_port, warning_for
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import check_time_for_poses, needs_poses
@@ -53,6 +52,7 @@ from gsplat_edu.survey.finding import Remedy
 from gsplat_edu.train.capacity import advised_side
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.part import parts
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
@@ -106,12 +106,11 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
     told = team.shared(None)
     if told["finished"]:
         return
-    data, train = ({name: _tuple(value) for name, value in told[part].items()} for part in ("data", "train"))
     options = RunOptions(
         arguments.data,
         arguments.out,
-        TrainConfig().changed(**train),
-        DataSettings(**data),
+        TrainConfig.of_record(told["train"]),
+        DataSettings.of_record(told["data"]),
         depth=arguments.depth,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
@@ -120,10 +119,6 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
         CaptureRun(options, team=team).train(interrupted)
     if interrupted():
         raise KeyboardInterrupt
-
-
-def _tuple(value: Any) -> Any:  # noqa: ANN401
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], None], team: Member) -> None:
@@ -175,9 +170,8 @@ def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], N
                 broadcast.update("evaluating")
 
             export = functools.partial(export_all, arguments.export, bar, options.backend, say)
-            clean = _cleaner(capture, say) if arguments.clean else None
             exporting = export if arguments.export else None
-            result = capture.finish(scored, exporting, clean, chosen.full_length)
+            result = capture.finish(scored, exporting, chosen.full_length)
         tell_result(capture, result, say, limited=deadline is not None)
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
@@ -234,11 +228,6 @@ def _is_over(options: RunOptions, team: Member, say: Callable[[str], None]) -> b
     if finished:
         say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")
     return finished
-
-
-def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:
-    options = capture.options
-    return cleaner(options.render_settings, say, options.config.appearance)
 
 
 def with_poses(
@@ -365,7 +354,7 @@ def with_choices(
     say: Callable[[str], None],
     time: TrialTime | None = None,
 ) -> RunOptions:
-    """Choose the settings whose option is auto, judge a lens or shutter to learn, and say what was found.
+    """Choose the settings whose option is auto, judge what parts want tried out, and say what was found.
 
     Short trainings end when `time` is over.
     """
@@ -375,7 +364,8 @@ def with_choices(
             say(Told(f"{option_flag(name)} {remedy.value}: {remedy.reason}", remedy.reason))
         return replace(options, config=options.config.changed(**{name: remedy.value}))
 
-    if undecided := [name for name in names if name != TRIED]:
+    tried = {part.tried: part for part in parts().values() if part.tried}
+    if undecided := [name for name in names if name not in tried]:
         with progress_bar(console, "") as bar:
             progress = photos_read(bar, lambda: False)
             remedies = remedies_for(
@@ -383,23 +373,22 @@ def with_choices(
             )
         for name, remedy in remedies.items():
             options = take(options, name, remedy)
-    asked = "" if TRIED in names else getattr(options.config, TRIED)
-    if TRIED in names or (asked in NEED_TRIALS and not (options.resume and options.folder.exists())):
+    is_new = not (options.resume and options.folder.exists())
+    for name, part in tried.items():
+        asked = "" if name in names else options.config.flat()[name]
+        if asked and not (is_new and part.needs_trial(asked)):
+            continue
         with progress_bar(console, "") as bar:
-            task = bar.add_task("short trainings", total=None)
-            chosen = chosen_by_pilots(
-                options,
-                reader,
-                lambda total: bar.update(task, advance=1, total=total),
-                asked,
-                *(() if time is None else (time.is_over,)),
-            )
-        options = take(
-            replace(options, records={**options.records, **chosen.record}),
-            TRIED,
-            Remedy(chosen.value, chosen.reason),
-        )
+            advance = functools.partial(_advance, bar, bar.add_task("short trainings", total=None))
+            limit = () if time is None else (time.is_over,)
+            chosen = chosen_by_pilots(part, options, reader, advance, asked, *limit)
+        options = replace(options, records={**options.records, **chosen.record})
+        options = take(options, name, Remedy(chosen.value, chosen.reason))
     return options
+
+
+def _advance(bar: Bar, task: TaskID, total: int) -> None:
+    bar.update(task, advance=1, total=total)
 
 
 def _either(first: Callable[[], bool], second: Callable[[], bool]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -113,6 +113,7 @@ class Dataset:
             DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.
         """
         path, capture, headers, placed = reader.path, reader.capture, reader.headers, reader.placed(points)
+        settings = with_own_files(settings, path)
         notes = list(placed.notes)
         placed_frames = placed.frames if settings.lens == "undistort" else whole_panoramas(placed.frames)
         listed = _listed(path, placed_frames, settings)
@@ -126,7 +127,8 @@ class Dataset:
             View.stored(camera, partial(store.read, source), frame.name)
             for frame, (source, camera, _) in zip(frames, made, strict=True)
         ]
-        if (region := _region(path, settings, placed.origin)) is not None:
+        region = Region.of_numbers(settings.region).moved(-placed.origin) if settings.region else None
+        if region is not None:
             views, notes = list(views_of_region(views, region)), [*notes, OnlyInRegion()]
         notes += _lens_notes(frames, sources, [rescaled for _, _, rescaled in made])
         notes += _shutter_notes(frames, [camera for _, camera, _ in made], settings)
@@ -201,13 +203,22 @@ def load_dataset(
     return Dataset.of(CaptureReader(path), settings, points=points)
 
 
-def _region(path: Path, settings: DataSettings, origin: Float64[np.ndarray, "3"]) -> Region | None:
-    """Return the region of interest in the dataset's coordinates; None if there is none."""
+def with_own_files(settings: DataSettings, path: Path) -> DataSettings:
+    """Return settings with what the capture's own files say: the photos that it leaves out, and its region.
+
+    Args:
+        settings: What they give counts instead.
+        path: The capture.
+
+    Raises:
+        DatasetError: a file is damaged or cannot be read.
+    """
+    if settings.left_out is None and settings.train_views is None:
+        settings = replace(settings, left_out=read_left_out(path))
     if settings.region is None:
-        found = read_region(path)
-    else:
-        found = Region.of_numbers(settings.region) if settings.region else None
-    return None if found is None else found.moved(-origin)
+        region = read_region(path)
+        settings = replace(settings, region=() if region is None else region.numbers)
+    return settings
 
 
 def _listed(path: Path, frames: Sequence[Frame], settings: DataSettings) -> Sequence[Frame]:
@@ -340,8 +351,7 @@ def _used(
     """Return the frames that are not left out, with their parts, and report the others."""
     if settings.train_views is not None:
         return list(frames), list(parts)
-    listed = read_left_out(path) if settings.left_out is None else settings.left_out
-    out = [is_left_out(frame, path, listed) for frame in frames]
+    out = [is_left_out(frame, path, settings.left_out or ()) for frame in frames]
     if any(out):
         notes.append(LeftOutPhotos(sum(out), len(frames), frames[out.index(True)].name))
     kept = [part for part, gone in zip(parts, out, strict=True) if not gone]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from msgspec import Meta
 from PIL import Image, ImageDraw
 
-from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.records import Record, record_of
 from gsplat_edu.base.text import legible
 
 MOST_SHAPES, MOST_NUMBERS, LARGEST = 500, 4000, 100_000
@@ -21,18 +22,26 @@ BRUSH = "brush:"
 """Begins the text of a stroke, before its radius and its points."""
 
 
-@dataclass(frozen=True)
-class BrushStroke:
+class BrushStroke(Record, frozen=True, rename={"radius": "brush"}):
     """What a round brush covers on its way.
 
     Args:
         radius: Radius of the brush, px, at least 1.
         points: x and y of each point of the way, px of the upright photo; they may lie outside it. One point is a
             disc.
+
+    Raises:
+        ArgumentError: a point lacks its y, or there are none or too many.
     """
 
-    radius: int
-    points: tuple[int, ...]
+    radius: Annotated[int, Meta(ge=1, le=LARGEST)]
+    points: tuple[Annotated[int, Meta(ge=-LARGEST, le=LARGEST)], ...]
+
+    def __post_init__(self) -> None:
+        """Check the number of points."""
+        count = len(self.points)
+        if not count or count % 2 or count > MOST_NUMBERS:
+            raise ArgumentError(f"has {count} numbers, but a stroke needs x and y of each point")
 
 
 Shape = tuple[int, ...] | BrushStroke
@@ -61,33 +70,18 @@ def checked_shape(found: object) -> Shape:
     Raises:
         DatasetError: it is no shape.
     """
-    if isinstance(found, dict):
-        return _checked_stroke(found)
-    if not isinstance(found, list | tuple) or not _whole(found, 0):
-        raise DatasetError(f"shape: has to be a list of whole numbers from 0 to {LARGEST}, or a stroke")
-    if len(found) < 4 or len(found) % 2 or len(found) > MOST_NUMBERS:
+    try:
+        shape: Shape = record_of(
+            "shape", found, BrushStroke | tuple[Annotated[int, Meta(ge=0, le=LARGEST)], ...]
+        )
+    except ArgumentError as error:
+        raise DatasetError(str(error)) from None
+    if isinstance(shape, tuple) and (len(shape) < 4 or len(shape) % 2 or len(shape) > MOST_NUMBERS):
         raise DatasetError(
-            f"shape: has {len(found)} numbers, but needs x and y of two corners of a rectangle, or of three or more "
+            f"shape: has {len(shape)} numbers, but needs x and y of two corners of a rectangle, or of three or more "
             "of a polygon"
         )
-    return tuple(found)
-
-
-def _checked_stroke(found: dict[Any, Any]) -> BrushStroke:
-    if set(found) != {"brush", "points"}:
-        raise DatasetError("shape: a stroke has to have brush, its radius, and points, and nothing else")
-    radius, points = found["brush"], found["points"]
-    if not _whole([radius], 1):
-        raise DatasetError(f"shape: brush: has to be a whole number from 1 to {LARGEST}, the radius in px")
-    if not isinstance(points, list | tuple) or not _whole(points, -LARGEST):
-        raise DatasetError(f"shape: points: has to be whole numbers from {-LARGEST} to {LARGEST}")
-    if not points or len(points) % 2 or len(points) > MOST_NUMBERS:
-        raise DatasetError(f"shape: has {len(points)} numbers, but a stroke needs x and y of each point")
-    return BrushStroke(radius, tuple(points))
-
-
-def _whole(numbers: Sequence[object], least: int) -> bool:
-    return all(type(n) is int and least <= n <= LARGEST for n in numbers)
+    return shape
 
 
 def shape_text(shape: Shape) -> str:

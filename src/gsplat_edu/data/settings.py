@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import float64_array, in_range, one_of, whole_number
@@ -70,3 +72,31 @@ class DataSettings:
         whole_number("image_memory", self.image_memory, 0)
         if self.train_views is not None and not self.train_views:
             raise ArgumentError("train_views: is empty; name at least one view, or give None for all")
+
+    def completed(self, own: DataSettings) -> DataSettings:
+        """Return the settings with those of `own` where they would use the capture's own files."""
+        names = ("region",) if self.train_views is not None else ("left_out", "region")
+        given: dict[str, Any] = {name: getattr(own, name) for name in names if getattr(self, name) is None}
+        return replace(self, **given)
+
+    def record(self) -> dict[str, Any]:
+        """Return the settings of a run by name, for config.json: a region only if the run has one."""
+        record = asdict(self)
+        return record if self.region else {name: record[name] for name in record if name != "region"}
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> DataSettings:
+        """Return the settings of a run that `record` returned and JSON kept, which has lists for tuples.
+
+        Args:
+            record: May lack settings, which have their defaults then, and have other keys. One without a region has
+                none, even if its capture has got one since.
+
+        Raises:
+            ArgumentError: a value is out of range.
+            TypeError: a value has the wrong type.
+        """
+        known: dict[str, Any] = {"region": ()}
+        for name in (one.name for one in fields(cls) if one.name in record):
+            known[name] = tuple(record[name]) if isinstance(record[name], list) else record[name]
+        return cls(**known)

@@ -24,7 +24,6 @@ from gsplat_edu.survey.finding import (
     Finding,
     Severity,
     command,
-    counted,
 )
 from gsplat_edu.survey.residuals import Residual
 from gsplat_edu.survey.trained import FAINT, Trained, far_below, logged, mean_psnr
@@ -32,9 +31,6 @@ from gsplat_edu.survey.trained import FAINT, Trained, far_below, logged, mean_ps
 FITTED = 27.0
 """Blame a photo for its low PSNR only if the training views' median PSNR is at least this, dB; otherwise the scene is
 too small or too little trained. 18 photos of `fern` with 45,000 Gaussians had a mean of 25.8, `snowmiku97` has 29."""
-
-VEILED = 0.02
-"""Warn if near splats cover more than this fraction of a view's pixels: a spot of a seventh of its width and height."""
 
 FAINT_SHARE = 0.4
 """Report faint splats when their share exceeds this. Three runs of 2,000 iterations had 0.1 to 0.33."""
@@ -51,7 +47,6 @@ def examine_run(run: Trained, parts: Sequence[Examined] = ()) -> Diagnosis:
         ("length", _length(run)),
         ("outliers", _outliers(run)),
         ("test views", _gap(run)),
-        ("floaters", _floaters(run)),
         *([("cut-outs", _spilled(run))] if _outsides(run) else []),
         ("splats", _splats(run)),
         *(check for part in parts for check in part.checks.items()),
@@ -235,21 +230,6 @@ def _gap(run: Trained) -> list[Finding]:
     advice = Told(f"{photos}; {rest} lower --max-gaussians", f"{photos}; {rest} train with fewer splats")
     options, changes = (("max_gaussians", str(fewer)),), (MORE_PHOTOS, SHORTER, FEWER_SPLATS)
     return [Finding("overfitted", Severity.WARNING, what, advice, options=options, changes=changes)]
-
-
-def _floaters(run: Trained) -> list[Finding]:
-    veiled = sorted((v for v in (*run.train, *run.test) if v.veiled > VEILED), key=lambda view: -view.veiled)
-    if not veiled:
-        return []
-    names = tuple(view.name for view in veiled)
-    shares = tuple(f"{100 * view.veiled:.0f} %" for view in veiled)
-    what = f"{counted(len(veiled), 'view')} with splats floating close to the camera"
-    fewer = "they are fewer with real start points and no exposure jumps"
-    advice = Told(
-        f"remove them with gsplat-edu clean, or train with --clean; {fewer}",
-        f"remove them with Clean under Share; {fewer}",
-    )
-    return [Finding("floaters", Severity.WARNING, what, advice, names, shares)]
 
 
 def _outsides(run: Trained) -> list[tuple[Residual, float]]:

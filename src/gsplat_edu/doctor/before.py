@@ -21,7 +21,6 @@ from gsplat_edu.doctor.cameras import (
     check_wrong_poses,
 )
 from gsplat_edu.doctor.cloud import check_cloud
-from gsplat_edu.doctor.cut_out import check_masks
 from gsplat_edu.doctor.diagnosis import Advice, Diagnosis, in_order, new_run
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
 from gsplat_edu.survey.capture import Survey
@@ -46,7 +45,6 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("coverage", check_coverage),
     ("duplicates", check_duplicates),
     ("cloud", check_cloud),
-    ("masks", check_masks),
     ("resolution", check_resolution),
 )
 """Checks that compare views; they need at least two."""

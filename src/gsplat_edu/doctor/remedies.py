@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import option_flag
-from gsplat_edu.doctor.cut_out import outside_masks_of
 from gsplat_edu.survey.capture import Undecided
 from gsplat_edu.survey.finding import Remedy
 from gsplat_edu.train.part import parts
@@ -27,8 +26,6 @@ def remedies_for(capture: Undecided, names: Sequence[str]) -> dict[str, Remedy]:
 
 
 def _remedy(capture: Undecided, name: str) -> Remedy:
-    if name == "outside_masks":  # it needs no part
-        return outside_masks_of(capture.survey)
     for part in parts().values():
         remedy: Remedy | None = part.choose(name, capture)
         if remedy is not None:

@@ -83,7 +83,10 @@ OFFERED = {
     "time_limit": Plain("Time instead of a quality", group=LENGTH, example="30m"),
     "max_memory": Plain("Memory limit", group=LENGTH, example="8GiB"),
     "resolution": Plain(
-        "Size of the photos: 2 for half, longest side in px, or auto", group=LENGTH, example="full size"
+        "Size of the photos: 2 for half, longest side in px, or auto",
+        group=LENGTH,
+        example="full size",
+        again="Train with smaller photos",
     ),
     "lens": Plain(
         "Lens",
@@ -375,6 +378,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         background=config.background if flattened else None,
         image_memory=DataSettings.image_memory if arguments.image_memory is None else arguments.image_memory,
         lens=arguments.lens or DataSettings.lens,
+        region=() if config.region == "none" else None,
     )
     return RunOptions(
         data=arguments.data,
@@ -388,6 +392,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
         resume=arguments.resume,
+        asked=("floaters",) if arguments.clean else (),
     )
 
 

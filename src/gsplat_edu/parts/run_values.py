@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,21 @@ class Captured:
     say: Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Tried:
+    """The value of a setting that short trainings chose or judged.
+
+    Args:
+        value: The value.
+        reason: Why, as a clause.
+        record: Entries of config.json; empty if no training was judged.
+    """
+
+    value: str
+    reason: str
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False)
 class Added:
     """What a part adds to the start of a training.
@@ -54,6 +69,38 @@ class Added:
 
     gaussians: Gaussians | None = None
     shell: Shell | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Unwritten:
+    """A scene that is trained and not written yet.
+
+    Args:
+        gaussians: The scene, as the parts before left it.
+        dataset: The capture as the parts' `learned` returned it.
+        settings: The run's render settings.
+        is_asked: Whether `gsplat_edu.runs.options.RunOptions.asked` names the part.
+        say: Receives sentences for the user.
+    """
+
+    gaussians: Gaussians
+    dataset: Dataset
+    settings: RenderSettings
+    is_asked: bool
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Revised:
+    """What a part makes of a trained scene.
+
+    Args:
+        gaussians: The scene.
+        facts: Entries of metrics.json.
+    """
+
+    gaussians: Gaussians
+    facts: Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,8 @@
-"""Clean a scene file or the scene of a run: its capture, the report, the preview."""
+"""Clean a scene file or the scene of a run: its capture, the preview."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,12 @@ import torch
 
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.clean.guard import Cleaning, clean
+from gsplat_edu.clean.guard import Cleaning
 from gsplat_edu.clean.judge import Reason
 from gsplat_edu.data.dataset import Dataset, load_dataset
-from gsplat_edu.evaluate.metrics import SPILLED
 from gsplat_edu.io.formats import FORMATS
-from gsplat_edu.parts.exposure.photos import at_exposure_of_scene
-from gsplat_edu.render.api import render
+from gsplat_edu.parts.exposure.photos import as_corrected
 from gsplat_edu.render.backend import Backend
-from gsplat_edu.render.backends import load_backend
-from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import appearance_of, run_dataset
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
@@ -86,48 +81,13 @@ def open_subject(path: Path, dataset: Path | None, backend: Backend) -> Subject:
             raise ArgumentError(f"{capture.path} is not the capture of {run.path}: {found}")
         gaussians = source.scene.gaussians
         appearance = appearance_of(run.read_config())
-        capture = _at_exposure(capture, gaussians, source.settings, appearance, backend)
+        capture = as_corrected(capture, gaussians, source.settings, appearance, backend)
     cameras = _cameras(capture)
     up = source.scene.up or capture_up(capture)
     held_out = frozenset(view.name for view in capture.test)
     origin = as_origin("origin", capture.origin)
     scene = replace(source.scene, gaussians=gaussians, up=up, origin=origin)
     return Subject(replace(source, scene=scene, cameras=cameras, held_out=held_out), capture)
-
-
-def _at_exposure(
-    dataset: Dataset, gaussians: Gaussians, settings: RenderSettings, appearance: str, backend: Backend
-) -> Dataset:
-    """Return the dataset with photos at the scene's exposure; unchanged if the training corrected no exposures."""
-    if appearance == "none":
-        return dataset
-    shown = functools.partial(render, settings=settings, backend=backend)
-    vignetting = appearance == "vignetting"
-    return at_exposure_of_scene(dataset, gaussians, shown, settings.background, vignetting=vignetting)
-
-
-def cleaner(
-    settings: RenderSettings, say: Callable[[str], None], appearance: str = "none"
-) -> Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]:
-    """Return the function that `gsplat_edu.runs.training.CaptureRun.finish` cleans the scene with.
-
-    Args:
-        settings: The scene's render settings.
-        say: Receives the report, line by line.
-        appearance: The training's setting `appearance`. Unless it is "none", photos are converted to the scene's
-            exposure first.
-    """
-    backend = load_backend("cpu")
-
-    def cleaned(gaussians: Gaussians, dataset: Dataset) -> tuple[Gaussians, dict[str, Any]]:
-        here = gaussians.to(torch.device("cpu"))
-        photos = _at_exposure(dataset, here, settings, appearance, backend)
-        cleaning = clean(here, photos.train, photos.test, settings, backend=backend)
-        for line in report_lines(cleaning):
-            say(line)
-        return cleaning.apply(gaussians), document(cleaning)
-
-    return cleaned
 
 
 def default_target(path: Path) -> Path:
@@ -139,54 +99,6 @@ def default_target(path: Path) -> Path:
     name = path.name
     suffix = next((known.suffix for known in FORMATS if name.lower().endswith(known.suffix)), path.suffix)
     return path.with_name(f"{name[: len(name) - len(suffix)]}.clean.ply")
-
-
-def report_lines(cleaning: Cleaning) -> list[str]:
-    """Describe a cleaning: counts by reason, PSNR before and after, and what the guard took back.
-
-    Args:
-        cleaning: The cleaning.
-    """
-    counts, judged = cleaning.counts(), int((cleaning.judged != Reason.KEPT).sum())
-    total, removed = len(cleaning.reasons), sum(counts.values())
-    text = [f"removed {removed:,} of {total:,} splats, judged by {cleaning.views} views"]
-    text += [f"  {count:9,}  {reason.sentence}" for reason, count in counts.items()]
-    which = "held-out" if cleaning.held_out else "training"
-    if not cleaning.held_out:
-        text.append("no view is held out, so the training views guard, whose PSNR is weaker evidence")
-    if cleaning.before is None or cleaning.after is None:
-        text.append("PSNR: no view has a pixel that counts")
-        return text
-    if removed < judged:
-        assert cleaning.all_removed is not None
-        text.append(
-            f"{judged:,} were judged removable, but without them PSNR would be {cleaning.all_removed:.2f} dB:"
-            f" kept the {judged - removed:,} least certain"
-        )
-    change = cleaning.after - cleaning.before
-    text.append(
-        f"PSNR of {cleaning.guards} {which} views: {cleaning.before:.2f} dB before,"
-        f" {cleaning.after:.2f} dB after ({change:+.3f} dB)"
-    )
-    if cleaning.outside is not None and cleaning.outside > SPILLED:
-        text.append(
-            f"{100 * cleaning.outside:.0f} % of the scene's solid area still lies outside of what the photos cut out,"
-            " where their alpha is 0; train again without --white-background and --background"
-        )
-    return text
-
-
-def document(cleaning: Cleaning) -> dict[str, Any]:
-    """Return the entry for metrics.json."""
-    counts = {reason.name.lower(): count for reason, count in cleaning.counts().items()}
-    return {
-        "removed": counts,
-        "judged": int((cleaning.judged != Reason.KEPT).sum()),
-        "psnr_before": cleaning.before,
-        "psnr_after": cleaning.after,
-        "held_out": cleaning.held_out,
-        "outside_cut_outs": cleaning.outside,
-    }
 
 
 def preview(source: Source, cleaning: Cleaning) -> Source:

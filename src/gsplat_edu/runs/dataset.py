@@ -12,19 +12,6 @@ from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset, DataSettings
 from gsplat_edu.data.reader import CaptureReader
 
-KEYS = (
-    "resolution",
-    "test_every",
-    "background",
-    "image_memory",
-    "train_views",
-    "test_views",
-    "lens",
-    "left_out",
-    "region",
-)
-"""Keys of the section "data" that are data settings."""
-
 
 def appearance_of(config: Mapping[str, Any]) -> str:
     """Return the setting `appearance` from a run's config.json: one of `APPEARANCES`."""
@@ -49,11 +36,8 @@ def data_settings(config: dict[str, Any]) -> DataSettings:
     section = config.get("data")
     if not isinstance(section, dict):
         raise CheckpointError("config.json: the section data is missing; restore it or train again")
-    # a run without a region does not use one that its capture got later
-    values = {"region": ()} | {key: section[key] for key in KEYS if key in section}
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
     try:
-        return as_trained(DataSettings(**values), appearance_of(config))
+        return as_trained(DataSettings.of_record(section), appearance_of(config))
     except (ArgumentError, TypeError) as error:
         raise CheckpointError(f"config.json: data: {error}; fix the file") from None
 

@@ -24,7 +24,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.records import ABSENT, Absent, Number, Record, present, record_of
 from gsplat_edu.base.validation import ArrayLike, float64_array, quoted
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.fields import CONFIG, LOG, MESH, METRICS, checked
@@ -355,26 +356,41 @@ def _camera_entry(index: int, view: View, split: str, shift: np.ndarray) -> dict
     }
 
 
-def _camera(where: str, entry: object, shift: np.ndarray) -> tuple[str, str, Camera]:
-    if not isinstance(entry, dict):
-        raise CheckpointError(f"{where}: is not a JSON object; write the file again or remove it")
+Numbers = tuple[Number, Number, Number]
+
+
+class _Camera(Record, frozen=True, forbid_unknown_fields=False):
+    """An entry of cameras.json; `with_lens` reads the lens and the shutter."""
+
+    width: int
+    height: int
+    position: Numbers
+    rotation: tuple[Numbers, Numbers, Numbers]
+    fx: Number
+    fy: Number
+    cx: Number | Absent = ABSENT
+    cy: Number | Absent = ABSENT
+    img_name: str = ""
+    split: Literal["train", "test"] = "train"
+
+
+def _camera(where: str, entry: Any, shift: np.ndarray) -> tuple[str, str, Camera]:  # noqa: ANN401
     try:
-        width, height = entry["width"], entry["height"]
-        rotation = np.asarray(entry["rotation"], dtype=np.float64)
-        eye = float64_array("position", entry["position"], (3,))
+        one: _Camera = record_of("", entry, _Camera)
+        cx, cy = present(one.cx), present(one.cy)
         camera = Camera(
-            rotation.T,
-            eye - shift if shift.any() else eye,
-            entry["fx"],
-            entry["fy"],
-            entry.get("cx", (width - 1) / 2),
-            entry.get("cy", (height - 1) / 2),
-            height,
-            width,
+            np.array(one.rotation).T,
+            np.array(one.position) - shift if shift.any() else np.array(one.position),
+            one.fx,
+            one.fy,
+            (one.width - 1) / 2 if cx is None else cx,
+            (one.height - 1) / 2 if cy is None else cy,
+            one.height,
+            one.width,
         )
         camera = with_lens(camera, entry)
     except KeyError as error:
         raise CheckpointError(f"{where}: lacks {error}; write the file again or remove it") from None
     except (ValueError, TypeError, OverflowError) as error:
         raise CheckpointError(f"{where}: {error}; write the file again or remove it") from None
-    return str(entry.get("img_name", "")), str(entry.get("split", "train")), camera
+    return one.img_name, one.split, camera

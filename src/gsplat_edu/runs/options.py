@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.base.validation import whole_number
+from gsplat_edu.base.validation import one_of, whole_number
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.part import OWN_PARTS, PLUGGED_PARTS
 
 
 @dataclass(frozen=True)
@@ -32,10 +33,11 @@ class RunOptions:
             at any time.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
         resume: Continue from the last checkpoint of the folder.
+        asked: Parts that change the trained scene because the user asked for it; config.json does not have them.
         records: What led to the options, for config.json by its key there: short trainings, facts about the photos.
 
     Raises:
-        ArgumentError: a number is out of range.
+        ArgumentError: a number is out of range, or `asked` names no part.
     """
 
     data: Path
@@ -49,14 +51,15 @@ class RunOptions:
     eval_every: int = 1_000
     save_every: int = 500
     resume: bool = False
+    asked: tuple[str, ...] = ()
     records: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         for name in ("eval_every", "save_every"):
             whole_number(name, getattr(self, name), 0)
-        if self.config.region == "none":
-            object.__setattr__(self, "data_settings", replace(self.data_settings, region=()))
+        for name in self.asked:
+            one_of("asked", name, (*OWN_PARTS, *PLUGGED_PARTS))
 
     @property
     def folder(self) -> RunFolder:

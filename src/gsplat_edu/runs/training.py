@@ -19,16 +19,14 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.files import check_folder, remove_leftovers
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import stored_path
-from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.dataset import Dataset, with_own_files
 from gsplat_edu.data.depths import depth_name
-from gsplat_edu.data.left_out import read_left_out
 from gsplat_edu.data.reader import CaptureReader
-from gsplat_edu.data.region import read_region
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.evaluate.verdict import FULL_LENGTH, USUAL
 from gsplat_edu.io.formats import write_scene
-from gsplat_edu.parts.run_values import Captured, Finished
+from gsplat_edu.parts.run_values import Captured, Finished, Unwritten
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained, data_settings, reader_for
 from gsplat_edu.runs.evaluation import Evaluation, Progress, ScoredViews, evaluate_run
@@ -66,14 +64,11 @@ from gsplat_edu.train.trainer import Callback, Trainer
 
 def document(options: RunOptions) -> dict[str, Any]:
     """Return the part of config.json that a run's options determine."""
-    data = dataclasses.asdict(options.data_settings)
-    if not data["region"]:
-        del data["region"]  # as in the runs of older versions
     return {
         "version": version("gsplat-edu"),
         "data": {
             "path": str(options.data.resolve()),
-            **data,
+            **options.data_settings.record(),
             "points": None if options.points is None else str(options.points.resolve()),
             "scene": None if options.scene is None else str(scene_file(options.scene).resolve()),
             **({} if options.depth is None else {"depth": depth_name(options.depth)}),
@@ -90,22 +85,15 @@ def document(options: RunOptions) -> dict[str, Any]:
 Export = Callable[[Source], list[dict[str, Any]]]
 """Writes a scene in further formats and returns a record of each file: "path", "psnr" and more."""
 
-Clean = Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]
-"""Removes splats from a scene, and returns the others and a record of the removal."""
-
 
 def _with_own_files(options: RunOptions) -> RunOptions:
-    """Return the options with the left-out photos and the region of config.json, else of the capture's own files."""
-    settings, folder, changes = options.data_settings, options.folder, dict[str, Any]()
-    stored = data_settings(folder.read_config()) if folder.exists() else None
-    is_here = options.data.exists()
-    if settings.left_out is None and settings.train_views is None:
-        here = read_left_out(options.data) if stored is None and is_here else None
-        changes["left_out"] = here if stored is None else stored.left_out
-    if settings.region is None:
-        region = read_region(options.data) if stored is None and is_here else None
-        changes["region"] = (() if region is None else region.numbers) if stored is None else stored.region
-    return dataclasses.replace(options, data_settings=dataclasses.replace(settings, **changes))
+    """Return the options with what the files of the capture say of its photos: as in config.json, else as it is now."""
+    settings, folder = options.data_settings, options.folder
+    if folder.exists():
+        settings = settings.completed(data_settings(folder.read_config()))
+    elif options.data.exists():
+        settings = with_own_files(settings, options.data)
+    return dataclasses.replace(options, data_settings=settings)
 
 
 def _checked_folder(options: RunOptions) -> RunOptions:
@@ -441,7 +429,6 @@ class CaptureRun:
         self,
         progress: Progress | None = None,
         export: Export | None = None,
-        clean: Clean | None = None,
         full_length: int | None = None,
     ) -> Evaluation:
         """Write the scene, in other formats too if `export` is given, and score it on the test and training views.
@@ -451,7 +438,6 @@ class CaptureRun:
         Args:
             progress: Called for every scored view.
             export: Called with the written scene; metrics.json and the report get its result as "exports".
-            clean: Called with the scene and the capture first; metrics.json gets its record as "cleaning".
             full_length: Iterations that the run would have without a time limit; None for those of its configuration.
         """
         trainer, dataset, config = self.trainer, self.dataset, self.options.config
@@ -464,8 +450,8 @@ class CaptureRun:
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         facts[FULL_LENGTH] = full_length or config.iterations
         facts[USUAL] = usual_size(config, dataset)
-        if clean is not None:
-            gaussians, facts["cleaning"] = clean(gaussians, learned)
+        gaussians, revisions = self._revised(gaussians, learned)
+        facts |= revisions
         path = self.folder.scene(trainer.iteration)
         write_scene(path, capture_scene(gaussians, dataset, self.options.render_settings.antialiased))
         if export is not None:
@@ -496,6 +482,15 @@ class CaptureRun:
             facts,
             progress,
         )
+
+    def _revised(self, gaussians: Gaussians, learned: Dataset) -> tuple[Gaussians, dict[str, Any]]:
+        """Return the scene as the parts revise it, and entries of metrics.json."""
+        options, facts = self.options, dict[str, Any]()
+        for name, part in parts().items():
+            scene = Unwritten(gaussians, learned, options.render_settings, name in options.asked, self._say)
+            if (revised := part.revise(options.config.settings_of(name), scene)) is not None:
+                gaussians, facts = revised.gaussians, {**facts, **revised.facts}
+        return gaussians, facts
 
     @contextmanager
     def clock_stopped(self) -> Iterator[None]:

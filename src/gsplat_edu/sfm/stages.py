@@ -67,6 +67,29 @@ FACTS: Mapping[str, type[Facts]] = {
 }
 
 
+class _Stage(Record, frozen=True, forbid_unknown_fields=False):
+    options: dict[str, Any]
+    facts: Any
+
+
+class _File(Record, frozen=True, forbid_unknown_fields=False):
+    stages: dict[str, Any]
+
+
+def read_stages(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the stages in a file, each with "options" and "facts".
+
+    Raises:
+        ArgumentError: the file does not have them; the message names the field.
+        OSError: the file cannot be read.
+        ValueError: the file is not JSON.
+    """
+    file: _File = record_of("", parse_json(read_text(path)), _File)
+    for name, stage in file.stages.items():
+        record_of(f"stages.{name}", stage, _Stage)
+    return file.stages
+
+
 class Stages:
     """The stages of a run, stored in a file that is always complete.
 
@@ -86,15 +109,11 @@ class Stages:
         self._stages: dict[str, dict[str, Any]] = {}
         if path.is_file():
             try:
-                self._stages = parse_json(read_text(path))["stages"]
-                if not all(
-                    {"options", "facts"} <= stage.keys() and isinstance(stage["options"], dict)
-                    for stage in self._stages.values()
-                ):
-                    raise ValueError
-            except (ValueError, KeyError, TypeError, AttributeError):
+                self._stages = read_stages(path)
+            except ValueError as error:
+                reason = error if isinstance(error, ArgumentError) else "is not JSON"
                 raise DatasetError(
-                    f"{path}: is damaged; remove {path.parent} and run the same command again"
+                    f"{path}: {reason}; remove {path.parent} and run the same command again"
                 ) from None
 
     @property

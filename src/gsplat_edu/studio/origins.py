@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.record import Job, State
 from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.sfm.photos import fingerprint, photo_files
+from gsplat_edu.sfm.stages import read_stages
 from gsplat_edu.studio.commands import photos_source
 from gsplat_edu.studio.library import Library, scene_file
 from gsplat_edu.studio.renaming import FormerNames
@@ -179,10 +179,10 @@ def _with_digest(library: Library, stages: Path, photos: Sequence[Mapping[str, A
 def _digests_in(stages: Path, modified: int, size: int) -> frozenset[str]:
     """Read the digests in a file of stages once for each of its states."""
     try:
-        found = parse_json(read_text(stages))["stages"]
-        options = [found[stage]["options"].get(name) for stage, name in _DIGESTS.items() if stage in found]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        found = read_stages(stages)
+    except (OSError, ValueError):
         return frozenset()
+    options = [found[stage]["options"].get(name) for stage, name in _DIGESTS.items() if stage in found]
     return frozenset(digest for digest in options if isinstance(digest, str))
 
 

@@ -9,24 +9,17 @@ from urllib.parse import quote
 
 from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.jobs.events import Found
+from gsplat_edu.options.train import OFFERED
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.studio.origins import renamed_capture
 from gsplat_edu.studio.state import Studio
+from gsplat_edu.train.config import BY_NAME
 
-LABELS = {
-    "appearance": "Train with exposure correction",
-    "iterations": "Train longer",
-    "max_gaussians": "Train with {value} splats at most",
-    "outside_masks": "Train with the other choice for masks",
-    "refine": "Train and refine the poses",
-    "resolution": "Train with smaller photos",
-    "sky": "Train with a sky",
-    "transients": "Train and mask what moved",
-}
+LABELS = {name: plain.again for name, plain in OFFERED.items() if plain is not None and plain.again}
 """Words of a button by the option that its training changes."""
 
-WHOLE = ("iterations", "max_gaussians")
+WHOLE = frozenset(name for name in LABELS if name in BY_NAME and not BY_NAME[name].names)
 """Options whose values are whole numbers."""
 
 LENGTHS = ("quality", "iterations", "time_limit")

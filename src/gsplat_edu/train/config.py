@@ -105,7 +105,7 @@ class TrainConfig:
         Whole(1),
         "Number of images to train on; a step renders `batch` of them.",
         "2023",
-        option=Option(plain=Plain("Iterations instead of a quality", group=LENGTH)),
+        option=Option(plain=Plain("Iterations instead of a quality", group=LENGTH, again="Train longer")),
     )
     batch: int = number(
         1, Whole(1, 4096), "Views of a step; rates grow with its root.", "Zhao et al. 2024", option=Option()
@@ -189,6 +189,7 @@ class TrainConfig:
                     "none": "keep as photographed",
                 },
                 PHOTOS,
+                again="Train with exposure correction",
             ),
         ),
     )
@@ -206,6 +207,7 @@ class TrainConfig:
                     "none": "treat it like the rest",
                 },
                 PHOTOS,
+                again="Train with a sky",
             ),
         ),
     )
@@ -227,6 +229,7 @@ class TrainConfig:
                     "all": "correct poses, lenses and rolling shutters",
                 },
                 PHOTOS,
+                again="Train and refine the poses",
             ),
         ),
     )
@@ -240,6 +243,7 @@ class TrainConfig:
                 "What moved between the photos",
                 {"": "keep it", "mask": "leave it out", AUTO: "leave it out if there are enough photos"},
                 PHOTOS,
+                again="Train and mask what moved",
             ),
         ),
     )
@@ -257,6 +261,7 @@ class TrainConfig:
                     "ignore": "ignore: the masks hide something in front",
                 },
                 PHOTOS,
+                again="Train with the other choice for masks",
             ),
         ),
     )
@@ -332,7 +337,7 @@ class TrainConfig:
         None,
         _cap,
         "Cap on the number of Gaussians; mcmc and fast require one.",
-        option=Option(plain=Plain("Splats at most", group=LENGTH)),
+        option=Option(plain=Plain("Splats at most", group=LENGTH, again="Train with {value} splats at most")),
     )
     densify_start: int = number(
         500, Whole(0), "Density control begins after this iteration.", "2023, 2024", milestone=True

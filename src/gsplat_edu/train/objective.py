@@ -30,10 +30,6 @@ FEW_VISIBLE = 0.25
 a third of the start's Gaussians, views of an aerial capture of a city a tenth
 (the earlier results that benchmarks/RESULTS.md names)."""
 
-OUTSIDE_WEIGHT = 0.3
-"""Weight of the mean alpha outside the masks of an object. 0.1 leaves 1.4 times the alpha outside, 3 costs 1.3 dB
-inside (benchmarks/RESULTS.md)."""
-
 
 @runtime_checkable
 class Term(Protocol):
@@ -107,8 +103,7 @@ def make_objective(
 ) -> Objective:
     """Make the objective of a configuration: the photo term, the regularisers of its strategy, and the parts' terms.
 
-    (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
-    if nothing is outside of masks + weight_e sum_outside(alpha) / (H W)
+    (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale)
 
     For fast, the opacity is averaged over the visible Gaussians if they are few. Adam moves a parameter by its full
     rate if all its gradients agree, however small they are. If each view shows a twentieth of the scene, invisible
@@ -128,8 +123,6 @@ def make_objective(
         terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
         terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, FEW_VISIBLE)
-    if config.outside_masks == "empty":
-        terms["outside"] = EmptyOutside(OUTSIDE_WEIGHT)
     return Objective(terms | dict(others or {}))
 
 
@@ -178,25 +171,6 @@ class MeanOpacity:
 
 
 @dataclass(frozen=True)
-class EmptyOutside:
-    """Keeps the scene empty where the capture's masks exclude pixels, as around an object that they cut out.
-
-    Args:
-        weight: lambda_e.
-    """
-
-    weight: float
-
-    def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
-        """Return weight sum_outside(1 - T) / (H W), with the transmittance T; 0 if the photo has no mask."""
-        transmittance, outside = rendered.output.transmittance, rendered.target.outside
-        if outside is None:
-            return transmittance.new_zeros(())
-        value: Tensor = _EmptyOutside.apply(transmittance, self.weight, outside)  # type: ignore[no-untyped-call]
-        return value
-
-
-@dataclass(frozen=True)
 class MeanScale:
     """Keeps scales small.
 
@@ -239,24 +213,6 @@ class _MeanOpacity(torch.autograd.Function):
 
     @staticmethod
     @first_derivative_only("the mean opacity", "weight * torch.sigmoid(logits).mean()")
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
-        (gradient,) = ctx.saved_tensors
-        return chained(gradient, grad), None, None
-
-
-class _EmptyOutside(torch.autograd.Function):
-    """Compute weight sum_outside(1 - T) / (H W), with the gradient -weight / (H W) outside; on one thread, as above."""
-
-    @staticmethod
-    def forward(ctx: Any, transmittance: Tensor, weight: float, outside: Tensor) -> Tensor:  # noqa: ANN401
-        with one_thread():
-            share = weight / max(transmittance.numel(), 1)
-            gradient = reusable_tensor(transmittance.shape, transmittance).copy_(outside).mul_(-share)
-            ctx.save_for_backward(gradient)
-            return (transmittance * gradient).sum() - gradient.sum()
-
-    @staticmethod
-    @first_derivative_only("the alpha outside masks", "weight * (1 - transmittance)[outside].sum()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return chained(gradient, grad), None, None

@@ -63,6 +63,29 @@ class Part:
         """
         return None
 
+    tried: ClassVar[str] = ""
+    """The setting that short trainings choose if it is auto; empty for none."""
+
+    def needs_trial(self, value: str) -> bool:
+        """Return whether short trainings also judge a value of `tried` that the user gave."""
+        return False
+
+    def try_out(self, asked: str, bench: Any) -> Any:  # noqa: ANN401
+        """Choose the value of `tried` by short trainings, or judge the value that the user gave.
+
+        Args:
+            asked: That value; "" chooses.
+            bench: Trains and scores, a `gsplat_edu.parts.bench.Bench`.
+
+        Returns:
+            A `gsplat_edu.parts.run_values.Tried`.
+
+        Raises:
+            ArgumentError: the backend cannot learn what was asked for.
+            OutOfTimeError: the bench's time is over (`gsplat_edu.parts.bench`).
+        """
+        raise NotImplementedError(f"{type(self).__name__}: tried is {self.tried!r}, but nothing tries it out")
+
     def judge(self, settings: Any, run: Any) -> Any:  # noqa: ANN401
         """Return what the doctor has to say of a run, a `gsplat_edu.survey.finding.Examined`; None for nothing.
 
@@ -149,6 +172,20 @@ class Part:
         """
         return dataset
 
+    def revise(self, settings: Any, scene: Any) -> Any:  # noqa: ANN401
+        """Return what the part makes of the scene before it is written, a `gsplat_edu.parts.run_values.Revised`.
+
+        None leaves the scene as it is.
+
+        Args:
+            settings: The run's `Settings`.
+            scene: The scene, a `gsplat_edu.parts.run_values.Unwritten`.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+        """
+        return None
+
     def finish(self, settings: Any, run: Any) -> Mapping[str, Any]:  # noqa: ANN401
         """Write what the part has to write into a run's folder; return entries of metrics.json.
 
@@ -182,8 +219,10 @@ OWN_PARTS = {
     "poses": "gsplat_edu.parts.poses.part:POSES",
     "exposure": "gsplat_edu.parts.exposure.part:EXPOSURE",
     "transients": "gsplat_edu.parts.transients.part:TRANSIENTS",
+    "empty_outside": "gsplat_edu.parts.empty_outside.part:EMPTY_OUTSIDE",
     "surface": "gsplat_edu.parts.surface.part:SURFACE",
     "given_depth": "gsplat_edu.parts.given_depth.part:GIVEN_DEPTH",
+    "floaters": "gsplat_edu.parts.floaters.part:FLOATERS",
 }
 """Entry points of our own parts, in the order in which they act: poses move a camera before its image is corrected."""
 

@@ -40,6 +40,7 @@ class Needs:
         depth: The mean depth, `RenderOutput.depth`.
         normals: The composited `gsplat_edu.render.planes.facing_normals`, `RenderOutput.features`, and the depth.
         median_depth: `RenderOutput.median_depth`.
+        outside: `gsplat_edu.train.feed.Target.outside`.
         every_pixel: Also pixels that the mask of the photo excludes.
         turns: The steps in which it reads any of that.
     """
@@ -47,12 +48,15 @@ class Needs:
     depth: bool = False
     normals: bool = False
     median_depth: bool = False
+    outside: bool = False
     every_pixel: bool = True
     turns: Turns = Turns()
 
     def at(self, iteration: int) -> Needs:
         """Return what is read in the step of an iteration."""
-        return self if self.turns.due(iteration) else Needs(every_pixel=self.every_pixel)
+        return (
+            self if self.turns.due(iteration) else Needs(outside=self.outside, every_pixel=self.every_pixel)
+        )
 
     def __or__(self, other: Needs) -> Needs:
         """Return what either reads, in every step."""
@@ -60,6 +64,7 @@ class Needs:
             self.depth or other.depth,
             self.normals or other.normals,
             self.median_depth or other.median_depth,
+            self.outside or other.outside,
             self.every_pixel or other.every_pixel,
         )
 

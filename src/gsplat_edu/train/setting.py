@@ -47,12 +47,14 @@ class Plain:
         words: Its values and what they mean; the value "" leaves the choice to the program. Empty: any text or number.
         group: Heading above the question.
         example: A value, for an option without `words`.
+        again: Words of a button that trains with another value, in which {value} stands for it; "" if there is none.
     """
 
     label: str
     words: Mapping[str, str] = field(default_factory=dict)
     group: str = "Further settings"
     example: str = ""
+    again: str = ""
 
 
 @dataclass(frozen=True)

@@ -106,11 +106,11 @@ class Trainer:
         self._callbacks = tuple(callbacks)
         drawn = config.random_background or config.alpha_background == "random"
         behind, device = None if drawn else config.background, gaussians.means.device
-        empty = config.outside_masks == "empty"
+        outside = parts.objective.needs(0).outside
         groups = gaussian_groups(config, extent)
         self.stepper = make_stepper(gaussians, backend, groups, parts, config.batch)
         room = self.stepper.photo_room
-        self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, room, empty)
+        self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, room, outside)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
     @property

@@ -7,11 +7,13 @@ from typing import Any
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.evaluate.report_parts import Section
+from gsplat_edu.parts.bench import Bench
 from gsplat_edu.parts.poses.capture import aligned_score, with_refined_cameras, write_refined
+from gsplat_edu.parts.poses.choice import chosen_refinement
 from gsplat_edu.parts.poses.findings import check_fit
 from gsplat_edu.parts.poses.refinement import NEED_LENSES, Refinement, refinement_of
 from gsplat_edu.parts.poses.trials import RefineTrials
-from gsplat_edu.parts.run_values import Finished, Reported
+from gsplat_edu.parts.run_values import Finished, Reported, Tried
 from gsplat_edu.survey.finding import Examined
 from gsplat_edu.survey.trained import Trained
 from gsplat_edu.train.config import TrainConfig
@@ -22,6 +24,21 @@ from gsplat_edu.train.trainer import Trainer
 
 class PosesPart(Part):
     """Refines poses, lenses and rolling shutters with the scene."""
+
+    tried = "refine"
+
+    def needs_trial(self, value: str) -> bool:
+        """Return whether a value learns a lens or a motion, which short trainings judge also where the user gave it."""
+        return value in NEED_LENSES
+
+    def try_out(self, asked: str, bench: Bench) -> Tried:
+        """Choose `refine` by short trainings, or judge the value that the user gave.
+
+        Raises:
+            ArgumentError: the backend cannot learn what was asked for.
+            OutOfTimeError: the trainings take too long.
+        """
+        return chosen_refinement(asked, bench)
 
     def judge(self, settings: TrainConfig, run: Trained) -> Examined:
         """Report training views that the scene does not fit."""

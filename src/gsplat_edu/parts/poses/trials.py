@@ -30,12 +30,13 @@ class RefineTrials:
     moving: Mapping[str, float] = field(default_factory=dict)
     asked: str = ""
 
-    def json(self) -> dict[str, Any]:
-        """Return the entry of config.json, rounded to 0.0001 dB."""
+    @property
+    def record(self) -> dict[str, Any]:
+        """The scores for config.json by their key there, rounded to 0.0001 dB."""
         scores = {
             name: {k: round(v, 4) for k, v in getattr(self, name).items()} for name in ("posed", "moving")
         }
-        return asdict(self) | scores
+        return {KEY: asdict(self) | scores}
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> RefineTrials | None:

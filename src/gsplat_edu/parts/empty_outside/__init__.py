@@ -1,0 +1,1 @@
+"""The scene kept empty where the masks of an object exclude pixels."""

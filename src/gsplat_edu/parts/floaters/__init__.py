@@ -1,0 +1,1 @@
+"""Splats that the photos do not support, removed from a trained scene."""
