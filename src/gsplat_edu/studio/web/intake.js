@@ -146,7 +146,8 @@ addEventListener("beforeunload", (event) => {
   if (uploading) event.preventDefault();
 });
 
-// The field into which files are dropped. `into` is an entry {kind, name} that files are added to; null makes new ones.
+// How files come in: chosen here, or dropped anywhere, which calls take(transfer). `into` is an entry {kind, name} that files
+// are added to; null makes new ones. began() is called once something comes in.
 export function intake(store, into = null) {
   const line = errorLine();
   const batches = h("div", { class: "batches" });
@@ -157,10 +158,12 @@ export function intake(store, into = null) {
     h("option", { value: "photos" }, "photos without poses"),
     h("option", { value: "captures" }, "a capture: photos with poses"),
   );
+  const made = { began: () => {}, progress: h("div", { class: "coming" }, line, batches) };
 
-  async function take(files) {
+  async function taken(files) {
     const groups = into ? [{ ...into, files, zip: false }] : await sorted(files, kind.value);
     if (!groups.some((group) => group.files.length)) throw new Error("What was dropped holds no files.");
+    made.began();
     let landed = null;
     for (const group of groups) {
       if (!into) group.name = await promised(group.kind, group.name);
@@ -186,45 +189,42 @@ export function intake(store, into = null) {
       onchange: () => {
         const files = [...input.files].map((file) => ({ file, path: file.webkitRelativePath || file.name }));
         input.value = "";
-        attempt(null, line, () => take(files));
+        attempt(null, line, () => taken(files));
       },
     });
     return [input, button(text, () => input.click(), attributes)];
   };
 
-  const element = h(
+  made.take = (transfer) => {
+    const files = filesOf(transfer); // what was dropped is gone once the event has ended
+    return attempt(null, line, async () => taken(await files));
+  };
+  made.element = h(
     "section",
-    { class: "drop", "aria-label": into ? "Add photos" : "Add photos, a video or a scene" },
-    h(
-      "p",
-      { class: "hint" },
-      into ? "Drop more photos here, or" : "Drop photos, folders, a zip file, a video or a scene here, or",
-    ),
+    { class: into ? "drop row" : "drop empty", "aria-label": into ? "Add photos" : "Add photos, a video or a scene" },
+    into ? h("p", {}, "Drop more photos anywhere, or") : h("p", { class: "hint" }, "Drop photos anywhere"),
+    into ? null : h("p", { class: "quiet" }, "A folder, a zip file, a video or a finished scene will do, too."),
     h(
       "div",
       { class: "row" },
-      choose({}, "Choose files", { "data-key-u": "" }),
+      choose({}, "Choose files", { "data-key-u": "", class: into ? null : "primary" }),
       into ? null : choose({ webkitdirectory: true }, "Choose a folder"),
     ),
-    into ? null : h("p", { class: "row" }, h("label", { for: "take-as" }, "Take them in as "), kind),
-    into ? null : pathForm(store),
-    line,
-    batches,
+    into
+      ? null
+      : h(
+          "details",
+          {},
+          h("summary", {}, "Other ways"),
+          h("p", { class: "row" }, h("label", { for: "take-as" }, "Take them in as "), kind),
+          pathForm(store, made),
+        ),
   );
-  let inside = 0;
-  const mark = (by) => element.classList.toggle("over", (inside = Math.max(0, inside + by)) > 0);
-  element.addEventListener("dragenter", () => mark(1));
-  element.addEventListener("dragleave", () => mark(-1));
-  element.addEventListener("drop", (event) => {
-    event.preventDefault();
-    mark(-inside);
-    attempt(null, line, async () => take(await filesOf(event.dataTransfer)));
-  });
-  return element;
+  return made;
 }
 
 // Uses a folder or file of this computer where it is.
-function pathForm(store) {
+function pathForm(store, made) {
   const line = errorLine();
   const path = h("input", { id: "path", type: "text", required: true, autocomplete: "off", spellcheck: "false" });
   const kind = h(
@@ -240,9 +240,10 @@ function pathForm(store) {
       onsubmit: (event) => {
         event.preventDefault();
         attempt(add, line, async () => {
-          const made = await post("/api/adopt", { kind: kind.value, path: path.value });
+          const adopted = await post("/api/adopt", { kind: kind.value, path: path.value });
           await store.refresh();
-          location.hash = `#/${made.kind}/${encodeURIComponent(made.name)}`;
+          made.began();
+          location.hash = `#/${adopted.kind}/${encodeURIComponent(adopted.name)}`;
         });
       },
     },
@@ -252,5 +253,5 @@ function pathForm(store) {
     kind,
     add,
   );
-  return h("details", {}, h("summary", {}, "Use a folder on this computer without copying it"), form, line);
+  return h("div", {}, h("h3", {}, "Use a folder on this computer without copying it"), form, line);
 }

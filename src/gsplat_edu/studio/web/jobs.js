@@ -141,11 +141,15 @@ function waitingFor(store, others) {
 }
 
 // Progress is that of the present stage.
-export function leftOf({ done, total, seconds_left: left, is_least: isLeast }, isStage) {
-  const share = `${Math.floor((100 * done) / total)} %`;
-  return left === null || left === undefined
-    ? share
-    : `${share}, ${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
+export function leftOf(progress, isStage) {
+  const share = `${Math.floor((100 * progress.done) / progress.total)} %`;
+  return [share, timeLeft(progress, isStage)].filter(Boolean).join(", ");
+}
+
+// "4 min left"; empty if there is no forecast.
+export function timeLeft({ seconds_left: left, is_least: isLeast }, isStage) {
+  if (left === null || left === undefined) return "";
+  return `${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
 }
 
 // Why there is no picture of a training yet.
@@ -182,7 +186,7 @@ export function jobs({ main, store }) {
   const fault = errorLine();
   const list = h("div", { class: "cards wide" });
   const broken = h("ul", { class: "damaged", "aria-label": "damaged jobs" });
-  const empty = h("p", {}, "No jobs yet. Add photos in the ", link("library", "#/"), ", and start one there.");
+  const empty = h("p", {}, "No jobs yet. They begin in your ", link("projects", "#/"), ".");
   main.append(heading(1, "Jobs"), broken, fault, empty, list);
   return {
     update() {

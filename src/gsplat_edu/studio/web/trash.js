@@ -50,7 +50,7 @@ export function trash({ main, store }) {
     list,
     h("p", { class: "row" }, clear),
     line,
-    h("p", {}, link("Back to the library", "#/")),
+    h("p", {}, link("Back to the projects", "#/")),
   );
   attempt(null, line, read);
   return {};

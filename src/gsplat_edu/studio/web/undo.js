@@ -45,7 +45,7 @@ export async function discard(store, address, name) {
     }),
   );
   const away = button("Close", hide);
-  patch(place, h("p", { class: "row" }, h("span", {}, `${name} is in the trash.`), undo, away), line);
+  patch(place, h("p", { class: "toast" }, h("span", {}, `${name} is in the trash.`), undo, away), line);
   place.hidden = false;
   await store.refresh();
 }
