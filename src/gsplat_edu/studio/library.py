@@ -203,13 +203,13 @@ class Library:
         Args:
             kind: Kind of the new entry.
             name: The name.
-            word: Goes before the number, so that "walk-run-2" is no second set of photos.
+            word: Goes before the number: "walk-run-2" is no second set of photos. Without one, it is "walk (2)".
             others: Further kinds in which the name must be free.
         """
         chosen, copy = name, 2
         with self.lock:
             while any(self._is_taken(self.place(one, chosen)) for one in (kind, *others)):
-                chosen, copy = "-".join(filter(None, (name, word, str(copy)))), copy + 1
+                chosen, copy = f"{name}-{word}-{copy}" if word else f"{name} ({copy})", copy + 1
         return chosen
 
     def promise(self, kind: str, wish: str) -> str:

@@ -1,7 +1,7 @@
 // Takes in photos, folders, zip files, videos and scenes: dropped, chosen, or named by their path.
 
 import { at, post, remove, upload } from "./api.js";
-import { announce, attempt, bytes, button, count, errorLine, h, heading } from "./dom.js";
+import { announce, attempt, bytes, button, count, dateOf, errorLine, h, heading } from "./dom.js";
 
 const AT_ONCE = 3;
 const SCENES = /\.(ply|splat|spz|sog|glb)$/i;
@@ -10,7 +10,8 @@ const POSES = /(?:^|\/)(?:transforms(?:_train|_test|_val)?\.json|cameras\.(?:bin
 const TAIL = 1 << 20; // bytes at the end of a zip file with the names of its files
 const ZIPPED_POSES = /transforms(?:_train)?\.json|cameras\.(?:bin|txt)/;
 const IGNORED = /(?:^|\/)(?:\.[^/]*|Thumbs\.db|desktop\.ini)$/i;
-const NAMELESS = "photos"; // single files have no folder to be named after
+const HEAD = 1 << 18; // bytes at the start of a photo in which its EXIF data lie
+const TAKEN = /((?:19|20)\d\d):(0[1-9]|1[0-2]):(0[1-9]|[12]\d|3[01]) \d\d:\d\d:\d\d\0/g; // a date of EXIF, in every format
 
 // All files below dropped entries, as {file, path}.
 async function filesOf(transfer) {
@@ -39,6 +40,20 @@ async function hasPoses(file) {
   return ZIPPED_POSES.test(new TextDecoder("latin1").decode(tail));
 }
 
+// The day on which a photo was taken: the earliest date in its EXIF data, which a program that changed it later has not
+// replaced; else that of its file.
+export async function dayOf(file) {
+  const text = new TextDecoder("latin1").decode(await file.slice(0, HEAD).arrayBuffer());
+  const [first] = [...text.matchAll(TAKEN)].sort(([one], [other]) => (one < other ? -1 : 1));
+  return first ? new Date(first[1], first[2] - 1, first[3]) : new Date(file.lastModified);
+}
+
+// A name for photos that have no folder to be named after.
+export async function namedByDay(files) {
+  const byName = files.toSorted((one, other) => one.path.localeCompare(other.path, "en", { numeric: true }));
+  return `Photos of ${dateOf(await dayOf(byName[0].file))}`;
+}
+
 // Splits files into entries to make: {kind, name, files: [{file, path}], zip}.
 async function sorted(files, wanted) {
   const groups = new Map();
@@ -60,7 +75,7 @@ async function sorted(files, wanted) {
     if (wanted !== "auto" && !(single && !zip)) kind = wanted;
     const video = !top && own.length === 1 && VIDEOS.test(own[0].path);
     const stem = single || video ? own[0].path.replace(/\.[^.]+$/, "") : top;
-    found.push({ kind, name: stem || NAMELESS, files: own, zip });
+    found.push({ kind, name: stem || (await namedByDay(own)), files: own, zip });
   }
   return found;
 }

@@ -62,7 +62,7 @@ export function stepLine(store, project, stage) {
   const entries = project.entries.map((entry) => store.entry(...entry.split("/"))).filter(Boolean);
   const running = runningIn(store, entries);
   const isAt = running && (RUNS_AT[running.job.work.command] ?? "") === stage;
-  if (isAt) return workLine(running);
+  if (isAt) return "Working on it"; // the job's card has the one clock of a screen
   const of = (...kinds) => entries.filter(({ kind }) => kinds.includes(kind));
   const result = of("runs").findLast(({ verdict }) => verdict) ?? null;
   const lines = {
