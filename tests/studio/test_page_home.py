@@ -121,3 +121,25 @@ def test_a_card_has_picture_age_state_and_the_bar_of_its_training(visitor, libra
         studio.queue.cancel(job.id)
     card.get_by_text("Training: not finished").wait_for()
     assert not bar.is_visible()
+
+
+def test_emptying_the_trash_asks_first(visitor, library, owl):
+    """The button is no wider than its words, and what is asked can be refused by keyboard."""
+    (owl / "scenes" / "old").mkdir()
+    library[0].library.remove("scenes", "old")
+    tab = go(visitor().tab, "trash")
+    resize(tab, 1440, 900)
+    clear = tab.get_by_role("button", name="Empty the trash")
+    clear.wait_for()
+    assert clear.bounding_box()["width"] < 200
+    dialog = tab.get_by_role("dialog", name="Empty the trash?")
+    clear.click()
+    dialog.wait_for()
+    assert grave_faults_in_all_styles(tab) == []
+    tab.keyboard.press("Escape")
+    dialog.wait_for(state="detached")
+    assert [one["name"] for one in library[0].library.trash()] == ["old"]
+    clear.click()
+    dialog.get_by_role("button", name="Delete everything").click()
+    tab.get_by_text("The trash is empty.").wait_for()
+    assert library[0].library.trash() == []

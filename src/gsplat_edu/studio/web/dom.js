@@ -96,6 +96,30 @@ export function commandLine(command) {
 // A line about an error, next to what it is about.
 export const errorLine = () => h("p", { class: "error", role: "alert", hidden: true });
 
+// Asks before something that cannot be undone; resolves to whether the person agreed.
+export function agreed(question, line, yes) {
+  const dialog = h(
+    "dialog",
+    { "aria-labelledby": "agree-title" },
+    heading(2, question, { id: "agree-title" }),
+    h("p", {}, line),
+    h(
+      "form",
+      { method: "dialog", class: "actions" },
+      h("button", { value: "", autofocus: true }, "Cancel"),
+      h("button", { value: "yes", class: "danger" }, yes),
+    ),
+  );
+  document.body.append(dialog);
+  dialog.showModal();
+  return new Promise((resolve) =>
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve(dialog.returnValue === "yes");
+    }),
+  );
+}
+
 // Runs what a button does; shows its error in a line, and keeps the button from being pressed twice.
 export async function attempt(pressed, line, act) {
   if (pressed) pressed.disabled = true;

@@ -1,7 +1,8 @@
 // Jobs: how far each one is, its buttons, and the command that repeats it.
 
-import { at, get, post, remove } from "./api.js";
+import { at, get, post } from "./api.js";
 import { attempt, button, commandLine, duration, errorLine, h, heading, link, patch, put, toned, want } from "./dom.js";
+import { discard } from "./undo.js";
 
 const STATES = {
   held: "waits for you",
@@ -43,7 +44,9 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const pause = button("Pause", change("pause"));
   const resume = button("Resume", change("resume"), { class: "primary" });
   const stop = button("Stop", change("cancel"), { title: "A training writes a checkpoint and can be resumed." });
-  const forget = button(REMOVE, (event) => attempt(event.currentTarget, line, () => remove(at("jobs", id))));
+  const forget = button(REMOVE, (event) =>
+    attempt(event.currentTarget, line, () => discard(store, at("jobs", id), `“${store.jobs.get(id).job.title}”`)),
+  );
   if (main) {
     pause.dataset.keyP = "";
     resume.dataset.keyP = "";
@@ -195,7 +198,8 @@ export function jobs({ main, store }) {
       patch(
         broken,
         [...store.damaged.values()].map(({ id, line }) => {
-          const onclick = ({ currentTarget }) => attempt(currentTarget, fault, () => remove(at("jobs", id)));
+          const onclick = ({ currentTarget }) =>
+            attempt(currentTarget, fault, () => discard(store, at("jobs", id), `job ${id}`));
           return want("li", { "data-key": id }, line, " ", want("button", { type: "button", onclick }, REMOVE));
         }),
       );

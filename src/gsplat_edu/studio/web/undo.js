@@ -38,10 +38,11 @@ export async function discard(store, address, name) {
   const undo = button("Undo", () =>
     attempt(undo, line, async () => {
       const { entry } = await post(at("trash", trash, "restore"));
-      await store.refresh();
+      const isJob = entry.startsWith("jobs/");
+      await Promise.all([store.refresh(), isJob && store.readJobs()]);
       hide();
       announce(`${name} is back`);
-      if (address === at(entry)) location.hash = `#/${entry.split("/").map(encodeURIComponent).join("/")}`;
+      if (address === at(entry) && !isJob) location.hash = `#/${entry.split("/").map(encodeURIComponent).join("/")}`;
     }),
   );
   const away = button("Close", hide);
