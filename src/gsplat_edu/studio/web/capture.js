@@ -1,7 +1,7 @@
 // The screen of a capture: previews, the doctor's findings, and the start of a training with its forecast.
 
 import { at, get } from "./api.js";
-import { attempt, button, errorLine, forecastText, h, heading, link, patch, put, want } from "./dom.js";
+import { attempt, button, duration, errorLine, forecastText, h, heading, link, patch, put, want } from "./dom.js";
 import { choices } from "./choices.js";
 import { doctor } from "./doctor.js";
 import { gallery, unplaced } from "./gallery.js";
@@ -155,6 +155,16 @@ function startForm(store, entry, draw) {
   });
   const go = h("button", { "data-own": "" }, "Start training");
   const measure = button("Forecast time and memory", () => forecast());
+  let times = {}; // by quality
+
+  // Tells the next step how long the training takes that is chosen; of a number of iterations, nothing is known.
+  function tellTime() {
+    const form = element.querySelector("form");
+    const quality = new FormData(form).get("quality");
+    const isKnown = times[quality] && more.options(quality).quality === quality;
+    form.dataset.takes = isKnown ? `takes about ${duration(times[quality].seconds)}` : "";
+    store.changed();
+  }
 
   async function forecast() {
     measure.hidden = true;
@@ -163,9 +173,9 @@ function startForm(store, entry, draw) {
       const size = more.resolution();
       const resolution = size ? `?resolution=${encodeURIComponent(size)}` : "";
       const { qualities: forecasts } = await get(at(entry.entry, "forecast") + resolution);
-      for (const [value, facts] of said) {
-        facts.textContent = forecastText(forecasts[value]);
-      }
+      for (const [value, facts] of said) facts.textContent = forecastText(forecasts[value]);
+      times = forecasts;
+      tellTime();
     } catch (error) {
       for (const facts of said.values()) facts.textContent = "\u00a0";
       put(forecastLine, error.message);
@@ -183,6 +193,7 @@ function startForm(store, entry, draw) {
       {
         id: "train",
         "data-next": `train ${entry.entry}`,
+        onchange: () => tellTime(),
         onsubmit: (event) => {
           event.preventDefault();
           attempt(go, line, async () => {

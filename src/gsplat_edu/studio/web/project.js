@@ -103,7 +103,7 @@ function onward(step) {
   return found ?? null;
 }
 
-// The button for the next step. On the library's cards, `of` names the project; on an entry's screen, a form that asks
+// The button for the next step, and how long it takes if that is known. On the cards of home, `of` names the project; on an entry's screen, a form that asks
 // for the same job is sent with what is chosen there.
 export function nextStep(store, of = "") {
   const line = errorLine();
@@ -150,11 +150,13 @@ export function nextStep(store, of = "") {
         const own = one.querySelector("[data-own]");
         if (own) own.hidden = one === form;
       }
-      const text = JSON.stringify([found, Boolean(form), active]);
+      const takes = form?.dataset.takes ?? ""; // how long it takes with what is chosen there
+      const text = JSON.stringify([found, Boolean(form), active, takes]);
       if (shown === text) return;
       shown = text;
       put(line, "");
-      patch(place, found ? made(found, form) : active && !of && note);
+      const time = takes && want("span", { class: "quiet" }, takes);
+      patch(place, found ? [made(found, form), time] : active && !of && note);
     },
   };
 }
