@@ -143,3 +143,17 @@ def test_emptying_the_trash_asks_first(visitor, library, owl):
     dialog.get_by_role("button", name="Delete everything").click()
     tab.get_by_text("The trash is empty.").wait_for()
     assert library[0].library.trash() == []
+
+
+def test_the_rail_has_five_steps_at_the_left_or_along_the_top(visitor, owl):
+    tab = go(visitor().tab, "captures/owl")
+    rail = tab.get_by_role("navigation", name="steps of the project")
+    rail.locator("[aria-current=step]", has_text="Cameras").wait_for()
+    titles = rail.locator(".step").all_inner_texts()
+    assert titles == ["Photos", "Cameras", "Training", "Scene", "Share"]
+    check_widths(tab)
+    for width, beside in ((390, False), (1440, True)):
+        resize(tab, width, 800)
+        steps, stage = rail.bounding_box(), tab.locator(".stage").bounding_box()
+        assert (steps["x"] + steps["width"] <= stage["x"]) == beside
+        assert (steps["y"] + steps["height"] <= stage["y"]) != beside
