@@ -6,6 +6,7 @@ const events = new EventTarget();
 globalThis.addEventListener = events.addEventListener.bind(events);
 
 const { leftOf, startJob, waitsFor } = await import("../../src/gsplat_edu/studio/web/jobs.js");
+const { dayOf, namedByDay } = await import("../../src/gsplat_edu/studio/web/intake.js");
 const { Store } = await import("../../src/gsplat_edu/studio/web/store.js");
 
 const JOB = { id: "1", title: "training of a", subject: "runs/a", command: "", state: "running", waits_for: [] };
@@ -101,4 +102,15 @@ test("an older answer about the library does not replace a newer one", async () 
     await refreshed[i];
   }
   assert.equal(store.library.folder, "newer");
+});
+
+test("photos without a folder are named by the day they were taken", async () => {
+  const photo = (text, name) => new File([text], name, { lastModified: new Date(2025, 0, 2, 12).getTime() });
+  const edited = photo("\xff\xd8 2026:06:01 09:00:00\0 2026:05:14 23:59:59\0", "IMG_10.jpg");
+  assert.deepEqual(await dayOf(edited), new Date(2026, 4, 14));
+  const plain = photo("2026:05:14 is no date of EXIF, nor 2026:13:01 00:00:00\0", "IMG_9.png");
+  assert.equal((await dayOf(plain)).getFullYear(), 2025);
+  const named = [edited, plain].map((file) => ({ file, path: file.name }));
+  assert.equal(await namedByDay(named), "Photos of 2 January 2025"); // 9 comes before 10
+  assert.equal(await namedByDay(named.slice(0, 1)), "Photos of 14 May 2026");
 });

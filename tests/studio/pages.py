@@ -34,14 +34,17 @@ DROP = """([files, place]) => {
   const transfer = new DataTransfer();
   for (const [name, text] of files) {
     const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-    transfer.items.add(new File([bytes], name));
+    transfer.items.add(new File([bytes], name, { lastModified: Date.UTC(2026, 4, 14, 12) }));
   }
   for (const type of ["dragenter", "dragover", "drop"]) {
     const options = { dataTransfer: transfer, bubbles: true, cancelable: true };
     document.querySelector(place).dispatchEvent(new DragEvent(type, options));
   }
 }"""
-"""Script that drops files, a list of [name, base64], on the element of a selector."""
+"""Script that drops files, a list of [name, base64] of one day, on the element of a selector."""
+
+BY_DAY = "Photos of 14 May 2026"
+"""Name of an entry of photos that `DROP` has dropped without a folder."""
 
 
 @contextlib.contextmanager

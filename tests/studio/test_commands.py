@@ -421,5 +421,54 @@ def test_two_jobs_do_not_write_to_one_place(page, studio):
     assert page.post("/api/jobs/000001/explode").status_code == 404
     assert page.get("/api/jobs/999999").status_code == 404
     assert page.post("/api/jobs", json=request).status_code == 200
-    assert page.delete("/api/jobs/000001").json() == {"removed": "000001"}
+    assert list(page.delete("/api/jobs/000001").json()) == ["trash"]
     assert [job["id"] for job in page.get("/api/jobs").json()["jobs"]] == ["000002", "000003"]
+
+
+def test_no_export_replaces_another(studio):
+    """Of any format, also one with two endings."""
+    folder = studio.library.root / "scenes" / "a"
+    exports = folder / "exports"
+    exports.mkdir(parents=True)
+    request = {"command": "convert", "subject": "scenes/a"}
+    for name in ("a.spz", "a.compressed.ply", "a (2).compressed.ply"):
+        (exports / name).touch()
+
+    def output(**more):
+        (place,) = work_of(studio.library, {**request, **more}).outputs
+        return place.removeprefix("scenes/a/exports/")
+
+    assert output(format="spz") == "a (2).spz"
+    assert output(format="compressed.ply") == "a (3).compressed.ply"
+    assert output(format="html") == "a.html"
+    assert output(format="spz", to="b") == "b.spz"
+
+
+def test_a_job_that_is_removed_from_the_list_can_be_brought_back(studio, page):
+    (studio.library.root / "captures" / "a").mkdir()
+    request = {"command": "doctor", "subject": "captures/a"}
+    made = page.post("/api/jobs", json=request).json()
+    number = page.delete(f"/api/jobs/{made['id']}").json()["trash"]
+    assert page.get("/api/jobs").json()["jobs"] == []
+    (thrown,) = page.get("/api/trash").json()["trash"]
+    assert (thrown["kind"], thrown["name"], thrown["entry"]) == ("jobs", made["id"], None)
+    other = page.post("/api/jobs", json=request).json()
+    assert other["id"] > made["id"], "else the first one could not come back"
+    assert page.post(f"/api/trash/{number}/restore").json()["entry"] == f"jobs/{made['id']}"
+    back = page.get(f"/api/jobs/{made['id']}").json()
+    assert (back["state"], back["work"], back["created"]) == ("held", made["work"], made["created"])
+    assert page.get("/api/trash").json()["trash"] == []
+    assert page.post(f"/api/trash/{number}/restore").status_code == 404
+
+
+def test_a_job_does_not_come_back_over_another_one(studio, page):
+    (studio.library.root / "captures" / "a").mkdir()
+    made = page.post("/api/jobs", json={"command": "doctor", "subject": "captures/a"}).json()
+    number = page.delete(f"/api/jobs/{made['id']}").json()["trash"]
+    (studio.library.root / ".studio" / "jobs" / made["id"]).mkdir()
+    answer = page.post(f"/api/trash/{number}/restore")
+    assert (answer.status_code, answer.json()["error"]) == (
+        409,
+        f"job {made['id']}: exists already; remove that one first",
+    )
+    assert len(page.get("/api/trash").json()["trash"]) == 1

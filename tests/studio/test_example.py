@@ -22,7 +22,7 @@ def test_it_is_small_and_its_photos_are_traced():
 
 def test_it_becomes_a_capture_of_the_library_each_time(page, studio):
     first, second = (page.post("/api/example", json={}).json() for _ in range(2))
-    assert first["entry"] == "captures/garden" and second["entry"] == "captures/garden-2"
+    assert first["entry"] == "captures/garden" and second["entry"] == "captures/garden (2)"
     facts = page.get("/api/captures/garden").json()
     assert facts["photos"] == PHOTOS and not facts.get("problem")
     capture = CaptureReader(studio.library.root / "captures" / "garden").capture

@@ -278,11 +278,11 @@ def promised(page, wish, kind="photos"):
 
 def test_a_promised_name_is_given_once(page, studio, jpeg):
     """Two tabs that wish for one name get two, before either has sent a file; a name that is given up is free again."""
-    assert [promised(page, "walk"), promised(page, "walk")] == ["walk", "walk-2"]
+    assert [promised(page, "walk"), promised(page, "walk")] == ["walk", "walk (2)"]
     assert page.put("/api/photos/walk/files/a.jpg", content=jpeg).status_code == 201
     page.delete("/api/names/photos/walk")
-    page.delete("/api/names/photos/walk-2")
-    assert promised(page, "walk") == "walk-2"
+    page.delete("/api/names/photos/walk (2)")
+    assert promised(page, "walk") == "walk (2)"
     assert page.post("/api/names", json={"kind": "films", "wish": "a"}).status_code == 400
 
 
@@ -298,7 +298,7 @@ def test_an_adopted_folder_needs_no_name(page, studio, tmp_path, jpeg):
         (tmp_path / place).mkdir(parents=True)
     asked = [{"kind": "photos", "path": str(tmp_path / place / "trip: 1")} for place in "ab"]
     found = [page.post("/api/adopt", json=one).json() for one in asked]
-    assert [one.get("name", one) for one in found] == ["trip_ 1", "trip_ 1-2"]
+    assert [one.get("name", one) for one in found] == ["trip_ 1", "trip_ 1 (2)"]
 
 
 def test_a_name_that_a_waiting_job_will_take_is_not_free(page, studio):
@@ -330,7 +330,7 @@ def test_entries_of_one_name_belong_together(page, studio, jpeg):
     run = page.post("/api/jobs", json={"command": "train", "subject": "captures/walk"}).json()
     search = page.post("/api/jobs", json={"command": "sfm", "subject": "photos/walk"}).json()
     assert run["work"]["outputs"] + search["work"]["outputs"] == ["runs/walk-run-2", "captures/walk-poses-2"]
-    assert [promised(page, wish) for wish in ("walk", "other")] == ["walk-2", "other-2"]
+    assert [promised(page, wish) for wish in ("walk", "other")] == ["walk (2)", "other (2)"]
 
 
 def test_a_capture_says_what_the_search_for_its_poses_found(page, studio):

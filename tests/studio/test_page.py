@@ -3,6 +3,7 @@
 import io
 import re
 import zipfile
+from urllib.parse import quote
 
 import pytest
 from PIL import Image
@@ -10,7 +11,7 @@ from PIL import Image
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from lab.captures.textured_box import box_orbit, photograph_box
-from studio.pages import DROP, encoded, go, png, repeated, train_and_download, visitor_of
+from studio.pages import BY_DAY, DROP, encoded, go, png, repeated, train_and_download, visitor_of
 from waiting import resize, until_in
 
 HOSTILE = "<img src=x onerror=hacked=1>"
@@ -137,7 +138,7 @@ def test_hostile_names_are_text_and_refused_files_say_why(visitor):
     assert "neither a photo nor a video" in error.inner_text()
     card = tab.locator("a.card", has_text="1 photo")
     card.click()
-    person.reach("#/photos/photos")
+    person.reach(f"#/photos/{quote(BY_DAY)}")
     tab.locator(".thumbs .name", has_text=HOSTILE).wait_for()
     tab.locator("summary", has_text="Rename or remove").click()
     tab.get_by_label("Name", exact=True).fill(HOSTILE)

@@ -111,3 +111,20 @@ def test_the_box_is_chosen_while_there_is_one(visitor, library, plain):
     write_region(folder, None)
     assert job.work.options == {"quality": "standard", "set": {"region": "none"}}
     assert "region=none" in job.command
+
+
+def test_the_next_step_says_how_long_the_chosen_training_takes(visitor, library, plain):
+    """As the forecast of its quality does; of a number of iterations, nothing is known."""
+    tab = go(visitor().tab, "captures/choices")
+    forecasts = tab.locator(".forecast", has_text="of memory")
+    forecasts.nth(2).wait_for()
+    takes = tab.locator(".next-step .quiet")
+    for number, quality in enumerate(("Draft", "Standard", "High")):
+        tab.get_by_role("radio", name=quality).check()
+        said = forecasts.nth(number).inner_text().partition(",")[0]
+        takes.get_by_text(f"takes {said}", exact=True).wait_for()
+    tab.locator("summary", has_text="More").click()
+    tab.get_by_label("Iterations instead of a quality").fill("60")
+    tab.get_by_label("Iterations instead of a quality").press("Tab")
+    takes.wait_for(state="detached")
+    assert tab.get_by_role("button", name="Next: Start training").is_visible()

@@ -208,7 +208,7 @@ def test_unsaved_edits_survive_another_tab_of_the_page(visitor, wall_entry):
     tabs.get_by_role("link", name="Share").click()
     tab.get_by_text("Edits that are not saved yet are not exported").wait_for()
     tabs.get_by_role("link", name="Edit (unsaved)").wait_for()
-    tab.get_by_role("link", name="Library", exact=True).click()
+    tab.get_by_role("link", name="Projects", exact=True).click()
     person.reach("#/")
     frame = opened(tab)
     frame.locator("#edit-count", has_text=left).wait_for()
@@ -267,7 +267,7 @@ def test_the_view_and_the_card_of_a_scene_show_the_saved_edits(visitor, wall_ent
     shows(176)
     tab.get_by_label("with the saved edits").check()
     shows(left)
-    tab.get_by_role("link", name="Library", exact=True).click()
+    tab.get_by_role("link", name="Projects", exact=True).click()
     tab.locator("a.card", has_text="wall").scroll_into_view_if_needed()
     until_in(
         tab,

@@ -43,7 +43,7 @@ def folder(tmp_path):
 
 def test_a_dropped_folder_becomes_an_entry_with_its_folders(visitor, library, folder):
     person = visitor()
-    drop_paths(person.tab, ".drop", folder)
+    drop_paths(person.tab, "header", folder)
     person.reach("#/photos/walk%20round")
     person.tab.locator(".thumbs img").nth(2).wait_for()
     stored = library[0].library.root / "photos" / "walk round"
@@ -65,7 +65,7 @@ def test_a_chosen_folder_becomes_the_same_entry(visitor, library, folder):
 def test_a_dropped_video_becomes_an_entry_of_its_name(visitor, library, tmp_path):
     path = video_of(tmp_path / "a walk.mp4", [photograph_box(camera) for camera in box_orbit(3, 0.2)])
     person = visitor()
-    drop_paths(person.tab, ".drop", path)
+    drop_paths(person.tab, "header", path)
     person.reach("#/photos/a%20walk")
     person.tab.locator(".facts", has_text="1 video").wait_for()
     assert (library[0].library.root / "photos" / "a walk" / "a walk.mp4").read_bytes() == path.read_bytes()

@@ -1,10 +1,11 @@
 """Tabs that know the library at different times, in Chromium: names come from the server, and changes by the stream."""
 
 import json
+from urllib.parse import quote
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from studio.pages import DROP, encoded, go, png, visitor_of
+from studio.pages import BY_DAY, DROP, encoded, go, png, visitor_of
 from waiting import until_in
 
 
@@ -25,14 +26,14 @@ def test_a_stale_tab_makes_a_set_of_its_own(visitor, library):
     stale.wait_for_selector("footer p:not(:empty)")
     stale.route("**/api/library", lambda route: route.abort())  # it learns nothing more of the library
     drop(first.tab, 2, seed=1)
-    first.reach("#/photos/photos")
+    first.reach(f"#/photos/{quote(BY_DAY)}")
     drop(stale, 3, seed=2)
     until_in(stale, stale, "location.hash.startsWith('#/photos/')")
     stale.locator(".thumbs img").nth(2).wait_for()
     name = stale.evaluate("decodeURIComponent(location.hash.slice(9))")
-    assert name != "photos" and "is not in this library" not in stale.inner_text("main")
+    assert name == f"{BY_DAY} (2)" and "is not in this library" not in stale.inner_text("main")
     root = studio.library.root / "photos"
-    assert in_folder(root / "photos") == ["1_0.png", "1_1.png"]
+    assert in_folder(root / BY_DAY) == ["1_0.png", "1_1.png"]
     assert in_folder(root / name) == ["2_0.png", "2_1.png", "2_2.png"]
 
 

@@ -2,13 +2,14 @@
 
 import json
 import re
+from urllib.parse import quote
 
 import pytest
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.sfm.photos import fingerprint, photo_files
-from studio.pages import DROP, encoded, go, png
+from studio.pages import BY_DAY, DROP, encoded, go, png
 from waiting import until_in
 
 PRIMARY = "[...document.querySelectorAll('main .primary')].filter((one) => one.checkVisibility())"
@@ -20,9 +21,9 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     person = visitor()
     tab = person.tab
     tab.evaluate(DROP, [[[f"{i}.png", encoded(png(i, (160, 120)))] for i in range(3)], ".drop"])
-    person.reach("#/photos/photos")
+    person.reach(f"#/photos/{quote(BY_DAY)}")
     tab.get_by_role("button", name="Find the poses").click()
-    card = tab.get_by_role("article", name="poses of photos")
+    card = tab.get_by_role("article", name=f"poses of {BY_DAY}")
     card.locator(".badge.poor").wait_for()
     (work,) = (job.work for job in studio.queue.jobs())
     assert (studio.library.root / work.outputs[0] / "sfm").is_dir(), "a search that can be resumed is kept"
@@ -31,14 +32,15 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     )
     assert tab.evaluate(f"{PRIMARY}.map((one) => one.textContent)") == ["Try again"]
 
-    go(tab, "")
-    until_in(tab, tab, "document.querySelectorAll('.project li .badge').length === 2")
-    assert tab.locator("a.card").count() == 1, "photos and what was made from them are one project"
-    inside = tab.get_by_role("article", name="photos")
+    inside = tab.locator(".everything")
     inside.locator("summary", has_text="Everything in it (2)").click()
-    assert inside.locator("li", has_text="Capture photos").locator(".badge").inner_text() == "no poses yet"
-    inside.get_by_role("link", name=re.compile("^Next: Try again")).wait_for()
-    go(tab, "captures/photos")
+    assert inside.locator("li", has_text=f"Capture {BY_DAY}").locator(".badge").inner_text() == "no poses yet"
+    go(tab, "")
+    project = tab.get_by_role("article", name=BY_DAY)
+    project.get_by_text("Finding the cameras failed").wait_for()
+    assert tab.locator("a.card").count() == 1, "photos and what was made from them are one project"
+    project.get_by_role("link", name=re.compile("^Next: Try again")).wait_for()
+    go(tab, f"captures/{BY_DAY}")
     tab.get_by_text("has no poses yet").wait_for()
     assert not tab.get_by_role("button", name="Start training").is_visible()
     assert not tab.get_by_role("button", name="Examine").is_visible()
@@ -46,7 +48,7 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     until_in(tab, tab, f"{PRIMARY}.length > 0")  # the next step comes with the library's list
     assert tab.evaluate(f"{PRIMARY}.length") == 1
     back.click()
-    person.reach("#/photos/photos")
+    person.reach(f"#/photos/{quote(BY_DAY)}")
 
 
 def test_photos_that_were_not_placed_come_first_and_the_next_step_leads_to_the_cameras(visitor, library):

@@ -286,7 +286,7 @@ def test_the_text_of_an_upload_stays_in_its_card(visitor, size):
     tab = visitor().tab
     resize(tab, size[0], size[1])
     tab.route("**/files/**", lambda route: None)  # the upload waits
-    tab.locator(".drop").wait_for()
+    tab.locator(".drop").wait_for(state="attached")
     photos = [[f"a-rather-long-folder-name/IMG_{i:04}.png", encoded(png(i, (300, 200)))] for i in range(112)]
     tab.evaluate(DROP, [photos, ".drop"])
     card = tab.locator(".batches .job")

@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import described, remove_leftovers
@@ -50,6 +50,17 @@ MOST_QUEUED = 200
 
 PROGRAM = (sys.executable, "-m", "gsplat_edu")
 """What runs a command line."""
+
+
+Removed = TypeVar("Removed")
+
+
+def _delete(path: Path) -> Any:  # noqa: ANN401
+    """Delete the folder of a job; that of a damaged one may be a file or a link."""
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+    else:
+        shutil.rmtree(path)
 
 
 class JobQueue:
@@ -95,6 +106,7 @@ class JobQueue:
         self._endings: dict[str, tuple[str, float]] = {}  # the last signal of each cancellation, and when
         self._heard: dict[str, int] = {}  # size of each job's events when its process was started
         self._turns: dict[str, int] = {}  # when each job was queued, counted from 1
+        self._latest = 0  # the highest id that a job of this queue has, or had
         self._settled: object = None  # the states that `_start_waiting` saw last
         self._closed = threading.Event()
         folder.mkdir(parents=True, exist_ok=True)
@@ -140,7 +152,8 @@ class JobQueue:
             if waiting >= MOST_QUEUED:
                 raise ArgumentError(f"jobs: {waiting} are waiting; cancel some, or wait until they are done")
             known = [int(name) for name in os.listdir(self.folder) if ID.fullmatch(name)]  # noqa: PTH208
-            name = f"{max(known, default=0) + 1:06d}"
+            self._latest = max([self._latest, *known]) + 1
+            name = f"{self._latest:06d}"
             rendered = self._render(work, Purpose.BEGIN)
             facts = (name, rendered.work, rendered.argv, State.QUEUED, time.time())
             job = Job(*facts, begun_by=begun_by, begun_at=begun_at)
@@ -219,8 +232,12 @@ class JobQueue:
         with self._lock:
             return self._put(self.get(name), begun_by="", begun_at="")
 
-    def remove(self, name: str) -> None:
-        """Forget a job that waits or has ended or is damaged, and delete its record; what it wrote elsewhere stays.
+    def remove(self, name: str, away: Callable[[Path], Removed] = _delete) -> Removed:
+        """Forget a job that waits or has ended or is damaged; what it wrote elsewhere stays.
+
+        Args:
+            name: Its id. No later job of this queue gets it.
+            away: Takes its folder away; deletes it by default. What it returns is returned.
 
         Raises:
             ArgumentError: there is none of this id, or it is running.
@@ -229,14 +246,19 @@ class JobQueue:
         with self._lock:
             if name not in self.damaged and self.get(name).state in ACTIVE:
                 raise ArgumentError(f"job {name}: is {self.get(name).state}; cancel it first")
-            path = self.folder / name
-            if path.is_symlink() or not path.is_dir():  # of a damaged one
-                path.unlink(missing_ok=True)
-            else:
-                shutil.rmtree(path)
+            self._latest = max(self._latest, int(name))
+            removed = away(self.folder / name)
             self._jobs.pop(name, None)
             self.damaged.pop(name, None)
             self.changed(name, None)
+            return removed
+
+    def put_back(self, name: str) -> None:
+        """Know a job again whose folder was put back after `remove`; one that waited is held."""
+        with self._lock:
+            self._read(self.folder / name)
+            if name in self._jobs:
+                self.changed(name, self._jobs[name])
 
     def rename(self, old: str, new: str, move: Callable[[], object]) -> None:
         """Rename a place, and use its new name in all jobs.
@@ -415,22 +437,26 @@ class JobQueue:
     def _recover(self) -> None:
         """Read the records that an earlier queue left, and find its processes. Nothing starts."""
         for path in sorted(self.folder.iterdir()):
-            if not ID.fullmatch(path.name):
-                continue
-            folder = JobFolder(path)
-            try:
-                job = folder.read(self._render)
-            except ArgumentError as error:
-                self.damaged[path.name] = str(error)
-                continue
-            if job.state in ACTIVE and job.pid is None and (found := last_start(folder.events)):
-                # the earlier queue was killed between the start of the process and its note
-                job = replace(job, pid=found.pid, identity=found.identity)
-            self._jobs[job.id] = job
-            if job.state in ACTIVE and not _is_of(job, folder):
-                self._ended(replace(job, pid=None, identity=""), None)
-            elif job.state is State.QUEUED:
-                self._put(job, state=State.HELD)
+            self._read(path)
+
+    def _read(self, path: Path) -> None:
+        """Read the record of a job that this queue does not know yet. It does not start."""
+        if not ID.fullmatch(path.name):
+            return
+        folder = JobFolder(path)
+        try:
+            job = folder.read(self._render)
+        except ArgumentError as error:
+            self.damaged[path.name] = str(error)
+            return
+        if job.state in ACTIVE and job.pid is None and (found := last_start(folder.events)):
+            # the earlier queue was killed between the start of the process and its note
+            job = replace(job, pid=found.pid, identity=found.identity)
+        self._jobs[job.id] = job
+        if job.state in ACTIVE and not _is_of(job, folder):
+            self._ended(replace(job, pid=None, identity=""), None)
+        elif job.state is State.QUEUED:
+            self._put(job, state=State.HELD)
 
     def _put(self, job: Job, **changes: Any) -> Job:  # noqa: ANN401
         job = replace(job, **changes)

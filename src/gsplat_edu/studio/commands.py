@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 from msgspec import structs
 
 from gsplat_edu.base.errors import ArgumentError, SplatError
-from gsplat_edu.base.text import legible, option_flag, shortened
+from gsplat_edu.base.text import as_file_name, legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
 from gsplat_edu.options.offers import check_words, offered, words_of
 from gsplat_edu.server.refusal import RefusedError, conflict
@@ -327,12 +328,22 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
             raise RefusedError(
                 f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(command.forms)}"
             )
-        outputs = (f"{subject}/{EXPORTS}/{legible(checked_name('to', to or entry))}.{form}",)
+        outputs = (
+            f"{subject}/{EXPORTS}/{_free_export(path, legible(checked_name('to', to or entry)), form)}",
+        )
     inputs = [subject, *([f"{subject}/{EDITS}"] if request.get("edits") is True else [])]
     for mesh in MESHES:
         if request.get(mesh) is not None:
             inputs.append(f"{subject}/{EXPORTS}/{checked_name(mesh, request[mesh], LONGEST_FILE)}")
     return Work(str(name), tuple(inputs), outputs, options)
+
+
+def _free_export(entry: Path, name: str, form: str) -> str:
+    """Return the name of a file to export, with a number if there is one of its name: no export replaces another."""
+    chosen, copy = f"{name}.{form}", 2
+    while os.path.lexists(entry / EXPORTS / as_file_name(chosen)):
+        chosen, copy = f"{name} ({copy}).{form}", copy + 1
+    return chosen
 
 
 def command_line(library: Library, work: Work, purpose: Purpose) -> Rendered:

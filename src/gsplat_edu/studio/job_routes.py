@@ -89,10 +89,9 @@ def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
     if name not in studio.queue.damaged:
         _job(studio, request)
     try:
-        studio.queue.remove(name)
+        return {"trash": studio.forget(name)}
     except ArgumentError as error:
         raise conflict(str(error)) from None
-    return {"removed": name}
 
 
 def _events(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401

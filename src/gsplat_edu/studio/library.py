@@ -39,7 +39,10 @@ KINDS = ("photos", "captures", "runs", "scenes")
 HIDDEN = ".studio"
 """Folder of the studio's own files."""
 
-PARTS = ("jobs", "trash", "uploads", "cache")
+JOBS = "jobs"
+"""Folder in `HIDDEN` with the folders of the jobs."""
+
+PARTS = (JOBS, "trash", "uploads", "cache")
 """Folders in `HIDDEN`."""
 
 EXPORTS = "exports"
@@ -203,13 +206,13 @@ class Library:
         Args:
             kind: Kind of the new entry.
             name: The name.
-            word: Goes before the number, so that "walk-run-2" is no second set of photos.
+            word: Goes before the number: "walk-run-2" is no second set of photos. Without one, it is "walk (2)".
             others: Further kinds in which the name must be free.
         """
         chosen, copy = name, 2
         with self.lock:
             while any(self._is_taken(self.place(one, chosen)) for one in (kind, *others)):
-                chosen, copy = "-".join(filter(None, (name, word, str(copy)))), copy + 1
+                chosen, copy = f"{name}-{word}-{copy}" if word else f"{name} ({copy})", copy + 1
         return chosen
 
     def promise(self, kind: str, wish: str) -> str:
@@ -320,7 +323,7 @@ class Library:
         return self.discard(self.entry(kind, name))
 
     def discard(self, path: Path) -> str:
-        """Move an entry, or a file that was exported from one, to the trash; return its id there.
+        """Move an entry, a file that was exported from one, or a job's folder to the trash; return its id there.
 
         Raises:
             RefusedError: a job uses it, or it has just been removed.
@@ -346,7 +349,7 @@ class Library:
         """Return what is in the trash, newest first: id, kind, name, entry and when it was removed (s).
 
         Kind and name are those of an entry; of an exported file, kind is "exports" and `entry` what it was made from
-        ("runs/toy"), which is None for an entry.
+        ("runs/toy"), which is None otherwise; of a job, kind is "jobs" and name its id.
         """
         found = []
         for folder in sorted(self.hidden("trash").iterdir(), reverse=True):
@@ -364,7 +367,10 @@ class Library:
         return found
 
     def restore(self, number: str) -> Path:
-        """Move an entry, or a file that was exported from one, back from the trash; return the entry.
+        """Move an entry, a file that was exported from one, or a job's folder back from the trash.
+
+        Returns:
+            The entry, or the job's folder.
 
         Raises:
             RefusedError: there is none, its name is taken, or the entry of the file is gone.
@@ -373,13 +379,23 @@ class Library:
             for removed in self.trash():
                 if removed["id"] == number:
                     name, of = removed["name"], removed["entry"]
-                    target = self.fresh(removed["kind"], name) if of is None else self._fresh_export(of, name)
+                    target = self._fresh_place(removed["kind"], name, of)
                     folder = self.hidden("trash") / number
                     (folder / as_file_name(name)).rename(target)
                     _delete(folder)
                     self.changed()
                     return target if of is None else target.parent.parent
         raise not_found(f"trash/{shortened(number)}")
+
+    def _fresh_place(self, kind: str, name: str, of: str | None) -> Path:
+        """Return the place to which something returns from the trash; see `trash`."""
+        if of is not None:
+            return self._fresh_export(of, name)
+        if kind != JOBS:
+            return self.fresh(kind, name)
+        if os.path.lexists(path := self.hidden(JOBS) / checked_name("job", name)):
+            raise conflict(f"job {name}: exists already; remove that one first")
+        return path
 
     def _fresh_export(self, entry: str, name: str) -> Path:
         """Return the place of a file that returns to the exports of an entry; the folder is made if it is missing.
@@ -460,6 +476,8 @@ def _removed_from(path: Path) -> tuple[str, str | None] | None:
             text = file.read(4 * LONGEST).decode("utf-8", errors="replace")
     except OSError:
         return None
+    if text == f"{HIDDEN}/{JOBS}" and not path.is_symlink():
+        return JOBS, None
     kind, *rest = text.split("/")
     if kind not in KINDS or path.is_symlink():
         return None

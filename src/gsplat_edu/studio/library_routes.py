@@ -17,6 +17,7 @@ from gsplat_edu.jobs.record import State
 from gsplat_edu.options.studio import PORT
 from gsplat_edu.server.bodies import Json, content_length
 from gsplat_edu.server.refusal import RefusedError
+from gsplat_edu.studio.library import JOBS
 from gsplat_edu.studio.listing import summaries, summary
 from gsplat_edu.studio.origins import makers, origins
 from gsplat_edu.studio.pictures import leave_out, photo_list, thumbnail
@@ -133,7 +134,9 @@ def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
 
 
 def _restore(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    path = studio.library.restore(request.path_params["id"])
+    path = studio.restore(request.path_params["id"])
+    if path.parent == studio.library.hidden(JOBS):
+        return {"kind": JOBS, "name": path.name, "entry": f"{JOBS}/{path.name}"}
     return summary(studio.library, path.parent.name, path)
 
 

@@ -15,7 +15,7 @@ from gsplat_edu.jobs.record import ACTIVE, Job, State, Work
 from gsplat_edu.server.refusal import conflict
 from gsplat_edu.studio.commands import command_line, title_of, work_of
 from gsplat_edu.studio.floaters import Proposals
-from gsplat_edu.studio.library import HIDDEN, Library
+from gsplat_edu.studio.library import HIDDEN, JOBS, Library
 from gsplat_edu.studio.painter import Painter
 from gsplat_edu.studio.renaming import FormerNames, names_along, rename_all
 from gsplat_edu.studio.stream import Stream
@@ -52,7 +52,7 @@ class Studio:
         self.decoder = Worker(waiting=MOST_THUMBNAILS)
         self.painter = Painter()
         self.proposals = Proposals()
-        jobs = self.library.hidden("jobs")
+        jobs = self.library.hidden(JOBS)
         self.queue = JobQueue(
             jobs,
             lambda work, purpose: command_line(self.library, work, purpose),
@@ -95,6 +95,19 @@ class Studio:
             others = [job for job in self._pending() if job.id != name]
             self._check_first(self.queue.get(name).work, others)
             return self.queue.resume(name)
+
+    def forget(self, name: str) -> str:
+        """Move a job's record to the trash; return its id there. Errors as for `JobQueue.remove`."""
+        with self.library.lock:  # first, as always where both are locked
+            return self.queue.remove(name, self.library.discard)
+
+    def restore(self, number: str) -> Path:
+        """Move something back from the trash; see `Library.restore`."""
+        with self.library.lock:
+            path = self.library.restore(number)
+            if path.parent == self.library.hidden(JOBS):
+                self.queue.put_back(path.name)
+        return path
 
     def _check_first(self, work: Work, others: list[Job]) -> None:
         """Check that no other job does the same work or writes to the same place.

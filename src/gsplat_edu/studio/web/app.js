@@ -4,14 +4,14 @@ import { keepPresses } from "../../viewer/web/patch.js";
 import { gone } from "./api.js";
 import { announce, keptFocus, patch, put } from "./dom.js";
 import { Store } from "./store.js";
-import { library } from "./library.js";
+import { home } from "./home.js";
 import { trash } from "./trash.js";
 import { photos } from "./photos.js";
 import { capture } from "./capture.js";
 import { run, scene } from "./tabs.js";
 import { jobs } from "./jobs.js";
 
-const SCREENS = { "": library, photos, captures: capture, runs: run, scenes: scene, jobs, trash };
+const SCREENS = { "": home, photos, captures: capture, runs: run, scenes: scene, jobs, trash };
 const store = new Store();
 const main = document.getElementById("main");
 const keys = document.getElementById("keys");
@@ -37,7 +37,7 @@ function route() {
   if (shown?.follows?.(where)) return; // the screen shows another part of itself
   shown?.close?.();
   patch(main);
-  shown = (SCREENS[where.kind] ?? library)({ main, store, where });
+  shown = (SCREENS[where.kind] ?? home)({ main, store, where });
   update();
   for (const item of document.querySelectorAll("header nav a")) {
     const jobsShown = where.kind === "jobs";
@@ -62,6 +62,21 @@ function update() {
   put(document.getElementById("job-count"), active ? String(active) : "");
   shown?.update?.();
   keepFocus();
+}
+
+// Files are dropped anywhere. The screen that is shown takes them in, or else home does.
+function onDrag(event) {
+  event.preventDefault(); // a dropped file must not open
+  const { type, dataTransfer, relatedTarget } = event;
+  const holdsFiles = Boolean(dataTransfer?.types.includes("Files"));
+  const isOver = holdsFiles && (type === "dragover" || (type === "dragleave" && relatedTarget));
+  document.body.classList.toggle("dropping", Boolean(isOver));
+  if (type !== "drop" || !holdsFiles) return;
+  if (!shown.take) {
+    history.pushState(null, "", "#/");
+    route();
+  }
+  shown.take(dataTransfer);
 }
 
 // Many events come at once; one picture needs one update.
@@ -129,8 +144,7 @@ function start() {
   addEventListener("keydown", onKey);
   addEventListener("hashchange", route);
   addEventListener("focus", () => store.refreshSoon());
-  addEventListener("dragover", (event) => event.preventDefault()); // a file dropped beside the field must not open
-  addEventListener("drop", (event) => event.preventDefault());
+  for (const type of ["dragover", "dragleave", "drop"]) addEventListener(type, onDrag);
   route();
   store.refresh();
   store.readJobs().catch(() => {}); // the stream says when to read them again

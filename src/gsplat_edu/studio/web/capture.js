@@ -1,12 +1,13 @@
 // The screen of a capture: previews, the doctor's findings, and the start of a training with its forecast.
 
 import { at, get } from "./api.js";
-import { attempt, button, errorLine, forecastText, h, heading, link, patch, put, want } from "./dom.js";
+import { attempt, button, duration, errorLine, forecastText, h, heading, link, patch, put, want } from "./dom.js";
 import { choices } from "./choices.js";
 import { doctor } from "./doctor.js";
 import { gallery, unplaced } from "./gallery.js";
 import { startJob } from "./jobs.js";
-import { addressOf, entryHead, factsOf, management, withEntry } from "./library.js";
+import { addressOf, factsOf } from "./entries.js";
+import { entryHead, management, withEntry } from "./screen.js";
 import { places } from "./places.js";
 
 const QUALITIES = [
@@ -16,15 +17,16 @@ const QUALITIES = [
 ];
 
 export function capture(given) {
-  return withEntry(given, (entry) => {
-    let part = entry.unfinished ? search(given, entry) : training(given, entry);
+  const { store } = given;
+  return withEntry(given, (entry, stage) => {
+    let part = entry.unfinished ? search(store, stage, entry) : training(store, stage, entry);
     return {
       entry,
       close: () => part.close?.(),
       update(now) {
         if (part.unfinished && now.unfinished === false) {
           part.clear();
-          part = training(given, now);
+          part = training(store, stage, now);
         }
         part.update(now);
       },
@@ -33,7 +35,7 @@ export function capture(given) {
 }
 
 // A capture that has no poses: its search runs, or was stopped, or failed.
-function search({ main, store }, entry) {
+function search(store, stage, entry) {
   const head = entryHead(store, entry, "Capture");
   const job = [...store.jobs.values()]
     .filter(({ job: { work } }) => work.command === "sfm" && work.outputs[0] === entry.entry)
@@ -47,12 +49,12 @@ function search({ main, store }, entry) {
     ? h("p", { class: "next" }, link("Go to the photos", `#/${at(job.job.subject).slice(5)}`, { class: "button" }))
     : null;
   const parts = [head.element, said, photos, management(store, entry)].filter(Boolean);
-  main.append(...parts);
+  stage.append(...parts);
   return { unfinished: true, update: (now) => head.update(now), clear: () => parts.forEach((part) => part.remove()) };
 }
 
 // The screen of a capture with poses.
-function training({ main, store }, entry) {
+function training(store, stage, entry) {
   const head = entryHead(store, entry, "Capture");
   const line = errorLine();
   const pictures = gallery(
@@ -87,11 +89,10 @@ function training({ main, store }, entry) {
   const missing = h("div", {});
   const runs = h("ul", { class: "plain" });
   const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
-  main.append(
+  stage.append(
     head.element,
     missing,
-    taken.element,
-    start.element,
+    h("div", { class: "watch" }, taken.element, start.element),
     past,
     checked.element,
     pictures.element,
@@ -154,6 +155,16 @@ function startForm(store, entry, draw) {
   });
   const go = h("button", { "data-own": "" }, "Start training");
   const measure = button("Forecast time and memory", () => forecast());
+  let times = {}; // by quality
+
+  // Tells the next step how long the training takes that is chosen; of a number of iterations, nothing is known.
+  function tellTime() {
+    const form = element.querySelector("form");
+    const quality = new FormData(form).get("quality");
+    const isKnown = times[quality] && more.options(quality).quality === quality;
+    form.dataset.takes = isKnown ? `takes about ${duration(times[quality].seconds)}` : "";
+    store.changed();
+  }
 
   async function forecast() {
     measure.hidden = true;
@@ -162,9 +173,9 @@ function startForm(store, entry, draw) {
       const size = more.resolution();
       const resolution = size ? `?resolution=${encodeURIComponent(size)}` : "";
       const { qualities: forecasts } = await get(at(entry.entry, "forecast") + resolution);
-      for (const [value, facts] of said) {
-        facts.textContent = forecastText(forecasts[value]);
-      }
+      for (const [value, facts] of said) facts.textContent = forecastText(forecasts[value]);
+      times = forecasts;
+      tellTime();
     } catch (error) {
       for (const facts of said.values()) facts.textContent = "\u00a0";
       put(forecastLine, error.message);
@@ -182,6 +193,7 @@ function startForm(store, entry, draw) {
       {
         id: "train",
         "data-next": `train ${entry.entry}`,
+        onchange: () => tellTime(),
         onsubmit: (event) => {
           event.preventDefault();
           attempt(go, line, async () => {

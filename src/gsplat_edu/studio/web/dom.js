@@ -46,6 +46,20 @@ export function duration(seconds) {
   return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
+// How long ago a time (s since 1970) was, in words; a date beyond a week.
+export function age(time) {
+  const seconds = Math.max(0, Date.now() / 1000 - time);
+  const days = Math.floor(seconds / 86400);
+  if (seconds < 60) return "just now";
+  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ago`;
+  if (days < 1) return `${Math.floor(seconds / 3600)} h ago`;
+  if (days < 8) return `${count(days, "day")} ago`;
+  return dateOf(new Date(1000 * time));
+}
+
+// "14 May 2026", in the place's own time.
+export const dateOf = (date) => date.toLocaleDateString("en-GB", { day: "numeric", month: "long", year: "numeric" });
+
 // What a training takes, in words: one quality of a forecast.
 export const forecastText = ({ seconds, bytes: memory, gaussians, iterations }) =>
   `about ${duration(seconds)}, ${bytes(memory)} of memory; ${whole(iterations)} iterations, up to ${whole(gaussians)} splats`;
@@ -81,6 +95,30 @@ export function commandLine(command) {
 
 // A line about an error, next to what it is about.
 export const errorLine = () => h("p", { class: "error", role: "alert", hidden: true });
+
+// Asks before something that cannot be undone; resolves to whether the person agreed.
+export function agreed(question, line, yes) {
+  const dialog = h(
+    "dialog",
+    { "aria-labelledby": "agree-title" },
+    heading(2, question, { id: "agree-title" }),
+    h("p", {}, line),
+    h(
+      "form",
+      { method: "dialog", class: "actions" },
+      h("button", { value: "", autofocus: true }, "Cancel"),
+      h("button", { value: "yes", class: "danger" }, yes),
+    ),
+  );
+  document.body.append(dialog);
+  dialog.showModal();
+  return new Promise((resolve) =>
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve(dialog.returnValue === "yes");
+    }),
+  );
+}
 
 // Runs what a button does; shows its error in a line, and keeps the button from being pressed twice.
 export async function attempt(pressed, line, act) {

@@ -1,7 +1,7 @@
 // Takes in photos, folders, zip files, videos and scenes: dropped, chosen, or named by their path.
 
 import { at, post, remove, upload } from "./api.js";
-import { announce, attempt, bytes, button, count, errorLine, h, heading } from "./dom.js";
+import { announce, attempt, bytes, button, count, dateOf, errorLine, h, heading } from "./dom.js";
 
 const AT_ONCE = 3;
 const SCENES = /\.(ply|splat|spz|sog|glb)$/i;
@@ -10,7 +10,8 @@ const POSES = /(?:^|\/)(?:transforms(?:_train|_test|_val)?\.json|cameras\.(?:bin
 const TAIL = 1 << 20; // bytes at the end of a zip file with the names of its files
 const ZIPPED_POSES = /transforms(?:_train)?\.json|cameras\.(?:bin|txt)/;
 const IGNORED = /(?:^|\/)(?:\.[^/]*|Thumbs\.db|desktop\.ini)$/i;
-const NAMELESS = "photos"; // single files have no folder to be named after
+const HEAD = 1 << 18; // bytes at the start of a photo in which its EXIF data lie
+const TAKEN = /((?:19|20)\d\d):(0[1-9]|1[0-2]):(0[1-9]|[12]\d|3[01]) \d\d:\d\d:\d\d\0/g; // a date of EXIF, in every format
 
 // All files below dropped entries, as {file, path}.
 async function filesOf(transfer) {
@@ -39,6 +40,20 @@ async function hasPoses(file) {
   return ZIPPED_POSES.test(new TextDecoder("latin1").decode(tail));
 }
 
+// The day on which a photo was taken: the earliest date in its EXIF data, which a program that changed it later has not
+// replaced; else that of its file.
+export async function dayOf(file) {
+  const text = new TextDecoder("latin1").decode(await file.slice(0, HEAD).arrayBuffer());
+  const [first] = [...text.matchAll(TAKEN)].sort(([one], [other]) => (one < other ? -1 : 1));
+  return first ? new Date(first[1], first[2] - 1, first[3]) : new Date(file.lastModified);
+}
+
+// A name for photos that have no folder to be named after.
+export async function namedByDay(files) {
+  const byName = files.toSorted((one, other) => one.path.localeCompare(other.path, "en", { numeric: true }));
+  return `Photos of ${dateOf(await dayOf(byName[0].file))}`;
+}
+
 // Splits files into entries to make: {kind, name, files: [{file, path}], zip}.
 async function sorted(files, wanted) {
   const groups = new Map();
@@ -60,7 +75,7 @@ async function sorted(files, wanted) {
     if (wanted !== "auto" && !(single && !zip)) kind = wanted;
     const video = !top && own.length === 1 && VIDEOS.test(own[0].path);
     const stem = single || video ? own[0].path.replace(/\.[^.]+$/, "") : top;
-    found.push({ kind, name: stem || NAMELESS, files: own, zip });
+    found.push({ kind, name: stem || (await namedByDay(own)), files: own, zip });
   }
   return found;
 }
@@ -146,7 +161,8 @@ addEventListener("beforeunload", (event) => {
   if (uploading) event.preventDefault();
 });
 
-// The field into which files are dropped. `into` is an entry {kind, name} that files are added to; null makes new ones.
+// How files come in: chosen here, or dropped anywhere, which calls take(transfer). `into` is an entry {kind, name} that files
+// are added to; null makes new ones. began() is called once something comes in.
 export function intake(store, into = null) {
   const line = errorLine();
   const batches = h("div", { class: "batches" });
@@ -157,10 +173,12 @@ export function intake(store, into = null) {
     h("option", { value: "photos" }, "photos without poses"),
     h("option", { value: "captures" }, "a capture: photos with poses"),
   );
+  const made = { began: () => {}, progress: h("div", { class: "coming" }, line, batches) };
 
-  async function take(files) {
+  async function taken(files) {
     const groups = into ? [{ ...into, files, zip: false }] : await sorted(files, kind.value);
     if (!groups.some((group) => group.files.length)) throw new Error("What was dropped holds no files.");
+    made.began();
     let landed = null;
     for (const group of groups) {
       if (!into) group.name = await promised(group.kind, group.name);
@@ -186,45 +204,42 @@ export function intake(store, into = null) {
       onchange: () => {
         const files = [...input.files].map((file) => ({ file, path: file.webkitRelativePath || file.name }));
         input.value = "";
-        attempt(null, line, () => take(files));
+        attempt(null, line, () => taken(files));
       },
     });
     return [input, button(text, () => input.click(), attributes)];
   };
 
-  const element = h(
+  made.take = (transfer) => {
+    const files = filesOf(transfer); // what was dropped is gone once the event has ended
+    return attempt(null, line, async () => taken(await files));
+  };
+  made.element = h(
     "section",
-    { class: "drop", "aria-label": into ? "Add photos" : "Add photos, a video or a scene" },
-    h(
-      "p",
-      { class: "hint" },
-      into ? "Drop more photos here, or" : "Drop photos, folders, a zip file, a video or a scene here, or",
-    ),
+    { class: into ? "drop row" : "drop empty", "aria-label": into ? "Add photos" : "Add photos, a video or a scene" },
+    into ? h("p", {}, "Drop more photos anywhere, or") : h("p", { class: "hint" }, "Drop photos anywhere"),
+    into ? null : h("p", { class: "quiet" }, "A folder, a zip file, a video or a finished scene will do, too."),
     h(
       "div",
       { class: "row" },
-      choose({}, "Choose files", { "data-key-u": "" }),
+      choose({}, "Choose files", { "data-key-u": "", class: into ? null : "primary" }),
       into ? null : choose({ webkitdirectory: true }, "Choose a folder"),
     ),
-    into ? null : h("p", { class: "row" }, h("label", { for: "take-as" }, "Take them in as "), kind),
-    into ? null : pathForm(store),
-    line,
-    batches,
+    into
+      ? null
+      : h(
+          "details",
+          {},
+          h("summary", {}, "Other ways"),
+          h("p", { class: "row" }, h("label", { for: "take-as" }, "Take them in as "), kind),
+          pathForm(store, made),
+        ),
   );
-  let inside = 0;
-  const mark = (by) => element.classList.toggle("over", (inside = Math.max(0, inside + by)) > 0);
-  element.addEventListener("dragenter", () => mark(1));
-  element.addEventListener("dragleave", () => mark(-1));
-  element.addEventListener("drop", (event) => {
-    event.preventDefault();
-    mark(-inside);
-    attempt(null, line, async () => take(await filesOf(event.dataTransfer)));
-  });
-  return element;
+  return made;
 }
 
 // Uses a folder or file of this computer where it is.
-function pathForm(store) {
+function pathForm(store, made) {
   const line = errorLine();
   const path = h("input", { id: "path", type: "text", required: true, autocomplete: "off", spellcheck: "false" });
   const kind = h(
@@ -240,9 +255,10 @@ function pathForm(store) {
       onsubmit: (event) => {
         event.preventDefault();
         attempt(add, line, async () => {
-          const made = await post("/api/adopt", { kind: kind.value, path: path.value });
+          const adopted = await post("/api/adopt", { kind: kind.value, path: path.value });
           await store.refresh();
-          location.hash = `#/${made.kind}/${encodeURIComponent(made.name)}`;
+          made.began();
+          location.hash = `#/${adopted.kind}/${encodeURIComponent(adopted.name)}`;
         });
       },
     },
@@ -252,5 +268,5 @@ function pathForm(store) {
     kind,
     add,
   );
-  return h("details", {}, h("summary", {}, "Use a folder on this computer without copying it"), form, line);
+  return h("div", {}, h("h3", {}, "Use a folder on this computer without copying it"), form, line);
 }

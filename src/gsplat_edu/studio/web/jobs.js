@@ -1,7 +1,8 @@
 // Jobs: how far each one is, its buttons, and the command that repeats it.
 
-import { at, get, post, remove } from "./api.js";
+import { at, get, post } from "./api.js";
 import { attempt, button, commandLine, duration, errorLine, h, heading, link, patch, put, toned, want } from "./dom.js";
+import { discard } from "./undo.js";
 
 const STATES = {
   held: "waits for you",
@@ -43,7 +44,9 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const pause = button("Pause", change("pause"));
   const resume = button("Resume", change("resume"), { class: "primary" });
   const stop = button("Stop", change("cancel"), { title: "A training writes a checkpoint and can be resumed." });
-  const forget = button(REMOVE, (event) => attempt(event.currentTarget, line, () => remove(at("jobs", id))));
+  const forget = button(REMOVE, (event) =>
+    attempt(event.currentTarget, line, () => discard(store, at("jobs", id), `“${store.jobs.get(id).job.title}”`)),
+  );
   if (main) {
     pause.dataset.keyP = "";
     resume.dataset.keyP = "";
@@ -141,11 +144,15 @@ function waitingFor(store, others) {
 }
 
 // Progress is that of the present stage.
-export function leftOf({ done, total, seconds_left: left, is_least: isLeast }, isStage) {
-  const share = `${Math.floor((100 * done) / total)} %`;
-  return left === null || left === undefined
-    ? share
-    : `${share}, ${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
+export function leftOf(progress, isStage) {
+  const share = `${Math.floor((100 * progress.done) / progress.total)} %`;
+  return [share, timeLeft(progress, isStage)].filter(Boolean).join(", ");
+}
+
+// "4 min left"; empty if there is no forecast.
+export function timeLeft({ seconds_left: left, is_least: isLeast }, isStage) {
+  if (left === null || left === undefined) return "";
+  return `${isLeast ? "at least " : ""}${duration(left)} left${isStage ? " in this step" : ""}`;
 }
 
 // Why there is no picture of a training yet.
@@ -182,7 +189,7 @@ export function jobs({ main, store }) {
   const fault = errorLine();
   const list = h("div", { class: "cards wide" });
   const broken = h("ul", { class: "damaged", "aria-label": "damaged jobs" });
-  const empty = h("p", {}, "No jobs yet. Add photos in the ", link("library", "#/"), ", and start one there.");
+  const empty = h("p", {}, "No jobs yet. They begin in your ", link("projects", "#/"), ".");
   main.append(heading(1, "Jobs"), broken, fault, empty, list);
   return {
     update() {
@@ -191,7 +198,8 @@ export function jobs({ main, store }) {
       patch(
         broken,
         [...store.damaged.values()].map(({ id, line }) => {
-          const onclick = ({ currentTarget }) => attempt(currentTarget, fault, () => remove(at("jobs", id)));
+          const onclick = ({ currentTarget }) =>
+            attempt(currentTarget, fault, () => discard(store, at("jobs", id), `job ${id}`));
           return want("li", { "data-key": id }, line, " ", want("button", { type: "button", onclick }, REMOVE));
         }),
       );

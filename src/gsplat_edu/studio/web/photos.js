@@ -4,7 +4,8 @@ import { attempt, errorLine, h, heading, patch, put, want } from "./dom.js";
 import { gallery, unplaced } from "./gallery.js";
 import { intake } from "./intake.js";
 import { jobPlace, startJob } from "./jobs.js";
-import { addressOf, entryHead, management, searchOf, withEntry } from "./library.js";
+import { addressOf, searchOf } from "./entries.js";
+import { entryHead, management, withEntry } from "./screen.js";
 
 const MATCHERS = [
   ["", "chosen by what the photos are"],
@@ -13,8 +14,8 @@ const MATCHERS = [
 ];
 
 export function photos(given) {
-  const { main, store } = given;
-  return withEntry(given, (entry) => {
+  const { store } = given;
+  return withEntry(given, (entry, stage) => {
     const head = entryHead(store, entry, "Photos");
     const pictures = gallery(entry.entry);
     const line = errorLine();
@@ -55,31 +56,41 @@ export function photos(given) {
         h("label", { class: "check" }, exact, " the same poses to the bit every time (one thread, slower)"),
       ),
     );
+    const add = entry.adopted ? null : intake(store, { kind: "photos", name: entry.name });
     const later = h(
       "div",
       { class: "later", hidden: true },
-      entry.adopted ? null : intake(store, { kind: "photos", name: entry.name }),
+      add && [add.progress, add.element],
       management(store, entry),
     );
     const missing = h("div", {}); // the photos that its capture lacks
-    main.append(
+    stage.append(
       head.element,
       missing,
       h(
-        "section",
-        { "aria-label": "poses" },
-        heading(2, "Poses"),
-        h("p", {}, "The first step finds where each photo was taken (structure from motion). Photos need to overlap."),
-        form,
-        line,
-        job.element,
-        next,
+        "div",
+        { class: "watch turned" },
+        h(
+          "section",
+          { "aria-label": "poses" },
+          heading(2, "Poses"),
+          h(
+            "p",
+            {},
+            "The first step finds where each photo was taken (structure from motion). Photos need to overlap.",
+          ),
+          form,
+          line,
+          job.element,
+          next,
+        ),
+        pictures.element,
       ),
-      pictures.element,
       later,
     );
     return {
       entry,
+      take: add?.take,
       update(now) {
         job.update();
         head.update(now);

@@ -1,37 +1,92 @@
-// A project: its timeline, and the one next step.
+// A project: how far it is, and the one next step.
 
 import { at } from "./api.js";
-import { attempt, errorLine, h, patch, put, want } from "./dom.js";
-import { startJob } from "./jobs.js";
+import { attempt, count, errorLine, h, patch, put, want } from "./dom.js";
+import { startJob, timeLeft } from "./jobs.js";
 
-const STAGES = { photos: "Photos", poses: "Poses", training: "Training", look: "Look and edit", share: "Share" };
+export const STAGES = { photos: "Photos", poses: "Cameras", training: "Training", look: "Scene", share: "Share" };
 const STEPS = new Set(["sfm", "train", "convert", "render"]); // commands of jobs that lead to the next stage
 
 // The address of a place such as "runs/toy/share".
 export const hashOf = (place) => `#/${place.split("/").map(encodeURIComponent).join("/")}`;
 
-// The stages in order, each a link to what there is of it.
-export function timeline() {
-  const element = h("ol", { class: "timeline", "aria-label": "stages of the project" });
-  return {
-    element,
-    update(project) {
-      element.hidden = !project;
-      if (!project) return;
-      const present = project.steps.findIndex(({ stage }) => stage === project.stage);
-      patch(
-        element,
-        project.steps.map(({ stage, place }, index) => {
-          const title = STAGES[stage];
-          const more = {
-            class: index < present && place ? "done" : null,
-            "aria-current": index === present ? "step" : null,
-          };
-          return want("li", more, place ? want("a", { href: hashOf(place) }, title) : want("span", {}, title));
-        }),
-      );
-    },
+// What a job does, in a card's words.
+const DOING = {
+  sfm: "Finding the cameras",
+  train: "Training",
+  convert: "Exporting",
+  render: "Making a video",
+  clean: "Cleaning",
+  mesh: "Making a mesh",
+  doctor: "Examining the photos",
+};
+
+// The job that runs for one of some entries; undefined if there is none.
+export const runningIn = (store, entries) =>
+  entries.flatMap(({ entry }) => store.jobsOf(entry)).find(({ job }) => job.state === "running");
+
+const doing = (view) => DOING[view.job.work.command] ?? view.job.title;
+
+// "Training, 4 min left".
+function workLine(view) {
+  const { progress, stages } = view;
+  const left = progress?.total ? timeLeft(progress, stages.length > 1) : "";
+  return [doing(view), left].filter(Boolean).join(", ");
+}
+
+const ENDS = {
+  queued: "waits for its turn",
+  paused: "is paused",
+  held: "waits for you",
+  failed: "failed",
+  interrupted: "was interrupted",
+};
+
+// How far a project is, in one line.
+export function stateLine(store, project, entries) {
+  const running = runningIn(store, entries);
+  if (running) return workLine(running);
+  const last = entries.map(({ entry }) => store.jobsOf(entry)[0]).findLast((view) => view && ENDS[view.job.state]);
+  if (last) return `${doing(last)} ${ENDS[last.job.state]}`;
+  if (entries.some(({ problem }) => problem)) return "Damaged";
+  const stages = Object.keys(STAGES);
+  for (const stage of stages.slice(1, stages.indexOf(project.stage) + 1).reverse()) {
+    const line = stepLine(store, project, stage);
+    if (line) return `${STAGES[stage]}: ${line.toLowerCase()}`;
+  }
+  return stepLine(store, project, "photos");
+}
+
+// What there is of one step of a project, in two or three words; empty if there is nothing.
+export function stepLine(store, project, stage) {
+  const entries = project.entries.map((entry) => store.entry(...entry.split("/"))).filter(Boolean);
+  const running = runningIn(store, entries);
+  const isAt = running && (RUNS_AT[running.job.work.command] ?? "") === stage;
+  if (isAt) return "Working on it"; // the job's card has the one clock of a screen
+  const of = (...kinds) => entries.filter(({ kind }) => kinds.includes(kind));
+  const result = of("runs").findLast(({ verdict }) => verdict) ?? null;
+  const lines = {
+    photos: () => photosLine(of("photos", "captures")[0]),
+    poses: () => camerasLine(of("captures").findLast(({ unfinished }) => !unfinished)),
+    training: () => (of("runs").some(({ finished }) => finished) ? "Done" : of("runs").length ? "Not finished" : ""),
+    look: () => result?.verdict.grade ?? (of("scenes").length ? "Ready" : ""),
+    share: () => (project.stage === "share" ? "File made" : ""),
   };
+  return lines[stage]();
+}
+
+const RUNS_AT = { sfm: "poses", train: "training", clean: "look", convert: "share", render: "share", mesh: "share" };
+
+function photosLine(entry) {
+  if (!entry) return "";
+  const some = [entry.photos && count(entry.photos, "photo"), entry.videos && count(entry.videos, "video")];
+  return some.filter(Boolean).join(", ") || "No photos yet";
+}
+
+function camerasLine(capture) {
+  if (!capture?.layout) return "";
+  const { search } = capture;
+  return search?.photos ? `${search.posed} of ${search.photos} placed` : "Placed";
 }
 
 // Whether the page shows a place: an entry on any of its tabs, or the tab for sharing.
@@ -48,7 +103,7 @@ function onward(step) {
   return found ?? null;
 }
 
-// The button for the next step. On the library's cards, `of` names the project; on an entry's screen, a form that asks
+// The button for the next step, and how long it takes if that is known. On the cards of home, `of` names the project; on an entry's screen, a form that asks
 // for the same job is sent with what is chosen there.
 export function nextStep(store, of = "") {
   const line = errorLine();
@@ -95,11 +150,13 @@ export function nextStep(store, of = "") {
         const own = one.querySelector("[data-own]");
         if (own) own.hidden = one === form;
       }
-      const text = JSON.stringify([found, Boolean(form), active]);
+      const takes = form?.dataset.takes ?? ""; // how long it takes with what is chosen there
+      const text = JSON.stringify([found, Boolean(form), active, takes]);
       if (shown === text) return;
       shown = text;
       put(line, "");
-      patch(place, found ? made(found, form) : active && !of && note);
+      const time = takes && want("span", { class: "quiet" }, takes);
+      patch(place, found ? [made(found, form), time] : active && !of && note);
     },
   };
 }

@@ -18,7 +18,7 @@ import {
 } from "./dom.js";
 import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
-import { addressOf } from "./library.js";
+import { addressOf } from "./entries.js";
 import { meshes, newestOf } from "./mesh.js";
 import { discard } from "./undo.js";
 

@@ -4,7 +4,7 @@ import { h, link, patch } from "./dom.js";
 import { hasDraft } from "./draft.js";
 import { edit } from "./edit.js";
 import { compare, judge } from "./judge.js";
-import { entryHead, management, withEntry } from "./library.js";
+import { entryHead, management, withEntry } from "./screen.js";
 import { share } from "./share.js";
 import { undoBegun } from "./undo.js";
 import { look, watch } from "./watch.js";
@@ -16,8 +16,8 @@ export const run = (given) => tabbed(given, "Run", RUN);
 export const scene = (given) => tabbed(given, "Scene", SCENE);
 
 function tabbed(given, title, tabs) {
-  const { store, main } = given;
-  return withEntry(given, (entry) => {
+  const { store } = given;
+  return withEntry(given, (entry, stage) => {
     const head = entryHead(store, entry, title);
     const base = `#/${entry.kind}/${encodeURIComponent(entry.name)}`;
     const links = new Map(
@@ -25,14 +25,14 @@ function tabbed(given, title, tabs) {
     );
     const place = h("div", { class: "tab" });
     const begun = undoBegun(store, entry);
-    main.append(
+    stage.append(
       head.element,
       begun.element,
       h("nav", { class: "tabs", "aria-label": `parts of ${entry.name}` }, [...links.values()]),
       place,
     );
     const manage = management(store, entry);
-    main.append(manage);
+    stage.append(manage);
     let [part, now] = [null, entry];
 
     const top = () => {

@@ -1,7 +1,12 @@
 // What was removed, until the trash is emptied.
 
 import { at, get, post, remove } from "./api.js";
-import { attempt, button, errorLine, h, heading, link, patch, want } from "./dom.js";
+import { agreed, attempt, button, errorLine, h, heading, link, patch, want } from "./dom.js";
+
+const said = (kind, name, entry) => {
+  if (kind === "jobs") return `job ${name} of the list`;
+  return entry ? `${name}, a file of ${entry}` : `${kind}/${name}`;
+};
 
 export function trash({ main, store }) {
   const line = errorLine();
@@ -9,7 +14,7 @@ export function trash({ main, store }) {
   const empty = h("p", { hidden: true }, "The trash is empty.");
   const clear = button("Empty the trash", () =>
     attempt(clear, line, async () => {
-      if (!confirm("Delete everything in the trash? This cannot be undone.")) return;
+      if (!(await agreed("Empty the trash?", "What is in it is deleted for good.", "Delete everything"))) return;
       await remove("/api/trash");
       await read();
       store.refresh();
@@ -31,12 +36,13 @@ export function trash({ main, store }) {
             await post(at("trash", id, "restore"));
             await read();
             store.refresh();
+            if (kind === "jobs") await store.readJobs();
           });
         const when = new Date(1000 * removed).toLocaleString("en");
         return want(
           "li",
           { class: "row", "data-key": id },
-          want("span", {}, entry ? `${name}, a file of ${entry}` : `${kind}/${name}`),
+          want("span", {}, said(kind, name, entry)),
           want("span", { class: "quiet" }, `removed ${when}`),
           want("button", { type: "button", onclick }, "Restore"),
         );
@@ -50,7 +56,7 @@ export function trash({ main, store }) {
     list,
     h("p", { class: "row" }, clear),
     line,
-    h("p", {}, link("Back to the library", "#/")),
+    h("p", {}, link("Back to the projects", "#/")),
   );
   attempt(null, line, read);
   return {};

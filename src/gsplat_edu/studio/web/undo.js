@@ -38,14 +38,15 @@ export async function discard(store, address, name) {
   const undo = button("Undo", () =>
     attempt(undo, line, async () => {
       const { entry } = await post(at("trash", trash, "restore"));
-      await store.refresh();
+      const isJob = entry.startsWith("jobs/");
+      await Promise.all([store.refresh(), isJob && store.readJobs()]);
       hide();
       announce(`${name} is back`);
-      if (address === at(entry)) location.hash = `#/${entry.split("/").map(encodeURIComponent).join("/")}`;
+      if (address === at(entry) && !isJob) location.hash = `#/${entry.split("/").map(encodeURIComponent).join("/")}`;
     }),
   );
   const away = button("Close", hide);
-  patch(place, h("p", { class: "row" }, h("span", {}, `${name} is in the trash.`), undo, away), line);
+  patch(place, h("p", { class: "toast" }, h("span", {}, `${name} is in the trash.`), undo, away), line);
   place.hidden = false;
   await store.refresh();
 }

@@ -6,7 +6,7 @@ import { verdictOf } from "./judge.js";
 import { curve } from "./curves.js";
 import { beside, frame } from "./frame.js";
 import { jobPlace, waitsFor } from "./jobs.js";
-import { addressOf } from "./library.js";
+import { addressOf } from "./entries.js";
 
 const EVERY = 2000; // milliseconds between two looks at the curves
 const REFRESH = 5; // looks at the curves between two looks at the library

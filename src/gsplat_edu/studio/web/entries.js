@@ -1,0 +1,57 @@
+// What the entries of the library are, in a few words.
+
+import { bytes, count, whole } from "./dom.js";
+
+export const KINDS = { photos: "Photos", captures: "Capture", runs: "Run", scenes: "Scene" };
+
+export const addressOf = ({ kind, name }) => `#/${kind}/${encodeURIComponent(name)}`;
+
+// What an entry is, in a few words.
+export function factsOf(entry) {
+  const { kind } = entry;
+  if (kind === "photos" || kind === "captures") {
+    const videos = entry.videos ? count(entry.videos, "video") : "";
+    const photos = entry.photos || !videos ? count(entry.photos, "photo") : "";
+    if (entry.unfinished) return [bytes(entry.bytes)];
+    return [
+      photos,
+      videos,
+      kind === "captures" ? (entry.layout ?? "no poses found") : "",
+      searchOf(entry),
+      bytes(entry.bytes),
+    ];
+  }
+  if (kind === "scenes") return [entry.file ? entry.file.split(".").at(-1) : "no scene file", bytes(entry.scene_bytes)];
+  const done = entry.iterations ?? 0;
+  return [
+    entry.training
+      ? "in training"
+      : entry.finished
+        ? `${whole(done)} iterations`
+        : entry.planned
+          ? `${whole(done)} of ${whole(entry.planned)} iterations`
+          : "no iterations yet",
+    entry.verdict?.grade ?? "",
+    entry.num_gaussians ? `${whole(entry.num_gaussians)} splats` : "",
+    entry.edited ? "edited" : "",
+  ];
+}
+
+// What the search for a capture's poses found; empty if they come from another program.
+export function searchOf({ search }) {
+  if (!search) return "";
+  const all =
+    search.photos === null
+      ? ""
+      : `${whole(search.posed)} of ${count(search.photos, "photo")} ${search.photos === 1 ? "has" : "have"} a pose`;
+  return [all, `mean error ${search.error.toFixed(2)} px`].filter(Boolean).join(", ");
+}
+
+// The state of the newest job of an entry that somebody has to know of, or what is wrong with the entry; else "".
+export function stateOf(store, entry) {
+  const job = store.jobsOf(entry.entry)[0];
+  if (job && (job.active || ["held", "failed", "interrupted"].includes(job.job.state))) return job.job.state;
+  if (entry.problem) return "damaged";
+  if (entry.unfinished) return "unfinished";
+  return "";
+}
