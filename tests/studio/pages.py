@@ -100,7 +100,9 @@ class Visitor:
 
     def command(self, job):
         """Return the printed command of a job's card, by the job's title."""
-        return self.tab.get_by_role("article", name=job).get_by_role("textbox", name="command").inner_text()
+        card = self.tab.get_by_role("article", name=job)
+        card.locator("details").evaluate("(one) => (one.open = true)")
+        return card.get_by_role("textbox", name="command").inner_text()
 
 
 def go(tab, place):

@@ -86,7 +86,7 @@ def test_the_commands_and_their_defaults(library):
 
 
 REQUESTS = (
-    ({"command": "sfm", "subject": "photos/a b"}, "poses of a b", "photos/a b"),
+    ({"command": "sfm", "subject": "photos/a b"}, "cameras of a b", "photos/a b"),
     (
         {"command": "train", "subject": "captures/a", "options": {"quality": "draft"}},
         "training of a-run-2",

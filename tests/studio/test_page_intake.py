@@ -105,13 +105,13 @@ def test_a_dropped_video_becomes_a_capture(visitor, library, tmp_path):
     tab.locator("summary", has_text="More").click()
     tab.get_by_label("Frames of the video").fill("30")
     unread = SearchUnread(tab)
-    tab.get_by_role("button", name="Find the poses").click()
+    tab.get_by_role("button", name="Place the photos").click()
     onward = tab.get_by_role("link", name=re.compile("^Continue with the capture"))
     onward.wait_for(timeout=240_000)
     first = onward.element_handle()
     unread.ended = True
     library[0].stream.library_changed()
-    tab.get_by_text("30 of 30 photos have a pose").first.wait_for()
+    tab.get_by_text("30 of 30 photos placed").first.wait_for()
     assert first.evaluate("link => link.isConnected"), "a press while the words come would be lost"
     onward.click()
     person.reach("#/captures/orbit")

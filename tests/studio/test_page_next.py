@@ -96,7 +96,7 @@ def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tm
     tab.evaluate(DROP, [files, ".drop"])
     person.reach(f"#/photos/{quote(BY_DAY)}")
 
-    press_next(tab, "Find the poses")
+    press_next(tab, "Place the photos")
     go(tab, "")
     press_next(tab, "Look at the cameras", 240)
     person.reach(f"#/captures/{quote(BY_DAY)}")

@@ -22,8 +22,8 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     tab = person.tab
     tab.evaluate(DROP, [[[f"{i}.png", encoded(png(i, (160, 120)))] for i in range(3)], ".drop"])
     person.reach(f"#/photos/{quote(BY_DAY)}")
-    tab.get_by_role("button", name="Find the poses").click()
-    card = tab.get_by_role("article", name=f"poses of {BY_DAY}")
+    tab.get_by_role("button", name="Place the photos").click()
+    card = tab.get_by_role("article", name=f"cameras of {BY_DAY}")
     card.locator(".badge.poor").wait_for()
     (work,) = (job.work for job in studio.queue.jobs())
     assert (studio.library.root / work.outputs[0] / "sfm").is_dir(), "a search that can be resumed is kept"

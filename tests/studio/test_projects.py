@@ -76,7 +76,7 @@ def test_a_project_goes_from_photos_to_an_export(page, studio):
     folder = add_photos(studio, "walk")
     assert only(page)["stage"] == "poses"
     step = only(page)["next"]
-    assert step == {"label": "Find the poses", "request": {"command": "sfm", "subject": "photos/walk"}}
+    assert step == {"label": "Place the photos", "request": {"command": "sfm", "subject": "photos/walk"}}
     job = job_of(studio, **step["request"])
     assert only(page)["next"] == {"label": "Watch the search for poses", "place": "photos/walk"}
     job = studio.queue._put(job, state=State.DONE)
@@ -115,7 +115,7 @@ def test_a_project_goes_from_photos_to_an_export(page, studio):
 def test_what_was_stopped_is_tried_again(page, studio, state):
     add_photos(studio, "walk")
     job_of(studio, state, command="sfm", subject="photos/walk")
-    assert only(page)["next"] == {"label": "Try again to find the poses", "place": "photos/walk"}
+    assert only(page)["next"] == {"label": "Try again to place the photos", "place": "photos/walk"}
     capture = add_capture(studio, "walk", {})
     job_of(studio, state, command="train", subject="captures/walk")
     add_run(studio, "walk", capture, iterations=10)

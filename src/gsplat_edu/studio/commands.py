@@ -71,7 +71,7 @@ class _Asked:
         if kind == "photos" and not any(True for _ in files_within(entry)):
             raise conflict(f"{inputs[0]}: is empty; add photos first")
         if kind == "captures" and is_unfinished(entry):
-            raise conflict(f"{inputs[0]}: has no poses yet; find the poses of its photos first")
+            raise conflict(f"{inputs[0]}: its photos are not placed yet; place them first")
         return kind, entry
 
     def _along(self) -> dict[str, str]:
@@ -283,7 +283,7 @@ class _Command:
 
 
 COMMANDS: Mapping[str, _Command] = {
-    "sfm": _Command(_sfm, "poses of INPUT", ("photos",), "captures", word="poses"),
+    "sfm": _Command(_sfm, "cameras of INPUT", ("photos",), "captures", word="poses"),
     "train": _Command(_train, "training of OUTPUT", ("captures", "photos"), "runs", word="run"),
     "doctor": _Command(_doctor, "doctor of INPUT", ("captures", "runs"), without_options=("runs",)),
     "clean": _Command(_clean, "cleaning of INPUT", ("runs",), "scenes", "-clean", edits=True),

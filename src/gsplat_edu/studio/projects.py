@@ -207,7 +207,7 @@ class _State:
             return "photos", {"label": "Add photos", "place": entry}
         searches = [job for job in self.jobs if job.work.command == "sfm" and job.work.inputs[0] == entry]
         if searches and searches[-1].state in PENDING:
-            return "poses", {"label": "Watch the search for poses", "place": entry}
+            return "poses", {"label": "Watch the photos being placed", "place": entry}
         if searches and searches[-1].resumable:
-            return "poses", {"label": "Try again to find the poses", "place": entry}
-        return "poses", {"label": "Find the poses", "request": {"command": "sfm", "subject": entry}}
+            return "poses", {"label": "Try again to place the photos", "place": entry}
+        return "poses", {"label": "Place the photos", "request": {"command": "sfm", "subject": entry}}

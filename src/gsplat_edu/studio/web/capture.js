@@ -43,7 +43,7 @@ function search(store, stage, entry) {
   const said = h(
     "p",
     {},
-    "This capture has no poses yet. They come from its photos, where the search for them runs, or can be tried again.",
+    "These photos are not placed yet. The screen of the photos shows how far that is, or lets you try again.",
   );
   const photos = job
     ? h("p", { class: "next" }, link("Go to the photos", `#/${at(job.job.subject).slice(5)}`, { class: "button" }))
@@ -77,7 +77,7 @@ function training(store, stage, entry) {
   const checked = doctor(
     store,
     entry.entry,
-    "Looks for blurred photos, wrong poses, gaps and other faults before you spend time on a training.",
+    "Looks for blurred or misplaced photos, gaps and other faults before you spend time on a training.",
     (marks) => [pictures, taken].forEach((part) => part.mark(marks)),
     (photo, out) => {
       pictures.left(photo, out);

@@ -16,7 +16,7 @@ export function factsOf(entry) {
     return [
       photos,
       videos,
-      kind === "captures" ? (entry.layout ?? "no poses found") : "",
+      kind === "captures" ? (entry.layout ?? "not placed") : "",
       searchOf(entry),
       bytes(entry.bytes),
     ];
@@ -37,14 +37,10 @@ export function factsOf(entry) {
   ];
 }
 
-// What the search for a capture's poses found; empty if they come from another program.
+// How many photos of a capture were placed; empty if their poses come from another program.
 export function searchOf({ search }) {
   if (!search) return "";
-  const all =
-    search.photos === null
-      ? ""
-      : `${whole(search.posed)} of ${count(search.photos, "photo")} ${search.photos === 1 ? "has" : "have"} a pose`;
-  return [all, `mean error ${search.error.toFixed(2)} px`].filter(Boolean).join(", ");
+  return search.photos === null ? "" : `${whole(search.posed)} of ${count(search.photos, "photo")} placed`;
 }
 
 // The state of the newest job of an entry that somebody has to know of, or what is wrong with the entry; else "".

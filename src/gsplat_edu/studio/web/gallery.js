@@ -143,7 +143,7 @@ export function unplaced({ search }, photos) {
     const image = photos && want("img", { src: thumbOf(photos, name, 128), alt: "", width: 96, height: 72 });
     return want("figure", { "data-key": name }, image, want("figcaption", {}, name));
   };
-  const advice = `Take two more photos beside ${each}, which share most of what they show, add them to the photos, and find the poses again. What only ${names.length === 1 ? "this photo shows" : "these photos show"} will be missing.`;
+  const advice = `Take two more photos beside ${each}, which share most of what they show, add them to the photos, and place the photos again. What only ${names.length === 1 ? "this photo shows" : "these photos show"} will be missing.`;
   return want(
     "div",
     { class: "notice unplaced", role: "group", "aria-label": "photos that were not placed" },

@@ -13,7 +13,7 @@ const STATES = {
   failed: "failed",
   cancelled: "stopped",
   interrupted: "interrupted",
-  unfinished: "no poses yet",
+  unfinished: "not placed yet",
 };
 
 const REMOVE = "Remove from the list";
@@ -53,6 +53,8 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   }
   const output = h("pre", { tabindex: "0", role: "region", "aria-label": "output" });
   const view = store.jobs.get(id);
+  const label = h("p", { class: "label" });
+  const command = h("div", {});
   const more = h(
     "details",
     {
@@ -61,17 +63,18 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
           output.textContent = (await get(at("jobs", id, "output")).catch((error) => error.message)) || "nothing yet";
       },
     },
-    h("summary", {}, "Output"),
+    h("summary", {}, "Details"),
+    label,
+    command,
     output,
   );
+  more.open = view.job.state === "held"; // what somebody starts is in sight
   const waits = h("p", { class: "waits quiet" });
   const ask = h(
     "p",
     {},
     "An earlier start of the studio left this job waiting. It runs this command once you start it:",
   );
-  const label = h("p", { class: "label" });
-  const command = h("div", {});
   const element = h(
     "article",
     { class: "job card", "aria-label": view.job.title },
@@ -83,15 +86,13 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     line,
     ask,
     h("div", { class: "row" }, pause, resume, stop, forget),
-    label,
-    command,
     more,
   );
 
   function update() {
     const found = store.jobs.get(id);
     if (!found) return;
-    const { job, progress, messages } = found;
+    const { job, progress } = found;
     patch(state, badge(job.cancelling ? "stopping" : job.state));
     const current = found.stage;
     const ended = job.state === "done";
@@ -100,7 +101,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
       stages,
       found.stages.map((name) =>
         // files without their folders
-        want("li", { "data-key": name, title: name, "aria-current": step(name) }, name.replace(/\S*\/(?=\S)/g, "")),
+        want("li", { "data-key": name, title: name, "aria-current": step(name) }, name.replace(/^(\S+) .*\//, "$1 ")),
       ),
     );
     const known = progress?.total && !ended;
@@ -110,9 +111,8 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     else bar.value = 0;
     bar.parentElement.hidden = !found.active && !ended; // how far the last stage was says nothing of a job that failed
     left.textContent = known && found.active ? leftOf(progress, found.stages.length > 1) : "";
-    const pausing = job.state === "paused" ? "Paused. Resume continues it." : "";
-    said.textContent = pausing || (found.active ? (messages.at(-1) ?? "") : "");
-    said.hidden = !found.active; // a running job's line keeps its place
+    said.textContent = job.state === "paused" ? "Paused. Resume continues it." : "";
+    said.hidden = !said.textContent;
     waits.textContent = job.state === "queued" ? waitingFor(store, job.waits_for) : "";
     waits.hidden = !waits.textContent;
     line.classList.toggle("error", job.state !== "cancelled"); // stopping is no error

@@ -27,7 +27,7 @@ export function photos(given) {
     );
     const frames = h("input", { id: "frames", type: "number", min: 3, max: 5000, inputmode: "numeric" });
     const exact = h("input", { type: "checkbox" });
-    const find = h("button", { "data-own": "" }, "Find the poses");
+    const find = h("button", { "data-own": "" }, "Place the photos");
     const next = h("p", { class: "next", hidden: true });
     const form = h(
       "form",
@@ -72,8 +72,8 @@ export function photos(given) {
         { class: "watch turned" },
         h(
           "section",
-          { "aria-label": "poses" },
-          heading(2, "Poses"),
+          { "aria-label": "cameras" },
+          heading(2, "Cameras"),
           h(
             "p",
             {},
@@ -106,7 +106,7 @@ export function photos(given) {
           patch(missing, unplaced(made, entry.entry));
         }
         next.hidden = !made;
-        find.textContent = made ? "Find the poses again" : "Find the poses";
+        find.textContent = made ? "Place the photos again" : "Place the photos";
       },
     };
   });

@@ -235,7 +235,7 @@ export class RegionTool {
     element("region-tools").hidden = !this.drawing;
     element("region-draw").hidden = element("cameras").hidden = this.drawing;
     document.body.classList.toggle("drawing", this.drawing);
-    element("region-draw").textContent = this.saved ? "change the box" : "draw a box";
+    element("region-draw").textContent = this.saved ? "Change the box" : "Draw a box";
     element("region-remove").hidden = this.drawing || !this.saved;
     this.show();
     this.redraw();
