@@ -317,7 +317,7 @@ def test_a_capture_without_poses_of_a_search_is_not_trained(page, studio, jpeg):
     assert page.get("/api/captures/bad").json()["unfinished"]
     for command in ("train", "doctor"):
         answer = page.post("/api/jobs", json={"command": command, "subject": "captures/bad"})
-        assert (answer.status_code, "has no poses yet" in answer.json()["error"]) == (409, True)
+        assert (answer.status_code, "its photos are not placed yet" in answer.json()["error"]) == (409, True)
     (folder / "cameras.txt").touch()
     assert not page.get("/api/captures/bad").json()["unfinished"]
     assert page.post("/api/jobs", json={"command": "train", "subject": "captures/bad"}).status_code == 200

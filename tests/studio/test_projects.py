@@ -78,7 +78,7 @@ def test_a_project_goes_from_photos_to_an_export(page, studio):
     step = only(page)["next"]
     assert step == {"label": "Place the photos", "request": {"command": "sfm", "subject": "photos/walk"}}
     job = job_of(studio, **step["request"])
-    assert only(page)["next"] == {"label": "Watch the search for poses", "place": "photos/walk"}
+    assert only(page)["next"] == {"label": "Watch the photos being placed", "place": "photos/walk"}
     job = studio.queue._put(job, state=State.DONE)
     add_capture(studio, "walk", {})
     project = only(page)
