@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,12 +26,11 @@ from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import pairs_at_first, probe, resident_bytes
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.depths import CAPTURE, POINTS
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.ops.lenses import RAY_ROOM
 from gsplat_edu.scene.gaussians import Gaussians
-from gsplat_edu.scene.given_depth import GivenDepth
+from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH, GivenDepth
 from gsplat_edu.train.capacity import wanted_gaussians
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.fast import PlannedDensity
@@ -205,9 +203,10 @@ def test_depth_is_a_fact_of_views_that_carry_it(capture):
         depth = GivenDepth(np.zeros((1, 2)), np.ones(1), sparse=sparse)
         carried = tuple(view.with_depth(lambda depth=depth: depth) for view in dataset.train)
         assert Facts.of(dataclasses.replace(dataset, train=carried)).depth == kind
-    for path, kind in ((POINTS, "points"), (CAPTURE, "maps"), (Path("depth"), "maps")):
-        assert Facts.of(dataset, depth=path).depth == kind
-        assert Prospect(dataset, dataset, PLAIN, depth=path).facts.depth == kind
+    for source, kind in ((POINTS_AS_DEPTH, "points"), (CAPTURE_AS_DEPTH, "maps"), ("depth", "maps")):
+        asked = {"given_depth": source}
+        assert Facts.of(dataset, asked=asked).depth == kind
+        assert Prospect(dataset, dataset, PLAIN, asked=asked).facts.depth == kind
 
 
 def test_pairs_are_forecast_at_the_photo_size_with_which_the_run_starts():

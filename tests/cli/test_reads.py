@@ -9,8 +9,8 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data import reader
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.parts import bench
 from gsplat_edu.photos import decoding
-from gsplat_edu.runs import pilot
 from lab.captures.city import City, write_city
 
 COUNTED = ((reader, "read_capture"), (decoding, "image_header"), (decoding, "image_size"))
@@ -45,7 +45,7 @@ def photo_headers(folder):
 
 
 def test_train_with_everything_left_open(capture, tmp_path, reads, monkeypatch, capsys):
-    monkeypatch.setattr(pilot, "PILOT_STEPS", 5)
+    monkeypatch.setattr(bench, "PILOT_STEPS", 5)
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--iterations", "12"]
     words += ["--resolution", "auto", "--refine", "auto", "--transients", "auto", "--appearance", "auto"]
     assert main([*words, "--max-memory", "4GiB", "--time-limit", "9h"]) == 0

@@ -10,9 +10,9 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.parts import bench
 from gsplat_edu.parts.poses.refinement import DISTORTIONS, MOTIONS
 from gsplat_edu.parts.poses.trials import RefineTrials
-from gsplat_edu.runs import pilot
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.train.config import recipe
 
@@ -46,15 +46,15 @@ def test_a_run_writes_the_refined_capture_and_an_aligned_score(capture, tmp_path
 
 def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
     """With `--refine`, the scene fits the refined cameras, not the original ones."""
-    from gsplat_edu.runs import cleaning
+    from gsplat_edu.parts.floaters import part
 
-    judged, original = [], cleaning.clean
+    judged, original = [], part.clean
 
     def noted(gaussians, train, *others, **more):
         judged.extend(train)
         return original(gaussians, train, *others, **more)
 
-    monkeypatch.setattr(cleaning, "clean", noted)
+    monkeypatch.setattr(part, "clean", noted)
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--iterations", "12", "--refine", "poses", "--clean"]
     assert main(words) == 0
@@ -63,7 +63,7 @@ def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
 
 
 def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
+    monkeypatch.setattr(bench, "PILOT_STEPS", 20)
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--refine", "auto"]
     assert main([*words, "--iterations", "6"]) == 0
@@ -79,7 +79,7 @@ def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(capture, tmp_path, c
 
 
 def test_the_report_says_whether_a_given_shutter_helped(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
+    monkeypatch.setattr(bench, "PILOT_STEPS", 20)
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--refine", "shutter"]
     assert main([*words, "--iterations", "6"]) == 0

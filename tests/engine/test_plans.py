@@ -255,15 +255,15 @@ def test_a_run_in_time_repeats_its_decisions_and_its_bits(capture, tmp_path):
         {"outside_masks": "empty"},
         {"batch": 2},
         {"surface": True},
-        {"has_depth": True},
+        {"given_depth": "points"},
     ],
     ids=lambda changes: ",".join(f"{name}={value}" for name, value in changes.items()) or "plain",
 )
 def test_what_leaves_the_device_is_known_beforehand(dataset, changes):
     settings = {"strategy": "fast", "max_gaussians": 120} | changes
-    has_depth = settings.pop("has_depth", False)
+    asked = {name: settings.pop(name) for name in ("given_depth",) if name in settings}
     config = recipe(30, **settings)
-    if has_depth:
+    if asked:
         depth = GivenDepth(np.zeros((1, 2)), np.ones(1))
         dataset = dataclasses.replace(
             dataset, train=tuple(v.with_depth(lambda: depth) for v in dataset.train)
@@ -271,7 +271,7 @@ def test_what_leaves_the_device_is_known_beforehand(dataset, changes):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BackendWarning)
         run = training(config, dataset, load_backend("webgpu"))
-    reason = leaves_device(config, has_depth)
+    reason = leaves_device(config, asked)
     assert isinstance(run.stepper, ResidentStepper) == (reason is None)
     assert (reason is None) == (not changes.keys() - {"strategy"})
 

@@ -16,6 +16,16 @@ IMPORTERS = {
 }
 """Modules that use what a part offers beside its hooks, for example how a sky is found; no other may."""
 
+LOOPING = (
+    "train/resident.py",
+    "runs/dataset.py",
+    "runs/evaluation.py",
+    "runs/training.py",
+    "runs/options.py",
+)
+LOOPING += ("runs/identity.py", "runs/parts.py", "runs/pilot.py")
+"""Modules that ask each part for what they need of its settings, and of what the user asked of it."""
+
 SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
 
 
@@ -24,7 +34,7 @@ SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
     [
         *("train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"),
         *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py", "runs/dataset.py"),
-        "runs/pilot.py",
+        *("runs/pilot.py", "train/resident.py"),
         *("evaluate/report.py", "doctor/diagnosis.py", "survey/trained.py", "cli/result.py"),
     ],
 )
@@ -43,11 +53,18 @@ def test_a_training_does_not_name_the_files_of_a_capture(module):
     assert not re.findall("region|left_out", (SOURCE / module).read_text())
 
 
+@pytest.mark.parametrize("module", ["cli/train.py", "options/train.py", *LOOPING])
+def test_what_users_ask_of_parts_is_named_by_its_options(module):
+    """`RunOptions.asked` carries it; `options/asked.py` and the parts know what it is."""
+    text = (SOURCE / module).read_text()
+    assert not re.findall(r"given_depth|floaters|\bdepth\b(?!=False)|arguments\.clean", text)
+
+
 @pytest.mark.parametrize(
     "module",
     sorted(
         str(path.relative_to(SOURCE))
-        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", "cli/train.py")
+        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", "cli/train.py", *LOOPING)
         for path in SOURCE.glob(place)
     ),
 )

@@ -7,7 +7,6 @@ import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError
 from gsplat_edu.base.text import spelled_seconds
@@ -116,7 +115,7 @@ class Prospect:
         image_memory: Bytes of photos kept in memory.
         eval_every: Iterations between evaluations; 0 for none, not even at the end.
         save_every: Iterations between checkpoints; 0 for none.
-        depth: As for `RunOptions`: where depth comes from that it learns from; None for none.
+        asked: As for `RunOptions`.
     """
 
     dataset: Dataset
@@ -126,7 +125,7 @@ class Prospect:
     image_memory: int = 4 * 2**30
     eval_every: int = RunOptions.eval_every
     save_every: int = RunOptions.save_every
-    depth: Path | None = None
+    asked: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def of(cls, options: RunOptions, reader: CaptureReader) -> Prospect:
@@ -152,7 +151,7 @@ class Prospect:
             options.data_settings.image_memory,
             options.eval_every,
             options.save_every,
-            options.depth,
+            options.asked,
         )
         if config.strategy in ("fast", "mcmc") and config.max_gaussians is None:
             facts = found.facts
@@ -163,7 +162,7 @@ class Prospect:
     @functools.cached_property
     def facts(self) -> Facts:
         """The properties of the capture that determine the cost."""
-        facts = Facts.of(self.dataset, self.full, depth=self.depth)
+        facts = Facts.of(self.dataset, self.full, asked=self.asked)
         return facts if self.scene is None else dataclasses.replace(facts, points=len(self.scene))
 
     def measured(self, backend: str) -> Measurements:
@@ -209,7 +208,7 @@ def choose_backend(prospect: Prospect, *, allow_software: bool = False) -> Chose
 
     decision = decide(
         listed_outside(),
-        leaves_device(prospect.config, prospect.depth is not None),
+        leaves_device(prospect.config, prospect.asked),
         lambda: _failure(prospect),
         seconds,
         wanted=os.environ.get(ADAPTER_VARIABLE, ""),

@@ -10,9 +10,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -20,11 +19,11 @@ from jaxtyping import Float64, Int64
 from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.data.depths import POINTS
 from gsplat_edu.engine.room import PIXEL_BYTES, REPEATED_PHOTOS, Load, Room, kept_photos
 from gsplat_edu.ops.lenses import RAY_ROOM
 from gsplat_edu.parts.surface.patches import PHOTO_ROOM
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
+from gsplat_edu.scene.given_depth import POINTS_AS_DEPTH
 from gsplat_edu.scene.sh import num_coefficients
 from gsplat_edu.train.capacity import added_gaussians, wanted_gaussians
 from gsplat_edu.train.config import TrainConfig
@@ -112,14 +111,17 @@ class Facts:
     lens_pixels: float = 0.0
 
     @classmethod
-    def of(cls, dataset: Dataset, full: Dataset | None = None, *, depth: Path | None = None) -> Facts:
+    def of(
+        cls, dataset: Dataset, full: Dataset | None = None, *, asked: Mapping[str, str] | None = None
+    ) -> Facts:
         """Collect the facts of a dataset.
 
         Args:
             dataset: The capture at training size.
             full: The capture at the size of its files; None if that is the training size.
-            depth: As for `RunOptions`, if the training learns from depth that its views do not carry yet.
+            asked: As for `RunOptions`: depth to learn from that the views do not carry yet; None for nothing.
         """
+        depth = (asked or {}).get("given_depth")
         sizes, decoded = (
             [v.camera.W * v.camera.H for v in (*d.train, *d.test)] for d in (dataset, full or dataset)
         )
@@ -134,7 +136,7 @@ class Facts:
             dataset.images.workers,
             dataset.images.decoding,
             dataset.measured,
-            _depth_of(dataset) if depth is None else "points" if depth == POINTS else "maps",
+            _depth_of(dataset) if depth is None else "points" if depth == POINTS_AS_DEPTH else "maps",
             separate_views([view.camera for view in dataset.train], dataset.points),
             _lens_pixels(dataset),
         )

@@ -43,7 +43,7 @@ def check_device(options: RunOptions, reader: CaptureReader) -> None:
         BackendUnavailableError: the device does not start.
         DatasetError: the capture cannot be read.
     """
-    room = None if leaves_device(options.config, options.depth is not None) else room_of(options.backend)
+    room = None if leaves_device(options.config, options.asked) else room_of(options.backend)
     if room is not None:
         check_room(room, options.config, Dataset.of(reader, options.data_settings, points=options.points))
 

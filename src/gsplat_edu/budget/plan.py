@@ -248,7 +248,7 @@ def _measured(
     if "resolution" not in fixed:
         side = min(min(view.camera.W, view.camera.H) for view in (*files.train, *files.test))
         factors += tuple(factor for factor in FACTORS if factor > 1 and side / factor >= SMALLEST_SIDE)
-    facts, scene = Facts.of(dataset, files, depth=options.depth), None
+    facts, scene = Facts.of(dataset, files, asked=options.asked), None
     if options.scene is not None:
         scene, _ = scene_start(options.scene, options.config, dataset.origin)
         facts = dataclasses.replace(facts, points=len(scene))
@@ -270,7 +270,7 @@ def _with_planned_count(options: RunOptions, given: Collection[str], reader: Cap
     if config.max_gaussians is not None or not (config.strategy == "fast" or room is not None):
         return Plan(options)
     dataset = Dataset.of(reader, options.data_settings, points=options.points)
-    facts = Facts.of(dataset, depth=options.depth)
+    facts = Facts.of(dataset, asked=options.asked)
     if options.scene is not None:
         facts = dataclasses.replace(facts, points=len(scene_start(options.scene, config, dataset.origin)[0]))
     request = Request(options, Limits(), frozenset({*given, "iterations"}), True, facts, room=room)

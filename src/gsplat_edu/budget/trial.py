@@ -85,7 +85,7 @@ def run_trial(
         BackendUnavailableError: the device fails.
     """
     pairs, moments, runs = [0], list[float](), list[_CountedRun]()
-    make_run = None if leaves_device(config) else backend.resident
+    make_run = None if leaves_device(config, {}) else backend.resident
 
     def counting(
         gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, extra: Extra

@@ -27,11 +27,12 @@ from gsplat_edu.evaluate.verdict import measured_of
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed
+from gsplat_edu.options.asked import asked_of
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
-from gsplat_edu.runs.dataset import appearance_of, data_settings, run_reader
+from gsplat_edu.runs.dataset import data_settings, run_reader
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.runs.parts import judgements
+from gsplat_edu.runs.parts import judgements, stored_config
 from gsplat_edu.survey.capture import Survey, prepare
 from gsplat_edu.survey.residuals import residuals
 from gsplat_edu.survey.trained import Trained
@@ -97,7 +98,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         config = recipe(length, strategy=DEFAULT_STRATEGY)
         cap = facts.wanted(config)
         config = dataclasses.replace(config, max_gaussians=cap)
-        prospect = Prospect(dataset, full, config, depth=arguments.depth)
+        prospect = Prospect(dataset, full, config, asked=asked_of(arguments))
         chosen = choose_backend(prospect) if auto else None
         backend = backend if chosen is None else chosen.backend
         measured = None if chosen is None else chosen.measured.get(backend)
@@ -143,7 +144,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     gaussians = read_scene(scene).relative_to(dataset.origin).to(device_of(backend))
     renderer = functools.partial(render, settings=settings, backend=backend)
     section = config.get("train")
-    appearance = appearance_of(config)
+    appearance = stored_config(config).appearance
     with _bar(console) as bar:
         task = bar.add_task("views", total=len(dataset.train) + len(dataset.test))
         train, test = (
@@ -196,7 +197,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--transients": (None if train.get("transients", "none") == "none" else train["transients"],),
         "--outside-masks": ("empty" if train.get("outside_masks") == "empty" else None,),
         "--appearance": (
-            "vignetting" if appearance_of(config) == "vignetting" else None,
+            "vignetting" if stored_config(config).appearance == "vignetting" else None,
         ),  # never chosen by auto
         "--background": background if train.get("alpha_background") == "fixed" else (None,),
     }

@@ -36,6 +36,7 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.remedies import remedies_for
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.jobs.ranks import num_processes
+from gsplat_edu.options.asked import asked_of
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.settings import given
 from gsplat_edu.options.train import AUTO, left_open, options_from
@@ -111,7 +112,7 @@ def _follow(arguments: argparse.Namespace, team: Member) -> None:
         arguments.out,
         TrainConfig.of_record(told["train"]),
         DataSettings.of_record(told["data"]),
-        depth=arguments.depth,
+        asked=asked_of(arguments),
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
     )

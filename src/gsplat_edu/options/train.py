@@ -10,8 +10,8 @@ from gsplat_edu.base.constants import AUTO as AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.data.settings import LENS_MODES, DataSettings
+from gsplat_edu.options.asked import OFFERED_ASKED, add_of_photos, add_of_results, asked_of, check_asked
 from gsplat_edu.options.blocks import add_blocks, add_cluster, check_blocks
-from gsplat_edu.options.depth import add_depth, check_depth
 from gsplat_edu.options.length import length_of, strategy_of
 from gsplat_edu.options.settings import (
     add_setting,
@@ -24,7 +24,6 @@ from gsplat_edu.options.sfm import add_panorama, add_scale
 from gsplat_edu.options.values import NumberOr, add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
 from gsplat_edu.sfm.options import PANORAMA
 from gsplat_edu.sfm.scale_text import check_scale
 from gsplat_edu.train.capacity import PLANNED_VIEWS
@@ -42,7 +41,7 @@ from gsplat_edu.train.config import (
     recipe,
 )
 from gsplat_edu.train.length import DEFAULT_QUALITY, QUALITIES, UNIT
-from gsplat_edu.train.setting import BY_DEFAULT, LENGTH, PHOTOS, PURPOSE, Plain
+from gsplat_edu.train.setting import BY_DEFAULT, LENGTH, PHOTOS, Plain
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
 
@@ -97,18 +96,10 @@ OFFERED = {
         },
         PHOTOS,
     ),
-    "depth": Plain(
-        "Depth to learn from",
-        {
-            "": "none",
-            POINTS_AS_DEPTH: "the points that photos share",
-            CAPTURE_AS_DEPTH: "the capture's own depth maps",
-        },
-        PURPOSE,
-    ),
+    **OFFERED_ASKED,
     **{setting.name: setting.option.plain for setting in SETTINGS if setting.option and setting.is_single},
     **dict.fromkeys(("quality", "resume", "test_every", "panorama", "scale", "eval_every", "save_every")),
-    **dict.fromkeys(("clean", "white_background", "set")),
+    **dict.fromkeys(("white_background", "set")),
 }
 """Options that requests may give, and how pages ask for them; a page does not ask for those with None."""
 
@@ -239,11 +230,7 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
         ("--save-every", "checkpoints", "0 for the end only", RunOptions.save_every),
     ):
         _add_number(group, flag, f"iterations between {what}; {zero} (default: {every})", every)
-    group.add_argument(
-        "--clean",
-        action="store_true",
-        help="remove floaters and splats that no camera sees from the trained scene, as `gsplat-edu clean` does",
-    )
+    add_of_results(group)
     group.add_argument(
         "--export",
         type=Path,
@@ -303,7 +290,7 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
     )
     for name in ("appearance", "transients", "outside_masks"):
         add_setting(group, name)
-    add_depth(group, "learn from depth")
+    add_of_photos(group)
     for name in ("refine", "sky"):
         add_setting(group, name)
     _add_background(group)
@@ -346,7 +333,7 @@ def check(arguments: argparse.Namespace) -> None:
         raise DatasetError(
             f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"
         )
-    check_depth(arguments.depth, arguments.settings)
+    check_asked(arguments)
     check_several(arguments)
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
         if path is not None and not path.exists() and (flag, path) != ("--points", RANDOM_POINTS):
@@ -387,12 +374,11 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         data_settings=settings,
         points=None if arguments.points == RANDOM_POINTS else arguments.points,
         scene=arguments.scene,
-        depth=arguments.depth,
         backend=backend,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
         resume=arguments.resume,
-        asked=("floaters",) if arguments.clean else (),
+        asked=asked_of(arguments),
     )
 
 

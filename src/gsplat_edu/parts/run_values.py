@@ -28,7 +28,7 @@ class Captured:
         dataset: The capture, with what the parts before gave it.
         reader: It has read the capture.
         points: The run's file of start points; None if it has none.
-        depth: Where the run's depth comes from, as in `gsplat_edu.runs.options.RunOptions`.
+        asked: What the user asked of the part (`gsplat_edu.runs.options.RunOptions`); None for nothing.
         starts_from_scene: Whether the run starts from a scene, which may have far splats, instead of points.
         is_new: Whether the run begins now; false if it is resumed.
         say: Receives sentences for the user.
@@ -37,7 +37,7 @@ class Captured:
     dataset: Dataset
     reader: CaptureReader
     points: Path | None
-    depth: Path | None
+    asked: str | None
     starts_from_scene: bool
     is_new: bool
     say: Callable[[str], None]
@@ -79,14 +79,14 @@ class Unwritten:
         gaussians: The scene, as the parts before left it.
         dataset: The capture as the parts' `learned` returned it.
         settings: The run's render settings.
-        is_asked: Whether `gsplat_edu.runs.options.RunOptions.asked` names the part.
+        asked: As for `Captured`.
         say: Receives sentences for the user.
     """
 
     gaussians: Gaussians
     dataset: Dataset
     settings: RenderSettings
-    is_asked: bool
+    asked: str | None
     say: Callable[[str], None]
 
 

@@ -17,9 +17,10 @@ from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.parts.exposure.photos import as_corrected
 from gsplat_edu.render.backend import Backend
-from gsplat_edu.runs.dataset import appearance_of, run_dataset
+from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
+from gsplat_edu.runs.parts import stored_config
 from gsplat_edu.runs.source import NamedCamera, Source, capture_up, open_source, run_of
 from gsplat_edu.scene.frame import as_origin
 from gsplat_edu.scene.gaussians import Gaussians
@@ -80,7 +81,7 @@ def open_subject(path: Path, dataset: Path | None, backend: Backend) -> Subject:
         if found := capture_difference(run, capture):
             raise ArgumentError(f"{capture.path} is not the capture of {run.path}: {found}")
         gaussians = source.scene.gaussians
-        appearance = appearance_of(run.read_config())
+        appearance = stored_config(run.read_config()).appearance
         capture = as_corrected(capture, gaussians, source.settings, appearance, backend)
     cameras = _cameras(capture)
     up = source.scene.up or capture_up(capture)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,33 +9,29 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset, DataSettings
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.runs.parts import stored_config
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.part import parts
 
 
-def appearance_of(config: Mapping[str, Any]) -> str:
-    """Return the setting `appearance` from a run's config.json: one of `APPEARANCES`."""
-    section = config.get("train")
-    return str(section.get("appearance", "none")) if isinstance(section, Mapping) else "none"
-
-
-def as_trained(settings: DataSettings, appearance: str) -> DataSettings:
-    """Return the settings with which a training reads photos: with their alpha if it corrects colours.
-
-    The correction applies to the object only, so such photos are composited after it.
-    """
-    return settings if appearance == "none" else replace(settings, background=None)
+def as_trained(settings: DataSettings, config: TrainConfig) -> DataSettings:
+    """Return the settings with which a training reads photos: what its parts make of those given."""
+    for name, part in parts().items():
+        settings = part.reads(config.settings_of(name), settings)
+    return settings
 
 
 def data_settings(config: dict[str, Any]) -> DataSettings:
     """Build the data settings of a run from its config; keys missing in the section "data" get their defaults.
 
     Raises:
-        CheckpointError: the section is missing, or a value is out of range.
+        CheckpointError: the section is missing, or a value of it or of the section "train" is out of range.
     """
     section = config.get("data")
     if not isinstance(section, dict):
         raise CheckpointError("config.json: the section data is missing; restore it or train again")
     try:
-        return as_trained(DataSettings.of_record(section), appearance_of(config))
+        return as_trained(DataSettings.of_record(section), stored_config(config))
     except (ArgumentError, TypeError) as error:
         raise CheckpointError(f"config.json: data: {error}; fix the file") from None
 

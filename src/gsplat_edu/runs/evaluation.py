@@ -19,10 +19,9 @@ from gsplat_edu.evaluate.metrics import BLURRED_FROM, ImageScore, Renderer, scor
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.evaluate.verdict import BLURRED, SKIPPED
 from gsplat_edu.parts.run_values import Reported
-from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.meshes import mesh_entries
-from gsplat_edu.runs.parts import sections
+from gsplat_edu.runs.parts import scored, sections
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
@@ -119,7 +118,7 @@ def evaluate_run(
     test = score_views(gaussians, test_views, render, judged.background, gallery.add)
     train = score_views(gaussians, train_views, render, judged.background, tell)
     metrics = {**earlier, **_scores(judged, test, train), "num_gaussians": len(gaussians)}
-    metrics |= _appearance(config) | dict(facts or {})
+    metrics |= scored(config) | dict(facts or {})
     title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", [*map(str, judged.notes)]
     run = Reported(
         *(folder.path, config, metrics, log, train_views),
@@ -141,12 +140,6 @@ def _scores(judged: ScoredViews, test: list[ImageScore], train: list[ImageScore]
     means = {"test": summarize(test), "train": summarize(train), "test_views": views}
     ranked = sorted((*test, *train), key=lambda score: -(score.added_detail or 0.0))
     return means | {BLURRED: [score.name for score in ranked if (score.added_detail or 0.0) >= BLURRED_FROM]}
-
-
-def _appearance(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entry of metrics.json that says which exposures were corrected; empty if none were."""
-    chosen = appearance_of(config)
-    return {} if chosen == "none" else {"appearance": chosen}
 
 
 class _Gallery:

@@ -38,7 +38,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.fields import CONFIG, LOG, MESH, METRICS, checked
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.frame import ORIGIN
-from gsplat_edu.scene.lens_record import lens_entry, with_lens
+from gsplat_edu.scene.lens_record import Vector, lens_entry, with_lens
 from gsplat_edu.scene.views import View
 
 FORMAT = 1
@@ -356,16 +356,13 @@ def _camera_entry(index: int, view: View, split: str, shift: np.ndarray) -> dict
     }
 
 
-Numbers = tuple[Number, Number, Number]
-
-
 class _Camera(Record, frozen=True, forbid_unknown_fields=False):
     """An entry of cameras.json; `with_lens` reads the lens and the shutter."""
 
     width: int
     height: int
-    position: Numbers
-    rotation: tuple[Numbers, Numbers, Numbers]
+    position: Vector
+    rotation: tuple[Vector, Vector, Vector]
     fx: Number
     fy: Number
     cx: Number | Absent = ABSENT
@@ -389,8 +386,6 @@ def _camera(where: str, entry: Any, shift: np.ndarray) -> tuple[str, str, Camera
             one.width,
         )
         camera = with_lens(camera, entry)
-    except KeyError as error:
-        raise CheckpointError(f"{where}: lacks {error}; write the file again or remove it") from None
     except (ValueError, TypeError, OverflowError) as error:
         raise CheckpointError(f"{where}: {error}; write the file again or remove it") from None
     return one.img_name, one.split, camera

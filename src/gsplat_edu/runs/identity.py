@@ -16,11 +16,12 @@ from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.train.config import ONLY_FOR
+from gsplat_edu.train.part import parts
 
 SAME = ("train", "render", "data")
 """Sections of config.json that must be equal in a resumed run."""
 
-MAY_DIFFER = {"data": ("path", "points", "scene", "depth", "image_memory"), "train": ("iterations",)}
+MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
 """Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
 
 DIGESTS = "digests"
@@ -52,6 +53,8 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
         names = {*before, *now} - idle - set(MAY_DIFFER.get(section, ()))
+        if section == "data":
+            names -= {key for part in parts().values() for key in part.recorded(None)}
         # The strategy first: it explains other differences.
         for key in sorted(names, key=lambda name: (name != "strategy", name)):
             a, b = (_plain(values.get(key)) for values in (before, now))

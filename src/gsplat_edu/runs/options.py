@@ -27,13 +27,13 @@ class RunOptions:
         data_settings: How the capture is read.
         points: A PLY to start from; the capture's own points if None.
         scene: A trained scene to start from instead of points: a scene file or the folder of a run.
-        depth: Depth to learn from: a folder of maps, or a word of `gsplat_edu.data.depths`; None for none.
         backend: Name of the rendering backend.
         eval_every: Iterations between evaluations on the test views; the end of the run scores all views. 0 scores none
             at any time.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
         resume: Continue from the last checkpoint of the folder.
-        asked: Parts that change the trained scene because the user asked for it; config.json does not have them.
+        asked: What the user asked of parts beside the settings, by part: the value of its option, such as a folder;
+            empty for an option without one. config.json has what `Part.recorded` says of it.
         records: What led to the options, for config.json by its key there: short trainings, facts about the photos.
 
     Raises:
@@ -46,12 +46,11 @@ class RunOptions:
     data_settings: DataSettings
     points: Path | None = None
     scene: Path | None = None
-    depth: Path | None = None
     backend: str = "cpu"
     eval_every: int = 1_000
     save_every: int = 500
     resume: bool = False
-    asked: tuple[str, ...] = ()
+    asked: Mapping[str, str] = field(default_factory=dict)
     records: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -54,7 +54,7 @@ def chosen_by_pilots(
         return Tried(otherwise, OUT_OF_TIME)
     size = options.data_settings.resolution
     small = SIDE if size is None or not 32 <= size <= SIDE else size
-    settings = as_trained(replace(options.data_settings, resolution=small), options.config.appearance)
+    settings = as_trained(replace(options.data_settings, resolution=small), options.config)
     dataset = Dataset.of(reader, settings, points=options.points)
     if why := _why_not(dataset):
         return Tried(otherwise, why)

@@ -123,9 +123,7 @@ def try_lengths(
     """
     size = options.data_settings.resolution
     small = SIDE if size is None or not 32 <= size <= SIDE else size
-    settings = as_trained(
-        dataclasses.replace(options.data_settings, resolution=small), options.config.appearance
-    )
+    settings = as_trained(dataclasses.replace(options.data_settings, resolution=small), options.config)
     dataset = Dataset.of(reader, settings, points=options.points)
     judges = dataset.train[HOLD_OUT // 2 :: HOLD_OUT]
     kept = tuple(view for i, view in enumerate(dataset.train) if i % HOLD_OUT != HOLD_OUT // 2)

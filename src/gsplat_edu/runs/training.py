@@ -20,7 +20,6 @@ from gsplat_edu.base.files import check_folder, remove_leftovers
 from gsplat_edu.base.links import check_links
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset, with_own_files
-from gsplat_edu.data.depths import depth_name
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
@@ -40,6 +39,7 @@ from gsplat_edu.runs.identity import (
 )
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
+from gsplat_edu.runs.parts import recorded
 from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of, with_points_of_first
 from gsplat_edu.runs.source import Source, capture_scene, capture_up, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
@@ -71,7 +71,7 @@ def document(options: RunOptions) -> dict[str, Any]:
             **options.data_settings.record(),
             "points": None if options.points is None else str(options.points.resolve()),
             "scene": None if options.scene is None else str(scene_file(options.scene).resolve()),
-            **({} if options.depth is None else {"depth": depth_name(options.depth)}),
+            **recorded(options.asked),
         },
         "train": options.config.record(),
         **({} if not (used := options.config.plugins) else {"plugins": packages_of(used)}),
@@ -204,7 +204,7 @@ class CaptureRun:
             self._say_what_is_resumed()
         self.seconds = 0.0
         self._began: float | None = None  # during training: when the count of seconds started
-        settings = as_trained(options.data_settings, options.config.appearance)
+        settings = as_trained(options.data_settings, options.config)
         reader = reader_for(options.data, reader)
         capture = self._captured(reader, Dataset.of(reader, settings, points=options.points))
         self.dataset = capture.dataset
@@ -231,8 +231,9 @@ class CaptureRun:
         from_scene = self._team.shared(self._leads and self._is_from_scene())
         is_new = not self.folder.exists()
         dataset = with_points_of_first(dataset, self._team)
-        capture = Captured(dataset, reader, options.points, options.depth, from_scene, is_new, self._say)
+        capture = Captured(dataset, reader, options.points, None, from_scene, is_new, self._say)
         for name, part in parts().items():
+            capture = dataclasses.replace(capture, asked=options.asked.get(name))
             changed = part.captured(options.config.settings_of(name), capture)
             capture = dataclasses.replace(capture, dataset=changed)
         return capture
@@ -487,7 +488,7 @@ class CaptureRun:
         """Return the scene as the parts revise it, and entries of metrics.json."""
         options, facts = self.options, dict[str, Any]()
         for name, part in parts().items():
-            scene = Unwritten(gaussians, learned, options.render_settings, name in options.asked, self._say)
+            scene = Unwritten(gaussians, learned, options.render_settings, options.asked.get(name), self._say)
             if (revised := part.revise(options.config.settings_of(name), scene)) is not None:
                 gaussians, facts = revised.gaussians, {**facts, **revised.facts}
         return gaussians, facts

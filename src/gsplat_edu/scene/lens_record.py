@@ -10,16 +10,28 @@ Programs that do not know these keys take the camera for a pinhole of the same f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.validation import flag, in_range
+import msgspec
+
+from gsplat_edu.base.records import ABSENT, Absent, Number, Record, record_of
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.scene.projection import COEFFICIENTS, Distortion, Projection
+from gsplat_edu.scene.projection import COEFFICIENTS, PROJECTIONS, Distortion, Projection
 from gsplat_edu.scene.shutter import RollingShutter
 
-LARGEST_COEFFICIENT = 1e6
-"""Largest magnitude of a coefficient that is read."""
+Coefficient = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+Vector = tuple[Number, Number, Number]
+
+_COEFFICIENTS: Any = [(name, Coefficient | Absent, ABSENT) for name in COEFFICIENTS]
+_KIND: Any = [("kind", Literal[PROJECTIONS]), ("radial_first", bool, False)]
+_Projection = msgspec.defstruct("_Projection", [*_KIND, *_COEFFICIENTS], bases=(Record,), frozen=True)
+
+
+class _Shutter(Record, frozen=True):
+    turn: Vector
+    shift: Vector
+    readout: str = "down"
+    exposure: Number = 0.0
 
 
 def lens_entry(camera: Camera) -> dict[str, Any]:
@@ -52,32 +64,13 @@ def with_lens(camera: Camera, entry: Mapping[str, Any]) -> Camera:
     Raises:
         ArgumentError: a key or a value is not one that `lens_entry` writes.
     """
-    given, moving = entry.get("projection"), entry.get("shutter")
-    if given is None and moving is None:
-        return camera
-    shutter = None
+    given, moving, projection, shutter = entry.get("projection"), entry.get("shutter"), Projection(), None
+    if given is not None:
+        lens = record_of("projection", given, _Projection)
+        values = {name: c for name in COEFFICIENTS if (c := getattr(lens, name)) is not ABSENT}
+        distortion = Distortion.of(radial_first=lens.radial_first, **values) if values else None
+        projection = Projection(lens.kind, distortion)
     if moving is not None:
-        values = _object("shutter", moving, ("turn", "shift", "readout", "exposure"))
-        how = values.get("readout", "down"), values.get("exposure", 0.0)
-        shutter = RollingShutter(values["turn"], values["shift"], *how)
-    return camera.through(Projection() if given is None else _projection(given), shutter)
-
-
-def _projection(given: object) -> Projection:
-    values = _object("projection", given, ("kind", "radial_first", *COEFFICIENTS))
-    coefficients = {
-        name: in_range(f"projection.{name}", values[name], -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
-        for name in COEFFICIENTS
-        if name in values
-    }
-    first = flag("projection.radial_first", values.get("radial_first", False))
-    distortion = Distortion.of(radial_first=first, **coefficients) if coefficients else None
-    return Projection(values["kind"], distortion)
-
-
-def _object(name: str, given: object, keys: tuple[str, ...]) -> dict[str, Any]:
-    if not isinstance(given, dict):
-        raise ArgumentError(f"{name}: is not an object")
-    if unknown := [key for key in given if key not in keys]:
-        raise ArgumentError(f"{name}: has the unknown key {unknown[0]!r}")
-    return given
+        motion = record_of("shutter", moving, _Shutter)
+        shutter = RollingShutter(motion.turn, motion.shift, motion.readout, motion.exposure)
+    return camera if given is moving is None else camera.through(projection, shutter)

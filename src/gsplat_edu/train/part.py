@@ -32,6 +32,20 @@ class Part:
     """Frozen dataclass whose fields `gsplat_edu.train.strategy_config.number` declares; their names in options and
     config.json begin with the plug-in's name."""
 
+    off_device: ClassVar[tuple[str, ...]] = ()
+    """Settings of which a device can only do the default."""
+
+    def leaves_device(self, settings: Any, asked: str | None) -> str | None:  # noqa: ANN401
+        """Return what of the part no device can do, as "appearance is exposure"; None if it can do all.
+
+        Args:
+            settings: The run's `Settings`.
+            asked: What the user asked of the part (`gsplat_edu.runs.options.RunOptions`); None for nothing.
+        """
+        values = ((name, getattr(settings, name)) for name in self.off_device)
+        changed = (each for each in values if each[1] != getattr(type(settings), each[0]))
+        return next((f"{name} is {'on' if value is True else value}" for name, value in changed), None)
+
     def terms(self, settings: Any, extent: float) -> Mapping[str, Any]:  # noqa: ANN401
         """Return terms of the objective (`gsplat_edu.train.objective.Term`) by name.
 
@@ -119,6 +133,25 @@ class Part:
         """
         return None
 
+    def reads(self, settings: Any, data: Any) -> Any:  # noqa: ANN401
+        """Return how the photos of a run are read, for the training and for scores.
+
+        Args:
+            settings: The run's `Settings`.
+            data: As the parts before read them, a `gsplat_edu.data.settings.DataSettings`.
+        """
+        return data
+
+    def recorded(self, asked: str | None) -> Mapping[str, Any]:
+        """Return what the section data of config.json says of what the user asked of the part; None is not written.
+
+        A resumed run may have other values, as files may have moved; it is refused if `digest` differs.
+
+        Args:
+            asked: As for `leaves_device`.
+        """
+        return {}
+
     def captured(self, settings: Any, capture: Any) -> Any:  # noqa: ANN401
         """Return the dataset that a run trains on: that of the capture, perhaps with more.
 
@@ -185,6 +218,14 @@ class Part:
             DatasetError: a photo cannot be read.
         """
         return None
+
+    def scored(self, settings: Any) -> Mapping[str, Any]:  # noqa: ANN401
+        """Return what metrics.json says beside the scores of views, for example how they were corrected.
+
+        Args:
+            settings: The run's `Settings`.
+        """
+        return {}
 
     def finish(self, settings: Any, run: Any) -> Mapping[str, Any]:  # noqa: ANN401
         """Write what the part has to write into a run's folder; return entries of metrics.json.

@@ -23,6 +23,7 @@ from gsplat_edu.train.density.base import DensityStrategy, FollowsDevice
 from gsplat_edu.train.events import PHOTO, Change
 from gsplat_edu.train.objective import MeanOpacity, MeanScale, Objective, PhotoTerm
 from gsplat_edu.train.optimizer import ParameterGroup
+from gsplat_edu.train.part import parts
 from gsplat_edu.train.step import (
     Loaded,
     Shown,
@@ -89,9 +90,8 @@ def why_not(
     reasons = {
         "a batch has several views": batch > 1,
         "processes share the step": parts.team.size > 1,
-        "the view model corrects images or cameras (appearance, refine)": type(parts.view_model)
-        is not Identity,
-        "masks of moving things are found (transients)": bool(parts.maskers),
+        "the view model corrects images or cameras": type(parts.view_model) is not Identity,
+        "masks of moving things are found": bool(parts.maskers),
         "gradients are to be stored (fused=False)": not parts.fused,
         f"the Gaussians are {gaussians.means.dtype}": gaussians.means.dtype != torch.float32,
         "the density strategy does not follow a device": not _follows(parts.density),
@@ -106,25 +106,19 @@ def why_not(
     return None
 
 
-def leaves_device(config: TrainConfig, has_depth: bool = False) -> str | None:
-    """Return the setting of a configuration that no device can do, so that its steps pass through the processor.
+def leaves_device(config: TrainConfig, asked: Mapping[str, str]) -> str | None:
+    """Return what of a training no device can do, so that its steps pass through the processor; None if it can do all.
 
     It says beforehand what `why_not` says of the parts that a configuration leads to.
 
     Args:
         config: The configuration.
-        has_depth: Whether the training learns from given depth, which is no setting.
+        asked: As in `gsplat_edu.runs.options.RunOptions`.
     """
-    settings = {
-        f"batch is {config.batch}": config.batch > 1,
-        f"outside_masks is {config.outside_masks}": config.outside_masks != "ignore",
-        "surface is on": config.surface,
-        "depth is given": has_depth,
-    }
-    for name in ("appearance", "refine", "transients"):
-        value = getattr(config, name)
-        settings[f"{name} is {value}"] = value != "none"
-    return next((said for said, holds in settings.items() if holds), None)
+    if config.batch > 1:
+        return f"batch is {config.batch}"
+    said = (part.leaves_device(config.settings_of(name), asked.get(name)) for name, part in parts().items())
+    return next(filter(None, said), None)
 
 
 def _follows(density: DensityStrategy | None) -> bool:

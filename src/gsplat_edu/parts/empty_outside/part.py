@@ -14,6 +14,8 @@ from gsplat_edu.train.part_values import Begun, Setup
 class EmptyOutsidePart(Part):
     """Lets nothing be where masks exclude pixels."""
 
+    off_device = ("outside_masks",)
+
     def examine(self, survey: Survey) -> Examined:
         """Report what the training will do outside the masks."""
         return Examined({"masks": check_masks(survey)} if len(survey.shots) > 1 else {})

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.parts.exposure.findings import (
     EXPOSURE as CHECK,
     check_exposure,
@@ -21,6 +24,8 @@ from gsplat_edu.train.part_values import Begun, Setup
 class ExposurePart(Part):
     """Measures the exposure of each photo, and its vignetting if asked for."""
 
+    off_device = ("appearance",)
+
     def examine(self, survey: Survey) -> Examined:
         """Report photos that differ from their neighbours; nothing if they cannot be compared."""
         found = check_exposure(survey) if len(survey.shots) > 1 else []
@@ -33,6 +38,14 @@ class ExposurePart(Part):
     def judge(self, settings: TrainConfig, run: Trained) -> Examined:
         """Report photos that differ from the scene, or from their neighbours if the training corrected nothing."""
         return judged_exposure(run, settings.appearance)
+
+    def reads(self, settings: TrainConfig, data: DataSettings) -> DataSettings:
+        """Read photos with their alpha: the correction applies to the object only, before it is composited."""
+        return data if settings.appearance == "none" else replace(data, background=None)
+
+    def scored(self, settings: TrainConfig) -> dict[str, str]:
+        """Say what is corrected, if anything is."""
+        return {} if settings.appearance == "none" else {"appearance": settings.appearance}
 
     def begin(self, settings: TrainConfig, setup: Setup) -> Begun | None:
         """Return the view model that corrects the images."""

@@ -29,7 +29,7 @@ class FloatersPart(Part):
         Raises:
             DatasetError: a photo cannot be read.
         """
-        if not scene.is_asked:
+        if scene.asked is None:
             return None
         backend = load_backend("cpu")  # no other one collects the statistics of each splat
         here = scene.gaussians.to(torch.device("cpu"))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.data.depths import DepthReport, DepthSource, with_depth
+from gsplat_edu.data.depths import DepthReport, DepthSource, depth_name, with_depth
 from gsplat_edu.parts.given_depth.findings import NAME, depth_findings
 from gsplat_edu.parts.given_depth.term import DEPTH, DepthTerm
 from gsplat_edu.parts.run_values import Captured
@@ -20,6 +21,10 @@ from gsplat_edu.train.rendered import Turns
 class GivenDepthPart(Part):
     """Pulls the rendered depth to the given one."""
 
+    def leaves_device(self, settings: TrainConfig, asked: str | None) -> str | None:
+        """Say that a device cannot learn from depth, if the user gave some."""
+        return None if asked is None else "depth is given"
+
     def examine(self, survey: Survey) -> Examined:
         """Report what is wrong with the depth maps, if the survey has read them."""
         depth = survey.depth
@@ -28,15 +33,19 @@ class GivenDepthPart(Part):
         facts = [(NAME, depth.lines()[0])] if isinstance(depth, DepthReport) else []
         return Examined({NAME: depth_findings(depth)}, facts)
 
+    def recorded(self, asked: str | None) -> dict[str, str | None]:
+        """Return where depth comes from: the folder's full path, or the word."""
+        return {"depth": None if asked is None else depth_name(Path(asked))}
+
     def captured(self, settings: TrainConfig, capture: Captured) -> Dataset:
         """Give the training views the depth that the run's options name, and say what was found.
 
         Raises:
             DatasetError: the depth cannot be used.
         """
-        if capture.depth is None:
+        if capture.asked is None:
             return capture.dataset
-        source = DepthSource(capture.depth, settings.depth_kind, settings.depth_unit)
+        source = DepthSource(Path(capture.asked), settings.depth_kind, settings.depth_unit)
         dataset, report = with_depth(capture.dataset, capture.reader, source, capture.points)
         for sentence in report.lines():
             capture.say(sentence)

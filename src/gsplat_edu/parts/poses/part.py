@@ -25,6 +25,8 @@ from gsplat_edu.train.trainer import Trainer
 class PosesPart(Part):
     """Refines poses, lenses and rolling shutters with the scene."""
 
+    off_device = ("refine",)
+
     tried = "refine"
 
     def needs_trial(self, value: str) -> bool:

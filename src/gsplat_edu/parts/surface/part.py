@@ -16,6 +16,8 @@ from gsplat_edu.train.rendered import Turns
 class SurfacePart(Part):
     """Makes normals and neighbouring photos agree with the depth, and Gaussians flat."""
 
+    off_device = ("surface",)
+
     def begin(self, settings: TrainConfig, setup: Setup) -> Begun | None:
         """Return the terms of a surface.
 

@@ -25,6 +25,8 @@ from gsplat_edu.train.part_values import Begun, Setup
 class TransientsPart(Part):
     """Finds and masks what only single photos show."""
 
+    off_device = ("transients",)
+
     def choose(self, setting: str, capture: Undecided) -> Remedy | None:
         """Choose `transients` by the number of photos."""
         return transients_for(capture.training_photos) if setting == "transients" else None
