@@ -40,7 +40,15 @@ export class EditLook {
   constructor(editor) {
     const { viewer } = editor;
     const { gl } = viewer.renderer;
-    Object.assign(this, { editor, viewer, kind: "tint", outlined: false, hidden: false, selected: null, unseen: false });
+    Object.assign(this, {
+      editor,
+      viewer,
+      kind: "tint",
+      outlined: false,
+      hidden: false,
+      selected: null,
+      unseen: false,
+    });
     this.dots = linked(gl, "edit_dots");
     this.edge = linked(gl, "edit_edge");
     this.mask = { framebuffer: gl.createFramebuffer(), image: null, width: 0, height: 0 };
