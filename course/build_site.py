@@ -25,6 +25,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.styles import tokens_by_theme
 from site_figures import with_figures
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -183,6 +184,7 @@ def gather(stage: Path) -> None:
     _write(stage / "reference" / "index.md", _public_api())
     _write(stage / "docs" / "decisions" / "index.md", _records(records))
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
+    _write(stage / "static" / "tokens.css", tokens_by_theme())
     for picture in PICTURES:
         shutil.copyfile(ROOT / picture, stage / "static" / Path(picture).name)
     importlib.import_module("landing_scene").write_landing(stage / "static")

@@ -15,7 +15,7 @@ html_copy_source = False
 html_show_sphinx = False
 html_math_renderer = "mathml"
 html_static_path = ["static"]
-html_css_files = ["site.css"]
+html_css_files = ["tokens.css", "site.css"]  # the first one comes from course/build_site.py
 
 # What a notebook shows was made by course/build_notebooks.py.
 nb_execution_mode = "off"

@@ -52,6 +52,31 @@ test("a sample is the same each time and covers as much", () => {
   assert.ok(spread < 0.1 * sum(area), "a sharp picture follows");
 });
 
+test("a sample contains what it is to keep, each once and in order of depth", () => {
+  const data = vectors("sample");
+  const [means, scales, logits] = [data.means, data.log_scales, data.logits].map(arrayOf);
+  const splats = new SortedSplats([means, scales, logits], NEAR);
+  const sorted = () => {
+    const order = new Uint32Array(means.length / 3);
+    const { count, thinning } = splats.sort([0, 0, 1], [0, 0, -3], order, 2000);
+    return { chosen: [...order.slice(0, count)], thinning };
+  };
+  const before = sorted();
+  const left = Array.from({ length: means.length / 3 }, (_, i) => i).find((i) => !before.chosen.includes(i));
+  splats.keep(Uint32Array.of(before.chosen[5], left).sort());
+  const after = sorted();
+  assert.equal(after.thinning, before.thinning);
+  assert.deepEqual(
+    after.chosen.filter((i) => i !== left),
+    before.chosen,
+  );
+  assert.equal(after.chosen.length, before.chosen.length + 1);
+  const depths = after.chosen.map((i) => Math.fround(means[3 * i + 2] + 3));
+  assert.ok(depths.every((depth, i) => i === 0 || depth <= depths[i - 1]));
+  splats.keep(new Uint32Array(0));
+  assert.deepEqual(sorted(), before);
+});
+
 test("packed splats are unpacked as Python packs them", async () => {
   const { facts, packed, ...expected } = vectors("packed-scene");
   const data = gzipSync(Buffer.from(packed, "base64"));

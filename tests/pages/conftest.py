@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from gsplat_edu.base.icons import icons, icons_of
 from gsplat_edu.base.styles import components, sheet
 
 LONG = (
@@ -21,7 +22,11 @@ def gallery(tmp_path_factory):
     text = Path(__file__).with_name("components.html").read_text("utf-8")
     frame = '<li><button aria-label="photo {0}"{1}><img alt="" width="96" height="72"></button></li>'
     frames = "".join(frame.format(i, ' aria-current="true"' if i == 2 else "") for i in range(30))
+    shown = '<li><svg class="icon" aria-hidden="true"><use href="#icon-{0}"/></svg>{0}</li>'
+    listed = "".join(shown.format(name) for name in icons())
     for name, value in {
+        "list": listed,
+        "icons": icons_of(text, listed),
         "style": sheet(*components()),
         "frames": frames,
         "long": LONG,

@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 
 import gsplat_edu
-from gsplat_edu.base.styles import components, sheet, tokens
+from gsplat_edu.base.styles import components, sheet, tokens, tokens_by_theme
 from gsplat_edu.evaluate.report import STYLE
 
 PACKAGE = Path(gsplat_edu.__file__).parent
+
+REPOSITORY = Path(__file__).parents[2]
 
 RULE = re.compile(r"([^{}]+)\{([^{}]*)\}")
 
@@ -91,7 +93,7 @@ def test_every_text_and_mark_stands_out_from_its_ground(scheme):
     # a new colour belongs into one of the tables
     unchecked = {name for name, value in found.items() if re.fullmatch("#[0-9a-f]{6}", value)}
     unchecked -= {name for pair in measured for name in pair}
-    assert unchecked <= {"line", "stage", "mask", "halo", "on-glass"}
+    assert unchecked <= {"line", "stage", "mask", "halo", "on-glass", "paper"}
 
 
 @pytest.mark.parametrize("scene", ["#ffffff", "#7f7f7f", "#000000"])
@@ -117,9 +119,18 @@ def test_both_themes_set_the_same_colours():
     assert names[0] == names[1]
 
 
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_a_reader_of_the_site_may_choose_either_theme(theme):
+    chosen = values_of(tokens_by_theme(), f'body[data-theme="{theme}"]')
+    usual = values_of(tokens(), ":root", theme)
+    assert chosen and {name: usual[name] for name in chosen} == chosen
+    assert chosen["text"] != values_of(tokens(), ":root", "light" if theme == "dark" else None)["text"]
+
+
 SHEETS_OF_PAGES = {
     "components": "".join(components().values()),
     "report": STYLE.replace(tokens(), ""),
+    "site": (REPOSITORY / "docs" / "site" / "static" / "site.css").read_text("utf-8"),
     "studio": (PACKAGE / "studio" / "web" / "style.css").read_text("utf-8"),
 }
 """Style sheets by their pages, without the tokens."""

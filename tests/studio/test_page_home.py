@@ -151,6 +151,8 @@ def test_the_rail_has_five_steps_at_the_left_or_along_the_top(visitor, owl):
     rail.locator("[aria-current=step]", has_text="Cameras").wait_for()
     titles = rail.locator(".step").all_inner_texts()
     assert titles == ["Photos", "Cameras", "Training", "Scene", "Share"]
+    drawn = "[...document.querySelectorAll('.rail use')].filter((one) => one.getBBox().width > 10).length"
+    until_in(tab, tab, f"{drawn} === 5")
     check_widths(tab)
     for width, beside in ((390, False), (1440, True)):
         resize(tab, width, 800)

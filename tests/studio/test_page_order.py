@@ -117,7 +117,7 @@ def beside(visitor, library, capture):
     person = visitor()
     tabs = [person.tab, visitor_of(person, library[1])]
     for tab in tabs:
-        resize(tab, 1200, 900)  # smaller pages fold their panels
+        resize(tab, 1280, 900)  # frames of up to 600 px, in smaller windows, fold their panels
         tab.goto(f"{library[1]}#/captures/{capture.name}")
         tab.locator(".thumbs li").first.wait_for()
     return [(tab, capture_frame(tab, capture.name)) for tab in tabs]

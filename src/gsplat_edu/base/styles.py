@@ -15,9 +15,26 @@ SECTION = re.compile(r"^/\* == ([\w-]+) \*/\n", re.MULTILINE)
 """The line before a component."""
 
 
+DARK = re.compile(r"^:root, \.glass \{(.*?)\}", re.MULTILINE | re.DOTALL)
+
+LIGHT = re.compile(r"prefers-color-scheme: light\) \{\s*:root \{(.*?)\}", re.DOTALL)
+"""The colours of the two themes."""
+
+
 def tokens() -> str:
     """Return the style sheet that defines the tokens, custom properties of CSS."""
     return _text("tokens.css")
+
+
+def tokens_by_theme() -> str:
+    """Return the tokens for a page whose readers may choose a theme: `data-theme` of its body is dark or light."""
+    text = tokens()
+    (dark,), (light,) = DARK.findall(text), LIGHT.findall(text)
+    chosen = [
+        f'body[data-theme="{theme}"] {{ color-scheme: {theme};{values}}}\n'
+        for theme, values in (("dark", dark), ("light", light))
+    ]
+    return text + "".join(chosen)
 
 
 @functools.cache

@@ -15,7 +15,8 @@ import json
 import re
 
 from gsplat_edu.base.content_policy import content_policy, policy_element
-from gsplat_edu.base.styles import tokens
+from gsplat_edu.base.icons import icons_of
+from gsplat_edu.base.styles import sheet
 from gsplat_edu.viewer.capture_data import CaptureFacts
 from gsplat_edu.viewer.modules import script, web
 
@@ -44,6 +45,7 @@ def html(capture: CaptureFacts, findings: str = "") -> bytes:
         "title": html_text.escape(str(facts["title"])),
         "policy": policy_element(policy()),
         "style": _style(),
+        "icons": icons_of(web("capture.html"), script(ENTRIES)),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         "shaders": "\n".join(
@@ -69,4 +71,4 @@ def _packed(name: str, data: bytes) -> str:
 
 
 def _style() -> str:
-    return tokens() + "".join(web(name) for name in STYLES)
+    return sheet("icon") + "".join(web(name) for name in STYLES)

@@ -12,7 +12,8 @@ from typing import Any
 
 from gsplat_edu.base import constants
 from gsplat_edu.base.content_policy import content_policy, policy_element
-from gsplat_edu.base.styles import tokens
+from gsplat_edu.base.icons import icons_of
+from gsplat_edu.base.styles import sheet
 from gsplat_edu.viewer.modules import script, web
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "mesh.vert", "mesh.frag")
@@ -96,6 +97,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
         "style": _style(kind),
         "body": "glass" if kind is EDITOR else "visitor glass",
         "poster": _poster(poster),
+        "icons": icons_of(template, script(kind.entries)),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         "shaders": "\n".join(
@@ -111,7 +113,7 @@ def filled(template: str, title: str, facts: dict[str, Any], poster: bytes = b""
 
 
 def _style(kind: Kind) -> str:
-    return tokens() + "".join(web(name) for name in ("style.css", "visitor.css", *kind.styles))
+    return sheet("icon") + "".join(web(name) for name in ("style.css", "visitor.css", *kind.styles))
 
 
 def _text_element(name: str, text: str) -> str:

@@ -10,6 +10,10 @@ export const link = (text, href, more = {}) => h("a", { href, ...more }, text);
 
 export const heading = (level, text, more = {}) => h(`h${level}`, more, text);
 
+// An icon by its name, for patch() and h(); see gsplat_edu/base/icons.py.
+export const icon = (name) =>
+  want("svg", { class: "icon", "aria-hidden": "true" }, want("use", { href: `/base/web/icons.svg#icon-${name}` }));
+
 const TONES = Object.entries({
   busy: ["queued", "running", "paused", "stopping"],
   good: ["done"],

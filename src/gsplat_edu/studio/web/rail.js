@@ -1,9 +1,11 @@
 // The rail of a project's screens: five steps with their state, and the list of everything in the project.
 
 import { addressOf, factsOf, KINDS, stateOf } from "./entries.js";
-import { h, patch, want } from "./dom.js";
+import { h, icon, patch, want } from "./dom.js";
 import { badge } from "./jobs.js";
 import { hashOf, STAGES, stepLine } from "./project.js";
+
+const ICONS = { photos: "photos", poses: "camera", training: "training", look: "scene", share: "share" };
 
 // The step that the page shows; the one that the project has reached, if it shows none of them.
 function shownStage(store, project) {
@@ -28,13 +30,14 @@ export function rail(store) {
       patch(
         list,
         project.steps.map(({ stage, place }, index) => {
+          const isDone = index < present && place;
           const is = {
-            class: index < present && place ? "done" : index === present ? "present" : null,
+            class: isDone ? "done" : index === present ? "present" : null,
             "aria-current": stage === shown ? "step" : null,
           };
           const title = want("span", { class: "step" }, STAGES[stage]);
           const said = want("span", { class: "small quiet" }, stepLine(store, project, stage));
-          const inner = [want("span", { class: "number", "aria-hidden": "true" }, String(index + 1)), title, said];
+          const inner = [want("span", { class: "mark" }, icon(isDone ? "done" : ICONS[stage])), title, said];
           return want("li", is, place ? want("a", { href: hashOf(place) }, ...inner) : want("div", {}, ...inner));
         }),
       );

@@ -4,7 +4,7 @@ import { linked } from "./common.js";
 import { ORDER, Renderer } from "./draw.js";
 import { HIGHLIGHT } from "./edit_draw.js";
 import { SELECTED } from "./edit_flags.js";
-import { reduced } from "./pace.js";
+import { DETAILS, reduced } from "./pace.js";
 import { layout } from "./scene.js";
 
 const TINT = { tint: 0.6, centres: 0, rings: 0.75 }; // share of the highlight in the colour of a selected splat
@@ -13,6 +13,7 @@ const DOTS = [
   { selected: 0, color: [0.3, 0.62, 1, 0.7], size: 2 }, // sizes in CSS pixels
   { selected: 1, color: [...HIGHLIGHT, 1], size: 3 },
 ];
+const MOST_KEPT = DETAILS.at(-1).most; // selected splats that a coarse picture always has
 const OUTLINE_WIDTH = 2; // CSS pixels
 
 export const LOOK_ROW = `
@@ -32,13 +33,22 @@ Renderer.prototype.setUniforms = function (camera, settings) {
   const { tint, rings } = this.look ?? { tint: TINT.tint, rings: 0 };
   gl.uniform1f(gl.getUniformLocation(program, "highlight_share"), tint);
   gl.uniform1f(gl.getUniformLocation(program, "ring_width"), rings);
+  gl.uniform1f(gl.getUniformLocation(program, "kept"), this.kept ?? 0);
 };
 
 export class EditLook {
   constructor(editor) {
     const { viewer } = editor;
     const { gl } = viewer.renderer;
-    Object.assign(this, { editor, viewer, kind: "tint", outlined: false, hidden: false, selected: null });
+    Object.assign(this, {
+      editor,
+      viewer,
+      kind: "tint",
+      outlined: false,
+      hidden: false,
+      selected: null,
+      unseen: false,
+    });
     this.dots = linked(gl, "edit_dots");
     this.edge = linked(gl, "edit_edge");
     this.mask = { framebuffer: gl.createFramebuffer(), image: null, width: 0, height: 0 };
@@ -65,13 +75,20 @@ export class EditLook {
     const dense = window.devicePixelRatio || 1;
     const chosen = this.outlined && this.kind === "tint" ? 0 : TINT[this.kind];
     const rings = this.kind === "rings" ? dense : 0;
+    this.unseen = true;
     this.viewer.renderer.look = this.hidden ? { tint: 0, rings: 0 } : { tint: chosen, rings };
     this.viewer.refresh();
   }
 
-  // The states of the splats have changed.
+  // The states of the splats have changed. Every coarse picture has the selected splats, or of many an even share, so that
+  // a selection shows before the whole picture is drawn.
   changed() {
-    this.selected = null;
+    const { flags } = this.editor.history;
+    this.selected = indicesOf(flags, SELECTED);
+    this.unseen = true;
+    const step = Math.max(1, Math.ceil(this.selected.length / MOST_KEPT));
+    this.viewer.sorter.keep(this.selected.filter((_, i) => i % step === 0));
+    this.viewer.renderer.kept = 1 / step;
   }
 
   // Calls work() while splats are drawn as the scene has them.
@@ -88,8 +105,8 @@ export class EditLook {
   draw(camera) {
     const { viewer } = this;
     if (viewer.lost || this.hidden || (this.kind !== "centres" && !this.outlined)) return;
-    this.selected ??= Uint32Array.from(indicesOf(this.editor.history.flags, SELECTED));
-    const hurried = viewer.pace.slow && viewer.isMoving();
+    const hurried = viewer.pace.slow && viewer.isMoving() && !this.unseen;
+    this.unseen = false;
     if (this.outlined && this.selected.length && !hurried) this.drawOutline(camera);
     this.stride = hurried ? Math.max(1, Math.ceil(this.editor.values.count / viewer.pace.detail.most)) : 1;
     if (this.kind === "centres")
@@ -169,6 +186,9 @@ export class EditLook {
 }
 
 // The places at which an array has a value.
-function* indicesOf(array, value) {
-  for (let i = array.indexOf(value); i >= 0; i = array.indexOf(value, i + 1)) yield i;
+function indicesOf(array, value) {
+  const found = new Uint32Array(array.length);
+  let count = 0;
+  for (let i = 0; i < array.length; ++i) if (array[i] === value) found[count++] = i;
+  return found.slice(0, count);
 }

@@ -15,44 +15,24 @@ import { POINTS_OF } from "./edit_tools.js";
 import { TOUR_ROW } from "./edit_tour.js";
 import { want } from "./patch.js";
 
-// Tools: name, what its button is called, its key and what it does, and the strokes of its icon on a grid of 24.
+// Tools: name, what its button is called, its key and what it does, and its icon.
 const TOOLS = [
-  ["navigate", "navigate", "V: drags turn the view", "M5 3l14 8-6 1.5L10 19z"],
-  [
-    "rectangle",
-    "rectangle",
-    "T: select by a rectangle",
-    "M4 8V4h4m3 0h2m3 0h4v4m0 3v2m0 3v4h-4m-3 0h-2m-3 0H4v-4m0-3v-2",
-  ],
-  [
-    "lasso",
-    "lasso",
-    "L: select by a freehand outline",
-    "M12 4c5 0 8 2.2 8 5s-3 5-8 5-8-2.2-8-5 3-5 8-5zM7 13.5c-2 2-1 3.5 1 4s1.5 2.5-1 3",
-  ],
-  ["polygon", "polygon", "Shift L: select by a polygon, corner after corner", "M12 3l8 6-3 11H7L4 9z"],
-  [
-    "brush",
-    "brush",
-    "B: select by painting; [ and ] change the size",
-    "M20 4l-9.5 9.5M8.5 13C6 13 5 15 5 17c0 1.3-.8 2.2-2 2.7 4 1.2 8 .3 8-3.7A3 3 0 0 0 8.5 13z",
-  ],
-  ["sphere", "sphere", "O: select by a sphere", "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zM3 12c2 2.8 16 2.8 18 0"],
-  ["box", "box", "X: select by a box, or crop to it", "M12 3l8 4.5v9L12 21l-8-4.5v-9zM4 7.5l8 4.5 8-4.5M12 12v9"],
-  [
-    "move",
-    "move",
-    "Shift V: move and turn the selected splats",
-    "M12 3v18M3 12h18M9.5 5.5L12 3l2.5 2.5m-5 13L12 21l2.5-2.5m-9-9L3 12l2.5 2.5m13-5L21 12l-2.5 2.5",
-  ],
-  ["color", "colour", "G: select by colour", "M12 3s6 6.5 6 11a6 6 0 0 1-12 0c0-4.5 6-11 6-11z"],
-  ["floor", "floor", "Z: turn the scene upright by three points of the floor", "M3 9h18v6H3zM9 9v6m6-6v6m-3-3v.01"],
-  ["scale", "scale", "C: set the scale by two points", "M4 20L20 4M4 15v5h5M15 4h5v5"],
-  ["measure", "measure", "M: measure between two points", "M3 16L16 3l5 5L8 21zM7 12l2 2m1-5l2 2m1-5l2 2"],
+  ["navigate", "navigate", "V: drags turn the view", "#icon-pointer"],
+  ["rectangle", "rectangle", "T: select by a rectangle", "#icon-rectangle"],
+  ["lasso", "lasso", "L: select by a freehand outline", "#icon-lasso"],
+  ["polygon", "polygon", "Shift L: select by a polygon, corner after corner", "#icon-polygon"],
+  ["brush", "brush", "B: select by painting; [ and ] change the size", "#icon-brush"],
+  ["sphere", "sphere", "O: select by a sphere", "#icon-sphere"],
+  ["box", "box", "X: select by a box, or crop to it", "#icon-box"],
+  ["move", "move", "Shift V: move and turn the selected splats", "#icon-move"],
+  ["color", "colour", "G: select by colour", "#icon-colour"],
+  ["floor", "floor", "Z: turn the scene upright by three points of the floor", "#icon-floor"],
+  ["scale", "scale", "C: set the scale by two points", "#icon-scale"],
+  ["measure", "measure", "M: measure between two points", "#icon-measure"],
 ];
 
-const toolButton = ([tool, name, title, strokes]) =>
-  `<button data-tool="${tool}" title="${title}"><svg viewBox="0 0 24 24" aria-hidden="true"><path d="${strokes}"/></svg><span>${name}</span></button>`;
+const toolButton = ([tool, name, title, icon]) =>
+  `<button data-tool="${tool}" title="${title}"><svg class="icon" aria-hidden="true"><use href="${icon}"/></svg><span>${name}</span></button>`;
 
 const EDIT_PANEL = `
 <section id="edit" aria-label="editor">
@@ -99,8 +79,8 @@ ${FRONT_ROW}${POLYGON_ROW}
 <div id="edit-column">
 <div id="edit-history">
 <p class="row">
-<button data-do="undo" title="U or Ctrl Z: undo">undo</button>
-<button data-do="redo" title="Y or Ctrl Shift Z: redo">redo</button>
+<button data-do="undo" title="U or Ctrl Z: undo"><svg class="icon" aria-hidden="true"><use href="#icon-undo"/></svg><span>undo</span></button>
+<button data-do="redo" title="Y or Ctrl Shift Z: redo"><svg class="icon" aria-hidden="true"><use href="#icon-redo"/></svg><span>redo</span></button>
 <button data-do="save" title="Ctrl S: save the edits">save</button>
 <button data-do="download" title="Download the edits as a file">download</button>
 <button data-do="search" title="Ctrl K: find an action by its name">find</button>

@@ -2,7 +2,7 @@
 // them what is pressed, the focus, the selection, and what the user has unfolded or typed. The studio's pages use it too.
 
 const SVG = "http://www.w3.org/2000/svg";
-const SVG_NAMES = new Set(["svg", "path", "line", "polyline", "text", "title", "g", "circle"]);
+const SVG_NAMES = new Set(["svg", "path", "line", "polyline", "text", "title", "g", "circle", "use"]);
 const CONTROL = "button, a, summary, label, input, select, textarea";
 const PRESSABLE = "button, a, summary, label, [type=checkbox], [type=radio]"; // not what is dragged, or opens a list
 

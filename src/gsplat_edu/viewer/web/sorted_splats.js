@@ -13,6 +13,7 @@ export class SortedSplats {
     this.keys = new Uint32Array(means.length / 3);
     this.byLow = new Uint32Array(means.length / 3);
     this.ranked = this.values = null; // all splats by rank, and the value that ranks each
+    this.kept = new Uint32Array(0); // what every sample contains
   }
 
   // Replaces means, beginning with splat `at`.
@@ -20,13 +21,28 @@ export class SortedSplats {
     this.means.set(means, 3 * at);
   }
 
+  // Puts these splats into every sample, whatever their rank.
+  keep(indices) {
+    this.kept = indices;
+  }
+
   // Fills the first `count` entries of `order` with the splats in front of the camera: of all, or of a sample of `most`,
   // whose thinning is not 0. Without an axis, they are sorted by distance, in all directions.
   sort(axis, eye, order, most) {
     const thins = most < this.keys.length;
     if (thins && !this.ranked) this.rank();
-    const count = this.byDepth(axis, eye, order, thins ? this.ranked.slice(0, most).sort() : null);
+    const count = this.byDepth(axis, eye, order, thins ? this.sample(most) : null);
     return { count, thinning: thins ? Math.exp(OFFSET - this.values[this.ranked[most - 1]]) : 0 };
+  }
+
+  // The first splats by rank and those that every sample contains, in rising order.
+  sample(most) {
+    const first = this.ranked.subarray(0, most);
+    if (!this.kept.length) return first.slice().sort();
+    const all = new Uint32Array(first.length + this.kept.length);
+    all.set(first);
+    all.set(this.kept, first.length);
+    return all.sort().filter((index, i) => index !== all[i - 1]);
   }
 
   // Fills the first entries of `order` and returns the number of splats in front of the camera, of all or of some, whose

@@ -12,6 +12,7 @@ export class Sorter {
     this.running = null;
     this.sorted = "";
     this.version = 0; // of the means
+    this.keeping = 0; // version of what every sample contains
     this.camera = null; // of the last sort
     this.give(splats);
   }
@@ -39,7 +40,8 @@ export class Sorter {
   }
 
   key(camera, most) {
-    return `${this.version} ${this.ranks ? most : Infinity} ${Sorter.key(camera)}`;
+    const sample = this.ranks && most < Infinity ? `${most} ${this.keeping}` : "all";
+    return `${this.version} ${sample} ${Sorter.key(camera)}`;
   }
 
   // An order depends only on depth, or on distance for a head, which is a camera whose R is null.
@@ -55,6 +57,12 @@ export class Sorter {
   write(means, at) {
     ++this.version;
     this.worker.postMessage({ replaced: means, at }, [means.buffer]);
+  }
+
+  // Puts these splats into every sample, see sorted_splats.js; it takes the array.
+  keep(indices) {
+    ++this.keeping;
+    this.worker.postMessage({ kept: indices }, [indices.buffer]);
   }
 
   // Takes splats out of the order.

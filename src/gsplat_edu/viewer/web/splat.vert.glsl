@@ -26,6 +26,7 @@ uniform mat3 moving_turn;        // turned about one point, which goes to anothe
 uniform vec3 moving_from;
 uniform vec3 moving_to;
 uniform float highlight_share;   // of it in their colour
+uniform float kept;              // share of the selected splats that every sample contains
 #endif
 #ifdef SEEN
 uniform highp usampler2D photos_seen;  // number of photos that saw a splat
@@ -102,9 +103,10 @@ mat3 turn_of(ivec2 place) {
 #endif
 
 // By how much a splat of a sample is enlarged, to cover for others; a little less than they covered, as these overlap.
-float enlarged(vec3 scales, float logit) {
+// `least` is a lower bound of the probability that the sample contains it.
+float enlarged(vec3 scales, float logit, float least) {
     float area = scales.x * scales.y * scales.z / min(scales.x, min(scales.y, scales.z));
-    float chance = min(1.0, thinning * sqrt(area / (1.0 + exp(-logit))));
+    float chance = clamp(thinning * sqrt(area / (1.0 + exp(-logit))), least, 1.0);
     return min(MOST_ENLARGED, pow(chance, -0.4));
 }
 
@@ -146,7 +148,11 @@ void main() {
     RS = turn * RS;
 #endif
     vec3 scales = exp(texelFetch(log_scales, place, 0).xyz);
-    if (thinning > 0.0) scales *= enlarged(scales, texelFetch(logit_opacities, place, 0).r);
+    float least = 0.0;
+#ifdef EDITING
+    if (flag == 1u) least = kept;
+#endif
+    if (thinning > 0.0) scales *= enlarged(scales, texelFetch(logit_opacities, place, 0).r, least);
     RS[0] *= scales.x, RS[1] *= scales.y, RS[2] *= scales.z;
 
     vec2 ratio = clamp(p.xy / p.z, ratio_low, ratio_high);

@@ -39,6 +39,7 @@ export class Viewer {
     this.seen = this.compare = this.guide = this.headset = null; // see the modules of these names
     this.pace = new Pace();
     this.movedAt = -Infinity;
+    this.unseen = false; // whether a change waits for its first picture
     this.gauged = false;
     this.isTraining = false; // the scene, on this computer
     this.isWhole = false; // whether the screen shows the current view with all splats at full resolution
@@ -256,6 +257,7 @@ export class Viewer {
     this.stop();
     this.exact = null;
     this.movedAt = performance.now();
+    this.unseen = true;
     this.cameraIndex = cameraIndex;
     this.isWhole = false; // the screen shows another view until the next frame
     this.panel.mark(cameraIndex);
@@ -266,6 +268,7 @@ export class Viewer {
   // What is seen from here has changed. A slow page shows that in a coarse picture first, as if the view had moved.
   refresh() {
     this.movedAt = performance.now();
+    this.unseen = true;
     this.askFrame();
   }
 
@@ -352,7 +355,8 @@ export class Viewer {
     try {
       while (this.outdated && !this.paused) {
         this.outdated = false;
-        if (this.isMoving()) await this.drawCoarse();
+        // however late the page comes to it, a change is not first seen in the whole picture
+        if (this.isMoving() || this.unseen) await this.drawCoarse();
         else if (this.isTraining) await this.drawSparing();
         else if (!(await this.drawWhole())) this.outdated = true;
       }
@@ -372,6 +376,7 @@ export class Viewer {
 
   async drawCoarse() {
     const { detail } = this.pace;
+    this.unseen = false;
     const began = performance.now();
     const camera = this.camera();
     await this.sorter.sort(camera, detail.most);
