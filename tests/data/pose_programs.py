@@ -1,0 +1,101 @@
+"""Files with poses as other programs write them, and where such a program's documentation says a point is seen.
+
+Nothing here uses a reader. Positions have the centre of the first pixel at (0.5, 0.5).
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from gsplat_edu.data.lens_formulas import FORMULAS
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.reader import read_capture
+
+W, H = 24, 18
+OPENGL = np.diag([1.0, -1.0, -1.0])
+COLORS = (255.0, 128.0, 0.0)
+
+views, POINTS, _ = procedural_capture(W, 6, splats=40)
+CAMERAS = [
+    (f"shot_{i}.png", np.array(view.camera.R), np.array(view.camera.eye)) for i, view in enumerate(views)
+]
+
+
+def write_photos(folder: Path, count: int = len(CAMERAS)) -> None:
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for name, _, _ in CAMERAS[:count]:
+        Image.new("RGB", (W, H), (60, 90, 120)).save(folder / "images" / name)
+
+
+def rays(R, eye):
+    seen = (POINTS - eye) @ R.T
+    return seen[:, 0] / seen[:, 2], seen[:, 1] / seen[:, 2]
+
+
+def assert_reads(folder: Path, program: str, seen, count: int = len(CAMERAS)):
+    """Check poses, and the positions in the photos, which `seen` returns for two arrays of rays; return the capture."""
+    capture = read_capture(folder)
+    assert capture.layout == program and len(capture.frames) == count
+    assert str(capture.notes[0]) == f"poses of {program}: {count} of {count} photos"
+    frames = {frame.name: frame for frame in capture.frames}
+    for name, R, eye in CAMERAS[:count]:
+        frame = frames[name]
+        np.testing.assert_allclose(frame.R, R, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(frame.eye, eye, rtol=0, atol=1e-9)
+        x, y = rays(frame.R, frame.eye)
+        formula, lens = FORMULAS[frame.lens.model], frame.lens
+        c = np.array([*lens.coefficients, *[0.0] * (len(formula.names) - len(lens.coefficients))])
+        a, b = formula.image(x, y, c)
+        expected = seen(*rays(R, eye))
+        np.testing.assert_allclose(lens.fx * a + lens.cx + 0.5, expected[0], rtol=0, atol=1e-3)
+        np.testing.assert_allclose(lens.fy * b + lens.cy + 0.5, expected[1], rtol=0, atol=1e-3)
+    return capture
+
+
+def write_opensfm(folder: Path, cameras=CAMERAS, camera=None, extra=()):
+    write_photos(folder)
+    camera = camera or {"projection_type": "perspective", "focal": 0.9, "k1": -0.1, "k2": 0.02}
+    shots = {
+        name: {
+            "camera": "v2 any",
+            "rotation": Rotation.from_matrix(R).as_rotvec().tolist(),
+            "translation": (-R @ eye).tolist(),
+            "orientation": 1,
+        }
+        for name, R, eye in cameras
+    }
+    points = {str(i): {"coordinates": p.tolist(), "color": COLORS} for i, p in enumerate(POINTS)}
+    one = {"cameras": {"v2 any": {"width": W, "height": H, **camera}}, "shots": shots, "points": points}
+    (folder / "reconstruction.json").write_text(json.dumps([*extra, one]))
+
+
+def write_bundler(folder: Path, cameras=CAMERAS, f=20.0, k1=-0.1, k2=0.02):
+    write_photos(folder)
+    lines = ["# Bundle file v0.3", f"{len(cameras)} {len(POINTS)}"]
+    for _, R, eye in cameras:
+        down = OPENGL @ R
+        lines.append(f"{f} {k1} {k2}")
+        lines += [" ".join(map(repr, row)) for row in [*down.tolist(), (-down @ eye).tolist()]]
+    for point in POINTS.tolist():
+        lines += [" ".join(map(repr, point)), "255 128 0", "1 0 0 0.5 -0.5"]
+    (folder / "bundle.out").write_text("\n".join(lines) + "\n")
+    (folder / "list.txt").write_text("".join(f"./{name} 0 {f}\n" for name, _, _ in cameras))
+
+
+def write_nvm(folder: Path, cameras=CAMERAS, f=20.0, r=-0.05, first="NVM_V3"):
+    write_photos(folder)
+    lines = [first, "", str(len(cameras))]
+    for name, R, eye in cameras:
+        x, y, z, w = Rotation.from_matrix(R).as_quat()
+        numbers = (f, w, x, y, z, *eye, r, 0)
+        lines.append(f"images\\{name}\t" + " ".join(str(float(v)) for v in numbers))
+    lines += ["", str(len(POINTS))]
+    lines += [" ".join(map(repr, p)) + " 255 128 0 1 0 5 0.5 -0.5" for p in POINTS.tolist()]
+    (folder / "any name.nvm").write_text("\n".join([*lines, "", "0", "0"]) + "\n")
+
+
+WRITERS = {"OpenSfM": write_opensfm, "Bundler": write_bundler, "VisualSFM": write_nvm}
+"""A writer for each program: of a folder and, if they are not `CAMERAS`, its cameras."""
