@@ -97,5 +97,106 @@ def write_nvm(folder: Path, cameras=CAMERAS, f=20.0, r=-0.05, first="NVM_V3"):
     (folder / "any name.nvm").write_text("\n".join([*lines, "", "0", "0"]) + "\n")
 
 
-WRITERS = {"OpenSfM": write_opensfm, "Bundler": write_bundler, "VisualSFM": write_nvm}
+RC_LENS = {
+    "f": 33.0,
+    "px": 0.02,
+    "py": -0.03,
+    "k1": -0.1,
+    "k2": 0.02,
+    "k3": -0.004,
+    "k4": 0,
+    "t1": 0.003,
+    "t2": -0.002,
+}
+RC_NUMBERS = ("name", "x", "y", "alt", "heading", "pitch", "roll", *RC_LENS)
+
+
+def write_table(folder: Path, cameras=CAMERAS, columns=RC_NUMBERS, lens=RC_LENS, count="#cameras 6\n"):
+    """Angles as the documentation of the program defines them, by SciPy."""
+    write_photos(folder)
+    lines = ["#" + ",".join(columns)]
+    for name, R, eye in cameras:
+        gl = (OPENGL @ R).T
+        heading, pitch, roll = Rotation.from_matrix(gl).as_euler("ZXY", degrees=True)
+        kappa, phi, omega = Rotation.from_matrix(gl).as_euler("YXZ", degrees=True)
+        row = {"name": name, "x": eye[0], "y": eye[1], "alt": eye[2], "z": eye[2]}
+        row |= {
+            "heading": -heading,
+            "pitch": pitch,
+            "roll": roll,
+            "omega": -omega,
+            "phi": phi,
+            "kappa": kappa,
+        }
+        lines.append(",".join(f"{value}" for value in ({**row, **lens}[column] for column in columns)))
+    (folder / "cameras.csv").write_text(count + "\n".join(lines) + "\n")
+
+
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
+  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+    <rdf:Description xcr:Version="3" xcr:DistortionModel="brown3t2" xcr:FocalLength35mm="{f}" xcr:Skew="0"
+       xcr:AspectRatio="1" xcr:PrincipalPointU="{px}" xcr:PrincipalPointV="{py}"
+       xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">
+      <xcr:Rotation>{R}</xcr:Rotation>
+      <xcr:Position>{eye}</xcr:Position>
+      <xcr:DistortionCoeficients>{k1} {k2} {k3} {k4} {t1} {t2}</xcr:DistortionCoeficients>
+    </rdf:Description>
+  </rdf:RDF>
+</x:xmpmeta>
+"""
+
+
+def write_xmp(folder: Path, cameras=CAMERAS):
+    write_photos(folder)
+    for name, R, eye in cameras:
+        pose = {"R": " ".join(map(str, R.ravel())), "eye": " ".join(map(str, eye))}
+        (folder / "images" / name).with_suffix(".xmp").write_text(XMP.format(**RC_LENS, **pose))
+
+
+MS_LENS = {
+    "f": 20.0,
+    "cx": 0.4,
+    "cy": -0.3,
+    "b1": 1.5,
+    "k1": -0.1,
+    "k2": 0.02,
+    "k3": -0.004,
+    "p1": 0.003,
+    "p2": -0.002,
+}
+
+
+def write_metashape(folder: Path, cameras=CAMERAS, kind="frame", lens=MS_LENS, more=""):
+    """Chunk coordinates are turned, shrunk and moved against those of the world."""
+    write_photos(folder)
+    turn, scale, shift = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix(), 2.5, np.array([4.0, -7.0, 2.0])
+    numbers = "".join(f"<{name}>{value}</{name}>" for name, value in lens.items())
+    rows = []
+    for number, (name, R, eye) in enumerate(cameras):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn.T @ R.T, turn.T @ (eye - shift) / scale
+        text = " ".join(map(str, pose.ravel()))
+        label = name.removesuffix(".png")
+        rows.append(
+            f'<camera id="{number}" sensor_id="1" label="{label}"><transform>{text}</transform></camera>'
+        )
+    (folder / "cameras.xml").write_text(
+        '<?xml version="1.0" encoding="UTF-8"?>\n<document version="1.5.0"><chunk label="one"><sensors>'
+        '<sensor id="0" type="frame"/>'
+        f'<sensor id="1" type="{kind}"><resolution width="{W}" height="{H}"/>'
+        f'<calibration type="{kind}" class="initial"><f>1</f></calibration>'
+        f'<calibration type="{kind}" class="adjusted"><resolution width="{W}" height="{H}"/>{numbers}</calibration>'
+        f"</sensor></sensors><cameras>{''.join(rows)}{more}</cameras><transform>"
+        f'<rotation locked="1">{" ".join(map(str, turn.ravel()))}</rotation>'
+        f"<translation>{' '.join(map(str, shift))}</translation><scale>{scale}</scale></transform></chunk></document>\n"
+    )
+
+
+WRITERS = {
+    "OpenSfM": write_opensfm,
+    "Bundler": write_bundler,
+    "VisualSFM": write_nvm,
+    "RealityCapture": write_table,
+    "Metashape": write_metashape,
+}
 """A writer for each program: of a folder and, if they are not `CAMERAS`, its cameras."""

@@ -121,8 +121,10 @@ def read_capture(path: Path) -> Capture:
     if files := pose_files(path):
         return read_poses(path, files)
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
-    others = ", ".join(f"{program.files} ({program.name})" for program in PROGRAMS)
-    looked = f"{TRAIN_FILE}, transforms.json, cameras and images (.bin or .txt) in {places}, {others}"
+    others = ", ".join(dict.fromkeys(program.name for program in PROGRAMS))
+    looked = (
+        f"{TRAIN_FILE}, transforms.json, cameras and images (.bin or .txt) in {places}, poses of {others}"
+    )
     if _has_photos(path):
         raise DatasetError(
             f"{path}: holds photos but no camera poses; find the poses with "

@@ -98,4 +98,4 @@ def _name(line: str) -> str:
     return " ".join(itertools.takewhile(lambda word: word != "0", words)) if len(words) > 2 else line
 
 
-BUNDLER = Program("Bundler", "bundle.out with list.txt", holds, read)
+BUNDLER = Program("Bundler", holds, read)

@@ -122,4 +122,4 @@ def _section(path: Path, lines: list[str], what: str) -> list[str]:
     return lines[1 : 1 + count]
 
 
-VISUALSFM = Program("VisualSFM", ".nvm", holds, read)
+VISUALSFM = Program("VisualSFM", holds, read)

@@ -1,8 +1,8 @@
 """OpenSfM's and OpenDroneMap's reconstruction.json.
 
 A shot's `rotation` is the axis of a rotation times its angle in radians, and with `translation` it takes world to
-camera coordinates: x_cam = R x + t, OpenCV axes. Focal lengths and principal points are fractions of the photo's longer side;
-principal points are relative to its middle.
+camera coordinates: x_cam = R x + t, OpenCV axes. Focal lengths and principal points are fractions of the photo's longer
+side; principal points are relative to its middle.
 
 Source: OpenSfM's documentation, "Geometric Models"; `camera_from_json` in its io.py; camera_distortions_functions.h.
 """
@@ -168,4 +168,4 @@ def _lens(camera: Camera) -> Callable[[Path], Lens]:
     return sized(values, size, MODEL_OF[kind])
 
 
-OPENSFM = Program("OpenSfM", NAME, holds, read)
+OPENSFM = Program("OpenSfM", holds, read)

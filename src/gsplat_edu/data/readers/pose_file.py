@@ -91,14 +91,12 @@ class Program:
 
     Args:
         name: Its name.
-        files: The files that are looked for, in a few words.
         holds: Returns whether a file is one of them, by its name and its first `HEAD` bytes.
         read: Reads such a file. It raises a DatasetError if the file is damaged.
         together: Whether each photo has its own file; `read` then reads all in the folder of the given one.
     """
 
     name: str
-    files: str
     holds: Callable[[Path, bytes], bool]
     read: Callable[[Path], Poses]
     together: bool = False

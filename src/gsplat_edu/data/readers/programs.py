@@ -21,19 +21,21 @@ from gsplat_edu.data.capture import (
 from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import MissingPhotos, OtherPoses, PosesOf
 from gsplat_edu.data.readers.bundler import BUNDLER
+from gsplat_edu.data.readers.metashape import METASHAPE
 from gsplat_edu.data.readers.nvm import VISUALSFM
 from gsplat_edu.data.readers.opensfm import OPENSFM
 from gsplat_edu.data.readers.photo_names import PhotoNames
 from gsplat_edu.data.readers.pose_file import Poses, Program, head_of
+from gsplat_edu.data.readers.realitycapture import TABLE, XMP
 from gsplat_edu.data.scale import read_scale
 
-PROGRAMS = (OPENSFM, BUNDLER, VISUALSFM)
+PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, BUNDLER, VISUALSFM)
 """In the order in which they are preferred, if their files have equally many photos."""
 
 PLACES = (".", "images", "opensfm")
 """Folders of a capture that are searched for pose files."""
 
-SUFFIXES = (".json", ".out", ".nvm")
+SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm")
 """Suffixes of pose files, in lower case; other files are not opened."""
 
 
@@ -56,12 +58,12 @@ def pose_files(path: Path) -> list[Found]:
     for place in (path / name for name in PLACES):
         if not is_folder(place):
             continue
-        once = set[str]()
+        once = set[Program]()
         for file in entries(place):
             if file.suffix.lower() not in SUFFIXES or not is_file(file):
                 continue
-            new = [each for each in _recognized(file) if each.program.name not in once]
-            once.update(each.program.name for each in new if each.program.together)
+            new = [each for each in _recognized(file) if each.program not in once]
+            once.update(each.program for each in new if each.program.together)
             found += new
     return found
 
@@ -141,7 +143,10 @@ def _capture(folder: Path, photos: PhotoNames, program: Program, poses: Poses) -
             else "has no photo"
         )
         raise DatasetError(f"{poses.path}: {what}; put the photos beside it or into images/")
-    notes = [*poses.notes, *problem_notes(problems, len(problems) + posed)]
+    try:
+        notes = [*poses.notes, *problem_notes(problems, len(problems) + posed)]
+    except DatasetError as error:
+        raise DatasetError(str(error), problems[0].reason) from None
     if missing:
         notes.append(MissingPhotos(len(missing), len(missing) + len(problems) + posed, missing[0]))
     frames, mask_notes = with_masks(folder, frames)
