@@ -13,6 +13,7 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.panorama import FACES
 from gsplat_edu.data.reader import read_capture
 
+FISHEYE = ("k1", "k2", "k3", "k4", "p1", "p2", "s0", "s2")
 TWO = {"focal_x": 0.9, "focal_y": 0.8, "c_x": 0.02, "c_y": -0.03}
 RADIAL = {"k1": -0.1, "k2": 0.02, "k3": -0.004}
 TANGENTIAL = {"p1": 0.003, "p2": -0.002}
@@ -30,7 +31,8 @@ def perspective(x, y, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0):
     return d * x + a, d * y + b
 
 
-def fisheye(x, y, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0, s0=0.0, s2=0.0):
+def fisheye(x, y, **given):
+    k1, k2, k3, k4, p1, p2, s0, s2 = (given.get(name, 0.0) for name in FISHEYE)
     r = np.hypot(x, y)
     theta = np.arctan(r)
     h, w, q = x * theta / r, y * theta / r, theta**2

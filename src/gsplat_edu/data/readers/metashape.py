@@ -26,8 +26,17 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import printable, shortened, whole_of
 from gsplat_edu.data.lens import MAX_SIDE, PINHOLE_LIKE, Lens
 from gsplat_edu.data.notes import OtherReconstructions
-from gsplat_edu.data.panorama import FaceLens
-from gsplat_edu.data.readers.pose_file import AGAIN, Poses, Program, Shot, no_lens, numbers_of, sized, xml_of
+from gsplat_edu.data.readers.pose_file import (
+    AGAIN,
+    Poses,
+    Program,
+    Shot,
+    no_lens,
+    numbers_of,
+    panorama,
+    sized,
+    xml_of,
+)
 
 MODEL_OF = {"frame": PINHOLE_LIKE, "fisheye": "thin prism fisheye"}
 """Our models of Metashape's types of sensors, except for spherical ones."""
@@ -124,7 +133,7 @@ def _lens(where: str, sensor: Element) -> Callable[[Path], Lens]:
     kind = sensor.get("type") or "frame"
     size = _size(sensor.find("resolution"))
     if kind == "spherical" and size is not None:
-        return lambda photo: FaceLens.of(*size, 0)
+        return panorama(size)
     if kind not in MODEL_OF:
         return no_lens(f"sensors of type {shortened(printable(kind))!r} have no model here; {UNDISTORT}")
     given = sensor.findall("calibration")

@@ -19,7 +19,6 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.records import Number, Text
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens
 from gsplat_edu.data.notes import OtherReconstructions
-from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.readers.pose_file import (
     Foreign,
     Poses,
@@ -31,6 +30,7 @@ from gsplat_edu.data.readers.pose_file import (
     each_of,
     json_of,
     no_lens,
+    panorama,
     sized,
 )
 from gsplat_edu.scene.gaussian_math import quat_to_R
@@ -57,7 +57,7 @@ WITHOUT_MODEL = ("k5", "k6", "s1", "s3")
 """Coefficients of fisheye62 and fisheye624 that `PRISM` lacks; all other coefficients have a place in it."""
 
 
-class Camera(Foreign):
+class Camera(Foreign, frozen=True):
     """A camera; missing numbers are zero."""
 
     projection_type: str = "perspective"
@@ -82,7 +82,7 @@ class Camera(Foreign):
     s3: Number = 0.0
 
 
-class ShotEntry(Foreign):
+class ShotEntry(Foreign, frozen=True):
     """A posed photo."""
 
     camera: str
@@ -90,14 +90,14 @@ class ShotEntry(Foreign):
     translation: Triple = (0.0, 0.0, 0.0)
 
 
-class Point(Foreign):
+class Point(Foreign, frozen=True):
     """A point with its colour, 0 to 255."""
 
     coordinates: Triple
     color: Triple = (128.0, 128.0, 128.0)
 
 
-class Reconstruction(Foreign):
+class Reconstruction(Foreign, frozen=True):
     """Photos that see one another: `Camera`, `ShotEntry` and `Point` by their names."""
 
     cameras: dict[str, Any]
@@ -147,7 +147,7 @@ def _lens(camera: Camera) -> Callable[[Path], Lens]:
     kind = camera.projection_type
     size = (camera.width, camera.height) if camera.width and camera.height else None
     if kind in PANORAMAS and size is not None:
-        return lambda photo: FaceLens.of(*size, 0)
+        return panorama(size)
     if kind not in MODEL_OF or size is None:
         what = f"the projection {kind!r} has no model here" if size else "its camera has no size"
         return no_lens(f"{what}; undistort with `opensfm undistort`")

@@ -27,6 +27,7 @@ from gsplat_edu.base.text import printable, shortened
 from gsplat_edu.data.capture import Cloud, unit_colors
 from gsplat_edu.data.lens import MAX_SIDE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.notes import Note
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.photos.decoding import image_size
 
 HEAD = 4096
@@ -42,6 +43,8 @@ Size = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
 """A side of a photo, px."""
 
 Triple = tuple[Number, Number, Number]
+
+Triples = Sequence[Sequence[float] | Float64[np.ndarray, "3"]]
 
 
 class Foreign(msgspec.Struct, frozen=True):
@@ -232,6 +235,16 @@ def _lens(values: tuple[tuple[str, float], ...], W: int, H: int, model: str) -> 
     return lens_of({**named, **middle}, W, H, model)
 
 
+def panorama(size: tuple[int, int]) -> Callable[[Path], Lens]:
+    """Return the lens of a shot that is an equirectangular panorama.
+
+    Args:
+        size: Width and height, px.
+    """
+    W, H = size
+    return lambda photo: FaceLens.of(W, H, 0)
+
+
 def no_lens(reason: str) -> Callable[[Path], Lens]:
     """Return the lens of a shot whose lens has no model here: it raises an error with the reason."""
 
@@ -241,10 +254,7 @@ def no_lens(reason: str) -> Callable[[Path], Lens]:
     return lens
 
 
-def cloud_of(
-    points: Sequence[Sequence[float]] | Float64[np.ndarray, "N 3"],
-    colors: Sequence[Sequence[float]] | Float64[np.ndarray, "N 3"],
-) -> Cloud | None:
+def cloud_of(points: Triples, colors: Triples) -> Cloud | None:
     """Return points with colours of 0 to 255; None if there are none."""
     if not len(points):
         return None
