@@ -10,8 +10,8 @@ omega, phi, kappa:     G (Ry(kappa) Rx(phi) Rz(-omega))'
 The second turns a table of 706 photos into the rotations of the XMP files of the same project, to 1e-13. An XMP has the
 rotation world to camera by rows, OpenCV axes, and the camera's centre.
 
-Focal lengths `f` and `FocalLength35mm` are those of a photo whose longer side is 36 mm. Principal points are relative to the
-middle, and fractions of the longer side. k1 to k3 are OpenCV's, and so are t1 and t2 as p1 and p2.
+Focal lengths `f` and `FocalLength35mm` are those of a photo whose longer side is 36 mm. Principal points are relative
+to the middle, and fractions of the longer side. k1 to k3 are OpenCV's; t1 and t2 are read as p1 and p2.
 
 Source: RealityCapture's help, "XMP Camera Math"; nerfstudio's documentation of its exports.
 """
