@@ -192,11 +192,58 @@ def write_metashape(folder: Path, cameras=CAMERAS, kind="frame", lens=MS_LENS, m
     )
 
 
+MVG_LENS = {
+    "focal_length": 20.0,
+    "principal_point": [12.4, 8.7],
+    "disto_t2": [-0.1, 0.02, -0.004, 0.003, -0.002],
+}
+
+
+def write_openmvg(folder: Path, cameras=CAMERAS, kind="pinhole_brown_t2", lens=MVG_LENS):
+    """The first entry of a class has its name; the second intrinsic has only its number, and no view uses the third."""
+    write_photos(folder)
+    data = {"width": W, "height": H, **lens}
+    named = {
+        "polymorphic_id": 2**31 + 1,
+        "polymorphic_name": kind,
+        "ptr_wrapper": {"id": 2**31, "data": data},
+    }
+    other = {
+        "polymorphic_id": 2**31 + 2,
+        "polymorphic_name": "made up",
+        "ptr_wrapper": {"id": 9, "data": data},
+    }
+    later = {"polymorphic_id": 1, "ptr_wrapper": {"id": 7, "data": data}}
+    views = [
+        {"filename": name, "local_path": "", "id_view": i, "id_intrinsic": i % 2, "id_pose": 10 + i}
+        for i, (name, _, _) in enumerate(cameras)
+    ]
+    unposed = {"filename": "later.png", "id_view": 99, "id_intrinsic": 0, "id_pose": 2**32 - 1}
+    contents = {
+        "sfm_data_version": "0.3",
+        "root_path": "/elsewhere/images",
+        "views": [
+            {"key": i, "value": {"polymorphic_id": 2**30, "ptr_wrapper": {"id": i, "data": view}}}
+            for i, view in enumerate([*views, unposed])
+        ],
+        "intrinsics": [{"key": i, "value": value} for i, value in enumerate((named, later, other))],
+        "extrinsics": [
+            {"key": 10 + i, "value": {"rotation": R.tolist(), "center": eye.tolist()}}
+            for i, (_, R, eye) in enumerate(cameras)
+        ],
+        "structure": [
+            {"key": i, "value": {"X": p.tolist(), "observations": []}} for i, p in enumerate(POINTS)
+        ],
+    }
+    (folder / "sfm_data.json").write_text(json.dumps(contents))
+
+
 WRITERS = {
     "OpenSfM": write_opensfm,
     "Bundler": write_bundler,
     "VisualSFM": write_nvm,
     "RealityCapture": write_table,
     "Metashape": write_metashape,
+    "OpenMVG": write_openmvg,
 }
 """A writer for each program: of a folder and, if they are not `CAMERAS`, its cameras."""

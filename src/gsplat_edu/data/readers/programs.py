@@ -23,13 +23,14 @@ from gsplat_edu.data.notes import MissingPhotos, OtherPoses, PosesOf
 from gsplat_edu.data.readers.bundler import BUNDLER
 from gsplat_edu.data.readers.metashape import METASHAPE
 from gsplat_edu.data.readers.nvm import VISUALSFM
+from gsplat_edu.data.readers.openmvg import OPENMVG
 from gsplat_edu.data.readers.opensfm import OPENSFM
 from gsplat_edu.data.readers.photo_names import PhotoNames
 from gsplat_edu.data.readers.pose_file import Poses, Program, head_of
 from gsplat_edu.data.readers.realitycapture import TABLE, XMP
 from gsplat_edu.data.scale import read_scale
 
-PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, BUNDLER, VISUALSFM)
+PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, BUNDLER, VISUALSFM)
 """In the order in which they are preferred, if their files have equally many photos."""
 
 PLACES = (".", "images", "opensfm")
