@@ -238,6 +238,21 @@ def write_openmvg(folder: Path, cameras=CAMERAS, kind="pinhole_brown_t2", lens=M
     (folder / "sfm_data.json").write_text(json.dumps(contents))
 
 
+def llff_rows(cameras):
+    """Columns: down, right, backward, centre, and height, width and focal length; then two depths."""
+    rows = []
+    for _, R, eye in cameras:
+        right, down, forward = R
+        matrix = np.stack([down, right, -forward, eye, [H, W, 20.0]], axis=1)
+        rows.append([*matrix.ravel(), 0.1, 100.0])
+    return np.array(rows)
+
+
+def write_llff(folder: Path, cameras=CAMERAS):
+    write_photos(folder)
+    np.save(folder / "poses_bounds.npy", llff_rows(cameras))
+
+
 WRITERS = {
     "OpenSfM": write_opensfm,
     "Bundler": write_bundler,
@@ -245,5 +260,6 @@ WRITERS = {
     "RealityCapture": write_table,
     "Metashape": write_metashape,
     "OpenMVG": write_openmvg,
+    "LLFF": write_llff,
 }
 """A writer for each program: of a folder and, if they are not `CAMERAS`, its cameras."""

@@ -113,7 +113,8 @@ def test_a_colmap_model_comes_first(tmp_path, small):
 def test_photos_alone_are_no_capture_and_the_error_names_what_was_looked_for(tmp_path):
     write_opensfm(tmp_path)
     (tmp_path / "reconstruction.json").unlink()
-    said = "holds photos but no camera poses; .* poses of OpenSfM, Metashape, RealityCapture, OpenMVG, Bundler, VisualSFM"
+    programs = "OpenSfM, Metashape, RealityCapture, OpenMVG, Bundler, VisualSFM, LLFF"
+    said = f"holds photos but no camera poses; .* poses of {programs}"
     with pytest.raises(DatasetError, match=said):
         read_capture(tmp_path)
 

@@ -21,6 +21,7 @@ from gsplat_edu.data.capture import (
 from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import MissingPhotos, OtherPoses, PosesOf
 from gsplat_edu.data.readers.bundler import BUNDLER
+from gsplat_edu.data.readers.llff import LLFF
 from gsplat_edu.data.readers.metashape import METASHAPE
 from gsplat_edu.data.readers.nvm import VISUALSFM
 from gsplat_edu.data.readers.openmvg import OPENMVG
@@ -30,13 +31,13 @@ from gsplat_edu.data.readers.pose_file import Poses, Program, head_of
 from gsplat_edu.data.readers.realitycapture import TABLE, XMP
 from gsplat_edu.data.scale import read_scale
 
-PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, BUNDLER, VISUALSFM)
+PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, BUNDLER, VISUALSFM, LLFF)
 """In the order in which they are preferred, if their files have equally many photos."""
 
 PLACES = (".", "images", "opensfm")
 """Folders of a capture that are searched for pose files."""
 
-SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm")
+SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy")
 """Suffixes of pose files, in lower case; other files are not opened."""
 
 
