@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import gsplat_edu.cli.main as command_line
+from data.pose_programs import write_metashape
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.engine import adapters
@@ -39,6 +40,15 @@ def scene(count=50):
     )
     gaussians.means[0] = torch.tensor([-7.0, 0.5, 9.25])
     return gaussians
+
+
+def test_a_pose_file_of_another_program_is_a_capture(info, tmp_path):
+    write_metashape(tmp_path)
+    for path in (tmp_path, tmp_path / "cameras.xml"):
+        printed = info(path)
+        assert "layout     Metashape\n" in printed and "poses of Metashape: 6 of 6 photos" in printed
+    (tmp_path / "cameras.xml").write_text("<chunk/>")
+    assert "cameras.xml: unknown scene format" in info(tmp_path / "cameras.xml", 2)
 
 
 def test_without_a_path_the_computer_and_its_backends_are_described(capsys):

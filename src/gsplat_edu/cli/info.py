@@ -19,7 +19,7 @@ from gsplat_edu.base.text import short_number
 from gsplat_edu.budget.choice import usual_choice
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
-from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.reader import CaptureReader, layout_of
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.engine import adapters
 from gsplat_edu.evaluate.verdict import skipped_views
@@ -63,8 +63,7 @@ def run(arguments: argparse.Namespace) -> None:
     if not path.exists():
         raise ArgumentError(f"{path}: does not exist; give a dataset folder, a run folder or a scene file")
     path = file_in(path)
-    # any other .json may be a dataset's transforms.json
-    if path.is_file() and (path.suffix.lower() != ".json" or path.name.lower() in (SOG_META, LOD_META)):
+    if path.is_file() and not _is_pose_file(path):
         facts = _scene_facts(path)
     elif RunFolder(path).exists():
         facts = _run_facts(RunFolder(path))
@@ -75,6 +74,11 @@ def run(arguments: argparse.Namespace) -> None:
         plain = str.maketrans(BLOCKS, PLAIN_BLOCKS)
         facts = [(name, value.translate(plain)) for name, value in facts]
     console.say(*(f"{name:<10} {value}".rstrip() for name, value in facts))
+
+
+def _is_pose_file(path: Path) -> bool:
+    """Return whether a file is a capture's, such as a transforms.json, and not a scene."""
+    return path.name.lower() not in (SOG_META, LOD_META) and layout_of(path) is not None
 
 
 def _computer_facts() -> list[Fact]:

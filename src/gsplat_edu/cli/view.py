@@ -52,12 +52,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _is_capture(path: Path) -> bool:
     """Return whether a path is to be read as a capture, and not as a scene or a run."""
+    from gsplat_edu.data.reader import is_capture, layout_of
+
     if path.is_file():
-        return path.suffix.lower() == ".json" and path.name.lower() not in (LOD_META, SOG_META)
+        return path.name.lower() not in (LOD_META, SOG_META) and layout_of(path) is not None
     if not path.is_dir() or RunFolder(path).exists() or file_in(path) != path:
         return False
-    from gsplat_edu.data.reader import is_capture
-
     return is_capture(path)
 
 

@@ -95,7 +95,7 @@ class Capture:
     """The contents of a capture folder.
 
     Args:
-        layout: "COLMAP", "transforms.json" or "Blender".
+        layout: "COLMAP", "transforms.json", "Blender", or the name of another program or a plug-in.
         frames: In any order; at least one.
         cloud: The capture's points; None if it has none.
         notes: Facts that the user should know.

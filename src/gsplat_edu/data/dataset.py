@@ -66,7 +66,7 @@ class Dataset:
 
     Args:
         path: The loaded path.
-        layout: "COLMAP", "transforms.json" or "Blender".
+        layout: "COLMAP", "transforms.json", "Blender", or the name of another program or a plug-in.
         train: Training views, sorted by name; at least one.
         test: Test views, sorted by name.
         points: (N, 3) initial point cloud, in the cameras' coordinate frame, world units.

@@ -195,6 +195,61 @@ class TwoLayouts:
 
 
 @dataclass(frozen=True)
+class PosesOf(SomePhotos):
+    """The capture's poses are those of another program.
+
+    Args:
+        program: Its name.
+    """
+
+    program: str
+
+    def __str__(self) -> str:
+        return f"poses of {self.program}: {self.counted}"
+
+
+@dataclass(frozen=True)
+class OtherPoses:
+    """Pose files of other programs that are not read.
+
+    Args:
+        read: The file that is read.
+        photos: Number of photos that it poses.
+        others: The others, each with what it has instead.
+    """
+
+    read: Path
+    photos: int
+    others: tuple[tuple[Path, str], ...]
+
+    def __str__(self) -> str:
+        others = ", ".join(f"{path.name} ({what})" for path, what in self.others)
+        return f"{self.read.name} ({_photos(self.photos)}) is read, as it poses the most photos; not read: {others}"
+
+
+@dataclass(frozen=True)
+class OtherReconstructions:
+    """Reconstructions of a pose file other than the largest, which is read.
+
+    Args:
+        file: The pose file.
+        photos: Number of photos of the largest.
+        others: Numbers of photos of the others. At least one.
+    """
+
+    file: Path
+    photos: int
+    others: tuple[int, ...]
+
+    def __str__(self) -> str:
+        others = ", ".join(map(str, self.others))
+        return (
+            f"{self.file.name} holds {len(self.others) + 1} reconstructions: that of {_photos(self.photos)} is read, "
+            f"those of {others} are not"
+        )
+
+
+@dataclass(frozen=True)
 class UnreadColors(NamedPhotos):
     """Photos whose colours are taken as sRGB although their files declare others.
 
@@ -273,6 +328,9 @@ Note = (
     | RepeatedPhotos
     | UnusedSplit
     | TwoLayouts
+    | PosesOf
+    | OtherPoses
+    | OtherReconstructions
     | UnreadColors
     | LeftOutPhotos
     | OnlyInRegion

@@ -28,6 +28,7 @@ from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.loading_notes import LoadingNote, MovedOrigin
 from gsplat_edu.data.notes import TwoLayouts
 from gsplat_edu.data.points import finite_cloud, read_points_ply
+from gsplat_edu.data.readers.programs import PROGRAMS, pose_files, read_poses
 from gsplat_edu.data.scale import read_scale
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.data.watch import FileWatch
@@ -59,7 +60,8 @@ class CaptureReader:
     They share the digests of the photos' files, so that a change of a photo between two datasets is detected.
 
     Args:
-        path: A capture folder of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
+        path: A capture folder of COLMAP, nerfstudio, instant-ngp, Blender or a program of
+            `gsplat_edu.data.readers.programs`; or a transforms.json or such a program's file.
 
     Attributes:
         path: The capture's path.
@@ -102,10 +104,12 @@ def read_capture(path: Path) -> Capture:
     if (foreign := _plugged_reader(path)) is not None:
         reader: Reader = plugins("readers")[foreign]
         return reader.read(path)
+    if is_file(path) and (files := pose_files(path)):
+        return read_poses(path, files)
     if path.suffix.lower() == ".json" and is_file(path):
         return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
     if not is_folder(path):
-        raise DatasetError(f"{path}: is neither a folder nor a .json file; give the folder of a capture")
+        raise DatasetError(f"{path}: is neither a folder nor a file with poses; give the folder of a capture")
     if is_file(path / TRAIN_FILE):
         return read_blender(path)
     model = find_model(path)
@@ -114,8 +118,13 @@ def read_capture(path: Path) -> Capture:
         return capture if model is None else replace(capture, notes=(TwoLayouts(path), *capture.notes))
     if model is not None:
         return replace(read_colmap(path, model), scale=read_scale(path))
+    if files := pose_files(path):
+        return read_poses(path, files)
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
-    looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
+    others = ", ".join(dict.fromkeys(program.name for program in PROGRAMS))
+    looked = (
+        f"{TRAIN_FILE}, transforms.json, cameras and images (.bin or .txt) in {places}, poses of {others}"
+    )
     if _has_photos(path):
         raise DatasetError(
             f"{path}: holds photos but no camera poses; find the poses with "
@@ -134,7 +143,9 @@ def is_capture(path: Path) -> bool:
 
 
 def layout_of(path: Path) -> str | None:
-    """Return the layout of a capture by its files: "Blender", "transforms.json", "COLMAP" or a plug-in's name.
+    """Return the layout of a capture by its files: "Blender", "transforms.json", "COLMAP" or another program's name.
+
+    A plug-in has the name of its reader.
 
     Args:
         path: The folder, or the capture's file.
@@ -144,12 +155,16 @@ def layout_of(path: Path) -> str | None:
     """
     if (foreign := _plugged_reader(path)) is not None:
         return foreign
+    if is_file(path) and (files := pose_files(path)):
+        return files[0].program.name
     if path.suffix.lower() == ".json" and is_file(path):
         return "Blender" if path.name == TRAIN_FILE else "transforms.json"
     for layout, name in (("Blender", TRAIN_FILE), ("transforms.json", "transforms.json")):
         if is_file(path / name):
             return layout
-    return None if find_model(path) is None else "COLMAP"
+    if find_model(path) is not None:
+        return "COLMAP"
+    return next((found.program.name for found in pose_files(path)), None)
 
 
 class Reader(Protocol):

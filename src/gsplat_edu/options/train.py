@@ -129,7 +129,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         "data",
         type=Path,
         metavar="DATA",
-        help="capture (COLMAP, transforms.json or Blender), or photos or a video, whose poses are found first",
+        help="capture (COLMAP, transforms.json, Blender and others), or photos or a video, whose poses are found first",
     )
     run = parser.add_argument_group("run")
     run.add_argument("--out", type=Path, metavar="RUN", required=True, help="run folder to write (required)")

@@ -74,7 +74,7 @@ class Survey:
 
     Args:
         path: The capture.
-        layout: "COLMAP", "transforms.json" or "Blender".
+        layout: "COLMAP", "transforms.json", "Blender", or the name of another program or a plug-in.
         shots: Readable photos, sorted by name.
         refused: Unusable photos, sorted by name.
         unposed: Names of photos that have no pose: those in the same folders, and those that the search left out.

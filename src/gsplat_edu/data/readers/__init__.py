@@ -1,0 +1,1 @@
+"""Readers of the poses of other programs, a module for each."""
