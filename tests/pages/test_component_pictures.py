@@ -4,7 +4,7 @@ Fonts and their rasterisation differ between machines. The pictures are therefor
 every character is the same solid bar: text keeps its place, size, weight and colour, and has no curves. The rest is
 drawn by Chromium's own code with the flags of the tests' browser, on any machine: the pictures were equal in every
 pixel with and without --enable-gpu-rasterization. The tolerance is for the rounding of another Chromium; the smallest
-change that a test here makes, 1 px of a radius, exceeds it. With --disable-gpu, which no test uses, Chromium draws
+change that a test here makes, 3 px of a radius, exceeds it. With --disable-gpu, which no test uses, Chromium draws
 strokes and rounded corners differently (up to 620 pixels of a picture by more than 8 levels, 2,842 of the icons).
 
 After a change of a component that is meant, make the pictures again, and look at them:

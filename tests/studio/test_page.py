@@ -3,7 +3,7 @@
 import io
 import re
 import zipfile
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import pytest
 from PIL import Image
@@ -176,7 +176,7 @@ def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
     tab.get_by_label("the same poses to the bit every time").check()
     tab.get_by_role("button", name="Place the photos").click()
     place = person.place().removeprefix("#/photos/")
-    sfm = person.command(f"cameras of {place}")
+    sfm = person.command(f"cameras of {unquote(place)}")
     onward = tab.get_by_role("link", name=re.compile("^Continue with the capture"))
     onward.wait_for(timeout=240_000)
     found = re.compile(r"14 of 14 photos placed")

@@ -117,10 +117,13 @@ def beside(visitor, library, capture):
     person = visitor()
     tabs = [person.tab, visitor_of(person, library[1])]
     for tab in tabs:
-        resize(tab, 1280, 900)  # frames of up to 600 px, in smaller windows, fold their panels
+        resize(tab, 1280, 900)
         tab.goto(f"{library[1]}#/captures/{capture.name}")
         tab.locator(".thumbs li").first.wait_for()
-    return [(tab, capture_frame(tab, capture.name)) for tab in tabs]
+    frames = [capture_frame(tab, capture.name) for tab in tabs]
+    for frame in frames:
+        frame.click("#fold")  # the panel is closed in a narrow frame
+    return list(zip(tabs, frames, strict=True))
 
 
 def test_another_tab_shows_what_is_left_out(visitor, library, capture):

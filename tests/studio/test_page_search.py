@@ -34,14 +34,16 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
 
     inside = tab.locator(".everything")
     inside.locator("summary", has_text="Everything in it (2)").click()
-    assert inside.locator("li", has_text=f"Capture {BY_DAY}").locator(".badge").inner_text() == "not placed yet"
+    assert (
+        inside.locator("li", has_text=f"Capture {BY_DAY}").locator(".badge").inner_text() == "not placed yet"
+    )
     go(tab, "")
     project = tab.get_by_role("article", name=BY_DAY)
     project.get_by_text("Finding the cameras failed").wait_for()
     assert tab.locator("a.card").count() == 1, "photos and what was made from them are one project"
     project.get_by_role("link", name=re.compile("^Next: Try again")).wait_for()
     go(tab, f"captures/{BY_DAY}")
-    tab.get_by_text("has not placed yet").wait_for()
+    tab.get_by_text("are not placed yet").wait_for()
     assert not tab.get_by_role("button", name="Start training").is_visible()
     assert not tab.get_by_role("button", name="Examine").is_visible()
     back = tab.get_by_role("link", name="Go to the photos")
