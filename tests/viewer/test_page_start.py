@@ -71,7 +71,7 @@ def test_the_editors_box_starts_around_the_subject_and_not_around_a_large_floor(
     )
     floor.logit_opacities.fill_(4.0)
     scene = Scene(Gaussians.concatenated([body, floor]))
-    source = Source(tmp_path / "scene.ply", scene, around(640, 480, 300.0), RenderSettings())
+    source = Source(tmp_path / "scene.ply", scene, tuple(around(640, 480, 300.0)), RenderSettings())
     box = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json").facts["subject"]
     low, high = (np.array(box["center"]) + sign * np.abs(box["rotation"]) @ box["half"] for sign in (-1, 1))
     assert (low < body.means.numpy().min(0) + 0.1).all() and (high > body.means.numpy().max(0) - 0.1).all()
