@@ -7,6 +7,7 @@ from pathlib import Path
 
 import site_figures
 from chapters import ROOT
+from gsplat_edu.base.styles import tokens_by_theme
 from waiting import until_in
 
 STATIC = ROOT / "docs" / "site" / "static"
@@ -14,6 +15,7 @@ FIGURES = [(figure.chapter, figure.name) for figure in site_figures.FIGURES]
 CHAPTERS = sorted({chapter for chapter, _ in FIGURES})
 HEAD = (
     '<!doctype html><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+    f"<style>{tokens_by_theme()}</style>"
     '<link rel="stylesheet" href="../_static/site.css">'
     "<style>body { margin: 0; --color-brand-primary: #2962ff; }</style>"
 )

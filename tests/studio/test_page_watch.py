@@ -73,9 +73,9 @@ def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     until_in(tab, tab, "document.querySelectorAll('#beside-view option').length > 2")
     tab.get_by_label("View", exact=True).select_option(index=2)
     tab.locator(".over-photo:not([hidden])").wait_for()
-    assert not frame.locator("#panel").is_visible(), "the panel lies on the photo"
+    assert not frame.locator("#bar").is_visible(), "the bar lies on the photo"
     tab.get_by_label("View", exact=True).select_option(index=0)
-    assert frame.locator("#panel").is_visible()
+    assert frame.locator("#bar").is_visible()
 
 
 PHOTOS_SHOWN = """() => {
@@ -242,7 +242,7 @@ def test_normal_use_leaves_no_errors_in_the_console(visitor, runs):
     tab.locator(".verdict").wait_for()
     figures = tab.get_by_text("After 150 iterations, renders of the held-out photos reach")
     assert figures.is_hidden()
-    tab.get_by_text("Details", exact=True).click()
+    tab.get_by_text("Details", exact=True).first.click()
     figures.wait_for()
     frame_of(tab)
     tab.get_by_role("link", name="Judge it").click()

@@ -156,7 +156,7 @@ def test_a_photo_is_slid_over_the_picture_by_pointer(shown):
     assert tab.inner_text("#compare-card strong") == "photo 1: used for training (1 of 2)"
     becomes(seen, 250, 240, RED)
     assert not is_color(color_at(seen, 400, 240), RED)
-    drag(tab, (320, 300), (450, 300))
+    drag(tab, (320, 150), (450, 150))
     assert tab.locator("#photo-share").input_value() == "70"
     becomes(seen, 430, 240, RED)
     assert not is_color(color_at(seen, 480, 240), RED)

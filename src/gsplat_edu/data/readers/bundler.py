@@ -18,8 +18,8 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import is_file
 from gsplat_edu.data.readers.pose_file import (
     AGAIN,
+    PoseProgram,
     Poses,
-    Program,
     Shot,
     cloud_of,
     numbers_of,
@@ -98,4 +98,4 @@ def _name(line: str) -> str:
     return " ".join(itertools.takewhile(lambda word: word != "0", words)) if len(words) > 2 else line
 
 
-BUNDLER = Program("Bundler", holds, read)
+BUNDLER = PoseProgram("Bundler", holds, read)

@@ -20,7 +20,7 @@ from gsplat_edu.base.files import unreadable
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, entries, is_folder
 from gsplat_edu.data.lens import MAX_SIDE
-from gsplat_edu.data.readers.pose_file import AGAIN, Poses, Program, Shot, no_lens, sized
+from gsplat_edu.data.readers.pose_file import AGAIN, PoseProgram, Poses, Shot, no_lens, sized
 
 NAME = "poses_bounds.npy"
 
@@ -84,4 +84,4 @@ def _rows(path: Path) -> Float64[np.ndarray, "N 17"]:
     return rows
 
 
-LLFF = Program("LLFF", holds, read)
+LLFF = PoseProgram("LLFF", holds, read)

@@ -28,8 +28,8 @@ from gsplat_edu.data.lens import MAX_SIDE, PINHOLE_LIKE, Lens
 from gsplat_edu.data.notes import OtherReconstructions
 from gsplat_edu.data.readers.pose_file import (
     AGAIN,
+    PoseProgram,
     Poses,
-    Program,
     Shot,
     no_lens,
     numbers_of,
@@ -167,4 +167,4 @@ def _size(resolution: Element | None) -> tuple[int, int] | None:
     return (W, H) if 0 < W <= MAX_SIDE and 0 < H <= MAX_SIDE else None
 
 
-METASHAPE = Program("Metashape", holds, read)
+METASHAPE = PoseProgram("Metashape", holds, read)

@@ -17,7 +17,7 @@ import numpy as np
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import whole_of
 from gsplat_edu.data.lens import Lens, lens_of
-from gsplat_edu.data.readers.pose_file import AGAIN, Poses, Program, Shot, cloud_of, numbers_of, text_of
+from gsplat_edu.data.readers.pose_file import AGAIN, PoseProgram, Poses, Shot, cloud_of, numbers_of, text_of
 from gsplat_edu.photos.decoding import image_size
 from gsplat_edu.scene.gaussian_math import quat_to_R
 
@@ -122,4 +122,4 @@ def _section(path: Path, lines: list[str], what: str) -> list[str]:
     return lines[1 : 1 + count]
 
 
-VISUALSFM = Program("VisualSFM", holds, read)
+VISUALSFM = PoseProgram("VisualSFM", holds, read)

@@ -21,8 +21,8 @@ from gsplat_edu.base.text import printable, shortened
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens
 from gsplat_edu.data.readers.pose_file import (
     Foreign,
+    PoseProgram,
     Poses,
-    Program,
     Shot,
     Size,
     Triple,
@@ -73,7 +73,7 @@ class Wrapped(Foreign, frozen=True):
     polymorphic_name: str = ""
 
 
-class View(Foreign, frozen=True):
+class ViewEntry(Foreign, frozen=True):
     """A photo."""
 
     filename: Text
@@ -138,7 +138,9 @@ def read(path: Path) -> Poses:
     """
     contents: SfmData = json_of(path, SfmData)
     seen = _wrapped(path, "view", contents.views)
-    views: dict[str, View] = each_of(path, "view", {k: v.ptr_wrapper.data for k, v in seen.items()}, View)
+    views: dict[str, ViewEntry] = each_of(
+        path, "view", {k: v.ptr_wrapper.data for k, v in seen.items()}, ViewEntry
+    )
     wrapped = _wrapped(path, "intrinsic", contents.intrinsics)
     inner = each_of(path, "intrinsic", {k: v.ptr_wrapper.data for k, v in wrapped.items()}, Intrinsic)
     kinds = {v.polymorphic_id & ~FIRST: v.polymorphic_name for v in wrapped.values() if v.polymorphic_name}
@@ -190,4 +192,4 @@ def _lens(kind: str, intrinsic: Intrinsic) -> Callable[[Path], Lens]:
     return sized(values, (width, height), FISHEYE if kind == "fisheye" else PINHOLE_LIKE)
 
 
-OPENMVG = Program("OpenMVG", holds, read)
+OPENMVG = PoseProgram("OpenMVG", holds, read)

@@ -21,8 +21,8 @@ from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens
 from gsplat_edu.data.notes import OtherReconstructions
 from gsplat_edu.data.readers.pose_file import (
     Foreign,
+    PoseProgram,
     Poses,
-    Program,
     Shot,
     Size,
     Triple,
@@ -57,7 +57,7 @@ WITHOUT_MODEL = ("k5", "k6", "s1", "s3")
 """Coefficients of fisheye62 and fisheye624 that `PRISM` lacks; all other coefficients have a place in it."""
 
 
-class Camera(Foreign, frozen=True):
+class CameraEntry(Foreign, frozen=True):
     """A camera; missing numbers are zero."""
 
     projection_type: str = "perspective"
@@ -90,7 +90,7 @@ class ShotEntry(Foreign, frozen=True):
     translation: Triple = (0.0, 0.0, 0.0)
 
 
-class Point(Foreign, frozen=True):
+class PointEntry(Foreign, frozen=True):
     """A point with its colour, 0 to 255."""
 
     coordinates: Triple
@@ -98,7 +98,7 @@ class Point(Foreign, frozen=True):
 
 
 class Reconstruction(Foreign, frozen=True):
-    """Photos that see one another: `Camera`, `ShotEntry` and `Point` by their names."""
+    """Photos that see one another: `CameraEntry`, `ShotEntry` and `PointEntry` by their names."""
 
     cameras: dict[str, Any]
     shots: dict[Text, Any]
@@ -122,14 +122,14 @@ def read(path: Path) -> Poses:
         raise DatasetError(f"{path}: has no posed photo; run `opensfm reconstruct`, or choose another file")
     others = tuple(len(each.shots) for each in found if each is not largest)
     notes = (OtherReconstructions(path, len(largest.shots), others),) if others else ()
-    cameras: dict[str, Camera] = each_of(path, "camera", largest.cameras, Camera)
+    cameras: dict[str, CameraEntry] = each_of(path, "camera", largest.cameras, CameraEntry)
     lenses = {name: _lens(camera) for name, camera in cameras.items()}
     shots, entries = [], each_of(path, "shot", largest.shots, ShotEntry)
     for name, shot in entries.items():
         R = rotation(shot.rotation)
         lens = lenses.get(shot.camera) or no_lens("its camera is not in the file")
         shots.append(Shot(name, R, -R.T @ np.array(shot.translation), lens))
-    points = each_of(path, "point", largest.points, Point).values()
+    points = each_of(path, "point", largest.points, PointEntry).values()
     cloud = cloud_of([point.coordinates for point in points], [point.color for point in points])
     return Poses(path, shots, cloud, notes)
 
@@ -143,7 +143,7 @@ def rotation(axis: Triple) -> np.ndarray:
     return quat_to_R(np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * vector / angle]))
 
 
-def _lens(camera: Camera) -> Callable[[Path], Lens]:
+def _lens(camera: CameraEntry) -> Callable[[Path], Lens]:
     kind = camera.projection_type
     size = (camera.width, camera.height) if camera.width and camera.height else None
     if kind in PANORAMAS and size is not None:
@@ -168,4 +168,4 @@ def _lens(camera: Camera) -> Callable[[Path], Lens]:
     return sized(values, size, MODEL_OF[kind])
 
 
-OPENSFM = Program("OpenSfM", holds, read)
+OPENSFM = PoseProgram("OpenSfM", holds, read)

@@ -89,7 +89,7 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Program:
+class PoseProgram:
     """A program whose poses are read.
 
     Args:

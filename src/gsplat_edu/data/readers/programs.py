@@ -27,7 +27,7 @@ from gsplat_edu.data.readers.nvm import VISUALSFM
 from gsplat_edu.data.readers.openmvg import OPENMVG
 from gsplat_edu.data.readers.opensfm import OPENSFM
 from gsplat_edu.data.readers.photo_names import PhotoNames
-from gsplat_edu.data.readers.pose_file import Poses, Program, head_of
+from gsplat_edu.data.readers.pose_file import PoseProgram, Poses, head_of
 from gsplat_edu.data.readers.realitycapture import TABLE, XMP
 from gsplat_edu.data.scale import read_scale
 
@@ -44,7 +44,7 @@ SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy")
 class Found(NamedTuple):
     """A pose file and the program that wrote it."""
 
-    program: Program
+    program: PoseProgram
     path: Path
 
 
@@ -60,7 +60,7 @@ def pose_files(path: Path) -> list[Found]:
     for place in (path / name for name in PLACES):
         if not is_folder(place):
             continue
-        once = set[Program]()
+        once = set[PoseProgram]()
         for file in entries(place):
             if file.suffix.lower() not in SUFFIXES or not is_file(file):
                 continue
@@ -111,7 +111,7 @@ def read_poses(path: Path, files: list[Found]) -> Capture:
     )
 
 
-def _capture(folder: Path, photos: PhotoNames, program: Program, poses: Poses) -> tuple[int, Capture]:
+def _capture(folder: Path, photos: PhotoNames, program: PoseProgram, poses: Poses) -> tuple[int, Capture]:
     """Return the number of photos with a usable pose, and the capture."""
     frames, missing, owners, posed = list[Frame](), list[str](), dict[str, str](), 0
     problems = [

@@ -33,8 +33,8 @@ from gsplat_edu.data.capture import entries, is_file
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.readers.pose_file import (
     AGAIN,
+    PoseProgram,
     Poses,
-    Program,
     Shot,
     head_of,
     no_lens,
@@ -229,5 +229,5 @@ def _values(xmp: Element) -> dict[str, str]:
     return found
 
 
-TABLE = Program("RealityCapture", holds_table, read_table)
-XMP = Program("RealityCapture", holds_xmp, read_xmp, together=True)
+TABLE = PoseProgram("RealityCapture", holds_table, read_table)
+XMP = PoseProgram("RealityCapture", holds_xmp, read_xmp, together=True)
