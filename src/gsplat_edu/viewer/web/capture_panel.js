@@ -27,7 +27,7 @@ export class CapturePanel {
     for (const id of ["show-points", "show-path"]) element(id).addEventListener("change", () => actions.repaint());
     element("size").addEventListener("input", ({ target }) => actions.size(2 ** (Number(target.value) / 5)));
     element("size").addEventListener("keydown", (event) => event.stopPropagation()); // arrows move the slider only
-    this.folded = new Fold("(max-width: 800px)");
+    this.folded = new Fold("(max-width: 800px)"); // the stage of the studio is narrower, too
     this.fillList();
     this.tell();
   }
