@@ -6,6 +6,7 @@ import io
 import re
 import shlex
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 from PIL import Image
@@ -91,8 +92,8 @@ class Visitor:
         return self.tab.evaluate("location.hash")
 
     def reach(self, place):
-        """Wait until the page shows a screen."""
-        awaited(self.tab, lambda: self.place() == place, place)
+        """Wait until the page shows a screen; its address may have escaped characters."""
+        awaited(self.tab, lambda: unquote(self.place()) == unquote(place), place)
 
     def shift(self):
         """Cumulative layout shift since the page was loaded."""

@@ -183,7 +183,7 @@ def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
     tab.locator(".next", has_text=found).wait_for()
     onward.click()
     until_in(tab, tab, "location.hash.startsWith('#/captures/')")
-    name = re.fullmatch("#/captures/(.+)", person.place())[1]
+    name = unquote(re.fullmatch("#/captures/(.+)", person.place())[1])
     tab.locator("main h1", has_text=name).wait_for()
     tab.locator(".head .facts", has_text=found).wait_for()
     data, commands = train_and_download(person, name, 200)

@@ -62,6 +62,7 @@ def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     assert tab.evaluate("document.createElement('canvas').getContext('webgl2')") is None
     go(tab, "scenes/wall")
     frame = framed_viewer(tab)
+    frame.locator("#fold").press("Enter")  # the bar lies below the window
     frame.locator("#count", has_text="176 splats, drawn by the program that serves this page").wait_for()
     assert "no WebGL2" in frame.inner_text("#count")
     frame.locator("#message").wait_for(state="hidden")

@@ -156,6 +156,7 @@ function startForm(store, entry, draw) {
   const go = h("button", { "data-own": "" }, "Start training");
   const measure = button("Forecast time and memory", () => forecast());
   let times = {}; // by quality
+  let asked = false; // for a forecast
 
   // Tells the next step how long the training takes that is chosen; of a number of iterations, nothing is known.
   function tellTime() {
@@ -167,6 +168,7 @@ function startForm(store, entry, draw) {
   }
 
   async function forecast() {
+    asked = true;
     measure.hidden = true;
     for (const facts of said.values()) facts.textContent = "measuring ...";
     try {
@@ -212,7 +214,6 @@ function startForm(store, entry, draw) {
       line,
     ),
   );
-  let asked = false;
   // the training and the page of the cameras also report a box that cannot be read
   let [version, questions, isDrawn] = [null, 0, false];
 
@@ -236,7 +237,6 @@ function startForm(store, entry, draw) {
       if (now.modified !== version) askForBox().catch((error) => put(line, error.message));
       version = now.modified;
       if (asked || !store.entry("captures", entry.name)?.layout) return; // that of a new capture comes later
-      asked = true;
       // measuring takes seconds of the processor, which a running job needs
       if (![...store.jobs.values()].some(({ active }) => active)) forecast();
     },
