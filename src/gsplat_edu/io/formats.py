@@ -49,6 +49,7 @@ FORMATS: tuple[Format, ...] = (
     Format(".compressed.ply", "gsplat_edu.io.compressed_ply", "SuperSplat compressed PLY"),
     Format(".ply", "gsplat_edu.io.ply", "Inria PLY"),
     Format(".splat", "gsplat_edu.io.splat", "antimatter splat", sh_degree=0, metadata=False),
+    Format(".ksplat", "gsplat_edu.io.ksplat", "GaussianSplats3D's KSPLAT", sh_degree=2, metadata=False),
     Format(".spz", "gsplat_edu.io.spz", "Niantic SPZ"),
     Format(".sog", "gsplat_edu.io.sog.codec", "PlayCanvas SOG"),
     Format(".glb", "gsplat_edu.io.glb", "glTF with KHR_gaussian_splatting"),

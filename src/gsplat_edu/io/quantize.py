@@ -1,4 +1,4 @@
-"""Shared by several formats: opacities as bytes, unit quaternions, and a limit on the size that a file may claim."""
+"""Shared by formats: values as bytes, positive scales, unit quaternions, the most that a file may claim to hold."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ MAX_EXPANSION = 64
 
 SMALL = 1 << 20
 """Bytes that even the smallest file may claim, since test and toy scenes compress very well."""
+
+MIN_SCALE, MAX_SCALE = (float(x) for x in (np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max))
+"""Scales are clamped to the positive range of float32, so that their logarithms are finite."""
 
 
 def byte_to_logit(values: Integer[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
@@ -40,6 +43,11 @@ def logit_to_byte(logits: Float32[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."
         opacities = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
     rounded: UInt8[np.ndarray, "..."] = np.floor(255.0 * opacities + 0.5).astype(np.uint8)
     return rounded
+
+
+def rounded_bytes(values: Float64[np.ndarray, "N C"]) -> Float64[np.ndarray, "N C"]:
+    """Round to the nearest of the values 0 to 255."""
+    return np.clip(np.floor(values + 0.5), 0.0, 255.0)
 
 
 def unit_quats(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:

@@ -23,14 +23,18 @@ from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.ply_table import LFS_POINTER
 from gsplat_edu.base.reading import read_bytes
-from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
+from gsplat_edu.io.quantize import (
+    MAX_SCALE,
+    MIN_SCALE,
+    byte_to_logit,
+    logit_to_byte,
+    rounded_bytes,
+    unit_quats,
+)
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.gaussians import Gaussians
 
 SPLAT = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-
-MIN_SCALE, MAX_SCALE = (float(x) for x in (np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max))
-"""Scales are clamped to the positive range of float32, so that their logarithms are finite."""
 
 
 def read(path: Path) -> Scene:
@@ -99,9 +103,9 @@ def write(path: Path, scene: Scene) -> None:
     splats = np.empty(len(gaussians), dtype=SPLAT)
     splats["position"] = tensors["means"]
     splats["scales"] = _scales(tensors["log_scales"])
-    splats["rgba"][:, :3] = _rounded((tensors["sh0"][:, 0].astype(np.float64) * C0 + SH_OFFSET) * 255.0)
+    splats["rgba"][:, :3] = rounded_bytes((tensors["sh0"][:, 0].astype(np.float64) * C0 + SH_OFFSET) * 255.0)
     splats["rgba"][:, 3] = logit_to_byte(tensors["logit_opacities"])
-    splats["quat"] = _rounded(unit_quats(tensors["quats"]) * 128.0 + 128.0)
+    splats["quat"] = rounded_bytes(unit_quats(tensors["quats"]) * 128.0 + 128.0)
     with written_aside(path) as aside:
         aside.write_bytes(splats[_order(splats)].tobytes())
 
@@ -124,11 +128,6 @@ def _scales(log_scales: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"
     low, high = np.log((MIN_SCALE, MAX_SCALE))
     scales: Float64[np.ndarray, "N 3"] = np.exp(np.clip(log_scales.astype(np.float64), low, high))
     return scales.astype(np.float32)
-
-
-def _rounded(values: Float64[np.ndarray, "N C"]) -> Float64[np.ndarray, "N C"]:
-    """Round to the nearest byte."""
-    return np.clip(np.floor(values + 0.5), 0.0, 255.0)
 
 
 def _order(splats: np.ndarray) -> Int64[np.ndarray, " N"]:
