@@ -26,6 +26,12 @@ LOOPING = (
 LOOPING += ("runs/identity.py", "runs/parts.py", "runs/pilot.py")
 """Modules that ask each part for what they need of its settings, and of what the user asked of it."""
 
+OPTIONS = ("options/train.py", "options/block_parts.py", "options/settings.py", "options/length.py")
+"""Modules that read from the declarations of settings where an option belongs, and what may not be given with it."""
+
+COMMANDS = ("cli/train.py", "cli/blocks.py", "cli/doctor.py")
+"""Commands that choose, share and repeat settings of a training."""
+
 SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
 
 
@@ -53,18 +59,18 @@ def test_a_training_does_not_name_the_files_of_a_capture(module):
     assert not re.findall("region|left_out", (SOURCE / module).read_text())
 
 
-@pytest.mark.parametrize("module", ["cli/train.py", "options/train.py", *LOOPING])
+@pytest.mark.parametrize("module", ["cli/train.py", *OPTIONS, *LOOPING])
 def test_what_users_ask_of_parts_is_named_by_its_options(module):
     """`RunOptions.asked` carries it; `options/asked.py` and the parts know what it is."""
     text = (SOURCE / module).read_text()
-    assert not re.findall(r"given_depth|floaters|\bdepth\b(?!=False)|arguments\.clean", text)
+    assert not re.findall(r"given_depth|floaters|\bdepth\b(?!=False)|arguments\.clean|[\"']clean[\"']", text)
 
 
 @pytest.mark.parametrize(
     "module",
     sorted(
         str(path.relative_to(SOURCE))
-        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", "cli/train.py", *LOOPING)
+        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", *COMMANDS, *OPTIONS, *LOOPING)
         for path in SOURCE.glob(place)
     ),
 )
