@@ -219,6 +219,18 @@ class Part:
         """
         return None
 
+    def compared(self, settings: Any, scene: Any) -> Any:  # noqa: ANN401
+        """Return the capture with photos as the trained scene is compared with them, for example at its exposure.
+
+        Args:
+            settings: The run's `Settings`.
+            scene: The scene and the capture, a `gsplat_edu.parts.run_values.Compared`.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+        """
+        return scene.dataset
+
     def scored(self, settings: Any) -> Mapping[str, Any]:  # noqa: ANN401
         """Return what metrics.json says beside the scores of views, for example how they were corrected.
 
