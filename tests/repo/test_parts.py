@@ -8,8 +8,7 @@ import pytest
 from gsplat_edu.train.part import OWN_PARTS
 
 IMPORTERS = {
-    "budget/costs.py": "the room that the surface takes for photos",
-    "runs/meshes.py": "which photos see the same from elsewhere: pairs of photos are compared over a mesh as in training",
+    "runs/meshes.py": "which photos see the same from elsewhere: a mesh is checked by pairs of photos",
     "runs/painting.py": "where the masks of what moved lie: they outlast the training, and only paint asks for them",
 }
 """Modules that use what a part offers beside its hooks, and what that is; no other may."""
@@ -22,6 +21,7 @@ LOOPING = (
     "runs/options.py",
 )
 LOOPING += ("runs/identity.py", "runs/parts.py", "runs/pilot.py")
+LOOPING += ("budget/forecast.py", "runs/cleaning.py", "runs/lod_refinement.py")
 """Modules that ask each part for what they need of its settings, and of what the user asked of it."""
 
 OPTIONS = ("options/train.py", "options/block_parts.py", "options/settings.py", "options/length.py")
@@ -38,7 +38,7 @@ SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
     [
         *("train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"),
         *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py", "runs/dataset.py"),
-        *("runs/pilot.py", "train/resident.py"),
+        *("runs/pilot.py", "train/resident.py", "budget/costs.py", "budget/forecast.py"),
         *("evaluate/report.py", "doctor/diagnosis.py", "survey/trained.py", "cli/result.py"),
     ],
 )
@@ -55,6 +55,11 @@ def test_the_source_names_no_part(module):
 def test_a_training_does_not_name_the_files_of_a_capture(module):
     """What they say of the photos comes with the data settings: which photos are left out, which pixels count."""
     assert not re.findall("region|left_out", (SOURCE / module).read_text())
+
+
+@pytest.mark.parametrize("module", ["runs/cleaning.py", "runs/lod_refinement.py", "parts/floaters/part.py"])
+def test_parts_say_how_photos_are_compared_with_a_scene(module):
+    assert not re.findall("appearance|vignetting", (SOURCE / module).read_text())
 
 
 @pytest.mark.parametrize("module", ["cli/train.py", *OPTIONS, *LOOPING])

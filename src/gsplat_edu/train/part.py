@@ -46,6 +46,16 @@ class Part:
         changed = (each for each in values if each[1] != getattr(type(settings), each[0]))
         return next((f"{name} is {'on' if value is True else value}" for name, value in changed), None)
 
+    def cost(self, settings: Any, asked: str | None, capture: Any) -> Any:  # noqa: ANN401
+        """Return what the part's terms add to a forecast, a `gsplat_edu.train.part_values.Cost`; None for nothing.
+
+        Args:
+            settings: The run's `Settings`.
+            asked: As for `leaves_device`.
+            capture: The capture at training size, a `gsplat_edu.budget.costs.Facts`.
+        """
+        return None
+
     def terms(self, settings: Any, extent: float) -> Mapping[str, Any]:  # noqa: ANN401
         """Return terms of the objective (`gsplat_edu.train.objective.Term`) by name.
 
