@@ -11,8 +11,6 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.text import spelled_seconds
 from gsplat_edu.budget.choice import Prospect
 from gsplat_edu.budget.costs import (
-    DEPTH_TIME,
-    SURFACE_TIME,
     Facts,
     Footprint,
     Measurements,
@@ -29,6 +27,8 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.ops.lenses import RAY_ROOM
+from gsplat_edu.parts.given_depth.part import TERM_TIME
+from gsplat_edu.parts.surface.part import TERMS_TIME
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH, GivenDepth
 from gsplat_edu.train.capacity import wanted_gaussians
@@ -183,17 +183,18 @@ def test_a_forecast_counts_the_term_of_depth():
     plain, depth = (
         predict(dataclasses.replace(FACTS, depth=given), MEASURED, PLAIN) for given in ("", "maps")
     )
-    more = 1.0 + DEPTH_TIME["maps"] / PLAIN.depth_every
-    assert DEPTH_TIME["maps"] > DEPTH_TIME["points"] > 0.0 and PLAIN.depth_every > 1
+    more = 1.0 + TERM_TIME["maps"] / PLAIN.depth_every
+    assert TERM_TIME["maps"] > TERM_TIME["points"] > 0.0 and PLAIN.depth_every > 1
     assert depth.seconds["training"] == pytest.approx(more * plain.seconds["training"], rel=1e-12)
     assert depth.steps == pytest.approx([more * step for step in plain.steps], rel=1e-12)
     others = [{**one.seconds, "training": 0.0} for one in (plain, depth)]
     assert others[0] == others[1] and plain.memory == depth.memory
     each = PLAIN.changed(depth_every=1, surface=True, surface_start=10)
-    factors, points = term_factors(each, "points"), DEPTH_TIME["points"]
+    with_points = dataclasses.replace(FACTS, depth="points")
+    factors, points = term_factors(each, with_points), TERM_TIME["points"]
     assert factors[9] == 1.0 + points
-    assert factors[10] == 1.0 + points + SURFACE_TIME / each.surface_every
-    assert factors - points == pytest.approx(term_factors(each))
+    assert factors[10] == 1.0 + points + TERMS_TIME / each.surface_every
+    assert factors - points == pytest.approx(term_factors(each, FACTS))
 
 
 def test_depth_is_a_fact_of_views_that_carry_it(capture):
@@ -205,8 +206,9 @@ def test_depth_is_a_fact_of_views_that_carry_it(capture):
         assert Facts.of(dataclasses.replace(dataset, train=carried)).depth == kind
     for source, kind in ((POINTS_AS_DEPTH, "points"), (CAPTURE_AS_DEPTH, "maps"), ("depth", "maps")):
         asked = {"given_depth": source}
-        assert Facts.of(dataset, asked=asked).depth == kind
-        assert Prospect(dataset, dataset, PLAIN, asked=asked).facts.depth == kind
+        longer = 1.0 + TERM_TIME[kind] / PLAIN.depth_every
+        assert term_factors(PLAIN, Facts.of(dataset, asked=asked))[0] == longer
+        assert term_factors(PLAIN, Prospect(dataset, dataset, PLAIN, asked=asked).facts)[0] == longer
 
 
 def test_pairs_are_forecast_at_the_photo_size_with_which_the_run_starts():

@@ -191,13 +191,19 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_3000").is_dir()
     # The advice repeats the recipe of the run. A run without a stored recipe was trained by adc.
     for changes, strategy in (
-        ({"strategy": "mcmc", "max_gaussians": 300}, "mcmc"),
+        ({"strategy": "mcmc", "max_gaussians": 300, "refine": "poses", "surface": True}, "mcmc"),
         ({"strategy": None}, "adc"),
     ):
         changed = {key: value for key, value in (train | changes).items() if value is not None}
         RunFolder(place / "run; one").write_config(config | {"train": changed})
         longer = next(words for words in pasted(doctor(place / "run; one")[1]) if "30000" in words)
         assert longer[longer.index("--strategy") + 1] == strategy
+        for name in ("max_gaussians", "refine", "surface"):
+            flag, value = f"--{name.replace('_', '-')}", changes.get(name)
+            assert (flag in longer) == (name in changes), (
+                "settings are repeated where they are not the default"
+            )
+            assert value in (None, True) or longer[longer.index(flag) + 1] == str(value)
 
 
 def test_the_proposed_output_folder_does_not_exist_yet(doctor, capture, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from gsplat_edu.options.values import bytes_text, seconds_text
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import check_options
 from gsplat_edu.runs.training import document
-from gsplat_edu.train.config import FOR_DEPTH, FOR_SURFACE, SETTINGS, TrainConfig, recipe
+from gsplat_edu.train.config import ONLY_WITH, SETTINGS, TrainConfig, recipe
 from gsplat_edu.train.length import QUALITIES
 
 
@@ -139,8 +139,8 @@ def test_config_json_has_flat_names(tmp_path):
         "outside_masks",
         "region",
         "surface",
-        *FOR_SURFACE,
-        *FOR_DEPTH,
+        *ONLY_WITH["surface"],
+        *ONLY_WITH["depth"],
     }
     assert {name: value for name, value in found["train"].items() if name not in newer} == flat
     folder = RunFolder(tmp_path)

@@ -8,13 +8,10 @@ import pytest
 from gsplat_edu.train.part import OWN_PARTS
 
 IMPORTERS = {
-    "budget/costs.py",
-    "runs/cleaning.py",
-    "runs/lod_refinement.py",
-    "runs/meshes.py",
-    "runs/painting.py",
+    "runs/meshes.py": "which photos see the same from elsewhere: a mesh is checked by pairs of photos",
+    "runs/painting.py": "where the masks of what moved lie: they outlast the training, and only paint asks for them",
 }
-"""Modules that use what a part offers beside its hooks, for example how a sky is found; no other may."""
+"""Modules that use what a part offers beside its hooks, and what that is; no other may."""
 
 LOOPING = (
     "train/resident.py",
@@ -24,7 +21,14 @@ LOOPING = (
     "runs/options.py",
 )
 LOOPING += ("runs/identity.py", "runs/parts.py", "runs/pilot.py")
+LOOPING += ("budget/forecast.py", "runs/cleaning.py", "runs/lod_refinement.py")
 """Modules that ask each part for what they need of its settings, and of what the user asked of it."""
+
+OPTIONS = ("options/train.py", "options/block_parts.py", "options/settings.py", "options/length.py")
+"""Modules that read from the declarations of settings where an option belongs, and what may not be given with it."""
+
+COMMANDS = ("cli/train.py", "cli/blocks.py", "cli/doctor.py")
+"""Commands that choose, share and repeat settings of a training."""
 
 SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
 
@@ -34,7 +38,7 @@ SOURCE = Path(__file__).parents[2] / "src" / "gsplat_edu"
     [
         *("train/compose.py", "train/trainer.py", "train/step.py", "train/objective.py"),
         *("runs/training.py", "runs/evaluation.py", "runs/options.py", "runs/parts.py", "runs/dataset.py"),
-        *("runs/pilot.py", "train/resident.py"),
+        *("runs/pilot.py", "train/resident.py", "budget/costs.py", "budget/forecast.py"),
         *("evaluate/report.py", "doctor/diagnosis.py", "survey/trained.py", "cli/result.py"),
     ],
 )
@@ -53,18 +57,23 @@ def test_a_training_does_not_name_the_files_of_a_capture(module):
     assert not re.findall("region|left_out", (SOURCE / module).read_text())
 
 
-@pytest.mark.parametrize("module", ["cli/train.py", "options/train.py", *LOOPING])
+@pytest.mark.parametrize("module", ["runs/cleaning.py", "runs/lod_refinement.py", "parts/floaters/part.py"])
+def test_parts_say_how_photos_are_compared_with_a_scene(module):
+    assert not re.findall("appearance|vignetting", (SOURCE / module).read_text())
+
+
+@pytest.mark.parametrize("module", ["cli/train.py", *OPTIONS, *LOOPING])
 def test_what_users_ask_of_parts_is_named_by_its_options(module):
     """`RunOptions.asked` carries it; `options/asked.py` and the parts know what it is."""
     text = (SOURCE / module).read_text()
-    assert not re.findall(r"given_depth|floaters|\bdepth\b(?!=False)|arguments\.clean", text)
+    assert not re.findall(r"given_depth|floaters|\bdepth\b(?!=False)|arguments\.clean|[\"']clean[\"']", text)
 
 
 @pytest.mark.parametrize(
     "module",
     sorted(
         str(path.relative_to(SOURCE))
-        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", "cli/train.py", *LOOPING)
+        for place in ("doctor/*.py", "studio/*.py", "studio/web/*.js", *COMMANDS, *OPTIONS, *LOOPING)
         for path in SOURCE.glob(place)
     ),
 )
@@ -84,4 +93,4 @@ def test_no_other_module_imports_a_part():
         for path in SOURCE.rglob("*.py")
         if re.search(rf"^\s*(from|import) gsplat_edu\.parts\.({rooms})\b", path.read_text(), re.MULTILINE)
     }
-    assert {path for path in found if not path.startswith("parts/")} == IMPORTERS
+    assert {path for path in found if not path.startswith("parts/")} == set(IMPORTERS)

@@ -20,15 +20,14 @@ from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.engine.room import PIXEL_BYTES, REPEATED_PHOTOS, Load, Room, kept_photos
-from gsplat_edu.ops.lenses import RAY_ROOM
-from gsplat_edu.parts.surface.patches import PHOTO_ROOM
 from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
-from gsplat_edu.scene.given_depth import POINTS_AS_DEPTH
 from gsplat_edu.scene.sh import num_coefficients
 from gsplat_edu.train.capacity import added_gaussians, wanted_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
 from gsplat_edu.train.overlap import separate_views
+from gsplat_edu.train.part import parts
+from gsplat_edu.train.part_values import Cost
 from gsplat_edu.train.schedule import photo_factor, planned_counts
 
 COPIES = 8
@@ -56,22 +55,6 @@ TILE_PIXELS = 128
 LATER = 150 * 2**20
 """Growth of the process once it trains and evaluates, bytes, for any scene: code, threads, allocator arenas."""
 
-
-GREY_BYTES = 2
-"""Bytes per pixel of a photo without colours, with the mask of its pixels that count."""
-
-SURFACE_TIME = 3.0
-"""Further time of a step that learns from normals and flatness, in times of a plain one
-("Surfaces" in the earlier results that benchmarks/RESULTS.md names)."""
-
-RAY_BYTES = 12
-"""Bytes of a pixel's ray in float32."""
-
-DEPTH_TIME = {"points": 0.2, "maps": 1.0}
-"""Further time of a step that compares its depth with given depth, in times of a plain one, by what gives it. Maps are
-taken to have a value for each pixel of a photo
-("What the depth term costs" in the earlier results that benchmarks/RESULTS.md names)."""
-
 Amount = TypeVar("Amount", float, np.ndarray)
 """A number, or an array with one number for each iteration."""
 
@@ -91,9 +74,10 @@ class Facts:
         workers: Number of photos decoded at the same time.
         decoding: Bytes per pixel of the file during decoding, most for HEIC and 16 bits.
         measured: Whether the start points are points of the scene; otherwise they are random.
-        depth: What gives the depth that the training learns from, of `DEPTH_TIME`; empty if nothing does.
+        depth: What gave the depth that the training views carry, "points" or "maps"; empty if they carry none.
         separate: Of the training views, as `gsplat_edu.train.overlap.separate_views` counts them.
         lens_pixels: Pixels of one training view for each lens that is kept; pinholes have none.
+        asked: What the user asked of parts that the views do not carry yet (`gsplat_edu.runs.options.RunOptions`).
     """
 
     train: int
@@ -109,6 +93,7 @@ class Facts:
     depth: str = ""
     separate: float = 1.0
     lens_pixels: float = 0.0
+    asked: Mapping[str, str] = dataclasses.field(default_factory=dict, hash=False)
 
     @classmethod
     def of(
@@ -119,9 +104,8 @@ class Facts:
         Args:
             dataset: The capture at training size.
             full: The capture at the size of its files; None if that is the training size.
-            asked: As for `RunOptions`: depth to learn from that the views do not carry yet; None for nothing.
+            asked: As for `Facts`; None for nothing.
         """
-        depth = (asked or {}).get("given_depth")
         sizes, decoded = (
             [v.camera.W * v.camera.H for v in (*d.train, *d.test)] for d in (dataset, full or dataset)
         )
@@ -136,9 +120,10 @@ class Facts:
             dataset.images.workers,
             dataset.images.decoding,
             dataset.measured,
-            _depth_of(dataset) if depth is None else "points" if depth == POINTS_AS_DEPTH else "maps",
+            _depth_of(dataset),
             separate_views([view.camera for view in dataset.train], dataset.points),
             _lens_pixels(dataset),
+            asked or {},
         )
 
     def wanted(self, config: TrainConfig) -> int:
@@ -267,19 +252,28 @@ def pixel_share(config: TrainConfig) -> float:
     return float(np.mean([photo_factor(config, iteration) ** -2 for iteration in some]))
 
 
-def term_factors(config: TrainConfig, depth: str = "") -> Float64[np.ndarray, " iterations"]:
-    """Return the time of each iteration as a multiple of its time without surface and depth.
-
-    The steps that compute these terms share their time with the others (`surface_every`, `depth_every`).
+def costs_of_parts(config: TrainConfig, facts: Facts) -> list[Cost]:
+    """Return what the parts add to a training.
 
     Args:
         config: The run.
-        depth: What gives depth, as for `Facts`.
+        facts: The capture at training size.
     """
-    compared = DEPTH_TIME[depth] / config.depth_every if depth else 0.0
-    surface = SURFACE_TIME / config.surface_every if config.surface else 0.0
-    late = np.arange(config.iterations) >= config.surface_start
-    return np.where(late, 1.0 + compared + surface, 1.0 + compared)
+    found = (
+        part.cost(config.settings_of(name), facts.asked.get(name), facts) for name, part in parts().items()
+    )
+    return [cost for cost in found if cost is not None]
+
+
+def term_factors(config: TrainConfig, facts: Facts) -> Float64[np.ndarray, " iterations"]:
+    """Return the time of each iteration as a multiple of its time without the terms of parts.
+
+    Arguments as for `costs_of_parts`. The steps that compute a term share its time with the others.
+    """
+    factors = np.ones(config.iterations)
+    for cost in costs_of_parts(config, facts):
+        factors[cost.since :] += cost.time
+    return factors
 
 
 def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.ndarray, " iterations"]:
@@ -293,24 +287,21 @@ def step_profile(config: TrainConfig, facts: Facts, speed: Speed) -> Float64[np.
     counts = expected_counts(config, facts.points, facts.pixels)
     factors = np.array([photo_factor(config, iteration) for iteration in range(config.iterations)])
     seconds = speed.seconds(counts.astype(np.float64), facts.pixels / factors**2)
-    return np.array(seconds * term_factors(config, facts.depth))
+    return np.array(seconds * term_factors(config, facts))
 
 
 def photo_copies(config: TrainConfig, facts: Facts) -> int:
-    """Return how many bytes the training's own copies of photos, and the rays of lenses, add to the peak memory.
+    """Return how many bytes the training's own copies of photos, and what its parts keep, add to the peak memory.
 
-    Only training photos have copies: reduced ones early, with at most half of their pixels, and for patches those
-    without colours, which stay, as rays do. All reduced ones are freed before training uses full size. While they
-    exist, a step therefore takes at most half of the memory that the evaluation takes for images, and only what exceeds
-    the other half raises the peak.
+    Only training photos have copies: reduced ones early, with at most half of their pixels. All of these are freed
+    before training uses full size. While they exist, a step therefore takes at most half of the memory that the
+    evaluation takes for images, and only what exceeds the other half raises the peak.
 
     Args:
         config: The run.
         facts: The capture at training size.
     """
-    kept = min(RAY_ROOM, RAY_BYTES * math.ceil(facts.lens_pixels)) if config.surface else 0
-    if config.surface and config.patch_weight > 0:
-        kept += min(PHOTO_ROOM, GREY_BYTES * math.ceil(facts.pixels) * facts.train)
+    kept = sum(cost.memory for cost in costs_of_parts(config, facts))
     if photo_factor(config, 0) <= 1.0:
         return kept
     share = facts.train / max(facts.train + facts.test, 1)

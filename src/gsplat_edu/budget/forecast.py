@@ -113,7 +113,7 @@ def predict(
     speed, last = measured.speed, config.iterations - 1
     missing = 1.0 - min(image_memory / max(facts.photo_bytes, 1), 1.0)
     reading_again = measured.read * missing / torch.get_num_threads()
-    longer = term_factors(config, facts.depth)
+    longer = term_factors(config, facts)
     plain = speed.seconds(float(counts.mean()), facts.pixels * pixel_share(config))
     each = plain * float(longer.mean()) + reading_again
 

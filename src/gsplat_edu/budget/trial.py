@@ -133,7 +133,7 @@ def _without_changes(config: TrainConfig, steps: int, gaussians: int) -> TrainCo
         fast_start_factor=1.0,
         fast_stop=steps + 1,
         max_gaussians=max(gaussians, config.max_gaussians or 0),
-        surface=False,  # `costs.term_factors` adds its time
+        surface=False,  # `costs.term_factors` adds the time of its terms
         **dict.fromkeys(("refine", "appearance", "transients", "sky"), "none"),
     )
 

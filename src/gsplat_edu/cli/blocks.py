@@ -41,6 +41,7 @@ from gsplat_edu.options.train import OPEN, left_open, options_from
 from gsplat_edu.runs.blocks_folder import BlocksFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun, is_finished
+from gsplat_edu.train.config import FOR_START
 from gsplat_edu.viewer.export import check_target
 
 Say = Callable[[str], None]
@@ -113,7 +114,7 @@ def _prepared(arguments: argparse.Namespace, console: Terminal) -> tuple[BlockPl
         if not coarse.resume:
             names = left_open(of_coarse)
             coarse = with_choices(coarse, reader, names, console, say)
-            shared = {name: getattr(coarse.config, name) for name in names if name != "sky"}
+            shared = {name: getattr(coarse.config, name) for name in names if name not in FOR_START}
             options = replace(options, config=options.config.changed(**shared))
         else:
             options = replace(options, config=options.config.changed(**_chosen_before(coarse, of_block)))
@@ -126,7 +127,7 @@ def _prepared(arguments: argparse.Namespace, console: Terminal) -> tuple[BlockPl
 def _chosen_before(coarse: RunOptions, of_block: argparse.Namespace) -> dict[str, object]:
     """Return the values that an interrupted coarse run chose for open settings."""
     stored = coarse.folder.read_config().get("train", {})
-    names = [name for name in OPEN if name != "sky" and getattr(of_block, name) in (None, "auto")]
+    names = [name for name in OPEN if name not in FOR_START and getattr(of_block, name) in (None, "auto")]
     return {name: stored[name] for name in names if name in stored}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
-from gsplat_edu.base.text import plain_of
+from gsplat_edu.base.text import option_flag, plain_of
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import Dataset, DataSettings, scene_extent
 from gsplat_edu.data.depths import own_depth
@@ -27,7 +27,7 @@ from gsplat_edu.evaluate.verdict import measured_of
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed
-from gsplat_edu.options.asked import asked_of
+from gsplat_edu.options.asked import ASKED, asked_of
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import data_settings, run_reader
@@ -36,7 +36,7 @@ from gsplat_edu.runs.parts import judgements, stored_config
 from gsplat_edu.survey.capture import Survey, prepare
 from gsplat_edu.survey.residuals import residuals
 from gsplat_edu.survey.trained import Trained
-from gsplat_edu.train.config import DEFAULT_STRATEGY, TrainConfig, recipe
+from gsplat_edu.train.config import BY_NAME, DEFAULT_STRATEGY, WITH_OPTION, TrainConfig, recipe
 from gsplat_edu.train.length import DEFAULT_QUALITY, planned_iterations
 
 EXIT_HOPELESS = 1
@@ -128,8 +128,8 @@ def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
         words += ("--iterations", str(arguments.iterations))
     if arguments.resolution is not None:
         words += ("--resolution", f"{arguments.resolution:g}")
-    if arguments.depth is not None:
-        words += ("--depth", str(arguments.depth))
+    for part, value in asked_of(arguments).items():
+        words += (option_flag(ASKED[part]), value)
     return words
 
 
@@ -143,17 +143,16 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     dataset = Dataset.of(reader, data_settings(config))
     gaussians = read_scene(scene).relative_to(dataset.origin).to(device_of(backend))
     renderer = functools.partial(render, settings=settings, backend=backend)
-    section = config.get("train")
-    appearance = stored_config(config).appearance
+    used = stored_config(config)
     with _bar(console) as bar:
         task = bar.add_task("views", total=len(dataset.train) + len(dataset.test))
         train, test = (
-            residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task), appearance)
+            residuals(
+                gaussians, views, renderer, settings.background, lambda: bar.advance(task), used.appearance
+            )
             for views in (dataset.train, dataset.test)
         )
     extent = scene_extent([view.camera for view in dataset.train])
-    planned = section.get("iterations") if isinstance(section, dict) else None
-    planned = planned if isinstance(planned, int) else None
     trained = Trained(
         folder.path,
         gaussians,
@@ -161,11 +160,11 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         train,
         test,
         reached,
-        planned,
+        used.iterations if "iterations" in config.get("train", {}) else None,
         log=folder.log(),
         capture=reader.path,
-        options=_options(config),
-        strategy=_strategy(section),
+        options=_options(config["data"], used),
+        strategy=used.strategy,
         measured=measured_of(folder.read_metrics(), config),
         views=dataset.train,
         features=functools.partial(render, backend=backend),
@@ -176,41 +175,31 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     return examine_run(trained, judgements(config, trained)), [*views, *_gpu_lines(backend)]
 
 
-def _strategy(section: object) -> str:
-    """Return the strategy in the section "train" of config.json; a run that names none has the library's."""
-    found = section.get("strategy") if isinstance(section, dict) else None
-    return TrainConfig.strategy if found is None else str(found)
+def _options(data: Mapping[str, Any], train: TrainConfig) -> tuple[str, ...]:
+    """Return the options to repeat in a longer run: those of the input, and of settings that are not the defaults.
 
-
-def _options(config: dict[str, Any]) -> tuple[str, ...]:
-    """Return the options to repeat in a longer run: input, strategy, background, limits."""
-    section, data = config.get("train"), config["data"]
-    train, strategy = section if isinstance(section, dict) else {}, _strategy(section)
-    background = train.get("background") or ()
-    named = {
-        "--resolution": (data.get("resolution"),),
-        "--test-every": (data.get("test_every"),),
-        "--points": (data.get("points"),),
-        "--from": (data.get("scene"),),
-        "--strategy": (None if strategy == DEFAULT_STRATEGY else strategy,),
-        "--max-gaussians": (train.get("max_gaussians"),),
-        "--transients": (None if train.get("transients", "none") == "none" else train["transients"],),
-        "--outside-masks": ("empty" if train.get("outside_masks") == "empty" else None,),
-        "--appearance": (
-            "vignetting" if stored_config(config).appearance == "vignetting" else None,
-        ),  # never chosen by auto
-        "--background": background if train.get("alpha_background") == "fixed" else (None,),
+    Args:
+        data: The section "data" of config.json.
+        train: The training.
+    """
+    given = {"resolution": "resolution", "test_every": "test_every", "points": "points", "scene": "from"}
+    named = {option_flag(flag): data.get(name) for name, flag in given.items()}
+    if train.strategy != DEFAULT_STRATEGY:
+        named["--strategy"] = train.strategy
+    if train.alpha_background == "fixed":
+        named["--background"] = train.background
+    values = train.flat()
+    named |= {
+        BY_NAME[name].written: values[name]
+        for name in WITH_OPTION
+        if name not in ("iterations", "strategy", "background") and values[name] != BY_NAME[name].default
     }
     words = []
-    for flag, values in named.items():
-        if None not in values:
-            words += [flag, *(f"{value:g}" if isinstance(value, float) else str(value) for value in values)]
-    flags = {
-        "--antialiased": "antialiased",
-        "--random-background": "random_background",
-        "--surface": "surface",
-    }
-    return (*words, *(flag for flag, key in flags.items() if train.get(key)))
+    for flag, value in named.items():
+        if value is not None:
+            several = value if isinstance(value, tuple) else () if value is True else (value,)
+            words += [flag, *(f"{one:g}" if isinstance(one, float) else str(one) for one in several)]
+    return tuple(words)
 
 
 def _surveyed(reader: CaptureReader, console: Console) -> Survey:

@@ -26,6 +26,10 @@ OFFERED_ASKED = {
 """How pages ask for them, as `gsplat_edu.options.train.OFFERED` has it."""
 
 
+COMMON_ASKED = ("clean",)
+"""Those that `--help` shows."""
+
+
 def add_of_photos(group: argparse._ActionsContainer) -> None:
     """Add the options that say what else there is beside the photos."""
     add_depth(group, "learn from depth")
@@ -44,9 +48,9 @@ def check_asked(arguments: argparse.Namespace) -> None:
     """Check the options without reading a photo.
 
     Raises:
-        ArgumentError: a folder does not exist, or a setting needs an option that is not given.
+        ArgumentError: a folder does not exist.
     """
-    check_depth(arguments.depth, arguments.settings)
+    check_depth(arguments.depth)
 
 
 def asked_of(arguments: argparse.Namespace) -> dict[str, str]:

@@ -7,10 +7,9 @@ import argparse
 from gsplat_edu.data.settings import FACTOR_BELOW
 from gsplat_edu.options.blocks import COARSE_FACTOR, COARSE_SHARE
 from gsplat_edu.options.length import length_of, strategy_of
-from gsplat_edu.options.train import FOR_POINTS
 from gsplat_edu.runs.blocks_folder import BlocksFolder
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.config import FOR_START, WITH_OPTION, TrainConfig
 from gsplat_edu.train.strategy_config import FastConfig
 
 
@@ -24,13 +23,14 @@ def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, 
     """
     of_block = argparse.Namespace(**vars(arguments))
     of_block.resume, of_block.scene = False, arguments.scene or arguments.out
-    kept = {name: value for name, value in arguments.settings.items() if name not in FOR_POINTS}
+    kept = {name: value for name, value in arguments.settings.items() if name not in FOR_START}
     of_block.settings = {"means_rate": TrainConfig.means_rate, **kept}  # a coarse model is not in place yet
     if (
         arguments.scene is None and strategy_of(arguments) == "fast"
     ):  # and has no detail that small photos would undo
         of_block.settings = {"fast_start_factor": FastConfig.start_factor, **of_block.settings}
-    of_block.sky = None
+    for name in set(FOR_START) & set(WITH_OPTION):
+        setattr(of_block, name, None)
     coarse = argparse.Namespace(**vars(arguments))
     if arguments.scene is not None:
         return of_block, None

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
-from gsplat_edu.train.config import BY_NAME, FOR_DEPTH
 
 WORDS = (POINTS_AS_DEPTH, CAPTURE_AS_DEPTH)
 """Values that are no folders."""
@@ -31,22 +29,16 @@ def add_depth(group: argparse._ActionsContainer, text: str) -> None:
     )
 
 
-def check_depth(path: Path | None, settings: Iterable[str] = ()) -> None:
+def check_depth(path: Path | None) -> None:
     """Check the option without reading a map.
 
     Args:
         path: Its value; None if it is not given.
-        settings: Names of the settings that are given.
 
     Raises:
-        ArgumentError: the folder does not exist, or settings of depth are given without it.
+        ArgumentError: the folder does not exist.
     """
-    if path is None:
-        if idle := [name for name in FOR_DEPTH if name in settings]:
-            raise ArgumentError(
-                f"{BY_NAME[idle[0]].written}: only --depth uses it; leave it out or add --depth"
-            )
-    elif str(path) not in WORDS and not path.is_dir():
+    if path is not None and str(path) not in WORDS and not path.is_dir():
         raise ArgumentError(
             f"--depth: {path} is no folder; give the folder of maps, or one of the words {' and '.join(WORDS)}"
         )

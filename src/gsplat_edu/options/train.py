@@ -8,9 +8,17 @@ from typing import Any
 
 from gsplat_edu.base.constants import AUTO as AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import one_of
 from gsplat_edu.data.settings import LENS_MODES, DataSettings
-from gsplat_edu.options.asked import OFFERED_ASKED, add_of_photos, add_of_results, asked_of, check_asked
+from gsplat_edu.options.asked import (
+    COMMON_ASKED,
+    OFFERED_ASKED,
+    add_of_photos,
+    add_of_results,
+    asked_of,
+    check_asked,
+)
 from gsplat_edu.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.options.length import length_of, strategy_of
 from gsplat_edu.options.settings import (
@@ -31,9 +39,10 @@ from gsplat_edu.train.config import (
     BY_NAME,
     DEFAULT_STRATEGY,
     FAST_FROM_SCENE,
-    FOR_SURFACE,
+    FOR_START,
     FROM_SCENE,
     ONLY_FOR,
+    ONLY_WITH,
     RECIPE_ITERATIONS,
     SETTINGS,
     WITH_OPTION,
@@ -45,33 +54,11 @@ from gsplat_edu.train.setting import BY_DEFAULT, LENGTH, PHOTOS, Plain
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
 
-FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_scale", "sky")
-"""Settings that only a start from points uses."""
-
 COMMON = (
-    *(
-        "out",
-        "resume",
-        "scene",
-        "iterations",
-        "time_limit",
-        "max_memory",
-        "strategy",
-        "quality",
-        "max_gaussians",
-    ),
-    *(
-        "resolution",
-        "test_every",
-        "appearance",
-        "surface",
-        "sky",
-        "white_background",
-        "seed",
-        "backend",
-        "debug",
-    ),
-    *("eval_every", "clean", "export", "view", "settings"),
+    *("out", "resume", "scene", "time_limit", "max_memory", "quality", "resolution", "test_every"),
+    *("white_background", "backend", "debug", "eval_every", "export", "view", "settings"),
+    *COMMON_ASKED,
+    *(name for name, option in WITH_OPTION.items() if option.common),
 )
 """What `--help` shows; `--help-all` shows the other options too."""
 
@@ -288,11 +275,10 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         metavar="SIZE",
         help="memory for decoded photos, for example 500MB; others are read again for each use (default: 4GiB)",
     )
-    for name in ("appearance", "transients", "outside_masks"):
-        add_setting(group, name)
+    for name, option in WITH_OPTION.items():
+        if option.plain is not None and option.plain.group == PHOTOS:
+            add_setting(group, name)
     add_of_photos(group)
-    for name in ("refine", "sky"):
-        add_setting(group, name)
     _add_background(group)
 
 
@@ -308,11 +294,9 @@ def _add_background(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_recipe(parser: argparse.ArgumentParser, group: argparse._ArgumentGroup) -> None:
-    for name in ("antialiased", "batch", "sh_degree", "surface"):
-        add_setting(group, name)
     listed = {action.dest for action in parser._actions}
     for name in WITH_OPTION:
-        if name not in listed:  # those of plug-ins, and of ours that no other group lists
+        if name not in listed:
             add_setting(group, name)
     add_settings(group)
 
@@ -412,15 +396,16 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
             raise ArgumentError(
                 f"{BY_NAME[idle[0]].written}: only --strategy {only} uses it; leave it out or choose that strategy"
             )
-    if not arguments.surface and (idle := [name for name in FOR_SURFACE if name in changes]):
-        raise ArgumentError(
-            f"{BY_NAME[idle[0]].written}: only --surface uses it; leave it out or add --surface"
-        )
+    for only, names in ONLY_WITH.items():
+        if (idle := [name for name in names if name in changes]) and not getattr(arguments, only):
+            raise ArgumentError(
+                f"{BY_NAME[idle[0]].written}: only {option_flag(only)} uses it; leave it out or add {option_flag(only)}"
+            )
     planned = arguments.max_memory is not None or (
         arguments.time_limit is not None and arguments.iterations is None
     )
     if _starts_from_scene(arguments):
-        if idle := [BY_NAME[name].written for name in FOR_POINTS if changes.get(name, "none") != "none"]:
+        if idle := [BY_NAME[name].written for name in FOR_START if changes.get(name, "none") != "none"]:
             raise ArgumentError(f"{idle[0]}: only a start from points uses it, not --from; leave it out")
         changes = FROM_SCENE | (FAST_FROM_SCENE if strategy == "fast" else {}) | changes
     iterations = length_of(arguments, strategy)
@@ -445,13 +430,13 @@ def _given_or_stored(arguments: argparse.Namespace, name: str) -> str:
 def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Return which of `OPEN` have to be chosen for a new run: those that are auto, some by default for fast.
 
-    A run that starts from a scene has the sky of that scene.
+    A run that starts from a scene has what only a start from points chooses, such as a sky, from that scene.
     """
     if arguments.resume and RunFolder(arguments.out).exists():
         return ()
     default = OPEN_FOR_FAST if strategy_of(arguments) == "fast" else ()
     given = {name: getattr(arguments, name) or (AUTO if name in default else None) for name in OPEN}
-    return tuple(n for n in OPEN if given[n] == AUTO and (n != "sky" or arguments.scene is None))
+    return tuple(n for n in OPEN if given[n] == AUTO and (n not in FOR_START or arguments.scene is None))
 
 
 def _starts_from_scene(arguments: argparse.Namespace) -> bool:

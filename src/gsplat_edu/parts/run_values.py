@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,14 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.evaluate.alignment import TensorRenderer
 from gsplat_edu.evaluate.metrics import Renderer
+from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
+from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.far import Shell
+from gsplat_edu.train.part import parts
 from gsplat_edu.train.trainer import Trainer
 
 
@@ -101,6 +104,37 @@ class Revised:
 
     gaussians: Gaussians
     facts: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A trained scene and the photos that it is compared with.
+
+    Args:
+        dataset: The capture, as the parts before left it.
+        gaussians: The scene, on the backend's device.
+        settings: How it is rendered.
+        backend: What renders it.
+    """
+
+    dataset: Dataset
+    gaussians: Gaussians
+    settings: RenderSettings
+    backend: Backend
+
+    def photos(self, config: TrainConfig) -> Dataset:
+        """Return the capture as the parts of a training leave it.
+
+        Args:
+            config: The training that made the scene.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+        """
+        dataset = self.dataset
+        for name, part in parts().items():
+            dataset = part.compared(config.settings_of(name), replace(self, dataset=dataset))
+        return dataset
 
 
 @dataclass(frozen=True, eq=False)

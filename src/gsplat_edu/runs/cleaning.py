@@ -15,7 +15,7 @@ from gsplat_edu.clean.guard import Cleaning
 from gsplat_edu.clean.judge import Reason
 from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.io.formats import FORMATS
-from gsplat_edu.parts.exposure.photos import as_corrected
+from gsplat_edu.parts.run_values import Compared
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
@@ -81,8 +81,8 @@ def open_subject(path: Path, dataset: Path | None, backend: Backend) -> Subject:
         if found := capture_difference(run, capture):
             raise ArgumentError(f"{capture.path} is not the capture of {run.path}: {found}")
         gaussians = source.scene.gaussians
-        appearance = stored_config(run.read_config()).appearance
-        capture = as_corrected(capture, gaussians, source.settings, appearance, backend)
+        config = stored_config(run.read_config())
+        capture = Compared(capture, gaussians, source.settings, backend).photos(config)
     cameras = _cameras(capture)
     up = source.scene.up or capture_up(capture)
     held_out = frozenset(view.name for view in capture.test)

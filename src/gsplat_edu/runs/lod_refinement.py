@@ -19,13 +19,13 @@ import torch
 
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.io.lod.levels import Node, leaves_of, level_of, with_levels
-from gsplat_edu.parts.exposure.photos import at_exposure_of_scene
-from gsplat_edu.parts.poses.capture import with_camera
+from gsplat_edu.parts.run_values import Compared
 from gsplat_edu.paths.orbits import resized
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend
 from gsplat_edu.runs.dataset import data_settings, run_dataset
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.parts import stored_config
 from gsplat_edu.runs.source import Source, run_of
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
@@ -141,15 +141,12 @@ def _photos(source: Source, run: RunFolder, factor: float, backend: str) -> Spli
     dataset = run_dataset(config)
     known = dict(source.cameras)
     train, test = (
-        tuple(with_camera(view, _posed(view.camera, known.get(view.name))) for view in views)
+        tuple(view.with_camera(_posed(view.camera, known.get(view.name))) for view in views)
         for views in (dataset.train, dataset.test)
     )
     dataset = replace(dataset, train=train, test=_spread(test))
-    section = config.get("train")
-    if isinstance(section, dict) and section.get("appearance", "none") != "none":
-        shown = functools.partial(render, settings=source.settings, backend=backend)
-        on_device = source.scene.gaussians.to(device_of(backend))
-        dataset = at_exposure_of_scene(dataset, on_device, shown, source.settings.background)
+    shown = source.scene.gaussians.to(device_of(backend))
+    dataset = Compared(dataset, shown, source.settings, load_backend(backend)).photos(stored_config(config))
     return dataset.train, dataset.test
 
 

@@ -77,6 +77,14 @@ class View:
         view._set(self.camera, self.name, self.read, on_disk=self.on_disk, depth=depth)
         return view
 
+    def with_camera(self, camera: Camera) -> View:
+        """Return the view with another camera, and without depth, which is that of its own camera.
+
+        Args:
+            camera: The camera, of the photo's size.
+        """
+        return View.stored(camera, self.read, self.name)
+
     def scaled(self, factor: float) -> View:
         """Return the view with width and height divided by a factor, and intrinsics that fit exactly.
 

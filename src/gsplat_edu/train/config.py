@@ -105,7 +105,9 @@ class TrainConfig:
         Whole(1),
         "Number of images to train on; a step renders `batch` of them.",
         "2023",
-        option=Option(plain=Plain("Iterations instead of a quality", group=LENGTH, again="Train longer")),
+        option=Option(
+            plain=Plain("Iterations instead of a quality", group=LENGTH, again="Train longer"), common=True
+        ),
     )
     batch: int = number(
         1, Whole(1, 4096), "Views of a step; rates grow with its root.", "Zhao et al. 2024", option=Option()
@@ -120,7 +122,7 @@ class TrainConfig:
         0,
         Whole(0),
         "Seed of the view order, splits, relocations, noise, and of the choice of start points over the cap.",
-        option=Option(),
+        option=Option(common=True),
     )
     means_rate: float = number(
         1.6e-4, _not_negative, "Initial learning rate of the means, times the scene's extent.", "2023"
@@ -191,12 +193,14 @@ class TrainConfig:
                 PHOTOS,
                 again="Train with exposure correction",
             ),
+            common=True,
         ),
     )
     sky: str = number(
         "none",
         OneOf(SKIES),
         '"shell": start with far splats wherever photos show the sky; "none": without.',
+        only="start",
         option=Option(
             auto=BY_DEFAULT,
             plain=Plain(
@@ -209,6 +213,7 @@ class TrainConfig:
                 PHOTOS,
                 again="Train with a sky",
             ),
+            common=True,
         ),
     )
     refine: str = number(
@@ -309,12 +314,13 @@ class TrainConfig:
         "Clamp of the projection's Jacobian, in half fields of view; none clamps nothing.",
         "2023's code",
     )
-    start_opacity: float = number(0.1, _opacity, "Opacity of the initial Gaussians.", "2023")
+    start_opacity: float = number(0.1, _opacity, "Opacity of the initial Gaussians.", "2023", only="start")
     start_scale: float = number(
         1.0,
         _positive,
         "Factor on the initial scales, which are the root mean squared distance to 3 neighbours.",
         "2023",
+        only="start",
     )
     strategy: str = number(
         "adc",
@@ -330,14 +336,18 @@ class TrainConfig:
                     "adc": "the one of 2023, 30,000 iterations",
                 },
                 LENGTH,
-            )
+            ),
+            common=True,
         ),
     )
     max_gaussians: int | None = number(
         None,
         _cap,
         "Cap on the number of Gaussians; mcmc and fast require one.",
-        option=Option(plain=Plain("Splats at most", group=LENGTH, again="Train with {value} splats at most")),
+        option=Option(
+            plain=Plain("Splats at most", group=LENGTH, again="Train with {value} splats at most"),
+            common=True,
+        ),
     )
     densify_start: int = number(
         500, Whole(0), "Density control begins after this iteration.", "2023, 2024", milestone=True
@@ -360,7 +370,8 @@ class TrainConfig:
         "Learn a surface, for meshes: normals and neighbouring photos agree with the depth, and Gaussians are flat. It"
         " takes 2.2 to 2.8 times as long and costs about 0.3 dB of PSNR, 1 dB on the object.",
         option=Option(
-            plain=Plain("Purpose", {"": "to look at", "true": "for a mesh: learn surfaces"}, PURPOSE)
+            plain=Plain("Purpose", {"": "to look at", "true": "for a mesh: learn surfaces"}, PURPOSE),
+            common=True,
         ),
     )
     surface_start: int = number(
@@ -567,10 +578,15 @@ ONLY_FOR = {
 }
 """Settings that only one strategy uses."""
 
-FOR_SURFACE, FOR_DEPTH = (
-    tuple(setting.name for setting in SETTINGS if setting.only == what) for what in ("surface", "depth")
-)
-"""Settings that only a training with `surface`, or with depth, uses."""
+ONLY_WITH = {
+    option: tuple(setting.name for setting in SETTINGS if setting.only == option)
+    for option in dict.fromkeys(setting.only for setting in SETTINGS)
+    if option not in ("", "start", "course")
+}
+"""Settings that only a training with an option uses, for example with `surface`, by the option's name."""
+
+FOR_START = tuple(setting.name for setting in SETTINGS if setting.only == "start")
+"""Settings that only a start from points uses."""
 
 MILESTONES = tuple(setting.name for setting in SETTINGS if setting.milestone)
 """Settings that `recipe` scales with the length of the run; the densification interval is not one of them."""

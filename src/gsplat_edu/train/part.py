@@ -46,6 +46,16 @@ class Part:
         changed = (each for each in values if each[1] != getattr(type(settings), each[0]))
         return next((f"{name} is {'on' if value is True else value}" for name, value in changed), None)
 
+    def cost(self, settings: Any, asked: str | None, capture: Any) -> Any:  # noqa: ANN401
+        """Return what the part's terms add to a forecast, a `gsplat_edu.train.part_values.Cost`; None for nothing.
+
+        Args:
+            settings: The run's `Settings`.
+            asked: As for `leaves_device`.
+            capture: The capture at training size, a `gsplat_edu.budget.costs.Facts`.
+        """
+        return None
+
     def terms(self, settings: Any, extent: float) -> Mapping[str, Any]:  # noqa: ANN401
         """Return terms of the objective (`gsplat_edu.train.objective.Term`) by name.
 
@@ -218,6 +228,18 @@ class Part:
             DatasetError: a photo cannot be read.
         """
         return None
+
+    def compared(self, settings: Any, scene: Any) -> Any:  # noqa: ANN401
+        """Return the capture with photos as the trained scene is compared with them, for example at its exposure.
+
+        Args:
+            settings: The run's `Settings`.
+            scene: The scene and the capture, a `gsplat_edu.parts.run_values.Compared`.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+        """
+        return scene.dataset
 
     def scored(self, settings: Any) -> Mapping[str, Any]:  # noqa: ANN401
         """Return what metrics.json says beside the scores of views, for example how they were corrected.

@@ -102,3 +102,18 @@ class Begun:
     terms: Mapping[str, Any] = field(default_factory=dict)
     view_model: ViewModel | None = None
     masker: Masker | None = None
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a part adds to the time and memory of a training.
+
+    Args:
+        time: Further time of a step, in times of a plain one, on the average of all steps from `since` on.
+        since: First iteration that takes longer.
+        memory: Bytes that are kept.
+    """
+
+    time: float
+    since: int = 0
+    memory: int = 0

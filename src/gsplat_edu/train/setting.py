@@ -63,11 +63,14 @@ class Option:
 
     Args:
         auto: `ASKED` or `BY_DEFAULT` if the capture can decide; "" if not.
-        plain: How pages ask for it; None if they do not.
+        plain: How pages ask for it; None if they do not. Those of the group `PHOTOS` are listed with the options of
+            the photos, others with those of the recipe.
+        common: Whether `--help` shows it, and not only `--help-all`.
     """
 
     auto: str = ""
     plain: Plain | None = None
+    common: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,9 @@ class Setting:
         milestone: Whether `recipe` scales it with the length of the run.
         check: Raises if a value is out of range.
         option: The setting's own option; None if it has none.
-        only: What uses the setting: "surface" or "depth" for a training with that option, "course" for a training of
-            the course (`gsplat_edu.train.course`), which the command line does not have; "" for any training.
+        only: What uses the setting: the name of an option for a training with that option, "start" for one that starts
+            from points, "course" for a training of the course (`gsplat_edu.train.course`), which the command line does
+            not have; "" for any training.
     """
 
     name: str

@@ -111,12 +111,15 @@ class McmcConfig:
     stop: int = number(
         25_000, Whole(0), "Relocation and growth end before this iteration.", "2024's code", milestone=True
     )
-    start_opacity: float = number(0.5, _opacity, "Opacity of the initial Gaussians.", "2024's code")
+    start_opacity: float = number(
+        0.5, _opacity, "Opacity of the initial Gaussians.", "2024's code", only="start"
+    )
     start_scale: float = number(
         0.1,
         _positive,
         "Factor on the initial scales, which are the root mean squared distance to 3 neighbours.",
         "2024's code",
+        only="start",
     )
     growth: float = number(
         1.05,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
+from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.parts.exposure.findings import (
     EXPOSURE as CHECK,
@@ -13,6 +15,9 @@ from gsplat_edu.parts.exposure.findings import (
     judged_exposure,
 )
 from gsplat_edu.parts.exposure.model import Exposure
+from gsplat_edu.parts.exposure.photos import at_exposure_of_scene
+from gsplat_edu.parts.run_values import Compared
+from gsplat_edu.render.api import render
 from gsplat_edu.survey.capture import Survey, Undecided
 from gsplat_edu.survey.finding import Examined, Remedy
 from gsplat_edu.survey.trained import Trained
@@ -42,6 +47,18 @@ class ExposurePart(Part):
     def reads(self, settings: TrainConfig, data: DataSettings) -> DataSettings:
         """Read photos with their alpha: the correction applies to the object only, before it is composited."""
         return data if settings.appearance == "none" else replace(data, background=None)
+
+    def compared(self, settings: TrainConfig, scene: Compared) -> Dataset:
+        """Return the capture with photos at the exposure of the scene, without the vignetting that was measured.
+
+        Raises:
+            DatasetError: a photo cannot be read.
+        """
+        if settings.appearance == "none":
+            return scene.dataset
+        shown = functools.partial(render, settings=scene.settings, backend=scene.backend)
+        background, vignetting = scene.settings.background, settings.appearance == "vignetting"
+        return at_exposure_of_scene(scene.dataset, scene.gaussians, shown, background, vignetting=vignetting)
 
     def scored(self, settings: TrainConfig) -> dict[str, str]:
         """Say what is corrected, if anything is."""

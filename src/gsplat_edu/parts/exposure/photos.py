@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -15,10 +14,7 @@ from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.ops.recolor import recolored
-from gsplat_edu.render.api import render
-from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.photo import Photo
@@ -58,28 +54,6 @@ def at_exposure_of_scene(
         )
 
     return replace(dataset, train=converted(dataset.train), test=converted(dataset.test))
-
-
-def as_corrected(
-    dataset: Dataset, gaussians: Gaussians, settings: RenderSettings, appearance: str, backend: Backend
-) -> Dataset:
-    """Return the capture with photos at the exposure of a scene that a training with this `appearance` made.
-
-    Args:
-        dataset: The capture.
-        gaussians: The scene.
-        settings: How it is rendered.
-        appearance: The training's setting; with "none", photos stay as they are.
-        backend: What renders it.
-
-    Raises:
-        DatasetError: a photo cannot be read.
-    """
-    if appearance == "none":
-        return dataset
-    shown = functools.partial(render, settings=settings, backend=backend)
-    vignetting = appearance == "vignetting"
-    return at_exposure_of_scene(dataset, gaussians, shown, settings.background, vignetting=vignetting)
 
 
 def _measured(

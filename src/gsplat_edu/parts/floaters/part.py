@@ -6,9 +6,8 @@ import torch
 
 from gsplat_edu.clean.guard import clean
 from gsplat_edu.clean.report import record_of, report_lines
-from gsplat_edu.parts.exposure.photos import as_corrected
 from gsplat_edu.parts.floaters.findings import check_floaters
-from gsplat_edu.parts.run_values import Revised, Unwritten
+from gsplat_edu.parts.run_values import Compared, Revised, Unwritten
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.survey.finding import Examined
 from gsplat_edu.survey.trained import Trained
@@ -33,7 +32,7 @@ class FloatersPart(Part):
             return None
         backend = load_backend("cpu")  # no other one collects the statistics of each splat
         here = scene.gaussians.to(torch.device("cpu"))
-        photos = as_corrected(scene.dataset, here, scene.settings, settings.appearance, backend)
+        photos = Compared(scene.dataset, here, scene.settings, backend).photos(settings)
         cleaning = clean(here, photos.train, photos.test, scene.settings, backend=backend)
         for line in report_lines(cleaning):
             scene.say(line)

@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.depths import DepthReport, DepthSource, depth_name, with_depth
 from gsplat_edu.parts.given_depth.findings import NAME, depth_findings
 from gsplat_edu.parts.given_depth.term import DEPTH, DepthTerm
 from gsplat_edu.parts.run_values import Captured
+from gsplat_edu.scene.given_depth import POINTS_AS_DEPTH
 from gsplat_edu.survey.capture import Survey
 from gsplat_edu.survey.finding import Examined
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import Part
-from gsplat_edu.train.part_values import Begun, Setup
+from gsplat_edu.train.part_values import Begun, Cost, Setup
 from gsplat_edu.train.rendered import Turns
+
+TERM_TIME = {"points": 0.2, "maps": 1.0}
+"""Further time of a step that compares its depth with given depth, in times of a plain one, by what gives it. Maps are
+taken to have a value for each pixel of a photo
+("What the depth term costs" in the earlier results that benchmarks/RESULTS.md names)."""
 
 
 class GivenDepthPart(Part):
@@ -24,6 +31,11 @@ class GivenDepthPart(Part):
     def leaves_device(self, settings: TrainConfig, asked: str | None) -> str | None:
         """Say that a device cannot learn from depth, if the user gave some."""
         return None if asked is None else "depth is given"
+
+    def cost(self, settings: TrainConfig, asked: str | None, capture: Any) -> Cost | None:  # noqa: ANN401
+        """Return the time of the term, by what gives or will give the depth."""
+        given = "points" if asked == POINTS_AS_DEPTH else "maps" if asked else capture.depth
+        return Cost(TERM_TIME[given] / settings.depth_every) if given else None
 
     def examine(self, survey: Survey) -> Examined:
         """Report what is wrong with the depth maps, if the survey has read them."""

@@ -25,14 +25,9 @@ def with_refined_cameras(refinement: Refinement, dataset: Dataset) -> Dataset:
 
     The poses of test views are never refined.
     """
-    train = [with_camera(view, refinement.refined(i, view.camera)) for i, view in enumerate(dataset.train)]
-    test = [with_camera(view, refinement.with_refined_lens(view.camera)) for view in dataset.test]
+    train = [view.with_camera(refinement.refined(i, view.camera)) for i, view in enumerate(dataset.train)]
+    test = [view.with_camera(refinement.with_refined_lens(view.camera)) for view in dataset.test]
     return replace(dataset, train=tuple(train), test=tuple(test))
-
-
-def with_camera(view: View, camera: Camera) -> View:
-    """Return a view with another camera."""
-    return View.stored(camera, view.read, view.name)
 
 
 def write_refined(run: Path, dataset: Dataset) -> Path:

@@ -23,7 +23,6 @@ from dataclasses import replace
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.parts.bench import Bench, Pilot
-from gsplat_edu.parts.poses.capture import with_camera
 from gsplat_edu.parts.poses.refinement import DISTORTIONS, FREE, LEARNED, MOTIONS
 from gsplat_edu.parts.poses.trials import CONTROL, RefineTrials
 from gsplat_edu.parts.run_values import Tried
@@ -210,4 +209,4 @@ def _barely_distorted(view: View) -> View:
     """Return a view whose camera, if it is a pinhole at rest, is rendered as other lenses are."""
     if not view.camera.pinhole:
         return view
-    return with_camera(view, view.camera.through(Projection(distortion=Distortion.of(k1=BARELY))))
+    return view.with_camera(view.camera.through(Projection(distortion=Distortion.of(k1=BARELY))))
