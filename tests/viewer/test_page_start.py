@@ -14,6 +14,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.edit_page import editing_of
+from gsplat_edu.viewer.export import write
 from gsplat_edu.viewer.page_start import Start
 
 DESKTOP, PHONE = (1440, 900), (390, 844)
@@ -121,7 +122,26 @@ def test_a_phone_shows_the_ear_at_the_side_of_the_photo(visit, tmp_path, random_
     columns, rows = on_the_screen(seen, ear)
     assert columns.min() > 0 and columns.max() < PHONE[0] and 0 < rows.min() and rows.max() < PHONE[1]
     camera = seen.camera()
-    assert camera.fx / views[0][1].fx == pytest.approx(PHONE[0] / 480), "the whole width of the photo, and no more"
+    assert camera.fx / views[0][1].fx == pytest.approx(PHONE[0] / 480), (
+        "the whole width of the photo, and no more"
+    )
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_the_poster_lies_where_the_first_picture_shows_the_same(visit, tmp_path, random_gaussians, size):
+    body, _ = figure(random_gaussians)
+    source = Source(tmp_path / "body.ply", Scene(body), tuple(around(480, 640, 800.0)), RenderSettings())
+    write(tmp_path / "body.html", source)
+    seen = visit(*size).open(tmp_path / "body.html").ready()
+    start = page.usual_start(source.scene, source.cameras, source.held_out).camera
+    camera, box = (
+        seen.camera(),
+        seen.tab.evaluate("document.getElementById('poster').getBoundingClientRect()"),
+    )
+    scale = camera.fx / start.fx
+    assert (box["width"], box["height"]) == pytest.approx((scale * start.W, scale * start.H), abs=0.2)
+    for edge, principal, place in ((box["x"], start.cx, camera.cx), (box["y"], start.cy, camera.cy)):
+        assert edge + scale * (principal + 0.5) == pytest.approx(place + 0.5, abs=1.0)
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE, (844, 390)])
