@@ -45,8 +45,8 @@ def too_few(count: int, total: int) -> list[Finding]:
                 "few photos",
                 Severity.WARNING,
                 f"{count} photos are few: the scene between them is guessed",
-                f"take more photos: at least {FEW}, usually {USUAL[0]} to {USUAL[1]}, each sharing most of its view with"
-                " the next",
+                f"take more photos: at least {FEW}, usually {USUAL[0]} to {USUAL[1]}, each sharing most of its"
+                " view with the next",
                 certain=True,
             )
         ]

@@ -1,7 +1,7 @@
 """What photos show before anyone knows where they were taken: whether they are enough, and which are blurred.
 
-Each photo is compared with those taken before and after it, by the doctor's own measure of blur. How photos overlap, and
-whether their exposures agree, needs points that several of them show: the doctor of a capture says it.
+Each photo is compared with those taken before and after it, by the doctor's own measure of blur. How photos overlap,
+and whether their exposures agree, needs points that several of them show: the doctor of a capture says it.
 """
 
 from __future__ import annotations
