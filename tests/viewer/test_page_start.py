@@ -112,7 +112,7 @@ def test_no_head_is_cut_off_on_a_phone_and_the_picture_stays_when_the_controls_o
 def test_a_phone_shows_the_ear_at_the_side_of_the_photo(visit, tmp_path, random_gaussians):
     """Portrait photos, and few splats near their left edge, which do not count for the subject."""
     body, _ = figure(random_gaussians)
-    ear = (*np.random.default_rng(7).uniform(-0.02, 0.02, (20, 3)), -0.66, 0.3, 0.0)
+    ear = np.random.default_rng(7).uniform(-0.02, 0.02, (20, 3)) + np.array([-0.66, 0.3, 0.0])
     body.means[-20:] = torch.tensor(ear, dtype=torch.float32)
     views = around(480, 800, 1000.0)
     u, _, _ = views[0][1].project(views[0][1].world_to_cam(ear))
