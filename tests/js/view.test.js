@@ -97,11 +97,12 @@ test("zooming and panning are limited, so that a visitor cannot lose the scene",
   assert.ok(view.distance > 0.005 * farthest && view.distance < 0.05 * farthest);
 });
 
-test("a window of any shape keeps the middle of the photo, and crops at most a fifth of its height", () => {
+test("a window of any shape keeps the middle of the photo, crops at most a fifth of its height and adds at most half of it", () => {
   const photo = { R: AHEAD, eye: [0, 0, 0], fx: 230, fy: 250, cx: 150.3, cy: 108.6, W: 320, H: 200 };
   for (const [width, height, covered, scale] of [
-    [390, 844, 200, 3.22], // a narrow window shows exactly the whole height, and on a phone below the panel
-    [160, 500, 0, 2.5],
+    [390, 844, 200, 3.22 / 1.5], // a narrow window shows half as much again as the height, and on a phone below the panel
+    [160, 500, 0, 2.5 / 1.5],
+    [300, 200, 0, 0.9375], // and no more than it needs for the whole width
     [320, 200, 0, 1],
     [400, 200, 0, 1.25], // a wide window shows the whole width
     [800, 200, 0, 1.25], // a wider one crops no more, and shows the surroundings

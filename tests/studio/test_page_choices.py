@@ -46,7 +46,7 @@ def test_choices_in_words_become_options_of_the_command(visitor, library, plain)
         library,
         {
             "Brightness": "exposure",
-            "Poses": "auto",
+            "Camera positions": "auto",
             "Lens": "auto",
             "What moved between the photos": "mask",
             "Sky": "none",

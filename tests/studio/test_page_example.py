@@ -1,7 +1,7 @@
 """In Chromium, from the example of an empty library to a shared page by nothing but the button for the next step."""
 
 from studio.pages import go
-from studio.test_page_next import next_of, press_next
+from studio.test_page_next import press_next, shared_page
 
 
 def test_from_the_example_to_a_shared_page_by_next_alone(visitor, tmp_path):
@@ -12,11 +12,4 @@ def test_from_the_example_to_a_shared_page_by_next_alone(visitor, tmp_path):
     person.reach("#/captures/garden")
     press_next(tab, "Start training")
     person.reach("#/runs/garden")
-    press_next(tab, "Share it", 1200)
-    person.reach("#/runs/garden/share")
-    press_next(tab, "Make the file")
-    next_of(tab).filter(has_text="Save garden.html").wait_for()
-    with tab.expect_download() as download:
-        press_next(tab, "Save garden.html")
-    download.value.save_as(tmp_path / "page.html")
-    assert b'class="splats"' in (tmp_path / "page.html").read_bytes()
+    assert b'class="splats"' in shared_page(person, "garden", tmp_path, 1200).read_bytes()

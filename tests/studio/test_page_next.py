@@ -82,6 +82,20 @@ def check_access(tab, label):
     assert tab.locator(".timeline [aria-current=step]").count() == (0 if is_home else 1)
 
 
+def shared_page(person, name, folder, patience):
+    """From the screen of a training, by the next steps alone, to the file of its page, saved into a folder."""
+    tab = person.tab
+    press_next(tab, "Share it", patience)
+    person.reach(f"#/runs/{quote(name)}/share")
+    press_next(tab, "Make the file")
+    with tab.expect_download() as download:
+        press_next(tab, f"Save {name}.html")
+    assert download.value.suggested_filename == f"{name}.html"
+    saved = folder / f"{name}.html"
+    download.value.save_as(saved)  # the browser's own copy has no ending
+    return saved
+
+
 def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tmp_path):
     pytest.importorskip("pycolmap")
     files = []
@@ -102,14 +116,7 @@ def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tm
     person.reach(f"#/captures/{quote(BY_DAY)}")
     press_next(tab, "Start training")
     person.reach(f"#/runs/{quote(BY_DAY)}")
-    press_next(tab, "Share it", 600)
-    person.reach(f"#/runs/{quote(BY_DAY)}/share")
-    press_next(tab, "Make the file")
-    next_of(tab).filter(has_text=f"Save {BY_DAY}.html").wait_for()
-    check_access(tab, "Save")
-    with tab.expect_download() as download:
-        press_next(tab, f"Save {BY_DAY}.html")
-    assert download.value.suggested_filename == f"{BY_DAY}.html"
+    saved = shared_page(person, BY_DAY, tmp_path, 600)
 
     go(tab, "")
     tab.locator(".project").first.wait_for()
@@ -118,7 +125,6 @@ def test_from_dropped_photos_to_a_shared_page_by_next_alone(visitor, library, tm
     press_next(tab, "Share it")
     person.reach(f"#/runs/{quote(BY_DAY)}/share")
     page = tab.context.new_page()
-    download.value.save_as(tmp_path / "photos.html")  # the browser's own copy has no ending
-    page.goto((tmp_path / "photos.html").as_uri())
+    page.goto(saved.as_uri())
     until_in(page, page, "Boolean(window.viewer?.isWhole)")
     assert said == []

@@ -11,7 +11,7 @@ from gsplat_edu.edits.document import empty_document
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.runs.source import open_source
 from processes import Program
-from studio.pages import COMMAND, DROP, encoded, frame_of, go, png
+from studio.pages import COMMAND, DROP, encoded, frame_of, go, held_back, png
 from waiting import awaited, resize, until_in
 
 
@@ -62,6 +62,27 @@ def test_what_the_studio_did_not_answer_is_asked_for_again(visitor, library, run
     line.wait_for()
     library[0].stream.library_changed()
     line.wait_for(state="hidden")
+
+
+def test_the_cover_is_shown_until_the_scene_is_drawn(visitor, runs):
+    person = visitor()
+    resize(person.tab, 1440, 900)
+    held = held_back(person.tab, "**/api/runs/egg/page*", lambda request: request.method == "GET")
+    tab = go(person.tab, "runs/egg")
+    cover = tab.locator(".scene .cover")
+    cover.wait_for()
+    until_in(tab, tab, "document.querySelector('.scene .cover').naturalWidth === 512")
+    assert "/cover?" in cover.get_attribute("src")
+    box, stage = cover.bounding_box(), tab.locator(".scene").bounding_box()
+    assert box == stage, "it fills the stage"
+    before = person.shift()
+    awaited(tab, lambda: held, "the frame asks for the page")
+    for route, answer in held:
+        route.fulfill(response=answer)
+    tab.unroute("**/api/runs/egg/page*")
+    frame_of(tab)
+    cover.wait_for(state="hidden")
+    assert person.shift() - before < 0.01 and tab.locator(".scene").bounding_box() == stage
 
 
 @pytest.mark.parametrize("size", [(390, 844), (1440, 900)])

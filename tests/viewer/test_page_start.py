@@ -14,6 +14,7 @@ from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.edit_page import editing_of
+from gsplat_edu.viewer.export import write
 from gsplat_edu.viewer.page_start import Start
 
 DESKTOP, PHONE = (1440, 900), (390, 844)
@@ -106,6 +107,40 @@ def test_no_head_is_cut_off_on_a_phone_and_the_picture_stays_when_the_controls_o
     before = rows.min()
     seen.open_controls()
     assert on_the_screen(seen, head)[1].min() == before
+
+
+def test_a_phone_shows_the_ear_at_the_side_of_the_photo(visit, tmp_path, random_gaussians):
+    """Portrait photos, and few splats near their left edge, which do not count for the subject."""
+    body, _ = figure(random_gaussians)
+    ear = np.random.default_rng(7).uniform(-0.02, 0.02, (20, 3)) + np.array([-0.66, 0.3, 0.0])
+    body.means[-20:] = torch.tensor(ear, dtype=torch.float32)
+    views = around(480, 800, 1000.0)
+    u, _, _ = views[0][1].project(views[0][1].world_to_cam(ear))
+    assert u.min() > 0 and u.max() < 0.1 * 480, "it is in the photo, and far from its middle"
+    (tmp_path / "figure.html").write_bytes(page.html(Scene(body), views))
+    seen = visit(*PHONE).open(tmp_path / "figure.html").ready()
+    columns, rows = on_the_screen(seen, ear)
+    assert columns.min() > 0 and columns.max() < PHONE[0] and rows.min() > 0 and rows.max() < PHONE[1]
+    camera = seen.camera()
+    scale = camera.fx / views[0][1].fx
+    assert scale == pytest.approx(PHONE[0] / 480), "the whole width of the photo, and no more"
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_the_poster_lies_where_the_first_picture_shows_the_same(visit, tmp_path, random_gaussians, size):
+    body, _ = figure(random_gaussians)
+    source = Source(tmp_path / "body.ply", Scene(body), tuple(around(480, 640, 800.0)), RenderSettings())
+    write(tmp_path / "body.html", source)
+    seen = visit(*size).open(tmp_path / "body.html").ready()
+    start = page.usual_start(source.scene, source.cameras, source.held_out).camera
+    camera, box = (
+        seen.camera(),
+        seen.tab.evaluate("document.getElementById('poster').getBoundingClientRect()"),
+    )
+    scale = camera.fx / start.fx
+    assert (box["width"], box["height"]) == pytest.approx((scale * start.W, scale * start.H), abs=0.2)
+    for edge, principal, place in ((box["x"], start.cx, camera.cx), (box["y"], start.cy, camera.cy)):
+        assert edge + scale * (principal + 0.5) == pytest.approx(place + 0.5, abs=1.0)
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE, (844, 390)])

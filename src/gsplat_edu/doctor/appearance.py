@@ -10,10 +10,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 from gsplat_edu.scene.photo import shrunk
-from gsplat_edu.survey.capture import Shot, Survey
+from gsplat_edu.survey.capture import Survey
 from gsplat_edu.survey.finding import ALL_PHOTOS, FEWER_PHOTOS, Finding, Severity, counted
 from gsplat_edu.survey.geometry import inside
 from gsplat_edu.survey.photos import COARSE, WORK_SIDE
@@ -52,37 +52,62 @@ by less than this in radians: a tenth of a pixel in 1000."""
 
 def check_blur(survey: Survey) -> list[Finding]:
     """Find photos with less fine detail than their neighbours in some direction, inside of masks and cut-outs."""
-    losses = detail_losses(survey)
+    shots, neighbours = survey.shots, survey.geometry.neighbours
+    details = np.stack([shot.stats.detail for shot in shots])
+    return blur_findings(
+        survey.names, details, neighbours, [chance(shot.size, shot.stats.share) for shot in shots]
+    )
+
+
+def blur_findings(
+    photos: Sequence[str],
+    details: Float64[np.ndarray, "C 8"],
+    neighbours: Sequence[Int64[np.ndarray, "..."]],
+    chances: Sequence[float],
+) -> list[Finding]:
+    """Find photos with less fine detail than others that show the same.
+
+    Args:
+        photos: Their names.
+        details: (C, 8) detail of each by direction (`gsplat_edu.survey.photos.detail_of`).
+        neighbours: For each the indices of photos that show the same.
+        chances: For each the largest loss that chance explains (`chance`).
+    """
+    losses = detail_losses(details, neighbours)
     middle = float(np.median(losses))
     sharper = middle - float(np.quantile(losses, 0.16))
-    limits = [max(BLUR, middle + BLUR_SPREAD * sharper, _chance(shot)) for shot in survey.shots]
+    limits = [max(BLUR, middle + BLUR_SPREAD * sharper, least) for least in chances]
     worst_first = [i for i in np.argsort(-losses) if losses[i] > limits[i]]
     if not worst_first:
         return []
-    names = tuple(survey.names[i] for i in worst_first)
+    names = tuple(photos[i] for i in worst_first)
     what = f"{len(names)} of {len(losses)} photos show less detail than their neighbours"
     advice = f"remove or retake the blurred photos, first {names[0]}: the scene learns their blur"
     return [Finding("blurred", Severity.WARNING, what, advice, names, changes=(FEWER_PHOTOS,))]
 
 
-def _chance(shot: Shot) -> float:
-    """Return the largest loss that chance explains for a photo of this size."""
-    W, H = shot.size
+def chance(size: tuple[int, int], measured: float = 1.0) -> float:
+    """Return the largest loss that chance explains for a photo.
+
+    Args:
+        size: Its width and height, px.
+        measured: Share of its pixels in which the detail was measured.
+    """
+    W, H = size
     share = min(1.0, WORK_SIDE / max(W, H))
-    return CHANCE * math.sqrt(
-        2.0 * (4.0 * math.pi * COARSE**2) / max(W * H * share * share * shot.stats.share, 1.0)
-    )
+    return CHANCE * math.sqrt(2.0 * (4.0 * math.pi * COARSE**2) / max(W * H * share * share * measured, 1.0))
 
 
-def detail_losses(survey: Survey) -> Float64[np.ndarray, " C"]:
+def detail_losses(
+    detail: Float64[np.ndarray, "C 8"], neighbours: Sequence[Int64[np.ndarray, "..."]]
+) -> Float64[np.ndarray, " C"]:
     """Return each photo's loss of detail relative to the median of its neighbours, in the worst direction.
 
     Returns:
         Natural logarithms of energy; 0 for a photo like its neighbours.
     """
-    detail = np.stack([shot.stats.detail for shot in survey.shots])
     losses = np.empty(len(detail))
-    for i, near in enumerate(survey.geometry.neighbours):
+    for i, near in enumerate(neighbours):
         others = near if len(near) >= ENOUGH else np.delete(np.arange(len(detail)), i)
         losses[i] = (np.median(detail[others], axis=0) - detail[i]).max()
     return losses

@@ -12,9 +12,22 @@ FEW = 12
 matching."""
 
 
+USUAL = (40, 150)
+"""Usual numbers of photos of a thing or a room, smallest and largest, as docs/TOUR.md advises."""
+
+
 def check_usable(survey: Survey) -> list[Finding]:
     """Find captures with too few usable photos."""
-    count, total = len(survey.shots), len(survey.shots) + len(survey.refused)
+    return too_few(len(survey.shots), len(survey.shots) + len(survey.refused))
+
+
+def too_few(count: int, total: int) -> list[Finding]:
+    """Find whether photos are too few.
+
+    Args:
+        count: Photos that can be used.
+        total: All photos.
+    """
     if count < 2:
         what = f"{count} of {total} photos can be used, but a scene needs several views"
         return [
@@ -32,7 +45,8 @@ def check_usable(survey: Survey) -> list[Finding]:
                 "few photos",
                 Severity.WARNING,
                 f"{count} photos are few: the scene between them is guessed",
-                f"take more photos: at least {FEW}, better 30 or more, each sharing most of its view with the next",
+                f"take more photos: at least {FEW}, usually {USUAL[0]} to {USUAL[1]}, each sharing most of its"
+                " view with the next",
                 certain=True,
             )
         ]

@@ -44,6 +44,7 @@ def routes() -> list[BaseRoute]:
         act("/api/{kind}/{name}", "DELETE", _remove),
         act("/api/{kind}/{name}/rename", "POST", _rename),
         act("/api/{kind}/{name}/photos", "GET", _photos),
+        act("/api/photos/{name}/checks", "GET", _checks),
         act("/api/{kind}/{name}/left-out", "POST", _leave_out),
         act("/api/{kind}/{name}/thumbs/{path:path}", "GET", _thumb),
         Route("/api/{kind}/{name}/files/{path:path}", answered(_upload), methods=["PUT"]),
@@ -151,6 +152,12 @@ def _photos(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
     if kind not in ("photos", "captures"):
         raise RefusedError(f"{kind}: have no photos of their own; request the photos of a capture")
     return {"photos": photo_list(entry)}
+
+
+def _checks(studio: Studio, request: Request, body: Any) -> Any:  # noqa: ANN401
+    entry = studio.library.entry("photos", request.path_params["name"])
+    cache = studio.library.hidden("cache") / "checks"
+    return studio.decoder.ask("check_photos", entry=str(entry), cache=str(cache))
 
 
 def _leave_out(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -324,6 +324,13 @@ def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
     return make_thumbnail(photo, side, out)
 
 
+def check_photos(entry: str, cache: str) -> dict[str, Any]:
+    """Measure photos that are not placed yet; see `gsplat_edu.studio.photo_checks.check_photos`."""
+    from gsplat_edu.studio.photo_checks import check_photos
+
+    return check_photos(entry, cache)
+
+
 def draw_mask(
     capture: str, photo: str, shapes: list[Any] | None = None, version: str | None = None
 ) -> dict[str, Any]:
@@ -347,6 +354,7 @@ TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "picture": make_picture,
     "check_edits": check_edits,
     "thumbnail": make_thumbnail,
+    "check_photos": check_photos,
     "mask": draw_mask,
     "view_pictures": make_view_pictures,
     "forecast": forecast,

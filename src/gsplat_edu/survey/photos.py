@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -130,6 +131,21 @@ def _inner(counts: Bool[np.ndarray, "H W"] | None) -> Bool[np.ndarray, "H W"] | 
     side = 2 * math.ceil(EDGE * COARSE) + 1
     inner = cv2.erode(counts.view(np.uint8), np.ones((side, side), np.uint8)).astype(np.bool_)
     return np.asarray(inner)
+
+
+def detail_of_file(path: Path, size: tuple[int, int]) -> Float64[np.ndarray, "8"]:
+    """Measure the detail of a photo whose camera is not known; see `detail_of`.
+
+    Args:
+        path: Its file.
+        size: Width and height as stored, px.
+
+    Raises:
+        DatasetError: it cannot be decoded.
+    """
+    pixels, alpha = decode(path, smaller=WORK_SIDE if size[0] * size[1] <= JPEG_ONLY else None)
+    small = shrunk(pixels, WORK_SIDE)
+    return detail_of(small, _inner(_counting(alpha, None, small.shape[:2])))
 
 
 def detail_of(

@@ -225,16 +225,16 @@ class TrainConfig:
         option=Option(
             auto=ASKED,
             plain=Plain(
-                "Poses",
+                "Camera positions",
                 {
-                    "": "as they are",
-                    AUTO: "correct what held-out photos confirm",
-                    "poses": "correct the poses",
-                    "both": "correct poses and focal lengths",
-                    "all": "correct poses, lenses and rolling shutters",
+                    "": "as placed",
+                    AUTO: "refine what makes held-out photos match better",
+                    "poses": "refine positions and directions",
+                    "both": "refine positions, directions and focal lengths",
+                    "all": "refine them and the lenses, too",
                 },
                 PHOTOS,
-                again="Train and refine the poses",
+                again="Train and refine the camera positions",
             ),
         ),
     )

@@ -12,6 +12,7 @@ const LOOK = 250; // milliseconds between two looks whether the editor has start
 export function edit({ place, store, entry }) {
   const scene = frame(`editor of ${entry.name}`);
   scene.element.classList.add("tall");
+  scene.cover(entry);
   const note = h("p", { class: "quiet", hidden: true });
   const draft = h("p", { class: "notice", role: "status" });
   const unkept = h("p", { class: "notice", role: "alert", hidden: true });

@@ -1,6 +1,7 @@
 // Our page of a scene in a frame, and a photo laid over the same view.
 
 import { at, get, head } from "./api.js";
+import { picture } from "./covers.js";
 import { button, h, patch, put, want } from "./dom.js";
 
 const RETRY = 3000; // milliseconds until a page that is not there yet is asked for again
@@ -8,14 +9,17 @@ const LOOK = 250; // milliseconds between two looks at what the frame shows
 const GLANCE = 50; // milliseconds between two looks at whether a chosen view is drawn
 const MOST_SIDE = 1024; // px of a picture beside a photo
 
-// A frame that shows a page as soon as the server has it; until then, what it showed before.
+// A frame that shows a page as soon as the server has it; until then, what it showed before, or at first the picture of an
+// entry.
 export function frame(title) {
   const inner = h("iframe", { title, allow: "fullscreen; clipboard-write", hidden: true });
   const message = h("p", { class: "message", role: "status" }, "Loading the scene ...");
+  const cover = h("img", { class: "cover", alt: "", hidden: true });
   const photo = h("img", { class: "over-photo", alt: "", hidden: true });
   const full = button("Full screen", () => element.requestFullscreen?.());
-  const element = h("div", { class: "scene" }, inner, photo, message);
-  let [address, timer] = [null, 0];
+  const element = h("div", { class: "scene" }, inner, cover, photo, message);
+  element.image = cover;
+  let [address, timer, looks] = [null, 0, 0];
 
   async function open() {
     clearTimeout(timer);
@@ -36,11 +40,23 @@ export function frame(title) {
 
   // the page may have gone between the two requests; the frame then has the server's line, or the browser's own error
   inner.addEventListener("load", () => {
-    if (inner.hidden || inner.contentDocument?.contentType === "text/html") return;
+    if (inner.hidden) return;
+    if (inner.contentDocument?.contentType === "text/html") {
+      uncover();
+      return;
+    }
     inner.hidden = true;
     put(message, "Loading the scene ...");
     timer = setTimeout(open, RETRY);
   });
+
+  // The page inside says what it waits for until it shows something.
+  function uncover() {
+    clearTimeout(looks);
+    const waits = inner.contentDocument?.querySelector("#message.waiting");
+    if (waits) looks = setTimeout(uncover, LOOK);
+    else cover.classList.add("gone");
+  }
 
   function within(name) {
     try {
@@ -58,6 +74,10 @@ export function frame(title) {
     bare(on) {
       inner.contentDocument?.documentElement.classList.toggle("bare", on);
     },
+    // Shows the picture of an entry until the page inside shows something.
+    cover(entry) {
+      if (entry && !cover.classList.contains("gone")) picture(element, entry);
+    },
     show(next, why = "Loading the scene ...") {
       if (inner.hidden) put(message, why);
       if (next === address) return;
@@ -67,6 +87,7 @@ export function frame(title) {
     close() {
       address = null;
       clearTimeout(timer);
+      clearTimeout(looks);
     },
     // the viewer inside, once it has started
     get viewer() {

@@ -34,6 +34,7 @@ export function meshes(store, entry) {
   });
   const job = jobPlace(store, entry.entry, ["mesh"]);
   const scene = frame(`mesh of ${entry.name} beside its splats`);
+  scene.cover(entry);
   const look = button("Show beside the splats", () => open(), { hidden: true });
   const preview = h("div", { hidden: true }, scene.element, h("div", { class: "row" }, scene.full));
   let [surface, collider] = [null, null];

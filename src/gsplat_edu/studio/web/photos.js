@@ -1,5 +1,6 @@
 // The screen of photos without poses: previews, and the first step, which finds the poses.
 
+import { checks } from "./checks.js";
 import { attempt, errorLine, h, heading, patch, put, want } from "./dom.js";
 import { gallery, unplaced } from "./gallery.js";
 import { intake } from "./intake.js";
@@ -18,6 +19,7 @@ export function photos(given) {
   return withEntry(given, (entry, stage) => {
     const head = entryHead(store, entry, "Photos");
     const pictures = gallery(entry.entry);
+    const seen = checks(entry.entry, (marks) => pictures.mark(marks));
     const line = errorLine();
     const job = jobPlace(store, entry.entry, ["sfm"], { main: true });
     const matcher = h(
@@ -84,13 +86,14 @@ export function photos(given) {
           job.element,
           next,
         ),
-        pictures.element,
+        h("div", {}, seen.element, pictures.element),
       ),
       later,
     );
     return {
       entry,
       take: add?.take,
+      close: () => seen.close(),
       update(now) {
         job.update();
         head.update(now);
@@ -98,6 +101,7 @@ export function photos(given) {
           () => (later.hidden = false),
           (error) => put(line, error.message),
         );
+        if (now.photos) seen.read(now);
         form.hidden = Boolean(job.view?.active);
         const made = store.madeBy(job.view);
         if (made) {

@@ -8,6 +8,7 @@ import { frame } from "./frame.js";
 // region(drawn) is called after the box was saved or removed inside.
 export function places(entry, left, region) {
   const scene = frame(`cameras of ${entry.name}`);
+  scene.cover(entry);
   const hint =
     "Click a camera to see its photo and to leave it out. Draw a box to say what a training learns. After an examination, colours show what was found about each photo.";
   const element = h(

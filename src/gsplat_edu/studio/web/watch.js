@@ -43,7 +43,13 @@ export function look({ place, store, entry }) {
   const scene = frame(`scene ${entry.name}`);
   const page = edited(store, entry);
   place.append(scene.element, h("div", { class: "row" }, scene.full), page.element);
-  return { close: () => scene.close(), update: (now) => scene.show(page.address(now)) };
+  return {
+    close: () => scene.close(),
+    update(now) {
+      scene.cover(now);
+      scene.show(page.address(now));
+    },
+  };
 }
 
 export function watch({ place, store, entry }) {
@@ -143,6 +149,7 @@ export function watch({ place, store, entry }) {
       }
       const waits = waitsFor(view);
       page.element.hidden = active;
+      scene.cover(now.finished && !active ? now : captureOf());
       if (active && view.job.state !== "queued" && now.files) scene.show(at(entry.entry, "live", "page"), waits);
       else if (active) scene.show(null, waits);
       else if (now.files) scene.show(page.address(now));

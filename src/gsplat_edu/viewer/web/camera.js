@@ -27,26 +27,30 @@ export function turned(vector, axis, angle) {
 // Most that a wide window enlarges the image beyond fitting it: at most a fifth of its height is cropped.
 const MOST_CROPPED = 1.25;
 
+// Most that a narrow window shows above and below the image, in the image's height: at most a third of the window is what
+// other photos show. More would be mostly what no photo shows.
+const MOST_BEYOND = 1.5;
+
 // Width of a narrow window and height of a wide one, in those of the subject that has to be in view.
 const ROOM = 1.1;
 
 // Least part of a window's height below the panel; in a lower window, the panel lies over the picture.
 const LEAST_FREE = 0.2;
 
-// Fits a camera to a window of another shape, of which a panel covers `covered` px at the top. A narrow window is filled
-// and the sides are cropped, since no camera saw anything above and below the image, but as much as `subject` (left, top,
-// right, bottom in px of the image) stays in view. A wide window shows some more at the sides and crops a little of the
+// Fits a camera to a window of another shape, of which a panel covers `covered` px at the top. A narrow window shows the
+// whole width if it then shows at most `MOST_BEYOND` times the height; otherwise the sides are cropped, but as much as
+// `subject` (left, top, right, bottom in px of the image) stays in view. A wide window shows some more at the sides and crops a little of the
 // height, but not the subject. The centre of the image, or of the subject, is in the middle of the part without a panel.
 export function fitted(camera, width, height, covered = 0) {
   const { subject, ...rest } = camera;
   const free = height - covered < LEAST_FREE * height ? height : height - covered;
   const [across, down] = [width / camera.W, free / camera.H];
-  let scale = across > down ? Math.min(across, MOST_CROPPED * down) : down;
+  let scale = across > down ? Math.min(across, MOST_CROPPED * down) : Math.max(across, down / MOST_BEYOND);
   let [x, y] = [0.5 * camera.W, 0.5 * camera.H];
   if (subject) {
     const [left, top, right, bottom] = subject;
     if (across < down) {
-      scale = Math.min(down, Math.max(across, width / (ROOM * (right - left))));
+      scale = Math.min(scale, Math.max(across, width / (ROOM * (right - left))));
       x = within(0.5 * (left + right), camera.W, width / scale);
     } else scale = Math.min(scale, Math.max(down, free / (ROOM * (bottom - top))));
     y = within(0.5 * (top + bottom), camera.H, free / scale);

@@ -1,8 +1,11 @@
 // What the pages of scenes and of captures share: elements, the message, lists, and shader programs.
 
-import { keepPresses, patch } from "./patch.js";
+import { keepPresses, patch, want } from "./patch.js";
 
 export const element = (id) => document.getElementById(id);
+
+// An icon, for patch(), by the address of its symbol in the page, such as "#icon-close".
+export const icon = (href) => want("svg", { class: "icon", "aria-hidden": "true" }, want("use", { href }));
 
 export function say(text) {
   element("message").textContent = text;

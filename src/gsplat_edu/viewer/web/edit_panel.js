@@ -1,7 +1,7 @@
 // The editor's panel: tools, their options, the list of operations.
 
 import { plus } from "./camera.js";
-import { element, refill } from "./common.js";
+import { element, icon, refill } from "./common.js";
 import { EditFloaters, FLOATERS_PANEL } from "./edit_floaters.js";
 import { FRONT_ROW } from "./edit_front.js";
 import { numberFields } from "./edit_gizmo_panel.js";
@@ -404,15 +404,17 @@ export class EditPanel {
   list() {
     const { history, editor } = { history: this.editor.history, editor: this.editor };
     const views = history.views();
-    const button = (text, label, onclick, more = {}) =>
-      want("button", { "aria-label": label || null, ...more, onclick }, text);
+    const button = (shown, label, onclick, more = {}) =>
+      want("button", { "aria-label": label || null, ...more, onclick }, shown);
     const row = (...parts) => want("li", {}, ...parts);
     const names = [...views.named.keys()];
     const rows = [...views.named.values()].map((view) =>
       row(
         button(view.text ? `${view.name} · tour` : view.name, `go to ${view.name}`, () => this.show(view)),
         ...editor.tour.buttons(view.name, names, button),
-        button("×", `remove ${view.name}`, () => editor.perform({ op: "remove_view", name: view.name })),
+        button(icon("#icon-close"), `remove ${view.name}`, () =>
+          editor.perform({ op: "remove_view", name: view.name }),
+        ),
       ),
     );
     if (views.start) rows.unshift(row(button("start", "go to the start view", () => editor.goTo(views.start))));

@@ -1,6 +1,6 @@
 // The order of the named views, and the guided tour as a visitor of the exported page walks through it.
 
-import { element } from "./common.js";
+import { element, icon } from "./common.js";
 import { Guide } from "./guide.js";
 import { readKeyframe } from "./keyframes.js";
 
@@ -45,11 +45,11 @@ export class EditTour {
   buttons(name, names, button) {
     const at = names.indexOf(name);
     return [
-      ["↑", "earlier", -1],
-      ["↓", "later", 1],
-    ].map(([sign, when, by]) => {
+      ["#icon-up", "earlier", -1],
+      ["#icon-down", "later", 1],
+    ].map(([href, when, by]) => {
       const more = { "data-order": `${when} ${name}`, "aria-disabled": String(names[at + by] === undefined) };
-      return button(sign, `${name} ${when}`, () => this.move(names, at, by, when), more);
+      return button(icon(href), `${name} ${when}`, () => this.move(names, at, by, when), more);
     });
   }
 

@@ -1,7 +1,7 @@
 // The camera path of the page: views that the user saves, or the path that came with the page.
 
 import { plus, radians, transposed } from "./camera.js";
-import { element, refill } from "./common.js";
+import { element, icon, refill } from "./common.js";
 import { want } from "./patch.js";
 import { PathCurve } from "./path.js";
 import { appended, grown } from "./path_edits.js";
@@ -106,14 +106,14 @@ export class Keyframes {
     element("path").querySelector("summary").textContent = `Camera path (${keyframes.length})`;
     element("loop").checked = loop;
     for (const name of ["play", "download-path"]) element(name).disabled = !this.playable;
-    const button = (text, label, onclick) => want("button", { "aria-label": label, onclick }, text);
+    const button = (shown, label, onclick) => want("button", { "aria-label": label, onclick }, shown);
     const items = keyframes.map((keyframe, i) => {
       const goTo = () => this.actions.goToView(this.camera(keyframe));
       return want(
         "li",
         {},
         button(`view ${i + 1}`, `go to view ${i + 1}`, goTo),
-        !keyframe.given && button("×", `remove view ${i + 1}`, () => this.remove(i)),
+        !keyframe.given && button(icon("#icon-close"), `remove view ${i + 1}`, () => this.remove(i)),
       );
     });
     refill(element("path").querySelector("ol"), items, element("save-view"));

@@ -1,6 +1,7 @@
 // The page of a scene whose splats it contains.
 
-import { startPage } from "./common.js";
+import { fitted } from "./camera.js";
+import { element, startPage } from "./common.js";
 import { FACTS } from "./facts.js";
 import { Headset } from "./headset.js";
 import { unpackSplats } from "./scene.js";
@@ -10,7 +11,21 @@ import { tellUnpacked, Visitor } from "./visitor.js";
 // page.html?ui=0 is the picture alone, for a page that embeds it.
 if (new URLSearchParams(location.search).get("ui") === "0") document.documentElement.classList.add("bare");
 
+// Shows the poster, a picture of the start view, where the first picture will have it.
+function placePoster({ start: { camera }, border, settings }) {
+  const poster = element("poster");
+  if (!poster) return;
+  const { fx, cx, cy } = fitted(camera, innerWidth, innerHeight);
+  const scale = fx / camera.fx;
+  const px = { left: cx - scale * (camera.cx + 0.5), top: cy - scale * (camera.cy + 0.5) }; // but for half a pixel
+  Object.assign(px, { wide: scale * camera.W, high: scale * camera.H });
+  for (const [name, value] of Object.entries(px)) poster.style.setProperty(`--${name}`, `${value.toFixed(1)}px`);
+  const around = (border || settings.background).map((level) => Math.round(255 * level));
+  poster.parentElement.style.background = `rgb(${around})`;
+}
+
 startPage(async () => {
+  placePoster(FACTS);
   const splats = await unpackSplats(FACTS, tellUnpacked);
   const viewer = new Viewer(FACTS, splats);
   await showScene(viewer, splats);

@@ -1,0 +1,46 @@
+"""In Chromium, photos that are not placed yet: how many there are, how many are usual, and which are blurred."""
+
+import re
+
+import cv2
+import numpy as np
+
+from gsplat_edu.doctor.files import USUAL
+from studio.pages import go
+
+BLURRED = "photo_04.jpg"
+
+
+def photographs(folder, count):
+    """Write photos of one wall from places side by side; the fifth is out of focus."""
+    wall = np.random.default_rng(3).integers(0, 255, (75, 150, 3), dtype=np.uint8)
+    wall = cv2.resize(wall, (1500, 750), interpolation=cv2.INTER_NEAREST)
+    folder.mkdir(parents=True)
+    for i in range(count):
+        photo = wall[:600, 20 * i : 20 * i + 800]
+        name = f"photo_{i:02d}.jpg"
+        cv2.imwrite(str(folder / name), cv2.GaussianBlur(photo, (0, 0), 8) if name == BLURRED else photo)
+
+
+def test_the_screen_of_photos_says_how_many_are_usual_and_which_are_blurred(visitor, library):
+    photographs(library[0].library.root / "photos" / "wall", 14)
+    tab = go(visitor().tab, "photos/wall")
+    said = tab.get_by_role("status").filter(has_text="are usual")
+    said.wait_for()
+    assert said.inner_text().startswith(f"14 photos; {USUAL[0]} to {USUAL[1]} are usual. How well")
+    (finding,) = tab.locator(".findings li").all_inner_texts()
+    assert re.match(r"1 of 14 photos show less detail .*first photo_04\.jpg", finding, re.DOTALL)
+    assert tab.locator(".thumbs .mark:not(:empty)").all_inner_texts() == ["blurred"]
+
+
+def test_few_photos_that_are_sharp(visitor, library):
+    photographs(library[0].library.root / "photos" / "few", 4)
+    tab = go(visitor().tab, "photos/few")
+    tab.get_by_role("status").filter(has_text="None is blurred").wait_for()
+    (finding,) = tab.locator(".findings li").all_inner_texts()
+    assert "4 photos are few: the scene between them is guessed.\n\nTake more photos: at least 12" in finding
+
+
+def test_the_usual_number_is_that_of_the_tour(request):
+    tour = (request.config.rootpath / "docs" / "TOUR.md").read_text("utf-8")
+    assert f"{USUAL[0]} to {USUAL[1]} photos are a good start" in tour
