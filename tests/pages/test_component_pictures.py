@@ -69,6 +69,8 @@ def tab(browser, gallery):
     opened.goto(gallery)
     face = f"@font-face {{ font-family: bars; src: url(data:font/ttf;base64,{bars()}); }}"
     opened.add_style_tag(content=face + ":root { --font: bars; --mono: bars; font-synthesis: none; }")
+    # the arrow of a list, and how much of the text it covers, differ between versions of Chromium
+    opened.add_style_tag(content="select { appearance: none; }")
     opened.evaluate("document.fonts.load('16px bars')")
     resize(opened, WIDTH, 900)
     yield opened
