@@ -2,8 +2,8 @@
 
 About 40 pairs of photos are matched without poses. Under each reading of the poses (`gsplat_edu.data.conventions`), the
 ray of a match should lie on an arc of the other photo: the image of all points along the other ray, from infinity to
-the other camera. The error of a match is the mean angle to these arcs, times the focal length. Unlike the distance from a
-whole epipolar line, it also sees which way a camera moved.
+the other camera. The error of a match is the mean angle to these arcs, times the focal length. Unlike the distance from
+a whole epipolar line, it also sees which way a camera moved.
 """
 
 from __future__ import annotations
