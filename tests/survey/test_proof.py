@@ -155,7 +155,9 @@ def test_a_right_capture_is_not_doubted(captures, capture):
 
 
 UNSEEN = pytest.mark.xfail(
-    reason="moves rays by 0.2 px, less than `BETTER` times what is left: told as an agreement", strict=True
+    reason="moves rays by 0.2 px, less than `BETTER` times what is left: told as an agreement",
+    raises=AssertionError,
+    strict=True,
 )
 
 CASES = [

@@ -199,7 +199,7 @@ def _matched(photos: Sequence[Frame], pairs: Sequence[tuple[int, int]]) -> list[
         return [pair for pair in pool.map(matched, pairs) if pair is not None]
 
 
-def _errors(photos: Sequence[Frame], pairs: Sequence[_Pair]) -> list[Float64[np.ndarray, " m"]]:
+def _errors(photos: Sequence[Frame], pairs: Sequence[_Pair]) -> list[Float64[np.ndarray, "..."]]:
     """Return the error of each match of each pair, px of the photos as their lenses give them."""
     found = []
     for pair in pairs:
@@ -247,7 +247,7 @@ def _angles(a: Float64[np.ndarray, "m 3"], b: Float64[np.ndarray, "m 3"]) -> Flo
 
 
 def _judged(
-    photos: Sequence[Frame], pairs: Sequence[_Pair], errors: dict[str, list[Float64[np.ndarray, " m"]]]
+    photos: Sequence[Frame], pairs: Sequence[_Pair], errors: dict[str, list[Float64[np.ndarray, "..."]]]
 ) -> Proof:
     medians = {name: float(np.median(np.concatenate(of_pairs))) for name, of_pairs in errors.items()}
     by_pair = {name: np.array([np.median(e) for e in of_pairs]) for name, of_pairs in errors.items()}
