@@ -1,0 +1,199 @@
+"""The usual mistakes in the conventions of poses and lenses, each with the reading that undoes it.
+
+C is a frame's camera-to-world rotation as read, and e its centre. World axes are not among the mistakes: turning the
+whole world (y or z up) changes no photo, so that no photo can tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsplat_edu.base.validation import one_of
+from gsplat_edu.data.capture import Capture, Frame
+from gsplat_edu.data.lens import PINHOLE_LIKE, Lens
+from gsplat_edu.data.lens_formulas import FORMULAS
+from gsplat_edu.data.panorama import FaceLens
+
+Rotation = Float64[np.ndarray, "3 3"]
+Vector = Float64[np.ndarray, "3"]
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+"""OpenCV's camera axes in OpenGL's, and the reverse."""
+
+HALF_TURNS = {
+    "the cameras' y and z axes point the other way (OpenGL's axes)": OPENGL,
+    "the cameras' x and y axes point the other way (PyTorch3D's axes)": np.diag([-1.0, -1.0, 1.0]),
+    "the cameras' x and z axes point the other way": np.diag([-1.0, 1.0, -1.0]),
+}
+"""Camera axes that are taken for others, by what the photos say about them."""
+
+SCALES = (2.0, 4.0, 8.0)
+"""Factors between photos and smaller copies of them."""
+
+HALF_PIXEL = 0.5
+"""Difference between the two conventions for the first pixel's centre, px."""
+
+Change = Callable[[Frame], Frame]
+"""Makes a frame as read into the frame that was meant."""
+
+
+def _posed(pose: Callable[[Rotation, Vector], tuple[Rotation, Vector]], frame: Frame) -> Frame:
+    """Change a frame's pose by a function of C and e; a panorama's faces change with the panorama."""
+    face = frame.lens.R if isinstance(frame.lens, FaceLens) else np.eye(3)
+    C, e = pose((face.T @ frame.R).T, frame.eye)
+    return replace(frame, R=face @ C.T, eye=e)
+
+
+def _lens(change: Callable[[Lens], Lens], frame: Frame) -> Frame:
+    return replace(frame, lens=change(frame.lens))
+
+
+def _poses() -> Iterator[tuple[str, Change]]:
+    """Yield the mistakes in poses. Where axes of files may differ too, a mistake has several readings."""
+    for name, turn in HALF_TURNS.items():
+        yield name, partial(_posed, lambda C, e, turn=turn: (C @ turn, e))
+    sides = [(a, b) for a in (np.eye(3), OPENGL) for b in (np.eye(3), OPENGL)]
+    inverse = "the matrices are inverted (world-to-camera and camera-to-world are exchanged)"
+    for a, b in sides:
+        yield inverse, partial(_posed, lambda C, e, a=a, b=b: (a @ C.T @ b, -a @ C.T @ e))
+    transposed = "the rotations are transposed"
+    for a, b in sides:
+        yield transposed, partial(_posed, lambda C, e, a=a, b=b: (a @ C.T @ b, e))
+    for a, b in sides:
+        yield transposed, partial(_posed, lambda C, e, a=a, b=b: (a @ C.T @ b, a @ C.T @ b @ C.T @ e))
+    exchanged = "centres and translations of the cameras are exchanged"
+    yield exchanged, partial(_posed, lambda C, e: (C, -C.T @ e))
+    yield exchanged, partial(_posed, lambda C, e: (C, -C @ e))
+    yield exchanged, partial(_posed, lambda C, e: (C, -C @ OPENGL @ e))
+
+
+def _scaled_focal(scale: float, lens: Lens) -> Lens:
+    return replace(lens, fx=lens.fx * scale, fy=lens.fy * scale)
+
+
+def _other_size(scale: float, lens: Lens) -> Lens:
+    """Scale all intrinsics, about the corner of the first pixel."""
+    cx, cy = scale * (lens.cx + 0.5) - 0.5, scale * (lens.cy + 0.5) - 0.5
+    return replace(lens, fx=lens.fx * scale, fy=lens.fy * scale, cx=cx, cy=cy)
+
+
+def _sides_exchanged(wide: bool, lens: Lens) -> Lens:
+    ratio = lens.W / lens.H
+    return _scaled_focal(ratio if wide else 1.0 / ratio, lens)
+
+
+def _shifted(by: float, lens: Lens) -> Lens:
+    return replace(lens, cx=lens.cx + by, cy=lens.cy + by)
+
+
+def _reordered(order: Sequence[str], signs: Sequence[float], lens: Lens) -> Lens:
+    """Take each of the first coefficients from the place of another one."""
+    names = FORMULAS[lens.model].names
+    padded = (*lens.coefficients, *[0.0] * (len(names) - len(lens.coefficients)))
+    moved = [sign * padded[names.index(name)] for name, sign in zip(order, signs, strict=True)]
+    return replace(lens, coefficients=(*moved, *padded[len(order) :]))
+
+
+def _negated(lens: Lens) -> Lens:
+    return replace(lens, coefficients=tuple(-c for c in lens.coefficients))
+
+
+def _without_distortion(lens: Lens) -> Lens:
+    return replace(lens, coefficients=(), model=PINHOLE_LIKE)
+
+
+def _lenses() -> Iterator[tuple[str, Callable[[Lens], Lens]]]:
+    """Yield the mistakes in lenses."""
+    for scale in SCALES:
+        for factor in (scale, 1.0 / scale):
+            much = f"{scale:g} times too {'short' if factor > 1 else 'long'}"
+            yield f"the focal length is {much}", partial(_scaled_focal, factor)
+            size = f"photos {scale:g} times {'smaller' if factor > 1 else 'larger'}"
+            yield f"focal length and principal point are those of {size}", partial(_other_size, factor)
+    yield "the focal length refers to the photo's height, not its width", partial(_sides_exchanged, True)
+    yield "the focal length refers to the photo's width, not its height", partial(_sides_exchanged, False)
+    yield (
+        "column and row of the principal point are exchanged",
+        lambda lens: replace(lens, cx=lens.cy, cy=lens.cx),
+    )
+    for by in (HALF_PIXEL, -HALF_PIXEL):
+        end = "low" if by > 0 else "high"
+        yield f"the principal point is half a pixel too {end}", partial(_shifted, by)
+    yield "the distortion has the opposite sign", _negated
+    yield "the photos are undistorted already", _without_distortion
+
+
+def _orders() -> Iterator[tuple[str, Callable[[Lens], Lens]]]:
+    """Yield the mistakes in the coefficients of a perspective lens."""
+    radial = ("k1", "k2", "p1", "p2")
+    yield "k1 and k2 are exchanged", partial(_reordered, ("k2", "k1", "p1", "p2"), (1, 1, 1, 1))
+    yield "p1 and p2 are exchanged", partial(_reordered, ("k1", "k2", "p2", "p1"), (1, 1, 1, 1))
+    yield "k1 and k2 have the opposite sign", partial(_reordered, radial, (-1, -1, 1, 1))
+    yield "p1 and p2 have the opposite sign", partial(_reordered, radial, (1, 1, -1, -1))
+    yield (
+        "k3 is in the place of p1, and p1 and p2 follow it",
+        partial(_reordered, ("k1", "k2", "p2", "k3", "p1"), (1, 1, 1, 1, 1)),
+    )
+
+
+POSES: tuple[tuple[str, Change], ...] = tuple(_poses())
+LENSES: tuple[tuple[str, Change], ...] = tuple((name, partial(_lens, change)) for name, change in _lenses())
+ORDERS: tuple[tuple[str, Change], ...] = tuple((name, partial(_lens, change)) for name, change in _orders())
+ALL: tuple[tuple[str, Change], ...] = (*POSES, *LENSES, *ORDERS)
+
+
+def _keys() -> tuple[str, ...]:
+    """Number the readings of one mistake, so that each has a name of its own in config.json."""
+    names = [name for name, _ in ALL]
+    counts = [names[:at].count(name) for at, name in enumerate(names)]
+    return tuple(
+        name if not count else f"{name} #{count + 1}" for name, count in zip(names, counts, strict=True)
+    )
+
+
+READINGS: dict[str, Change] = dict(zip(_keys(), (change for _, change in ALL), strict=True))
+"""All readings by name; those of one mistake that undo it in different files end in #2, #3 and so on."""
+
+
+def mistake(reading: str) -> str:
+    """Return what the photos say is wrong, for a name in `READINGS`."""
+    return reading.partition(" #")[0]
+
+
+def readings_for(frames: Sequence[Frame]) -> tuple[str, ...]:
+    """Return the names of the readings that make sense for frames.
+
+    A panorama has no lens to misread. A rolling shutter's motion is given along the pose, so that another pose would
+    need another motion: poses of such photos are compared as they are.
+
+    Args:
+        frames: At least one.
+    """
+    found = [] if any(frame.shutter is not None for frame in frames) else [name for name, _ in POSES]
+    lenses = [frame.lens for frame in frames]
+    if not any(isinstance(lens, FaceLens) for lens in lenses):
+        found += [name for name, _ in LENSES]
+        if all(lens.model == PINHOLE_LIKE for lens in lenses) and any(lens.distorts for lens in lenses):
+            found += [name for name, _ in ORDERS]
+    wanted = set(found)
+    return tuple(name for name in READINGS if mistake(name) in wanted)
+
+
+def read_as(capture: Capture, reading: str) -> Capture:
+    """Return a capture whose frames are read in another way.
+
+    Args:
+        capture: The capture as its format says.
+        reading: A name in `READINGS`.
+
+    Raises:
+        ArgumentError: there is no such reading.
+    """
+    one_of("reading", reading, tuple(READINGS))
+    change = READINGS[reading]
+    return replace(capture, frames=tuple(map(change, capture.frames)))
