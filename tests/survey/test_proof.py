@@ -12,8 +12,6 @@ from gsplat_edu.data.conventions import mistake
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.scene.views import View
-from gsplat_edu.survey import proof
-from gsplat_edu.survey.matching import features_of, matches_of
 from gsplat_edu.survey.proof import Verdict, prove
 from lab.captures.room import room_capture
 from lab.captures.textured_box import box_orbit, photograph_box
@@ -62,28 +60,6 @@ def captures(tmp_path_factory):
     edit(top / "distorted", lambda frame: {**frame, "camera_model": "OPENCV", **DISTORTION})
     write_transforms(top / "room", room_capture(WIDTH, HEIGHT, 24)[0])
     return top
-
-
-@pytest.fixture(scope="module", autouse=True)
-def seen_once(captures):
-    """Detect and match the features of a photo once: all copies of a capture have the same photos."""
-    known = {}
-
-    def remembered(function, key):
-        def answer(*given):
-            at = key(*given)
-            if at not in known:
-                known[at] = function(*given)
-            return known[at]
-
-        return answer
-
-    with pytest.MonkeyPatch.context() as patch:
-        of_photo = remembered(proof.features_of, lambda frame: (frame.image.read_bytes(), frame.lens.W))
-        patch.setattr(proof, "features_of", of_photo)
-        of_pair = remembered(proof.matches_of, lambda one, other, lenses: (id(one), id(other), lenses))
-        patch.setattr(proof, "matches_of", of_pair)
-        yield
 
 
 def edit(folder, change):
@@ -241,13 +217,10 @@ def test_blank_photos_prove_nothing(captures, tmp_path):
     assert str(found) == "The poses were not checked: too few matches between photos"
 
 
-def test_the_result_does_not_depend_on_the_number_of_threads(captures, monkeypatch):
+def test_the_result_does_not_depend_on_the_number_of_threads(captures):
     proofs = []
-    for workers in (1, 2):
-        monkeypatch.setattr(proof, "WORKERS", workers)
-        cv2.setNumThreads(workers)
-        monkeypatch.setattr(proof, "features_of", features_of)
-        monkeypatch.setattr(proof, "matches_of", matches_of)
+    for threads in (1, 2):
+        cv2.setNumThreads(threads)
         proofs.append(prove(CaptureReader(captures / "cropped")))
     cv2.setNumThreads(-1)
     assert proofs[0] == proofs[1]

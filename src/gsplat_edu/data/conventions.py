@@ -53,23 +53,48 @@ def _lens(change: Callable[[Lens], Lens], frame: Frame) -> Frame:
     return replace(frame, lens=change(frame.lens))
 
 
+def _turned(turn: Rotation, C: Rotation, e: Vector) -> tuple[Rotation, Vector]:
+    return C @ turn, e
+
+
+def _inverted(a: Rotation, b: Rotation, C: Rotation, e: Vector) -> tuple[Rotation, Vector]:
+    return a @ C.T @ b, -a @ C.T @ e
+
+
+def _transposed(a: Rotation, b: Rotation, C: Rotation, e: Vector) -> tuple[Rotation, Vector]:
+    return a @ C.T @ b, e
+
+
+def _transposed_about(a: Rotation, b: Rotation, C: Rotation, e: Vector) -> tuple[Rotation, Vector]:
+    """Transpose rotations of files whose translations were computed from them."""
+    R = a @ C.T @ b
+    return R, R @ C.T @ e
+
+
+def _translated(C: Rotation, e: Vector) -> tuple[Rotation, Vector]:
+    return C, -C.T @ e
+
+
+def _centred(turn: Rotation, C: Rotation, e: Vector) -> tuple[Rotation, Vector]:
+    return C, -C @ turn @ e
+
+
 def _poses() -> Iterator[tuple[str, Change]]:
     """Yield the mistakes in poses. Where axes of files may differ too, a mistake has several readings."""
     for name, turn in HALF_TURNS.items():
-        yield name, partial(_posed, lambda C, e, turn=turn: (C @ turn, e))
+        yield name, partial(_posed, partial(_turned, turn))
     sides = [(a, b) for a in (np.eye(3), OPENGL) for b in (np.eye(3), OPENGL)]
-    inverse = "the matrices are inverted (world-to-camera and camera-to-world are exchanged)"
-    for a, b in sides:
-        yield inverse, partial(_posed, lambda C, e, a=a, b=b: (a @ C.T @ b, -a @ C.T @ e))
-    transposed = "the rotations are transposed"
-    for a, b in sides:
-        yield transposed, partial(_posed, lambda C, e, a=a, b=b: (a @ C.T @ b, e))
-    for a, b in sides:
-        yield transposed, partial(_posed, lambda C, e, a=a, b=b: (a @ C.T @ b, a @ C.T @ b @ C.T @ e))
+    for name, pose in (
+        ("the matrices are inverted (world-to-camera and camera-to-world are exchanged)", _inverted),
+        ("the rotations are transposed", _transposed),
+        ("the rotations are transposed", _transposed_about),
+    ):
+        for a, b in sides:
+            yield name, partial(_posed, partial(pose, a, b))
     exchanged = "centres and translations of the cameras are exchanged"
-    yield exchanged, partial(_posed, lambda C, e: (C, -C.T @ e))
-    yield exchanged, partial(_posed, lambda C, e: (C, -C @ e))
-    yield exchanged, partial(_posed, lambda C, e: (C, -C @ OPENGL @ e))
+    yield exchanged, partial(_posed, _translated)
+    yield exchanged, partial(_posed, partial(_centred, np.eye(3)))
+    yield exchanged, partial(_posed, partial(_centred, OPENGL))
 
 
 def _scaled_focal(scale: float, lens: Lens) -> Lens:

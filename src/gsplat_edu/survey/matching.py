@@ -90,10 +90,10 @@ def features_of(frame: Frame) -> Features:
         counts &= resized_mask(alpha >= 128, h, w)
     if frame.mask is not None:
         counts &= resized_mask(decode_mask(frame.mask), h, w)
-    detector = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=CONTRAST)
+    detector = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=CONTRAST)
     found, descriptors = detector.detectAndCompute(grey, counts.astype(np.uint8) * 255)
     at = np.array([point.pt for point in found], np.float64).reshape(-1, 2)
-    if descriptors is None:
+    if not found:
         return Features(at, np.zeros((0, 128), np.float32))
     at, first = np.unique(at, axis=0, return_index=True)  # a place with two directions gives two features
     scale = np.array([frame.lens.W / w, frame.lens.H / h])
@@ -113,7 +113,7 @@ def rays_through(lens: Lens, at: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarr
         return np.stack([np.sin(across) * np.cos(down), np.sin(down), np.cos(across) * np.cos(down)], axis=1)
     wanted = np.stack([(at[:, 0] - lens.cx) / lens.fx, (at[:, 1] - lens.cy) / lens.fy])
     rays = np.stack([*_inverted(lens, wanted), np.ones(len(at))], axis=1)
-    return rays / np.sqrt(np.sum(rays * rays, axis=1, keepdims=True))
+    return np.asarray(rays / np.sqrt(np.sum(rays * rays, axis=1, keepdims=True)))
 
 
 def _inverted(lens: Lens, wanted: Float64[np.ndarray, "2 n"]) -> Float64[np.ndarray, "2 n"]:
@@ -131,12 +131,13 @@ def _inverted(lens: Lens, wanted: Float64[np.ndarray, "2 n"]) -> Float64[np.ndar
     q = wanted.copy()
     with np.errstate(all="ignore"):
         for _ in range(STEPS):
-            error = wanted - np.stack(formula.image(*slopes(q), coefficients))
+            x, y = slopes(q)
+            error = wanted - np.stack(formula.image(x, y, coefficients))
             q = q + error
             if np.nanmax(np.abs(error), initial=0.0) < CONVERGED:
                 break
         good = (np.hypot(*error) * max(lens.fx, lens.fy) < SOLVED) & (np.hypot(*q) < 1.5 if wide else True)
-        return np.where(good, slopes(q), np.nan)
+        return np.asarray(np.where(good, slopes(q), np.nan))
 
 
 def matches_of(

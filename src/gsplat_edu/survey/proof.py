@@ -223,7 +223,7 @@ def _to_arcs(
         rays: This camera's rays.
         centre: (3,) the other camera's centre, in this camera's axes; any length.
     """
-    ends = np.minimum(_angles(far, rays), np.pi)
+    ends: Float64[np.ndarray, " m"] = np.minimum(_angles(far, rays), np.pi)
     length = float(np.linalg.norm(centre))
     if length < 1e-12:
         return ends
@@ -238,7 +238,7 @@ def _to_arcs(
         np.sum(np.cross(feet, e[None]) * normals, axis=1) >= 0
     )
     inside = between & (sizes > 1e-9)
-    return np.where(inside, np.arcsin(np.clip(np.abs(height), 0.0, 1.0)), ends)
+    return np.asarray(np.where(inside, np.arcsin(np.clip(np.abs(height), 0.0, 1.0)), ends))
 
 
 def _angles(a: Float64[np.ndarray, "m 3"], b: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " m"]:
