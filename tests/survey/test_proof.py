@@ -11,7 +11,9 @@ import pytest
 from gsplat_edu.data.conventions import mistake
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_transforms
+from gsplat_edu.doctor.before import examine
 from gsplat_edu.scene.views import View
+from gsplat_edu.survey.capture import prepare
 from gsplat_edu.survey.proof import Verdict, prove
 from lab.captures.room import room_capture
 from lab.captures.textured_box import box_orbit, photograph_box
@@ -206,6 +208,18 @@ def test_poses_of_other_photos_are_named(captures, tmp_path):
     found = prove(CaptureReader(tmp_path / "capture"))
     assert found.verdict is Verdict.DISAGREE
     assert "other photos or another lens" in str(found)
+
+
+def test_the_doctor_tells_what_the_photos_say(captures, tmp_path):
+    right = examine(prepare(CaptureReader(captures / "cropped")))
+    assert "agreement" in right.fine
+    assert any(line.startswith("The poses agree with the photos: 0.") for _, line in right.facts)
+    shutil.copytree(captures / "cropped", tmp_path / "capture")
+    edit(tmp_path / "capture", POSES["OpenCV axes"][0])
+    wrong = examine(prepare(CaptureReader(tmp_path / "capture")))
+    assert wrong.advice[0].startswith("export the poses again")
+    (said,) = (finding.sentence for finding in wrong.findings if finding.name == "misread poses")
+    assert "only if the cameras' y and z axes point the other way" in said
 
 
 def test_blank_photos_prove_nothing(captures, tmp_path):

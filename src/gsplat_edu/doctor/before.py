@@ -12,6 +12,7 @@ from gsplat_edu.base.text import Told, short_number
 from gsplat_edu.data.notes import Background, MissingPhotos, Note
 from gsplat_edu.doctor.appearance import check_blur, check_duplicates
 from gsplat_edu.doctor.cameras import (
+    check_agreement,
     check_away,
     check_coverage,
     check_intrinsics,
@@ -25,6 +26,7 @@ from gsplat_edu.doctor.diagnosis import Advice, Diagnosis, in_order, new_run
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
 from gsplat_edu.survey.capture import Survey
 from gsplat_edu.survey.finding import Finding, command
+from gsplat_edu.survey.proof import Verdict
 from gsplat_edu.train.part import parts
 
 Check = Callable[[Survey], list[Finding]]
@@ -49,6 +51,9 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
 )
 """Checks that compare views; they need at least two."""
 
+OF_PROOFS: tuple[tuple[str, Check], ...] = (("agreement", check_agreement),)
+"""Checks of what the photos say about the poses, if they say anything."""
+
 OF_LISTS: tuple[tuple[str, Check], ...] = (
     ("poses", check_poses),
     ("missing photos", check_missing),
@@ -64,7 +69,13 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
         options: The user's training options, as command-line words; the recommended command repeats them, and adds
             --resolution auto where the photos are much larger than the scene resolves.
     """
-    checks = [*OF_FILES, *(OF_VIEWS if len(survey.shots) > 1 else ()), *OF_LISTS]
+    proven = survey.proof is not None and survey.proof.verdict is not Verdict.UNCHECKED
+    checks = [
+        *OF_FILES,
+        *(OF_VIEWS if len(survey.shots) > 1 else ()),
+        *(OF_PROOFS if proven else ()),
+        *OF_LISTS,
+    ]
     by_parts = [found for part in parts().values() if (found := part.examine(survey)) is not None]
     findings, fine = in_order(
         [
@@ -91,6 +102,8 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
         facts.append(("cameras", _arrangement(survey)))
+    if survey.proof is not None and not check_agreement(survey):
+        facts.append(("", str(survey.proof)))
     return tuple(facts)
 
 

@@ -19,6 +19,7 @@ from gsplat_edu.scene.rig import FAR_AWAY, SAME_PLACE, far_ratios, settled_eyes,
 from gsplat_edu.survey.capture import Shot, Survey
 from gsplat_edu.survey.finding import FEWER_PHOTOS, MORE_PHOTOS, NAMED, Finding, Severity, command
 from gsplat_edu.survey.geometry import AWAY_FACTOR, INWARD, Geometry, facing_away, inside
+from gsplat_edu.survey.proof import Verdict
 from gsplat_edu.train.capacity import advised_side
 
 OFF_CENTRE = 0.1
@@ -209,6 +210,18 @@ def check_away(survey: Survey) -> list[Finding]:
             Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons, changes=(FEWER_PHOTOS,))
         )
     return found
+
+
+def check_agreement(survey: Survey) -> list[Finding]:
+    """Find poses that the photos contradict, as `gsplat_edu.survey.proof` compares them."""
+    proof = survey.proof
+    if proof is not None and proof.verdict is Verdict.MISREAD:
+        advice = "export the poses again with the other convention, or correct their file"
+        return [Finding("misread poses", Severity.WARNING, str(proof), advice)]
+    if proof is not None and proof.verdict is Verdict.DISAGREE:
+        advice = "give the poses of these photos, or find new ones: gsplat-edu sfm"
+        return [Finding("foreign poses", Severity.WARNING, str(proof), advice)]
+    return []
 
 
 def check_wrong_poses(survey: Survey) -> list[Finding]:

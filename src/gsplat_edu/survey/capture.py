@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +27,7 @@ from gsplat_edu.photos.decoding import PhotoHeaders, recorded_exposure
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.survey.geometry import Geometry
 from gsplat_edu.survey.photos import PhotoStats, measure_photo, unmeasured
+from gsplat_edu.survey.proof import Proof, prove
 from gsplat_edu.survey.support import observed_points
 
 WORKERS = 2
@@ -82,6 +83,7 @@ class Survey:
         notes: Notes of the capture's reader.
         observed: Number of points observed in each photo, by shot name; empty if unknown.
         depth: What was found about depth that the user has, or why it cannot be used; None if it was not read.
+        proof: What the photos say about the poses; None if they were not compared.
     """
 
     path: Path
@@ -93,6 +95,7 @@ class Survey:
     notes: tuple[Note, ...]
     observed: Mapping[str, int] = field(default_factory=dict)
     depth: DepthReport | DatasetError | None = None
+    proof: Proof | None = None
 
     @property
     def names(self) -> list[str]:
@@ -117,7 +120,7 @@ def prepare(
     Args:
         reader: The capture.
         progress: Called with (photos done, total) in the calling thread.
-        sharpness: Measure the photos' sharpness too, which takes most of the time.
+        sharpness: Measure the photos' sharpness and compare them with the poses too, which takes most of the time.
         depth: Where depth comes from that is judged too; see `gsplat_edu.data.depths.DepthSource`.
         left_out: Photos that are not used; None uses the capture's own list.
 
@@ -142,7 +145,8 @@ def prepare(
     judged: DepthReport | DatasetError | None = None
     if depth is not None and shots:
         judged = _judged_depth(reader, [(shot.name, shot.camera) for shot in shots], depth)
-    return _survey(reader, shots, refused, left, judged)
+    survey = _survey(reader, shots, refused, left, judged)
+    return replace(survey, proof=prove(reader, left_out)) if sharpness and len(shots) > 1 else survey
 
 
 class Undecided:

@@ -11,6 +11,7 @@ CHECKS = (
         "parallax",
         "intrinsics",
         "sizes",
+        "agreement",
         "places",
         "viewing directions",
         "sharpness",
@@ -23,7 +24,8 @@ CHECKS = (
 """Names of the checks of a capture and of a run, the most harmful faults first; those of plug-ins come last."""
 
 CAUSES = (
-    *("usable", "no parallax", "unusable", "missing", "wrong poses", "intrinsics", "sizes"),
+    *("usable", "no parallax", "unusable", "missing", "misread poses", "foreign poses"),
+    *("wrong poses", "intrinsics", "sizes"),
     *("doubtful poses", "facing away", "splats", "same photo", "duplicates", "same pose", "white balance"),
     *RANKED,
     *("far points", "unseen points", "few points", "depth", "unexplained"),
@@ -35,6 +37,7 @@ contradict each other, that of the more serious finding counts, and of equally s
 order; those of plug-ins come last."""
 
 EXPLAINS = {
+    "misread poses": ("no parallax", "wrong poses", "facing away", "hole", "poor fit"),
     "wrong poses": ("facing away", "hole", "poor fit"),
     "unfinished": ("short training", "poor fit", "unexplained", "overfitted", "floaters"),
     "moving subject": ("unexplained", "overfitted", "moved", "floaters"),

@@ -94,7 +94,7 @@ class Proof:
             )
         if self.verdict is Verdict.MISREAD:
             found = f"{_px(self.corrected)} against {error}"
-            return f"The poses agree with the photos only if {mistake(self.reading)} ({found}): read so"
+            return f"The poses agree with the photos only if {mistake(self.reading)} ({found})"
         if self.verdict is Verdict.DISAGREE:
             count = f"{error} in {self.matches:,} matches of {self.pairs} pairs"
             return f"The poses do not agree with the photos ({count}): they are from other photos or another lens"
