@@ -253,6 +253,87 @@ def write_llff(folder: Path, cameras=CAMERAS):
     np.save(folder / "poses_bounds.npy", llff_rows(cameras))
 
 
+SFM_LENS = {
+    "type": "pinhole",
+    "distortionType": "brown",
+    "distortionParams": ["-0.1", "0.02", "-0.004", "0.003", "-0.002"],
+    "principalPoint": ["0.4", "-0.3"],
+    "sensorWidth": "36",
+    "focalLength": "30",
+    "pixelRatio": "1.05",
+}
+
+
+def write_meshroom(folder: Path, cameras=CAMERAS, lens=SFM_LENS, version="1 2 8"):
+    """All numbers are texts; Eigen stores the columns of the world-to-camera rotation one after the other."""
+    write_photos(folder)
+
+    def texts(values):
+        return [repr(float(v)) for v in values]
+
+    views = [
+        {
+            "viewId": f"{40 + i}",
+            "poseId": f"{40 + i}",
+            "intrinsicId": "7",
+            "path": f"/elsewhere/images/{name}",
+        }
+        for i, (name, _, _) in enumerate(cameras)
+    ]
+    poses = [
+        {
+            "poseId": f"{40 + i}",
+            "pose": {
+                "transform": {"rotation": texts(R.ravel(order="F")), "center": texts(eye)},
+                "locked": "0",
+            },
+        }
+        for i, (_, R, eye) in enumerate(cameras)
+    ]
+    intrinsic = {"intrinsicId": "7", "width": str(W), "height": str(H), "serialNumber": "", **lens}
+    contents = {
+        "version": version.split(),
+        "views": [*views, {"viewId": "1", "poseId": "1", "intrinsicId": "7", "path": "later.png"}],
+        "intrinsics": [intrinsic],
+        "poses": poses,
+        "structure": [
+            {"landmarkId": f"{i}", "color": ["255", "128", "0"], "X": texts(p)} for i, p in enumerate(POINTS)
+        ],
+    }
+    (folder / "cameras.sfm").write_text(json.dumps(contents, indent=4))
+
+
+OPF_LENS = {
+    "type": "perspective",
+    "principal_point_px": [12.4, 8.7],
+    "focal_length_px": 20.0,
+    "radial_distortion": [-0.1, 0.02, -0.004],
+    "tangential_distortion": [0.003, -0.002],
+}
+
+
+def write_opf(folder: Path, cameras=CAMERAS, lens=OPF_LENS):
+    """Angles of intrinsic turns about x, y and z, by SciPy."""
+    write_photos(folder)
+    rows = [
+        {
+            "id": 100 + i,
+            "sensor_id": 5,
+            "position": eye.tolist(),
+            "orientation_deg": Rotation.from_matrix((OPENGL @ R).T).as_euler("XYZ", degrees=True).tolist(),
+        }
+        for i, (_, R, eye) in enumerate(cameras)
+    ]
+    calibrated = {"format": "application/opf-calibrated-cameras+json", "version": "1.0"}
+    calibrated |= {"sensors": [{"id": 5, "internals": lens}], "cameras": rows}
+    (folder / "calibrated_cameras.json").write_text(json.dumps(calibrated))
+    uris = [
+        {"id": 100 + i, "uri": f"file:///c:/my%20photos/{name}"} for i, (name, _, _) in enumerate(cameras)
+    ]
+    listed = {"format": "application/opf-camera-list+json", "version": "1.0", "cameras": uris}
+    (folder / "camera_list.json").write_text(json.dumps(listed))
+
+
 WRITERS = {
     "OpenSfM": write_opensfm,
     "Bundler": write_bundler,
@@ -260,6 +341,8 @@ WRITERS = {
     "RealityCapture": write_table,
     "Metashape": write_metashape,
     "OpenMVG": write_openmvg,
+    "Meshroom": write_meshroom,
+    "Pix4D": write_opf,
     "LLFF": write_llff,
 }
 """A writer for each program: of a folder and, if they are not `CAMERAS`, its cameras."""

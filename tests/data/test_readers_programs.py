@@ -22,7 +22,7 @@ def test_the_layout_is_found_by_content(tmp_path, program, write):
     dataset = load_dataset(tmp_path)
     assert (dataset.layout, len(dataset.train) + len(dataset.test)) == (program, 6)
     for path in tmp_path.rglob("*"):
-        if path.is_file() and path.suffix not in (".png", ".txt"):
+        if path.is_file() and path.suffix != ".png":
             path.write_bytes(b"of another program")
     assert layout_of(tmp_path) is None
 
@@ -113,7 +113,7 @@ def test_a_colmap_model_comes_first(tmp_path, small):
 def test_photos_alone_are_no_capture_and_the_error_names_what_was_looked_for(tmp_path):
     write_opensfm(tmp_path)
     (tmp_path / "reconstruction.json").unlink()
-    programs = "OpenSfM, Metashape, RealityCapture, OpenMVG, Bundler, VisualSFM, LLFF"
+    programs = "OpenSfM, Metashape, RealityCapture, OpenMVG, Meshroom, Pix4D, Bundler, VisualSFM, LLFF"
     said = f"holds photos but no camera poses; .* poses of {programs}"
     with pytest.raises(DatasetError, match=said):
         read_capture(tmp_path)

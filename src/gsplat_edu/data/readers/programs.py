@@ -22,22 +22,24 @@ from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import MissingPhotos, OtherPoses, PosesOf
 from gsplat_edu.data.readers.bundler import BUNDLER
 from gsplat_edu.data.readers.llff import LLFF
+from gsplat_edu.data.readers.meshroom import MESHROOM
 from gsplat_edu.data.readers.metashape import METASHAPE
 from gsplat_edu.data.readers.nvm import VISUALSFM
 from gsplat_edu.data.readers.openmvg import OPENMVG
 from gsplat_edu.data.readers.opensfm import OPENSFM
+from gsplat_edu.data.readers.opf import OPF
 from gsplat_edu.data.readers.photo_names import PhotoNames
 from gsplat_edu.data.readers.pose_file import PoseProgram, Poses, head_of
 from gsplat_edu.data.readers.realitycapture import TABLE, XMP
 from gsplat_edu.data.scale import read_scale
 
-PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, BUNDLER, VISUALSFM, LLFF)
+PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, MESHROOM, OPF, BUNDLER, VISUALSFM, LLFF)
 """In the order in which they are preferred, if their files have equally many photos."""
 
-PLACES = (".", "images", "opensfm")
+PLACES = (".", "images", "opensfm", "opf")
 """Folders of a capture that are searched for pose files."""
 
-SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy")
+SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy", ".sfm")
 """Suffixes of pose files, in lower case; other files are not opened."""
 
 
