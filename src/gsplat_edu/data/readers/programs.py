@@ -29,18 +29,28 @@ from gsplat_edu.data.readers.openmvg import OPENMVG
 from gsplat_edu.data.readers.opensfm import OPENSFM
 from gsplat_edu.data.readers.opf import OPF
 from gsplat_edu.data.readers.photo_names import PhotoNames
+from gsplat_edu.data.readers.polycam import POLYCAM
 from gsplat_edu.data.readers.pose_file import PoseProgram, Poses, head_of
 from gsplat_edu.data.readers.realitycapture import TABLE, XMP
+from gsplat_edu.data.readers.record3d import RECORD3D
+from gsplat_edu.data.readers.rgbd import SCANNET, SEVEN_SCENES
+from gsplat_edu.data.readers.tum import TUM
 from gsplat_edu.data.scale import read_scale
 
-PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, MESHROOM, OPF, BUNDLER, VISUALSFM, LLFF)
+PROGRAMS = (
+    *(OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, MESHROOM, OPF, BUNDLER, VISUALSFM, LLFF),
+    *(POLYCAM, RECORD3D, SEVEN_SCENES, SCANNET, TUM),
+)
 """In the order in which they are preferred, if their files have equally many photos."""
 
-PLACES = (".", "images", "opensfm", "opf")
+PLACES = (
+    *(".", "images", "opensfm", "opf", "pose", "EXR_RGBD"),
+    *("keyframes/corrected_cameras", "keyframes/cameras"),
+)
 """Folders of a capture that are searched for pose files."""
 
-SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy", ".sfm")
-"""Suffixes of pose files, in lower case; other files are not opened."""
+SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy", ".sfm", ".txt", ".r3d", "")
+"""Suffixes of pose files, in lower case; other files are not opened. Record3D's metadata has none."""
 
 
 class Found(NamedTuple):
