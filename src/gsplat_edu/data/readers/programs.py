@@ -8,9 +8,11 @@ from typing import NamedTuple
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import (
+    POSE_PLACES,
     Capture,
     Frame,
     Problem,
+    capture_folder,
     checked_frame,
     entries,
     faces_of,
@@ -43,10 +45,7 @@ PROGRAMS = (
 )
 """In the order in which they are preferred, if their files have equally many photos."""
 
-PLACES = (
-    *(".", "images", "opensfm", "opf", "pose", "EXR_RGBD"),
-    *("keyframes/corrected_cameras", "keyframes/cameras"),
-)
+PLACES = (".", "images", *POSE_PLACES)
 """Folders of a capture that are searched for pose files."""
 
 SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy", ".sfm", ".txt", ".r3d", "")
@@ -97,7 +96,7 @@ def read_poses(path: Path, files: list[Found]) -> Capture:
     Raises:
         DatasetError: no file can be used; the message is that of the first.
     """
-    folder = path if is_folder(path) else path.parent
+    folder = capture_folder(path)
     photos = PhotoNames(folder)
     captures, errors = list[tuple[int, Found, Capture]](), list[tuple[Found, DatasetError]]()
     for each in files:
