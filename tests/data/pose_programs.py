@@ -35,14 +35,17 @@ def rays(R, eye):
     return seen[:, 0] / seen[:, 2], seen[:, 1] / seen[:, 2]
 
 
-def assert_reads(folder: Path, program: str, seen, count: int = len(CAMERAS)):
-    """Check poses, and the positions in the photos, which `seen` returns for two arrays of rays; return the capture."""
+def assert_reads(folder: Path, program: str, seen, count: int = len(CAMERAS), called=str):
+    """Check poses, and the positions in the photos, which `seen` returns for two arrays of rays; return the capture.
+
+    `called` returns the name in the capture of a photo of `CAMERAS`.
+    """
     capture = read_capture(folder)
     assert capture.layout == program and len(capture.frames) == count
     assert str(capture.notes[0]) == f"poses of {program}: {count} of {count} photos"
     frames = {frame.name: frame for frame in capture.frames}
     for name, R, eye in CAMERAS[:count]:
-        frame = frames[name]
+        frame = frames[called(name)]
         np.testing.assert_allclose(frame.R, R, rtol=0, atol=1e-9)
         np.testing.assert_allclose(frame.eye, eye, rtol=0, atol=1e-9)
         x, y = rays(frame.R, frame.eye)
@@ -253,6 +256,183 @@ def write_llff(folder: Path, cameras=CAMERAS):
     np.save(folder / "poses_bounds.npy", llff_rows(cameras))
 
 
+SFM_LENS = {
+    "type": "pinhole",
+    "distortionType": "brown",
+    "distortionParams": ["-0.1", "0.02", "-0.004", "0.003", "-0.002"],
+    "principalPoint": ["0.4", "-0.3"],
+    "sensorWidth": "36",
+    "focalLength": "30",
+    "pixelRatio": "1.05",
+}
+
+
+def write_meshroom(folder: Path, cameras=CAMERAS, lens=SFM_LENS, version="1 2 8"):
+    """All numbers are texts; Eigen stores the columns of the world-to-camera rotation one after the other."""
+    write_photos(folder)
+
+    def texts(values):
+        return [repr(float(v)) for v in values]
+
+    views = [
+        {
+            "viewId": f"{40 + i}",
+            "poseId": f"{40 + i}",
+            "intrinsicId": "7",
+            "path": f"/elsewhere/images/{name}",
+        }
+        for i, (name, _, _) in enumerate(cameras)
+    ]
+    poses = [
+        {
+            "poseId": f"{40 + i}",
+            "pose": {
+                "transform": {"rotation": texts(R.ravel(order="F")), "center": texts(eye)},
+                "locked": "0",
+            },
+        }
+        for i, (_, R, eye) in enumerate(cameras)
+    ]
+    intrinsic = {"intrinsicId": "7", "width": str(W), "height": str(H), "serialNumber": "", **lens}
+    contents = {
+        "version": version.split(),
+        "views": [*views, {"viewId": "1", "poseId": "1", "intrinsicId": "7", "path": "later.png"}],
+        "intrinsics": [intrinsic],
+        "poses": poses,
+        "structure": [
+            {"landmarkId": f"{i}", "color": ["255", "128", "0"], "X": texts(p)} for i, p in enumerate(POINTS)
+        ],
+    }
+    (folder / "cameras.sfm").write_text(json.dumps(contents, indent=4))
+
+
+OPF_LENS = {
+    "type": "perspective",
+    "principal_point_px": [12.4, 8.7],
+    "focal_length_px": 20.0,
+    "radial_distortion": [-0.1, 0.02, -0.004],
+    "tangential_distortion": [0.003, -0.002],
+}
+
+
+def write_opf(folder: Path, cameras=CAMERAS, lens=OPF_LENS):
+    """Angles of intrinsic turns about x, y and z, by SciPy."""
+    write_photos(folder)
+    rows = [
+        {
+            "id": 100 + i,
+            "sensor_id": 5,
+            "position": eye.tolist(),
+            "orientation_deg": Rotation.from_matrix((OPENGL @ R).T).as_euler("XYZ", degrees=True).tolist(),
+        }
+        for i, (_, R, eye) in enumerate(cameras)
+    ]
+    calibrated = {"format": "application/opf-calibrated-cameras+json", "version": "1.0"}
+    calibrated |= {"sensors": [{"id": 5, "internals": lens}], "cameras": rows}
+    (folder / "calibrated_cameras.json").write_text(json.dumps(calibrated))
+    uris = [
+        {"id": 100 + i, "uri": f"file:///c:/my%20photos/{name}"} for i, (name, _, _) in enumerate(cameras)
+    ]
+    listed = {"format": "application/opf-camera-list+json", "version": "1.0", "cameras": uris}
+    (folder / "camera_list.json").write_text(json.dumps(listed))
+
+
+def camera_to_world(R, eye, axes):
+    """Return the 4x4 pose of a camera with these axes instead of OpenCV's."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = (axes @ R).T, eye
+    return pose
+
+
+def write_photo(path: Path, size=(W, H)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (60, 90, 120)).save(path)
+
+
+def write_rows(path: Path, rows) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(" ".join(map(repr, map(float, row))) + "\n" for row in rows))
+
+
+def polycam_name(name):
+    return f"keyframes/corrected_images/{name.replace('png', 'jpg')}"
+
+
+def write_polycam(folder: Path, cameras=CAMERAS, kind="corrected_"):
+    """Depth maps have the photos' names."""
+    for name, R, eye in cameras:
+        pose = camera_to_world(R, eye, OPENGL)
+        contents = {f"t_{i}{j}": pose[i, j] for i in range(3) for j in range(4)}
+        contents |= {
+            "fx": 20.0,
+            "fy": 21.0,
+            "cx": 12.4,
+            "cy": 8.7,
+            "width": W,
+            "height": H,
+            "blur_score": 9.0,
+        }
+        stem = name.removesuffix(".png")
+        write_photo(folder / f"keyframes/{kind}images/{stem}.jpg")
+        write_photo(folder / f"keyframes/depth/{stem}.png")
+        path = folder / f"keyframes/{kind}cameras/{stem}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(contents))
+
+
+def numbered(name):
+    return name.removeprefix("shot_").removesuffix(".png")
+
+
+def write_record3d(folder: Path, cameras=CAMERAS, photos="rgbd", metadata="metadata", **more):
+    poses = []
+    for name, R, eye in cameras:
+        q = Rotation.from_matrix(camera_to_world(R, eye, OPENGL)[:3, :3]).as_quat()
+        poses.append([*q.tolist(), *eye.tolist()])
+        write_photo(folder / photos / f"{numbered(name)}.jpg")
+    K = np.array([[20.0, 0, 12.4], [0, 21.0, 8.7], [0, 0, 1]])
+    contents = {"w": W, "h": H, "fps": 60, "K": K.ravel(order="F").tolist(), "poses": poses, **more}
+    (folder / metadata).write_text(json.dumps(contents))
+
+
+def write_seven_scenes(folder: Path, cameras=CAMERAS):
+    for name, R, eye in cameras:
+        stem = f"frame-{int(numbered(name)):06d}"
+        write_photo(folder / f"{stem}.color.png", (640, 480))
+        write_photo(folder / f"{stem}.depth.png", (640, 480))
+        write_rows(folder / f"{stem}.pose.txt", camera_to_world(R, eye, np.eye(3)))
+
+
+def write_scannet(folder: Path, cameras=CAMERAS):
+    K = np.diag([20.0, 21.0, 1.0, 1.0])
+    K[:2, 2] = 12.4, 8.7
+    write_rows(folder / "intrinsic/intrinsic_color.txt", K)
+    for name, R, eye in cameras:
+        write_photo(folder / f"color/{numbered(name)}.jpg")
+        write_photo(folder / f"depth/{numbered(name)}.png")
+        write_rows(folder / f"pose/{numbered(name)}.txt", camera_to_world(R, eye, np.eye(3)))
+
+
+def tum_time(name):
+    return 1305031102.1758 + 0.5 * int(numbered(name))
+
+
+def write_tum(folder: Path, cameras=CAMERAS, lens=(20.0, 21.0, 11.9, 8.2), rgb="rgb.txt"):
+    """Between the poses of the photos there are others; the photos are 4 ms late."""
+    rows = ["# timestamp tx ty tz qx qy qz qw"]
+    photos = ["# timestamp filename"]
+    for name, R, eye in cameras:
+        q = Rotation.from_matrix(R.T).as_quat()
+        write_photo(folder / "rgb" / f"{tum_time(name) + 0.004:.6f}.png")
+        photos.append(f"{tum_time(name) + 0.004:.6f} rgb/{tum_time(name) + 0.004:.6f}.png")
+        rows.append(" ".join(map(repr, map(float, (tum_time(name), *eye, *q)))))
+        rows.append(" ".join(map(repr, map(float, (tum_time(name) + 0.01, *(eye + 1), 0, 0, 0, 1)))))
+    (folder / "groundtruth.txt").write_text("\n".join(rows) + "\n")
+    (folder / "calibration.txt").write_text(" ".join(map(str, lens)) + "\n")
+    if rgb:
+        (folder / rgb).write_text("\n".join(photos) + "\n")
+
+
 WRITERS = {
     "OpenSfM": write_opensfm,
     "Bundler": write_bundler,
@@ -260,6 +440,13 @@ WRITERS = {
     "RealityCapture": write_table,
     "Metashape": write_metashape,
     "OpenMVG": write_openmvg,
+    "Meshroom": write_meshroom,
+    "Pix4D": write_opf,
     "LLFF": write_llff,
+    "Polycam": write_polycam,
+    "Record3D": write_record3d,
+    "7-Scenes": write_seven_scenes,
+    "ScanNet": write_scannet,
+    "TUM": write_tum,
 }
 """A writer for each program: of a folder and, if they are not `CAMERAS`, its cameras."""

@@ -129,6 +129,26 @@ def is_folder(path: Path) -> bool:
         return False
 
 
+POSE_PLACES = ("opensfm", "opf", "pose", "EXR_RGBD", "keyframes/corrected_cameras", "keyframes/cameras")
+"""Folders in a capture where programs write their poses."""
+
+
+def capture_folder(path: Path) -> Path:
+    """Return the folder of a capture that is given by its folder or by its file with poses.
+
+    Args:
+        path: The folder, or a file in it or in one of `POSE_PLACES`; transforms.json and Blender's are in it.
+    """
+    if is_folder(path):
+        return path
+    folder = path.parent.absolute()
+    for place in () if path.name.startswith("transforms") else POSE_PLACES:
+        depth = place.count("/")
+        if folder.as_posix().endswith(f"/{place}"):
+            return folder.parents[depth]
+    return path.parent
+
+
 class Listings:
     """Names in the photo folders, each folder listed once.
 

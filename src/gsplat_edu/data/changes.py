@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.locks import locked
-from gsplat_edu.data.capture import is_folder
+from gsplat_edu.data.capture import capture_folder
 
 CHANGES = ".changes.lock"
 """Name of the lock file. It differs from that of `gsplat-edu sfm`, which writes to a capture for hours."""
@@ -36,7 +36,7 @@ def changing(capture: Path, say: Callable[[str], None] = lambda sentence: None) 
     if not capture.exists():
         yield
         return
-    folder = capture if is_folder(capture) else capture.parent
+    folder = capture_folder(capture)
     turn = _turns.setdefault(folder.resolve(), threading.Lock())
     if not turn.acquire(timeout=PATIENCE):
         raise DatasetError(f"{folder}: is being changed by another thread; try again")

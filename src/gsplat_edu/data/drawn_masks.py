@@ -28,7 +28,7 @@ from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.base.links import is_inside
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.base.text import legible
-from gsplat_edu.data.capture import PHOTO_FOLDERS, is_file, is_folder
+from gsplat_edu.data.capture import PHOTO_FOLDERS, capture_folder, is_file
 from gsplat_edu.data.changes import changing
 from gsplat_edu.data.left_out import photo_named, photo_path
 from gsplat_edu.data.mask_shapes import MOST_SHAPES, Shape, checked_shape, covered, shape_document, short_text
@@ -104,7 +104,7 @@ def read_drawings(capture: Path) -> dict[str, Drawing]:
     Raises:
         DatasetError: drawn_masks.json is damaged or cannot be read.
     """
-    path = _folder(capture) / DRAWN
+    path = capture_folder(capture) / DRAWN
     if not is_file(path):
         return {}
     try:
@@ -166,7 +166,7 @@ class _Target:
     """The mask of a photo, and what was drawn on it."""
 
     def __init__(self, capture: Path, photo: str) -> None:
-        self.capture, self.folder = capture, _folder(capture)
+        self.capture, self.folder = capture, capture_folder(capture)
         reader = CaptureReader(capture)
         frames = oriented(reader.capture.frames, reader.headers)
         self.photo = photo_named(capture, frames, photo)
@@ -294,10 +294,6 @@ class _Target:
             self.drawing, self.drawings = drawing, {**self.drawings, self.photo: drawing}
             self.undo()
             raise DatasetError(f"{legible(self.photo)}: no mask can be added; {reason}")
-
-
-def _folder(capture: Path) -> Path:
-    return capture if is_folder(capture) else capture.parent
 
 
 def _digest(data: bytes) -> str:

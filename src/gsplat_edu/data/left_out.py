@@ -14,7 +14,7 @@ from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.records import Record, Text, record_of
 from gsplat_edu.base.text import legible
-from gsplat_edu.data.capture import Frame, is_file, is_folder
+from gsplat_edu.data.capture import Frame, capture_folder, is_file
 from gsplat_edu.data.changes import changing
 from gsplat_edu.data.notes import UnusablePhotos
 
@@ -153,7 +153,7 @@ def photo_path(frame: Frame, capture: Path) -> str:
         frame: The frame.
         capture: The capture's folder, or its transforms.json.
     """
-    folder = capture if is_folder(capture) else capture.parent
+    folder = capture_folder(capture)
     return (frame.image.relative_to(folder) if frame.image.is_relative_to(folder) else frame.image).as_posix()
 
 
@@ -185,7 +185,7 @@ def _found(photo: str, paths: dict[str, str], capture: Path) -> str:
 
 
 def _list_of(capture: Path) -> Path:
-    return (capture if is_folder(capture) else capture.parent) / LEFT_OUT
+    return capture_folder(capture) / LEFT_OUT
 
 
 class WithoutPose(Record, frozen=True, forbid_unknown_fields=False):

@@ -18,7 +18,7 @@ from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import open_file, parse_json
 from gsplat_edu.base.records import Number, Record, record_of
-from gsplat_edu.data.capture import is_file, is_folder
+from gsplat_edu.data.capture import capture_folder, is_file
 from gsplat_edu.scene.region import Region
 
 REGION = "region.json"
@@ -132,4 +132,4 @@ def write_region(capture: Path, region: Region | None) -> None:
 
 
 def _file_of(capture: Path) -> Path:
-    return (capture if is_folder(capture) else capture.parent) / REGION
+    return capture_folder(capture) / REGION

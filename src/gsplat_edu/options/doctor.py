@@ -8,6 +8,7 @@ from pathlib import Path
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.options.depth import add_depth, check_depth
+from gsplat_edu.options.poses import add_poses, posed_by
 from gsplat_edu.options.values import add_backend, number_text, whole_number_text
 from gsplat_edu.train.length import DEFAULT_QUALITY
 
@@ -23,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "path", type=Path, metavar="PATH", help="capture (before training) or run folder (after it)"
     )
     before = parser.add_argument_group("before training")
+    add_poses(before)
     before.add_argument(
         "--no-forecast", action="store_true", help="skip the forecast of training time and memory"
     )
@@ -51,11 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace) -> None:
-    """Check the numbers and the depth.
+    """Check the numbers, the depth and the file with poses, which then stands for its capture.
 
     Raises:
-        ArgumentError: a number is out of range, or the folder of depth does not exist.
+        ArgumentError: a number is out of range, the folder of depth does not exist, or a file is no file with poses.
     """
+    arguments.path = posed_by(arguments.path, arguments.poses)
     DataSettings(resolution=arguments.resolution)
     if arguments.iterations is not None:
         whole_number("--iterations", arguments.iterations, 1)

@@ -21,6 +21,7 @@ from gsplat_edu.options.asked import (
 )
 from gsplat_edu.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.options.length import length_of, strategy_of
+from gsplat_edu.options.poses import add_poses, posed_by
 from gsplat_edu.options.settings import (
     add_setting,
     add_settings,
@@ -137,6 +138,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also train on photos whose poses are certainly wrong (default: leave them out and say so)",
     )
+    add_poses(photos)
     add_panorama(photos)
     add_scale(photos)
     _add_results(parser.add_argument_group("results"))
@@ -317,6 +319,7 @@ def check(arguments: argparse.Namespace) -> None:
         raise DatasetError(
             f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"
         )
+    arguments.data = posed_by(arguments.data, arguments.poses)
     check_asked(arguments)
     check_several(arguments)
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):

@@ -13,8 +13,11 @@ from gsplat_edu.data.masks import MASKS
 DEEPEST = 3
 """Folders within folders that are searched for photos."""
 
-NOT_SEARCHED = {MASKS, *PHOTO_FOLDERS[1:]}
+NOT_SEARCHED = {MASKS, "depth", "confidence", *PHOTO_FOLDERS[1:]}
 """Folders whose images are not the capture's photos in full size."""
+
+DEPTH = ".depth.png"
+"""End of the name of a depth map that lies beside its photo, as in 7-Scenes."""
 
 
 class PhotoNames:
@@ -69,6 +72,8 @@ class PhotoNames:
     def _collect(self, place: Path, prefix: str, depth: int) -> None:
         for path in entries(place):
             name = f"{prefix}{path.name}"
+            if path.name.lower().endswith(DEPTH):
+                continue
             if path.suffix.lower() in PHOTO_ENDINGS and is_file(path):
                 self.paths[name] = path
             elif depth and path.name[0] != "." and path.name not in NOT_SEARCHED and is_folder(path):

@@ -210,6 +210,29 @@ def numbers_of(where: str, text: str | None, count: int | None = None) -> Float6
     return values
 
 
+def quaternion(where: str, values: Sequence[float]) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation of a quaternion.
+
+    Args:
+        where: File and place, for messages.
+        values: x, y, z, w, of any length above 0.
+
+    Raises:
+        DatasetError: its length is 0.
+    """
+    length = float(np.linalg.norm(values))
+    if not 0 < length < np.inf:
+        raise DatasetError(f"{where}: its quaternion has the length {length:g}; {AGAIN}")
+    x, y, z, w = (value / length for value in values)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def sized(
     values: Mapping[str, float], size: tuple[int, int] | None, model: str = PINHOLE_LIKE
 ) -> Callable[[Path], Lens]:

@@ -8,9 +8,11 @@ from typing import NamedTuple
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import (
+    POSE_PLACES,
     Capture,
     Frame,
     Problem,
+    capture_folder,
     checked_frame,
     entries,
     faces_of,
@@ -22,23 +24,32 @@ from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import MissingPhotos, OtherPoses, PosesOf
 from gsplat_edu.data.readers.bundler import BUNDLER
 from gsplat_edu.data.readers.llff import LLFF
+from gsplat_edu.data.readers.meshroom import MESHROOM
 from gsplat_edu.data.readers.metashape import METASHAPE
 from gsplat_edu.data.readers.nvm import VISUALSFM
 from gsplat_edu.data.readers.openmvg import OPENMVG
 from gsplat_edu.data.readers.opensfm import OPENSFM
+from gsplat_edu.data.readers.opf import OPF
 from gsplat_edu.data.readers.photo_names import PhotoNames
+from gsplat_edu.data.readers.polycam import POLYCAM
 from gsplat_edu.data.readers.pose_file import PoseProgram, Poses, head_of
 from gsplat_edu.data.readers.realitycapture import TABLE, XMP
+from gsplat_edu.data.readers.record3d import RECORD3D
+from gsplat_edu.data.readers.rgbd import SCANNET, SEVEN_SCENES
+from gsplat_edu.data.readers.tum import TUM
 from gsplat_edu.data.scale import read_scale
 
-PROGRAMS = (OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, BUNDLER, VISUALSFM, LLFF)
+PROGRAMS = (
+    *(OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, MESHROOM, OPF, BUNDLER, VISUALSFM, LLFF),
+    *(POLYCAM, RECORD3D, SEVEN_SCENES, SCANNET, TUM),
+)
 """In the order in which they are preferred, if their files have equally many photos."""
 
-PLACES = (".", "images", "opensfm")
+PLACES = (".", "images", *POSE_PLACES)
 """Folders of a capture that are searched for pose files."""
 
-SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy")
-"""Suffixes of pose files, in lower case; other files are not opened."""
+SUFFIXES = (".json", ".xml", ".csv", ".xmp", ".out", ".nvm", ".npy", ".sfm", ".txt", ".r3d", "")
+"""Suffixes of pose files, in lower case; other files are not opened. Record3D's metadata has none."""
 
 
 class Found(NamedTuple):
@@ -85,7 +96,7 @@ def read_poses(path: Path, files: list[Found]) -> Capture:
     Raises:
         DatasetError: no file can be used; the message is that of the first.
     """
-    folder = path if is_folder(path) else path.parent
+    folder = capture_folder(path)
     photos = PhotoNames(folder)
     captures, errors = list[tuple[int, Found, Capture]](), list[tuple[Found, DatasetError]]()
     for each in files:

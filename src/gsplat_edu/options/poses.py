@@ -1,0 +1,51 @@
+"""The option `--poses`: the file of a capture whose poses are read."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.data.capture import capture_folder, is_file
+from gsplat_edu.data.reader import layout_of
+
+
+def add_poses(group: argparse._ActionsContainer) -> None:
+    """Add the option.
+
+    Args:
+        group: Receives it.
+    """
+    group.add_argument(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="read the poses of this file in the capture's folder, such as cameras.xml (default: a COLMAP model or"
+        " transforms.json, else the file that poses the most photos)",
+    )
+
+
+def posed_by(capture: Path | None, poses: Path | None) -> Path | None:
+    """Return what is read: the file with poses, if one is given, or else the capture.
+
+    Args:
+        capture: The capture's folder.
+        poses: The value of the option: a path, or one relative to the capture; None if it is not given.
+
+    Raises:
+        ArgumentError: it is no file with poses, or not in the capture's folder.
+    """
+    if poses is None:
+        return capture
+    if capture is None:
+        raise ArgumentError("--poses: needs the folder of a capture; give it, too")
+    path = next((each for each in (capture / poses, poses) if is_file(each)), None)
+    if path is None:
+        raise ArgumentError(f"--poses: {poses} is no file in {capture}; correct the name")
+    if layout_of(path) is None:
+        raise ArgumentError(
+            f"--poses: {path} has no poses of a known program; see docs/howto/other-programs-poses.md"
+        )
+    if capture_folder(path).resolve() != capture.resolve():
+        raise ArgumentError(f"--poses: {path} does not belong to {capture}; put it into that folder")
+    return path

@@ -1,0 +1,57 @@
+"""Pix4D's calibrated_cameras.json: poses, lenses, its list of photos and damage."""
+
+import json
+
+import pytest
+
+from data.pose_programs import OPF_LENS, assert_reads, write_opf
+from data.test_readers_openmvg import brown
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.data.reader import read_capture
+
+
+def seen(x, y):
+    a, b = brown(x, y, *OPF_LENS["radial_distortion"], *OPF_LENS["tangential_distortion"])
+    return 20 * a + 12.4, 20 * b + 8.7
+
+
+@pytest.mark.parametrize("folder", ["", "opf"])
+def test_poses_and_lenses(tmp_path, folder):
+    write_opf(tmp_path)
+    (tmp_path / folder).mkdir(exist_ok=True)
+    for path in tmp_path.glob("*.json"):
+        path.rename(tmp_path / folder / path.name)
+    assert_reads(tmp_path, "Pix4D", seen)
+
+
+def test_the_list_of_photos_is_asked_for(tmp_path):
+    write_opf(tmp_path)
+    (tmp_path / "camera_list.json").unlink()
+    with pytest.raises(DatasetError, match=r"lacks its list of photos; put camera_list\.json beside it"):
+        read_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda c: c.pop("cameras"), "lacks 'cameras'"),
+        (lambda c: c["cameras"].clear(), "has no calibrated camera"),
+        (lambda c: c["cameras"][0].update(id=9), "camera 9 is not in the camera list"),
+        (lambda c: c["cameras"][0].pop("position"), "lacks 'position'"),
+        (lambda c: c["cameras"][0].update(orientation_deg=[1, 2]), "has to have 3 entries"),
+        (lambda c: c["sensors"].clear(), "its sensor is not in the file"),
+        (
+            lambda c: c["sensors"][0]["internals"].update(type="fisheye"),
+            "the lens 'fisheye' has no model here",
+        ),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(tmp_path, change, says):
+    write_opf(tmp_path)
+    path = tmp_path / "calibrated_cameras.json"
+    contents = json.loads(path.read_text())
+    change(contents)
+    path.write_text(json.dumps(contents))
+    with pytest.raises(DatasetError, match=says) as caught:
+        read_capture(tmp_path)
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
