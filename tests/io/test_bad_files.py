@@ -25,7 +25,8 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
     # the format has no header, so a cut between two splats leaves a valid scene
     odd = 7 if suffix == ".splat" else 0
     for end in range(0, len(data), 64):
-        if end + odd < len(data) and end + odd > 0:
+        at_row = suffix == ".csv" and data[:end].endswith(b"\n")  # a table of fewer rows, without a count
+        if end + odd < len(data) and end + odd > 0 and not at_row:
             path.write_bytes(data[: end + odd])
             refused(path)
 

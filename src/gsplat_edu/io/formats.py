@@ -53,6 +53,7 @@ FORMATS: tuple[Format, ...] = (
     Format(".spz", "gsplat_edu.io.spz", "Niantic SPZ"),
     Format(".sog", "gsplat_edu.io.sog.codec", "PlayCanvas SOG"),
     Format(".glb", "gsplat_edu.io.glb", "glTF with KHR_gaussian_splatting"),
+    Format(".csv", "gsplat_edu.io.csv", "CSV of splats", metadata=False),
     *plugins("formats").values(),
 )
 """The first matching suffix wins; those of plug-ins come last."""

@@ -124,7 +124,7 @@ def save_ply(
 def _write(path: Path, gaussians: Gaussians, extra: list[str]) -> None:
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
-    names = [*MEANS, "nx", "ny", "nz", *SH0, *_rest_names(3 * tensors["sh_rest"].shape[1])]
+    names = [*MEANS, "nx", "ny", "nz", *SH0, *rest_names(3 * tensors["sh_rest"].shape[1])]
     names += [*OPACITY, *SCALES, *QUATS]
     header = ["ply", "format binary_little_endian 1.0", *extra, f"element vertex {count}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
@@ -132,11 +132,11 @@ def _write(path: Path, gaussians: Gaussians, extra: list[str]) -> None:
         file.write("\n".join(header).encode("ascii"))
         for start in range(0, count, BLOCK):
             rows = {name: values[start : start + BLOCK] for name, values in tensors.items()}
-            file.write(_table(rows).data)
+            file.write(rows_of(rows).data)
 
 
-def _table(tensors: Mapping[str, Float[np.ndarray, "N ..."]]) -> Float32[np.ndarray, "N P"]:
-    """Return the rows of the file for some Gaussians."""
+def rows_of(tensors: Mapping[str, Float[np.ndarray, "N ..."]]) -> Float32[np.ndarray, "N P"]:
+    """Return the columns of the file, normals included, of some Gaussians by the names of their tensors."""
     columns = (
         tensors["means"],
         np.zeros((len(tensors["means"]), 3)),  # normals
@@ -158,10 +158,10 @@ def _load(path: Path, finite: bool, origin: Vector | None) -> tuple[Gaussians, V
     """Return the Gaussians and their origin: that of a comment, or else the one that the positions need."""
     with open_file(path) as file:
         header = read_elements(path, file)
-        vertex = _splat_vertex(path, header.elements)
+        vertex = splat_vertex(path, header.elements)
         rest = sum(name.startswith("f_rest_") for name in vertex.names)
         filters = tuple(name for name in FILTERS if name in vertex.names)
-        groups = (MEANS, SH0, _rest_names(rest), OPACITY, SCALES, QUATS, filters)
+        groups = (MEANS, SH0, rest_names(rest), OPACITY, SCALES, QUATS, filters)
         columns = [name for group in groups for name in group]
         found, start, spoiled = None, 0, _Spoiled(path, columns)
         kinds = dict(vertex.properties)
@@ -235,11 +235,12 @@ def _floats(table: np.ndarray, columns: list[str]) -> Float32[np.ndarray, "N P"]
         return structured_to_unstructured(table[columns], dtype=np.float32)
 
 
-def _rest_names(count: int) -> tuple[str, ...]:
+def rest_names(count: int) -> tuple[str, ...]:
+    """Return the names of a number of f_rest properties."""
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
+def splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
     """Return the element `vertex` if it has all properties of a splat."""
     by_name = {element.name: element for element in elements}
     vertex = by_name.get("vertex")
@@ -262,7 +263,7 @@ def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
             advice = "give a scene PLY"
         raise SceneFormatError(f"{path}: is {kind}: lacks {', '.join(missing)}; {advice}")
     rest = [name for name in vertex.names if name.startswith("f_rest_")]
-    if len(rest) not in SH_REST_COUNTS or set(rest) != set(_rest_names(len(rest))):
+    if len(rest) not in SH_REST_COUNTS or set(rest) != set(rest_names(len(rest))):
         counts = ", ".join(str(count) for count in SH_REST_COUNTS)
         raise SceneFormatError(
             f"{path}: has {len(rest)} properties f_rest_*, but SH degrees 0-3 have {counts}, counted from 0"
