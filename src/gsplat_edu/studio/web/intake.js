@@ -60,7 +60,8 @@ async function sorted(files, wanted) {
   for (const { file, path } of files) {
     if (IGNORED.test(path)) continue;
     const inFolder = path.includes("/");
-    const single = !inFolder && (/\.zip$/i.test(path) || SCENES.test(path));
+    const isTable = /\.csv$/i.test(path) && files.length > 1; // the poses of the photos beside it, not a scene
+    const single = !inFolder && (/\.zip$/i.test(path) || (SCENES.test(path) && !isTable));
     const top = inFolder ? path.slice(0, path.indexOf("/")) : single ? path : "";
     const rest = inFolder ? path.slice(top.length + 1) : path;
     if (!groups.has(top)) groups.set(top, { top, single, files: [] });
