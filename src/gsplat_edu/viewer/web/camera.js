@@ -39,8 +39,9 @@ const LEAST_FREE = 0.2;
 
 // Fits a camera to a window of another shape, of which a panel covers `covered` px at the top. A narrow window shows the
 // whole width if it then shows at most `MOST_BEYOND` times the height; otherwise the sides are cropped, but as much as
-// `subject` (left, top, right, bottom in px of the image) stays in view. A wide window shows some more at the sides and crops a little of the
-// height, but not the subject. The centre of the image, or of the subject, is in the middle of the part without a panel.
+// `subject` (left, top, right, bottom in px of the image) stays in view. A wide window shows some more at the sides and
+// crops a little of the height, but not the subject. The centre of the image, or of the subject, is in the middle of the
+// part without a panel.
 export function fitted(camera, width, height, covered = 0) {
   const { subject, ...rest } = camera;
   const free = height - covered < LEAST_FREE * height ? height : height - covered;
