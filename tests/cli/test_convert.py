@@ -47,7 +47,8 @@ def test_every_format_is_written_and_verified_from_the_runs_cameras(convert, tmp
     folder, *_ = make_run(tmp_path / "run")
     out = tmp_path / f"new/out{suffix}"
     said = convert(folder.path, out, "--verify")
-    assert f"wrote {out}: 30 splats, SH degree {0 if suffix == '.splat' else 3}" in said
+    kept = {".splat": 0, ".ksplat": 2}.get(suffix, 3)
+    assert f"wrote {out}: 30 splats, SH degree {kept}" in said
     figures = re.search(r"PSNR ([\d.]+) dB over 5 views, worst ([\d.]+) \((.*)\.jpg\); ([\d,]+) bytes", said)
     assert int(figures[4].replace(",", "")) == out.stat().st_size
 
@@ -179,7 +180,10 @@ def test_a_page_carries_a_mesh_that_moves_with_the_scene(convert, tmp_path):
     ("words", "says"),
     [
         (["gone.ply", "out.ply"], "gone.ply: does not exist"),
-        (["IN", "out.obj"], "known are .compressed.ply, .ply, .splat, .spz, .sog, .glb, .html"),
+        (
+            ["IN", "out.obj"],
+            "known are .compressed.ply, .ply, .splat, .ksplat, .spz, .sog, .glb, .csv, .html",
+        ),
         (["IN", "."], "unknown scene format"),
         (["IN", "IN/out.ply"], "is a file; give a folder"),
         (["IN", "out.ply", "--crop", "1,2,3"], "is not 6 numbers"),

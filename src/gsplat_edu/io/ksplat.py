@@ -208,9 +208,10 @@ def read(path: Path) -> Scene:
         for bound, default in zip(header["sh_range"], (-SH_BOUND, SH_BOUND), strict=True)
     )
     degree = max(int(section.header["sh"]) for section in sections)
-    parts = [
-        _tensors(path, stored, section, int(header["level"]), (low, high), degree) for section in sections
-    ]
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are named
+        parts = [
+            _tensors(path, stored, section, int(header["level"]), (low, high), degree) for section in sections
+        ]
     return Scene(Gaussians(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]}))
 
 

@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.data.capture import capture_folder, is_file
-from gsplat_edu.data.reader import layout_of
 
 
 def add_poses(group: argparse._ActionsContainer) -> None:
@@ -37,6 +35,9 @@ def posed_by(capture: Path | None, poses: Path | None) -> Path | None:
     """
     if poses is None:
         return capture
+    from gsplat_edu.data.capture import capture_folder, is_file
+    from gsplat_edu.data.reader import layout_of
+
     if capture is None:
         raise ArgumentError("--poses: needs the folder of a capture; give it, too")
     path = next((each for each in (capture / poses, poses) if is_file(each)), None)
