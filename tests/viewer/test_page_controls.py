@@ -210,7 +210,8 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
         shown = seen.camera()
         u, v, _ = shown.project(shown.world_to_cam(inner))
         assert u.min() > 0 and u.max() < 390 and v.min() > 0 and v.max() < 844, "the whole ball is in view"
-        assert u.max() - u.min() > 0.5 * 390, "the ball fills the window"
+        # beside it, as much of the wall as fits: the window shows half more than the photo's height
+        assert u.max() - u.min() > 0.4 * 390, "the ball fills the window"
         assert abs(u.max() + u.min() - 390) < 0.2 * 390, "the ball is in the middle"
         assert abs(v.max() + v.min() - 844) < 0.1 * 844
 

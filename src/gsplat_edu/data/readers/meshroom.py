@@ -54,7 +54,7 @@ COEFFICIENTS: dict[str, tuple[str, ...]] = {
 UNDISTORT = "export undistorted photos with ExportImages"
 
 
-class View(Foreign, frozen=True, rename="camel"):
+class ViewRecord(Foreign, frozen=True, rename="camel"):
     """A photo."""
 
     path: Text
@@ -111,7 +111,7 @@ class Sfm(Foreign, frozen=True, rename="camel"):
     """The file."""
 
     version: list[Value]
-    views: list[View]
+    views: list[ViewRecord]
     intrinsics: list[Intrinsic] = []  # noqa: RUF012 - msgspec copies the default
     poses: list[Pose] = []  # noqa: RUF012
     structure: list[Landmark] = []  # noqa: RUF012

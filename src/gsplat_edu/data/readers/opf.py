@@ -57,7 +57,7 @@ class Sensor(Foreign, frozen=True):
     internals: Internals
 
 
-class Camera(Foreign, frozen=True):
+class CalibratedCamera(Foreign, frozen=True):
     """A pose."""
 
     id: int
@@ -70,7 +70,7 @@ class Calibrated(Foreign, frozen=True):
     """The file with poses."""
 
     sensors: list[Sensor]
-    cameras: list[Camera]
+    cameras: list[CalibratedCamera]
 
 
 class Listed(Foreign, frozen=True):

@@ -22,7 +22,7 @@ IMAGES = {"corrected_cameras": "corrected_images", "cameras": "images"}
 """Folder of the photos of each folder of cameras."""
 
 
-class Camera(Foreign, frozen=True):
+class KeyframeEntry(Foreign, frozen=True):
     """A pose and a lens."""
 
     fx: Number
@@ -61,7 +61,7 @@ def read(path: Path) -> Poses:
 
 
 def _shot(path: Path) -> Shot:
-    camera: Camera = json_of(path, Camera)
+    camera: KeyframeEntry = json_of(path, KeyframeEntry)
     pose = np.array([[getattr(camera, f"t_{row}{column}") for column in range(4)] for row in range(3)])
     W, H = camera.width, camera.height
     values = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - W / 2, "cy": camera.cy - H / 2}
