@@ -213,7 +213,8 @@ def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, 
         # beside it, as much of the wall as fits: the window shows half more than the photo's height
         assert u.max() - u.min() > 0.4 * 390, "the ball fills the window"
         assert abs(u.max() + u.min() - 390) < 0.2 * 390, "the ball is in the middle"
-        assert abs(v.max() + v.min() - 844) < 0.1 * 844
+        # the whole height of the photo is in view, so that its middle is the window's, and the ball is a little above
+        assert abs(v.max() + v.min() - 844) < 0.15 * 844
 
 
 @pytest.mark.parametrize("scheme", ["dark", "light"])
