@@ -7,9 +7,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.lens_formulas import FORMULAS
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.reader import read_capture
@@ -450,3 +452,19 @@ WRITERS = {
     "TUM": write_tum,
 }
 """A writer for each program: of a folder and, if they are not `CAMERAS`, its cameras."""
+
+
+def assert_refused(path: Path, change, says: str) -> None:
+    """Change the contents of a capture's JSON file; the capture is refused in one line that names the file.
+
+    Args:
+        path: The file, in the capture's folder.
+        change: Changes its contents in place.
+        says: Expression that the line matches.
+    """
+    contents = json.loads(path.read_text())
+    change(contents)
+    path.write_text(json.dumps(contents))
+    with pytest.raises(DatasetError, match=says) as caught:
+        read_capture(path.parent)
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)

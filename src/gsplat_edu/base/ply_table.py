@@ -59,6 +59,22 @@ BLOCK = 2**18
 LFS_POINTER = b"version https://git-lfs"
 
 
+def refuse_lfs_pointer(path: Path, start: bytes) -> None:
+    """Refuse a file that only points to the one that Git LFS has.
+
+    Args:
+        path: The file's name for the message.
+        start: Its first bytes, at least as many as `LFS_POINTER`.
+
+    Raises:
+        SceneFormatError: the file is such a pointer.
+    """
+    if start.startswith(LFS_POINTER):
+        raise SceneFormatError(
+            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
+        )
+
+
 @dataclass(frozen=True)
 class Element:
     """An element of a PLY.
@@ -119,10 +135,7 @@ def read_elements(path: Path, file: BinaryIO | BytesIO) -> Header:
         SceneFormatError: not a PLY, or the header is damaged; the message names the line.
     """
     first = file.readline(LINE_LIMIT)
-    if first.startswith(LFS_POINTER):
-        raise SceneFormatError(
-            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
-        )
+    refuse_lfs_pointer(path, first)
     if first.strip() != b"ply":
         raise SceneFormatError(f"{path}: is not a PLY: its first line is not 'ply'; give another file")
     header = HeaderLines()

@@ -13,8 +13,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.base.validation import one_of
-from gsplat_edu.data.capture import Capture, Frame
+from gsplat_edu.data.capture import Frame
 from gsplat_edu.data.lens import PINHOLE_LIKE, Lens
 from gsplat_edu.data.lens_formulas import FORMULAS
 from gsplat_edu.data.panorama import FaceLens
@@ -173,7 +172,7 @@ ALL: tuple[tuple[str, Change], ...] = (*POSES, *LENSES, *ORDERS)
 
 
 def _keys() -> tuple[str, ...]:
-    """Number the readings of one mistake, so that each has a name of its own in config.json."""
+    """Number the readings of one mistake, so that each has a name of its own."""
     names = [name for name, _ in ALL]
     counts = [names[:at].count(name) for at, name in enumerate(names)]
     return tuple(
@@ -207,18 +206,3 @@ def readings_for(frames: Sequence[Frame]) -> tuple[str, ...]:
             found += [name for name, _ in ORDERS]
     wanted = set(found)
     return tuple(name for name in READINGS if mistake(name) in wanted)
-
-
-def read_as(capture: Capture, reading: str) -> Capture:
-    """Return a capture whose frames are read in another way.
-
-    Args:
-        capture: The capture as its format says.
-        reading: A name in `READINGS`.
-
-    Raises:
-        ArgumentError: there is no such reading.
-    """
-    one_of("reading", reading, tuple(READINGS))
-    change = READINGS[reading]
-    return replace(capture, frames=tuple(map(change, capture.frames)))

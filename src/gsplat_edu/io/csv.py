@@ -27,7 +27,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.ply_table import BLOCK, LFS_POINTER, Element
+from gsplat_edu.base.ply_table import BLOCK, LFS_POINTER, Element, refuse_lfs_pointer
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.io.ply import (
     LARGEST_LOGIT,
@@ -62,10 +62,7 @@ def read(path: Path) -> Scene:
         OSError: the file cannot be read.
     """
     with open_file(path) as file:
-        if file.read(len(LFS_POINTER)) == LFS_POINTER:
-            raise SceneFormatError(
-                f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
-            )
+        refuse_lfs_pointer(path, file.read(len(LFS_POINTER)))
         file.seek(0)
         lines = TextIOWrapper(file, "utf-8-sig", errors="replace", newline="\n")
         names = [name.strip() for name in next(lines, "").split(",")]

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import parse_json
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -119,10 +119,7 @@ def container(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview]:
     Raises:
         SceneFormatError: the file is not a binary glTF of version 2, or is damaged.
     """
-    if data.startswith(LFS_POINTER):
-        raise SceneFormatError(
-            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
-        )
+    refuse_lfs_pointer(path, data)
     if len(data) < FILE_HEADER.size + CHUNK_HEADER.size or not data.startswith(b"glTF"):
         refuse(path, "is not a binary glTF")
     _, version, length = FILE_HEADER.unpack_from(data)

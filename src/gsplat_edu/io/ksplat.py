@@ -31,7 +31,7 @@ from jaxtyping import Float32, Float64, Int64
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.quantize import (
     MIN_SCALE,
@@ -285,10 +285,7 @@ def _layout(level: int, degree: int) -> np.dtype:
 def _sections(path: Path, stored: bytes) -> tuple[np.void, list[_Section]]:
     """Return the headers, checked against each other and against the file's size."""
     damaged = SceneFormatError(f"{path}: is truncated, damaged or not a .ksplat; get it again")
-    if stored.startswith(LFS_POINTER):
-        raise SceneFormatError(
-            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
-        )
+    refuse_lfs_pointer(path, stored)
     if len(stored) < HEADER.itemsize + SECTION.itemsize:
         raise damaged
     header = np.frombuffer(stored, HEADER, count=1)[0]

@@ -22,9 +22,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from PIL import Image
 
-from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.mesh_image import decoded
 from gsplat_edu.io.mesh_parts import (
@@ -110,10 +109,7 @@ def _lines(mesh: Mesh) -> Iterator[str]:
 def read(path: Path) -> StoredMesh:
     """Read a mesh; see `gsplat_edu.io.mesh_files.read_mesh`."""
     data = read_bytes(path)
-    if data.startswith(LFS_POINTER):
-        raise SceneFormatError(
-            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
-        )
+    refuse_lfs_pointer(path, data)
     found = _Lines(path)
     for place, words in _statements(data.decode("utf-8", "replace")):
         found.add(place, words)

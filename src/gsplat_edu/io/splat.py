@@ -21,7 +21,7 @@ from jaxtyping import Float32, Float64, Int64
 from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.quantize import (
     MAX_SCALE,
@@ -53,10 +53,7 @@ def read(path: Path) -> Scene:
         OSError: the file cannot be read.
     """
     stored = read_bytes(path)
-    if stored.startswith(LFS_POINTER):
-        raise SceneFormatError(
-            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
-        )
+    refuse_lfs_pointer(path, stored)
     if stored.startswith(b"ply"):
         raise SceneFormatError(f"{path}: is a PLY, not a .splat; rename it to .ply")
     if left := len(stored) % SPLAT.itemsize:

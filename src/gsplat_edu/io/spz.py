@@ -44,6 +44,7 @@ from jaxtyping import Float, UInt8
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.io import spz_values as values
 from gsplat_edu.io.axes import half_turned, root_transform
@@ -56,7 +57,6 @@ from gsplat_edu.scene.gaussians import Gaussians
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
-LFS_POINTER = b"version https://git-lfs"
 
 HEADER = struct.Struct("<4sIIBBBx")
 """Magic, version, splats, SH degree, fractional bits, flags."""
@@ -153,8 +153,7 @@ def in_own_axes(path: Path, data: bytes) -> Scene:
 
 def _opened(path: Path, data: bytes) -> tuple[Scene, dict[int, bytes]]:
     """Return the splats in the format's axes, and the content of the extensions by their kind."""
-    if data.startswith(LFS_POINTER):
-        raise SceneFormatError(f"{path}: is a Git LFS pointer, not the file; fetch it with: git lfs pull")
+    refuse_lfs_pointer(path, data)
     if data.startswith(GZIP):
         header, body = _unzipped(path, data)
         streams, records = _planes(path, header, body)

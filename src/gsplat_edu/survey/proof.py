@@ -74,7 +74,6 @@ class Proof:
         matches: Matches in all pairs.
         reading: Name of the reading that agrees, if the poses were misread; otherwise "".
         corrected: Its median error, px.
-        errors: Median error of each reading by its name, px.
     """
 
     verdict: Verdict
@@ -83,7 +82,6 @@ class Proof:
     matches: int
     reading: str = ""
     corrected: float = float("nan")
-    errors: tuple[tuple[str, float], ...] = ()
 
     def __str__(self) -> str:
         """One line for the user."""
@@ -254,7 +252,6 @@ def _judged(
     used = {photo for pair in pairs for photo in (pair.one, pair.other)}
     unit = float(np.median([_coarseness(photos[photo]) for photo in sorted(used)]))
     given, matches = medians[""], sum(len(pair.a) for pair in pairs)
-    told = tuple(medians.items())
     best = min((name for name in medians if name), key=lambda name: medians[name], default="")
     improved = float(np.mean(by_pair[best] < by_pair[""]))
     if (
@@ -264,9 +261,9 @@ def _judged(
         and given - medians[best] >= BEYOND * unit
         and improved >= IN_PAIRS
     ):
-        return Proof(Verdict.MISREAD, given, len(pairs), matches, best, medians[best], told)
+        return Proof(Verdict.MISREAD, given, len(pairs), matches, best, medians[best])
     verdict = Verdict.AGREE if given <= AGREES * unit else Verdict.DISAGREE
-    return Proof(verdict, given, len(pairs), matches, errors=told)
+    return Proof(verdict, given, len(pairs), matches)
 
 
 def _coarseness(frame: Frame) -> float:

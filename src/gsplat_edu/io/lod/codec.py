@@ -27,7 +27,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.files import named_failure, written_aside
-from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.edit import joined
 from gsplat_edu.io.lod.levels import Branch, Leaf, LodOptions, Node, build_levels, counts_of, leaves_of
@@ -49,8 +49,7 @@ def read_index(path: Path) -> LodMeta:
         OSError: it cannot be read.
     """
     data = read_bytes(path)
-    if data.startswith(LFS_POINTER):
-        raise SceneFormatError(f"{path}: is a Git LFS pointer, not the file; fetch it with: git lfs pull")
+    refuse_lfs_pointer(path, data)
     return from_json(path, data)
 
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.base.files import named_failure, written_aside
-from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
@@ -70,7 +70,7 @@ class Bundle:
     def __init__(self, path: Path) -> None:
         self._path = path
         data = read_bytes(path)
-        _check_pointer(path, data)
+        refuse_lfs_pointer(path, data)
         self._size = len(data)
         if not data.startswith(b"PK"):
             raise SceneFormatError(f"{path}: is not a SOG: it is not a zip; check its name")
@@ -126,7 +126,7 @@ class Folder:
         """
         file = self._file(name)
         data = read_bytes(file)
-        _check_pointer(file, data)
+        refuse_lfs_pointer(file, data)
         return data
 
     def stored(self, names: Iterable[str]) -> int:
@@ -143,11 +143,6 @@ class Folder:
 
 
 Files = Bundle | Folder
-
-
-def _check_pointer(path: Path, data: bytes) -> None:
-    if data.startswith(LFS_POINTER):
-        raise SceneFormatError(f"{path}: is a Git LFS pointer, not the file; fetch it with: git lfs pull")
 
 
 def _missing(path: Path, name: str) -> SceneFormatError:
