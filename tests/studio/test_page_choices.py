@@ -128,3 +128,22 @@ def test_the_next_step_says_how_long_the_chosen_training_takes(visitor, library,
     tab.get_by_label("Iterations instead of a quality").press("Tab")
     takes.wait_for(state="detached")
     assert tab.get_by_role("button", name="Next: Start training").is_visible()
+
+
+def test_the_page_asks_again_while_the_studio_is_busy(visitor, plain):
+    """Which is so while measurements wait that the pages of other captures have asked for."""
+    person = visitor()
+    refused = []
+
+    def answer(route):
+        if len(refused) == 2:
+            return route.continue_()
+        refused.append(route.request.url)
+        return route.fulfill(
+            status=503, json={"error": "forecast: too many requests are waiting; try again soon"}
+        )
+
+    person.tab.route("**/forecast*", answer)
+    tab = go(person.tab, "captures/choices")
+    tab.locator(".forecast", has_text="of memory").nth(2).wait_for()
+    assert len(refused) == 2

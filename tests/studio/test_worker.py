@@ -14,6 +14,17 @@ from waiting import PATIENCE, until
 HANGS = ("sleep", "100")
 """A worker that never answers."""
 
+COUNTS = """
+number=0
+while read -r request; do
+    touch "$0.begun"
+    until [ -e "$0" ]; do sleep 0.02; done
+    number=$((number + 1))
+    echo "{\\"error\\": \\"$number\\"}"
+done
+"""
+"""A worker, for the shell, that answers with the number of the request once there is a file."""
+
 
 @pytest.mark.own_process
 def test_a_worker_answers_and_is_replaced():
@@ -44,6 +55,21 @@ def test_the_number_of_waiting_requests_is_limited():
     worker.close()
     thread.join()
     assert "took too long" in said[0]
+
+
+@pytest.mark.own_process
+def test_equal_requests_that_wait_share_an_answer(tmp_path):
+    """As those of a page that is opened again and again while an earlier question is measured."""
+    worker = Worker(command=("sh", "-c", COUNTS, str(tmp_path / "gate")))
+    first = asking(worker)
+    until((tmp_path / "gate.begun").exists)
+    later = [asking(worker) for _ in range(3)]
+    until(lambda: worker.asked == 4)
+    (tmp_path / "gate").touch()
+    for thread, _ in (first, *later):
+        thread.join(PATIENCE)
+    worker.close()
+    assert [said for _, said in (first, *later)] == [["1"], ["2"], ["2"], ["2"]]
 
 
 @pytest.mark.own_process

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from concurrent.futures import Future
 from http import HTTPStatus
 from typing import Any
 
@@ -26,7 +27,9 @@ COMMAND = (sys.executable, "-m", "gsplat_edu.studio.worker")
 
 
 class Worker:
-    """A worker process, started when it is needed. It may be used from any thread; requests wait for one another.
+    """A worker process, started when it is needed. It may be used from any thread.
+
+    Requests wait for one another; equal ones that wait get one answer.
 
     Args:
         nice: Niceness of the process.
@@ -37,6 +40,7 @@ class Worker:
     Attributes:
         process: The process; None before the first request and after one that it did not answer.
         closed: Whether it was closed, and starts no process any more.
+        asked: Requests that wait or run now.
     """
 
     def __init__(
@@ -49,7 +53,10 @@ class Worker:
         self._command, self._patience = (*command, str(nice)), patience
         self._lock = threading.Lock()
         self.closed = False
-        self._room = threading.Semaphore(MOST_WAITING if waiting is None else waiting)
+        self._most = MOST_WAITING if waiting is None else waiting
+        self.asked = 0
+        self._sharing = threading.Lock()  # of the two around it
+        self._coming: dict[bytes, Future[bytes]] = {}  # the answers to requests that have not begun
         self.process: subprocess.Popen[bytes] | None = None
 
     def ask(self, task: str, **arguments: Any) -> Any:  # noqa: ANN401
@@ -59,17 +66,19 @@ class Worker:
             RefusedError: it failed, has ended, or too many requests are waiting; has the line.
         """
         line = json.dumps({"task": task, **arguments}).encode() + b"\n"
-        if not self._room.acquire(blocking=False):
-            raise RefusedError(
-                f"{task}: too many requests are waiting; try again soon", HTTPStatus.SERVICE_UNAVAILABLE
-            )
+        with self._sharing:
+            if self.asked >= self._most:
+                raise RefusedError(
+                    f"{task}: too many requests are waiting; try again soon", HTTPStatus.SERVICE_UNAVAILABLE
+                )
+            self.asked += 1
+            shared = self._coming.get(line)
+            own = self._coming[line] = Future() if shared is None else shared
         try:
-            with self._lock:
-                said = self._asked(line) or self._asked(
-                    line
-                )  # again if it had just ended after `IDLE` seconds
+            said = self._answered(line, own) if shared is None else shared.result()
         finally:
-            self._room.release()
+            with self._sharing:
+                self.asked -= 1
         if not said:
             raise RefusedError(
                 f"{task}: its process ended or took too long; close other programs, or cancel a job",
@@ -102,6 +111,20 @@ class Worker:
             with contextlib.suppress(OSError):
                 if pipe is not None:
                     pipe.close()
+
+    def _answered(self, line: bytes, answer: Future[bytes]) -> bytes:
+        """Send a request when those before it are done; return its answer, and give it to those who share it."""
+        try:
+            with self._lock:
+                with self._sharing:
+                    del self._coming[line]  # later requests may be about newer files
+                # again if the process had just ended after `IDLE` seconds
+                said = self._asked(line) or self._asked(line)
+        except BaseException as error:
+            answer.set_exception(error)
+            raise
+        answer.set_result(said)
+        return said
 
     def _asked(self, line: bytes) -> bytes:
         """Send a request; return the answer, empty if there is none."""

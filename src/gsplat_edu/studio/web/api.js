@@ -8,6 +8,7 @@ export class ApiError extends Error {
 }
 
 let start = ""; // the command that starts the studio again, which only the studio knows
+const BUSY = { most: 90, pause: 2000 }; // questions and milliseconds between them until it is too busy: three minutes
 const LOCKED = "The studio was started again. Open the address that it printed last in its terminal.";
 
 export const startsBy = (command) => (start = command);
@@ -43,7 +44,17 @@ async function ask(method, address, body) {
   return isJson && text ? JSON.parse(text) : text;
 }
 
-export const get = (address) => ask("GET", address);
+// Asks again while the studio is busy with other questions, which can have a line of them wait.
+export async function get(address) {
+  for (let left = BUSY.most; ; left--) {
+    try {
+      return await ask("GET", address);
+    } catch (error) {
+      if (error.status !== 503 || !left) throw error;
+    }
+    await new Promise((resolve) => setTimeout(resolve, BUSY.pause));
+  }
+}
 
 // For what may not be there yet: a refusal throws the same error, but the browser's console stays empty.
 async function quietly(method, address) {
