@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from gsplat_edu.cli.main import COMMANDS
+from gsplat_edu.cli.main import COMMANDS, main
 
 HEAVY = ("torch", "scipy", "cv2", "matplotlib", "PIL", "dask", "distributed", "starlette", "uvicorn")
 
@@ -93,3 +93,20 @@ def test_mistakes_and_help_import_nothing_heavy(tmp_path):
         in (answer_to["train CAPTURE --out RUN --iteration 10"])
     )
     assert "--backendd: did you mean --backend?" in answer_to["eval a --backendd cpu"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("eval -m a", "-m: it is RUN here, which is written without an option"),
+        ("train --source_path a -m b", "--source_path: it is DATA here, which is written without an option"),
+        ("train a -m b", "-m: it is --out here"),
+        ("train a --out b --max_steps 9", "--max_steps: it is --iterations here"),
+        ("convert -m a", "-m: it is IN here, which is written without an option"),
+    ],
+)
+def test_options_of_other_programs_lead_to_ours(capsys, words, said):
+    with pytest.raises(SystemExit) as left:
+        main(words.split())
+    assert left.value.code == 2
+    assert f"unrecognized argument {said};" in capsys.readouterr().err

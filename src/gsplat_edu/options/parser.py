@@ -17,6 +17,24 @@ from gsplat_edu.jobs.ranks import speaks_for_all
 
 EXIT_BAD_INPUT = 2
 
+SUBJECT = ""
+"""Stands for what a command works on, which is its first word here."""
+
+MODEL = "model"
+"""Stands for a trained model: a command that trains writes it to --out, for others it is the subject."""
+
+ELSEWHERE = {
+    **dict.fromkeys(("-s", "--source_path", "--source-path", "--data", "--data_dir", "--data-dir"), SUBJECT),
+    **dict.fromkeys(("-m", "--model_path", "--model-path"), MODEL),
+    **dict.fromkeys(
+        ("--output_dir", "--output-dir", "--result_dir", "--result-dir", "--export-path"), "--out"
+    ),
+    **dict.fromkeys(("--max_steps", "--max-steps", "--max-num-iterations", "--total-steps"), "--iterations"),
+    **dict.fromkeys(("-r", "--data_factor", "--data-factor", "--downscale-factor"), "--resolution"),
+    "--eval": "--test-every",
+}
+"""Options of other programs (Kerbl et al.'s, gsplat's trainer, nerfstudio, Brush), and ours that do the same."""
+
 
 class OneLineParser(argparse.ArgumentParser):
     """A parser that reports a mistake in one line: the error and where to find help.
@@ -67,17 +85,31 @@ class OneLineParser(argparse.ArgumentParser):
         if self._subparsers is None:  # otherwise the words belong to a command, whose parser reads them next
             for word in itertools.takewhile(lambda word: word != "--", words):
                 flag = word.partition("=")[0]
-                if flag.startswith("--") and flag not in self._option_string_actions:
+                if (flag.startswith("--") or flag in ELSEWHERE) and flag not in self._option_string_actions:
                     self.error(self._unknown(flag))
         return super().parse_known_args(words, namespace)
 
     def _unknown(self, flag: str) -> str:
         known = [option for option in self._option_string_actions if option.startswith("--")]
+        if said := self._here(flag):
+            return f"unrecognized argument {flag}: {said}"
         if said := self.explain_unknown(flag, known):
             return f"unrecognized argument {flag}: {said}"
         alike = difflib.get_close_matches(flag, known, n=1)
         meant = f"did you mean {alike[0]}?" if alike else "it is not known"
         return f"unrecognized argument {flag}: {meant}"
+
+    def _here(self, flag: str) -> str | None:
+        """Return what an option of another program is called here; None if nothing of this command does the same."""
+        ours = ELSEWHERE.get(flag)
+        if ours == MODEL:
+            ours = "--out" if "--iterations" in self._option_string_actions else SUBJECT
+        if ours in self._option_string_actions:
+            return f"it is {ours} here"
+        subject = next((one for one in self._actions if not one.option_strings), None)
+        if ours != SUBJECT or subject is None:
+            return None
+        return f"it is {subject.metavar or subject.dest} here, which is written without an option"
 
     def error(self, message: str) -> NoReturn:
         """Print the line and exit with 2."""
