@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_edu.io.edit import Similarity
-from gsplat_edu.io.formats import FORMATS, losses, read_scene, stored_bytes, write_scene
+from gsplat_edu.io.formats import FORMATS, file_in, losses, read_scene, stored_bytes, write_scene
 from scene_files import matched, random_scene
 
 STEPS = {"means": 8 / 2**11, "log_scales": 1 / 16, "sh0": 0.03, "sh_rest": 8 / 256}
@@ -79,3 +79,27 @@ def test_an_unpacked_sog_is_read_by_its_folder_or_its_meta_json(tmp_path):
     for name in (path, path.parent):
         assert len(read_scene(name).gaussians) == 30
     assert stored_bytes(path) == sum(file.stat().st_size for file in path.parent.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("files", "found"),
+    [
+        (
+            ["cfg_args", "input.ply", *(f"point_cloud/iteration_{n}/point_cloud.ply" for n in (7000, 30000))],
+            "point_cloud/iteration_30000/point_cloud.ply",
+        ),
+        (["cfg.yml", "ply/point_cloud_6999.ply", "ply/point_cloud_29999.ply"], "ply/point_cloud_29999.ply"),
+        (["splat.ply"], "splat.ply"),
+        (["splat.ply", "images/a.jpg"], None),
+        (["config.json", "point_cloud/iteration_30/point_cloud.ply"], None),
+    ],
+    ids=["Kerbl et al.", "gsplat", "nerfstudio", "a capture", "a run of ours"],
+)
+def test_the_folder_of_another_programs_model_is_its_last_scene(tmp_path, files, found):
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert file_in(tmp_path) == (tmp_path if found is None else tmp_path / found)
+    if found is not None:
+        write_scene(tmp_path / found, random_scene(5))
+        assert len(read_scene(tmp_path).gaussians) == 5

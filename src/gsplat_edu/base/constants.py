@@ -115,6 +115,9 @@ Source: Kerbl et al. 2023, its code."""
 SH_MAX_DEGREE: Final = 3
 """Highest supported SH degree: 16 coefficients per channel."""
 
+RUN_CONFIG: Final = "config.json"
+"""File of the folder of every run, with all its settings."""
+
 AUTO: Final = "auto"
 """Value of an option or a field that leaves the choice to the program, which decides by the photos."""
 

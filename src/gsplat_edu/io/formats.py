@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
-from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.constants import RUN_CONFIG, SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.validation import of_type
@@ -124,13 +125,37 @@ def losses(path: str | Path, scene: Scene) -> list[str]:
     return said
 
 
+MODELS = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
+"""Scenes in a model of Kerbl et al.'s code and in results of gsplat's trainer; the one of the last iteration counts."""
+
+EXPORT = "splat.ply"
+"""Scene in an export of nerfstudio. A capture, which has folders too, may hold a file of this name."""
+
+
 def file_in(path: Path) -> Path:
-    """Return the file that represents a scene stored as a folder; any other path as it is."""
-    if path.is_dir():
-        for name in (SOG_META, LOD_META):
-            if (path / name).is_file():
-                return path / name
-    return path
+    """Return the file that represents a scene stored as a folder; any other path as it is.
+
+    Args:
+        path: A SOG, levels of detail, or the folder of a model that another program has written; a run of ours is no
+            scene.
+    """
+    if not path.is_dir():
+        return path
+    for name in (SOG_META, LOD_META):
+        if (path / name).is_file():
+            return path / name
+    if (path / RUN_CONFIG).is_file():
+        return path
+    if found := [file for pattern in MODELS for file in path.glob(pattern)]:
+        return max(found, key=_number)
+    is_export = (path / EXPORT).is_file() and not any(entry.is_dir() for entry in path.iterdir())
+    return path / EXPORT if is_export else path
+
+
+def _number(file: Path) -> tuple[int, str]:
+    """Return the iteration that a model's path names, and the path."""
+    digits = re.findall(r"_([0-9]+)", file.as_posix())
+    return int(digits[-1]) if digits else -1, file.as_posix()
 
 
 def read_scene(path: str | Path) -> Scene:

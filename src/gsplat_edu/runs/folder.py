@@ -28,6 +28,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gsplat_edu.base.constants import RUN_CONFIG
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.plugins import plugins
@@ -58,7 +59,7 @@ class RunFolder:
     @property
     def config(self) -> Path:
         """All settings of the run."""
-        return self.path / "config.json"
+        return self.path / RUN_CONFIG
 
     @property
     def log_file(self) -> Path:
