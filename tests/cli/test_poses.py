@@ -49,7 +49,7 @@ def test_train_keeps_the_chosen_file(tmp_path, capsys):
     said(
         capsys,
         *("train", capture, "--poses", "any name.nvm", "--out", run, "--iterations", 1, "--backend", "cpu"),
-        "--keep-photos",
+        "--trust-poses",
     )
     assert json.loads((run / "config.json").read_text())["data"]["path"].endswith("any name.nvm")
 

@@ -50,7 +50,7 @@ def runs(captures, tmp_path_factory):
     for name, capture, options in (
         ("clean", "clean", ()),
         ("default", "wrong", ()),
-        ("kept", "wrong", ("--keep-photos",)),
+        ("kept", "wrong", ("--trust-poses",)),
     ):
         words = ("--iterations", "150", "--appearance", "none", "--sky", "none", "--max-gaussians", "600")
         assert main(["train", str(root / capture), "--out", str(out / name), *words, *options]) == 0
@@ -98,9 +98,9 @@ def test_the_photos_are_named_and_the_choice_can_be_revoked(captures, tmp_path, 
     ]
     assert main([*words, str(tmp_path / "a")]) == 0
     said = capsys.readouterr().out
-    assert "wrong poses: 2 of 24 cameras" in said and "--keep-photos" in said
+    assert "wrong poses: 2 of 24 cameras" in said and "--trust-poses" in said
     assert all(f"view_{i:03d}.png" in said for i in WRONG)
-    assert main([*words, str(tmp_path / "b"), "--keep-photos"]) == 0
+    assert main([*words, str(tmp_path / "b"), "--trust-poses"]) == 0
     said = capsys.readouterr().out
     assert "wrong poses: 2 of 24 cameras" in said and "training without" not in said
 
@@ -119,7 +119,7 @@ def test_eval_and_resume_agree_with_the_training(runs, captures, capsys):
     capsys.readouterr()
     words = ["train", str(root / "wrong"), "--iterations", "150", "--appearance", "none", "--sky", "none"]
     # the capture's own list and the option do not change what the run began with
-    options = ["--max-gaussians", "600", "--out", str(run.path), "--resume", "--keep-photos"]
+    options = ["--max-gaussians", "600", "--out", str(run.path), "--resume", "--trust-poses"]
     assert main([*words, *options]) == 0
     assert "nothing to do" in capsys.readouterr().out
 

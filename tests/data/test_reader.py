@@ -1,5 +1,7 @@
 """All datasets derived from one reader see what the reader has read first."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,8 @@ from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs.dataset import reader_for
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.train.config import recipe
 
 SETTINGS = (
     DataSettings(),
@@ -69,7 +73,8 @@ def test_a_photo_that_changes_between_two_datasets_is_noticed(tmp_path):
 
 def test_a_reader_of_another_capture_is_refused(capture, tmp_path):
     given = CaptureReader(capture)
-    assert reader_for(capture, given) is given
-    assert reader_for(capture, None).path == capture
+    options = RunOptions(capture, tmp_path / "run", recipe(1), DataSettings())
+    assert reader_for(options, given) is given
+    assert reader_for(options, None).path == capture
     with pytest.raises(ArgumentError, match="reader: reads"):
-        reader_for(tmp_path, given)
+        reader_for(replace(options, data=tmp_path), given)

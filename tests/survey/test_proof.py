@@ -217,9 +217,23 @@ def test_the_doctor_tells_what_the_photos_say(captures, tmp_path):
     shutil.copytree(captures / "cropped", tmp_path / "capture")
     edit(tmp_path / "capture", POSES["OpenCV axes"][0])
     wrong = examine(prepare(CaptureReader(tmp_path / "capture")))
-    assert wrong.advice[0].startswith("export the poses again")
+    assert wrong.advice[0].startswith("correct the file of the poses for other programs")
     (said,) = (finding.sentence for finding in wrong.findings if finding.name == "misread poses")
     assert "only if the cameras' y and z axes point the other way" in said
+
+
+@pytest.mark.parametrize("axes", [GL, np.eye(4)], ids=["OpenGL", "OpenCV"])
+def test_points_choose_between_readings_that_differ_by_a_turn_of_the_world(captures, tmp_path, axes):
+    """The photos agree with inverted matrices in two worlds; the points are in one of them."""
+    views, points, colors = room_capture(WIDTH, HEIGHT, 24)
+    write_transforms(tmp_path / "capture", views, points, colors)
+    edit(tmp_path / "capture", posed(lambda M: np.linalg.inv(M @ axes)))
+    reader = CaptureReader(tmp_path / "capture")
+    found = prove(reader)
+    assert mistake(found.reading).startswith("the matrices are inverted")
+    for frame, view in zip(reader.under(found.reading).capture.frames, views, strict=True):
+        np.testing.assert_allclose(frame.R, view.camera.R, atol=1e-9)
+        np.testing.assert_allclose(frame.eye, view.camera.eye, atol=1e-9)
 
 
 def test_blank_photos_prove_nothing(captures, tmp_path):

@@ -132,7 +132,7 @@ def merge_blocks(
         say(f"blocks were trained by different kernels ({named}): other machines may round to other bytes")
     gaussians, counts = merged(folder, plan, records)
     options = _whole(folder, plan, None if reader is None else reader.path)
-    dataset = Dataset.of(reader_for(options.data, reader), options.data_settings)
+    dataset = Dataset.of(reader_for(options, reader), options.data_settings)
     steps = max(done.iterations for done in records)
     run = folder.merged
     check_views(folder, plan, dataset)

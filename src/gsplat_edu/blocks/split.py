@@ -75,6 +75,13 @@ def recipe_of(options: RunOptions) -> dict[str, Any]:
     }
 
 
+MAY_DIFFER = ("data.image_memory", "eval_every", "save_every")
+"""Options that a resumed command may change."""
+
+CHOSEN = ("data.left_out", "data.region", "data.reading")
+"""Options that the first command may have chosen from the capture; one that does not give them keeps the choice."""
+
+
 def check_recipe(folder: Path, plan: BlockPlan, options: RunOptions) -> None:
     """Compare the options of a resumed command with those of the plan.
 
@@ -83,7 +90,9 @@ def check_recipe(folder: Path, plan: BlockPlan, options: RunOptions) -> None:
     """
     stored, given = (_flat(recipe) for recipe in (plan.recipe, recipe_of(options)))
     for key, value in given.items():
-        if key not in ("data.image_memory", "eval_every", "save_every") and stored.get(key) != value:
+        if key in MAY_DIFFER or (key in CHOSEN and value is None):
+            continue
+        if stored.get(key) != value:
             raise CheckpointError(
                 f"--resume: {folder / PLAN} was made with {key} = {stored.get(key)}, not {value}; give the same"
                 " options or another --out"
@@ -115,7 +124,7 @@ def split_capture(
         OSError: a file cannot be written.
     """
     folder, config = BlocksFolder(options.out), options.config
-    dataset = Dataset.of(reader_for(options.data, reader), options.data_settings)
+    dataset = Dataset.of(reader_for(options, reader), options.data_settings)
     _check_region(dataset)
     for note in dataset.notes:
         say(str(note))

@@ -202,7 +202,7 @@ def plan(
         SceneFormatError: the start scene cannot be read.
         CheckpointError: the config.json of a run to resume is damaged.
     """
-    reader, first_sentences = reader_for(options.data, reader), tuple[str, ...]()
+    reader, first_sentences = reader_for(options, reader), tuple[str, ...]()
     if quality is not None:
         options, said = with_planned_length(
             options, quality, reader, given, rescale=rescale, progress=progress

@@ -105,10 +105,11 @@ def _prepared(arguments: argparse.Namespace, console: Terminal) -> tuple[BlockPl
         raise CheckpointError(f"--out: {folder.path} holds a run that is not in blocks; give another folder")
     options = with_poses(options, arguments, console, say)
     reader = CaptureReader(options.data)
-    options = with_right_poses(options, reader, arguments.keep_photos, say)
+    options, reader = with_right_poses(options, reader, arguments, say)
     if of_coarse is not None:
         coarse = replace(options_from(of_coarse), data=options.data)
-        settings = replace(coarse.data_settings, left_out=options.data_settings.left_out)
+        chosen = options.data_settings
+        settings = replace(coarse.data_settings, left_out=chosen.left_out, reading=chosen.reading)
         coarse = replace(coarse, data_settings=settings)
         coarse = with_points(coarse, reader, None, console, say)
         if not coarse.resume:

@@ -78,8 +78,12 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         task = bar.add_task("photos", total=None)
         depth = arguments.depth or own_depth(reader)
         survey = prepare(
-            reader, lambda done, total: bar.update(task, completed=done, total=total), depth=depth
+            reader,
+            lambda done, total: bar.update(task, completed=done, total=total),
+            depth=depth,
+            trust=arguments.trust_poses,
         )
+        reader = reader.under(survey.reading)
         bar.add_task("comparing", total=None)
         diagnosis = examine(survey, _forecast_options(arguments))
     from gsplat_edu.budget.choice import Prospect, choose_backend, usual_choice

@@ -32,6 +32,7 @@ from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
+from gsplat_edu.survey.proof import prove
 
 PERCENTILES = (1, 25, 50, 75, 99)
 
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
     elif RunFolder(path).exists():
         facts = _run_facts(RunFolder(path))
     else:
-        facts = _dataset_facts(path)
+        facts = _dataset_facts(path, arguments.trust_poses)
     console = Terminal()
     if not console.shows(BLOCKS):
         plain = str.maketrans(BLOCKS, PLAIN_BLOCKS)
@@ -223,8 +224,11 @@ def _scores(scores: Mapping[str, Any]) -> list[str]:
     return said + ([] if images is None else [f"{images} images"])
 
 
-def _dataset_facts(path: Path) -> list[Fact]:
+def _dataset_facts(path: Path, trust: bool) -> list[Fact]:
     reader = CaptureReader(path)
+    proof = None if trust else prove(reader)
+    if proof is not None:
+        reader = reader.under(proof.reading or None)
     dataset = Dataset.of(reader, DataSettings())
     views = (*dataset.train, *dataset.test)
     cameras = [view.camera for view in views]
@@ -238,6 +242,7 @@ def _dataset_facts(path: Path) -> list[Fact]:
         ("cameras", _counted(lenses)),
         ("lens", _counted(Counter(file.lens.described for _, file in dataset.files))),
         *_shutter_facts([frame.shutter for frame in reader.capture.frames]),
+        *([] if proof is None else [("poses", str(proof))]),
         ("split", f"{len(dataset.train)} for training, {len(dataset.test)} held out"),
         ("extent", f"{short_number(scene_extent(cameras), 4)} world units"),
         ("positions", _bounds(eyes)),

@@ -30,7 +30,7 @@ from gsplat_edu.cli.result import tell_result
 from gsplat_edu.cli.terminal import Bar, Field, Terminal, stage_bars
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.data.points import read_points_ply
+from gsplat_edu.data.point_files import read_points
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.remedies import remedies_for
@@ -39,7 +39,7 @@ from gsplat_edu.jobs.ranks import num_processes
 from gsplat_edu.options.asked import asked_of
 from gsplat_edu.options.length import quality_of
 from gsplat_edu.options.settings import given
-from gsplat_edu.options.train import AUTO, left_open, options_from
+from gsplat_edu.options.train import AUTO, RANDOM_POINTS, left_open, options_from
 from gsplat_edu.runs.pilot import chosen_by_pilots
 from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.start_points import with_start_points
@@ -127,8 +127,8 @@ def _run(arguments: argparse.Namespace, console: Console, say: Callable[[str], N
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     options = with_poses(options_from(arguments), arguments, console, say, seconds)
     reader = CaptureReader(options.data)
-    options = with_right_poses(options, reader, arguments.keep_photos, say)
-    if arguments.points is None:
+    options, reader = with_right_poses(options, reader, arguments, say)
+    if arguments.points != RANDOM_POINTS:
         options = with_points(options, reader, seconds, console, say)
     chosen = _planned(arguments, options, reader, deadline, console, say)
     with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:
@@ -194,7 +194,7 @@ def with_points(
     console: Console,
     say: Callable[[str], None],
 ) -> RunOptions:
-    """Triangulate start points if the capture has none."""
+    """Make the start points that the capture lacks, or those of a scan."""
     with stage_bars(console) as progress:
         return with_start_points(options, reader, say, progress, time_limit)
 
@@ -245,7 +245,7 @@ def with_poses(
                 raise ArgumentError(f"--{name}: has an effect only if DATA has no poses; omit it")
         return options
     if options.points is not None:
-        read_points_ply(options.points)  # report errors in the file before the long computation
+        read_points(options.points)  # report errors in the file before the long computation
     check_links("--out", options.folder.path)
     found = options.folder.path / "capture"
     if options.folder.exists():

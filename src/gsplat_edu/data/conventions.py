@@ -13,9 +13,11 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.data.capture import Frame
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.data.capture import Capture, Frame
 from gsplat_edu.data.lens import PINHOLE_LIKE, Lens
 from gsplat_edu.data.lens_formulas import FORMULAS
+from gsplat_edu.data.notes import OtherReading
 from gsplat_edu.data.panorama import FaceLens
 
 Rotation = Float64[np.ndarray, "3 3"]
@@ -187,6 +189,22 @@ READINGS: dict[str, Change] = dict(zip(_keys(), (change for _, change in ALL), s
 def mistake(reading: str) -> str:
     """Return what the photos say is wrong, for a name in `READINGS`."""
     return reading.partition(" #")[0]
+
+
+def read_as(capture: Capture, reading: str) -> Capture:
+    """Return a capture with its poses and lenses under another reading, and a note that says so.
+
+    Args:
+        capture: As its reader gives it.
+        reading: A name in `READINGS`.
+
+    Raises:
+        DatasetError: there is no such reading, or a lens is out of range under it.
+    """
+    if reading not in READINGS:
+        raise DatasetError(f"reading: {reading!r} is not known to this version; train again")
+    frames = tuple(READINGS[reading](frame) for frame in capture.frames)
+    return replace(capture, frames=frames, notes=(*capture.notes, OtherReading(mistake(reading))))
 
 
 def readings_for(frames: Sequence[Frame]) -> tuple[str, ...]:

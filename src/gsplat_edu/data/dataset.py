@@ -112,6 +112,7 @@ class Dataset:
         Raises:
             DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.
         """
+        reader = reader.under(settings.reading)
         path, capture, headers, placed = reader.path, reader.capture, reader.headers, reader.placed(points)
         settings = with_own_files(settings, path)
         notes = list(placed.notes)
@@ -130,9 +131,7 @@ class Dataset:
         region = Region.of_numbers(settings.region).moved(-placed.origin) if settings.region else None
         if region is not None:
             views, notes = list(views_of_region(views, region)), [*notes, OnlyInRegion()]
-        notes += _lens_notes(frames, sources, [rescaled for _, _, rescaled in made])
-        notes += _shutter_notes(frames, [camera for _, camera, _ in made], settings)
-        notes += _file_notes(frames, sources, headers) + _alpha_notes(capture, sources, settings, headers)
+        notes += _notes_of_photos(capture, frames, made, settings, headers)
         if store.needed > store.budget:
             notes.append(PhotosExceedMemory(store.needed, store.budget))
         notes += about
@@ -201,6 +200,23 @@ def load_dataset(
         DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.
     """
     return Dataset.of(CaptureReader(path), settings, points=points)
+
+
+def _notes_of_photos(
+    capture: Capture,
+    frames: Sequence[Frame],
+    made: Sequence[tuple[PhotoFile, Camera, bool]],
+    settings: DataSettings,
+    headers: PhotoHeaders,
+) -> list[LoadingNote]:
+    """Return the notes about lenses, shutters, files and alpha of the photos that are used."""
+    sources = [source for source, *_ in made]
+    return [
+        *_lens_notes(frames, sources, [rescaled for _, _, rescaled in made]),
+        *_shutter_notes(frames, [camera for _, camera, _ in made], settings),
+        *_file_notes(frames, sources, headers),
+        *_alpha_notes(capture, sources, settings, headers),
+    ]
 
 
 def with_own_files(settings: DataSettings, path: Path) -> DataSettings:

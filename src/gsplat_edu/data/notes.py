@@ -316,6 +316,20 @@ class OnlyInRegion:
         )
 
 
+@dataclass(frozen=True)
+class OtherReading:
+    """Poses or lenses that are read otherwise than their format says, as the photos show.
+
+    Args:
+        mistake: What is wrong with them as the format has them.
+    """
+
+    mistake: str
+
+    def __str__(self) -> str:
+        return f"poses and lenses are read as the photos show: {self.mistake}"
+
+
 Note = (
     Background
     | MissingPhotos
@@ -330,6 +344,7 @@ Note = (
     | TwoLayouts
     | PosesOf
     | OtherPoses
+    | OtherReading
     | OtherReconstructions
     | UnreadColors
     | LeftOutPhotos

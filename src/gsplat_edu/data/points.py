@@ -28,14 +28,36 @@ FULL_SCALE = {"u1": 255.0, "u2": 65535.0}
 """Full brightness of integer colours; 1 for floats."""
 
 
+Points = Float64[np.ndarray, "N 3"]
+"""Positions, world units, or colours, 0 to 1."""
+
+
 def read_points_ply(path: Path) -> Cloud:
+    """Read a point cloud, as `read_ply` does; points without colour become grey.
+
+    Args:
+        path: A PLY, ASCII or binary.
+
+    Raises:
+        DatasetError: the file is not a point cloud in PLY, or is truncated.
+    """
+    points, colors = read_ply(path)
+    return Cloud(points, grey(points) if colors is None else colors)
+
+
+def grey(points: Points) -> Points:
+    """Return the colours of points that have none."""
+    return np.full(points.shape, 0.5)
+
+
+def read_ply(path: Path) -> tuple[Points, Points | None]:
     """Read a point cloud: x y z, with colours as red green blue or as the f_dc of a Gaussian scene.
 
     Args:
-        path: A PLY, ASCII or binary. Points without colour become grey.
+        path: A PLY, ASCII or binary.
 
     Returns:
-        The points, in the file's units, including NaN and infinity.
+        The points, in the file's units, including NaN and infinity; and their colours, None if there are none.
 
     Raises:
         DatasetError: the file is not a point cloud in PLY, or is truncated.
@@ -55,7 +77,7 @@ def read_points_ply(path: Path) -> Cloud:
     except SceneFormatError as error:
         raise DatasetError(str(error)) from None
     with np.errstate(invalid="ignore"):  # converting a signalling NaN raises this flag
-        return Cloud(_columns(table, ("x", "y", "z")), _colors(table, dict(vertex.properties)))
+        return _columns(table, ("x", "y", "z")), _colors(table, dict(vertex.properties))
 
 
 def write_points_ply(path: Path, cloud: Cloud) -> None:
@@ -104,10 +126,10 @@ def _columns(table: np.ndarray, names: Sequence[str]) -> Float64[np.ndarray, "N 
     return np.stack([table[name].astype(np.float64) for name in names], axis=1)
 
 
-def _colors(table: np.ndarray, kinds: Mapping[str, str | None]) -> Float64[np.ndarray, "N 3"]:
-    """Return colours from 0 to 1. `kinds` are the file's property types, which ASCII rows have lost."""
+def _colors(table: np.ndarray, kinds: Mapping[str, str | None]) -> Points | None:
+    """Return colours from 0 to 1, or None. `kinds` are the file's property types, which ASCII rows have lost."""
     if set(RGB) <= kinds.keys():
         return unit_colors(_columns(table, RGB) / [FULL_SCALE.get(kinds[name] or "", 1.0) for name in RGB])
     if set(SH0) <= kinds.keys():
         return unit_colors(0.5 + C0 * _columns(table, SH0))
-    return np.full((len(table), 3), 0.5)
+    return None

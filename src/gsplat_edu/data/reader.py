@@ -25,9 +25,11 @@ from gsplat_edu.data.capture import (
     is_folder,
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
+from gsplat_edu.data.conventions import read_as
 from gsplat_edu.data.loading_notes import LoadingNote, MovedOrigin
 from gsplat_edu.data.notes import TwoLayouts
-from gsplat_edu.data.points import finite_cloud, read_points_ply
+from gsplat_edu.data.point_files import read_points
+from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.data.readers.programs import PROGRAMS, pose_files, read_poses
 from gsplat_edu.data.scale import read_scale
 from gsplat_edu.data.transforms import read_transforms
@@ -62,35 +64,52 @@ class CaptureReader:
     Args:
         path: A capture folder of COLMAP, nerfstudio, instant-ngp, Blender or a program of
             `gsplat_edu.data.readers.programs`; or a transforms.json or such a program's file.
+        reading: Name of another reading of its poses and lenses, see `gsplat_edu.data.conventions`; None reads them as
+            the format says.
 
     Attributes:
         path: The capture's path.
+        reading: As given.
         headers: Headers of its photos and masks.
         watch: Digests of its photos and masks.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Path, reading: str | None = None) -> None:
+        self.path, self.reading = Path(path), reading
         self.headers, self.watch = PhotoHeaders(), FileWatch()
         self._placed: dict[Path | None, PlacedCapture] = {}
 
     @cached_property
     def capture(self) -> Capture:
         """The contents of the capture; see `read_capture`."""
-        return read_capture(self.path)
+        found = read_capture(self.path)
+        return found if self.reading is None else read_as(found, self.reading)
+
+    def under(self, reading: str | None) -> CaptureReader:
+        """Return a reader of the same capture with another reading; itself for its own, and for None.
+
+        Args:
+            reading: As for the constructor.
+        """
+        if reading is None or reading == self.reading:
+            return self
+        other = CaptureReader(self.path, reading)
+        other.headers, other.watch = self.headers, self.watch
+        return other
 
     def placed(self, points: Path | None = None) -> PlacedCapture:
         """Return the sorted frames and the start points, near the origin.
 
         Args:
-            points: A PLY that replaces the capture's start points, in the capture's coordinates; it is read once.
+            points: A file that replaces the capture's start points, in its coordinates; see `read_points`. It is read
+            once.
 
         Raises:
-            DatasetError: the capture or the PLY cannot be read.
+            DatasetError: the capture or the file cannot be read.
         """
         if points not in self._placed:
             capture = self.capture
-            given = read_points_ply(points) if points else capture.cloud
+            given = read_points(points).cloud if points else capture.cloud
             self._placed[points] = _near_origin(capture.frames, given, capture.notes)
         return self._placed[points]
 

@@ -37,6 +37,8 @@ class DataSettings:
             With `train_views`, it means nothing.
         region: The region of interest as `gsplat_edu.scene.region.Region.numbers` gives it, in the capture's
             coordinates; () for none. None uses the capture's region.json, if there is one.
+        reading: Name of the reading of the poses and lenses, one of `gsplat_edu.data.conventions.READINGS`; None reads
+            them as the capture's format says.
         lens: Which photos keep their lens instead of being undistorted, one of `LENS_MODES`.
 
     Raises:
@@ -52,6 +54,7 @@ class DataSettings:
     lens: str = "undistort"
     left_out: tuple[str, ...] | None = None
     region: tuple[float, ...] | None = None
+    reading: str | None = None
 
     def __post_init__(self) -> None:
         if self.resolution is not None and (in_range("resolution", self.resolution, 1.0) > 1e6):
@@ -74,15 +77,16 @@ class DataSettings:
             raise ArgumentError("train_views: is empty; name at least one view, or give None for all")
 
     def completed(self, own: DataSettings) -> DataSettings:
-        """Return the settings with those of `own` where they would use the capture's own files."""
-        names = ("region",) if self.train_views is not None else ("left_out", "region")
+        """Return the settings with those of `own` where they would use what the capture's files or photos say."""
+        names = ("region", "reading", *(() if self.train_views is not None else ("left_out",)))
         given: dict[str, Any] = {name: getattr(own, name) for name in names if getattr(self, name) is None}
         return replace(self, **given)
 
     def record(self) -> dict[str, Any]:
-        """Return the settings of a run by name, for config.json: a region only if the run has one."""
+        """Return the settings of a run by name, for config.json: a region and a reading only if the run has one."""
         record = asdict(self)
-        return record if self.region else {name: record[name] for name in record if name != "region"}
+        idle = {name for name in ("region", "reading") if not record[name]}
+        return {name: value for name, value in record.items() if name not in idle}
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> DataSettings:

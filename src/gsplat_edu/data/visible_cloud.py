@@ -1,7 +1,7 @@
-"""Random start points for a capture without points: only places that at least two training photos see.
+"""Points and the photos that see them: random start points, and those of scans.
 
-A point that a single photo sees fits at any depth, and a point that no photo sees never changes. Both would stay as a
-coloured cloud.
+Random ones are drawn only where at least two training photos look. A random point that a single photo sees fits at any
+depth, and a point that no photo sees never changes. Both would stay as a coloured cloud.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import RANDOM_POINTS, random_cloud
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.rig import point_nearest_axes, scene_extent, stray_eyes
+from gsplat_edu.scene.views import View
 
 LEAST_VIEWS = 2
 """A start point lies in at least this many photos, or in all of them if there are fewer."""
@@ -23,6 +24,9 @@ NEAREST, FARTHEST = 1.0, 5.0
 """Range of the depths from the camera, as multiples of the scene's size; the inverse of the depth is uniform. Nearer
 points become floaters: from 0.3, 0.6, 1.0 and 1.5 on, `fox --resolution 6` scores 30.6, 30.5, 31.5 and 28.9 dB (2,000
 iterations), a traced room whose walls lie beyond its cameras 18.9, 25.8, 29.2 and 29.7 (1,500)."""
+
+STEPS = 12
+"""Halvings in the search for the grid of `thinned`."""
 
 TRIES = 40
 """Largest number of draws of `RANDOM_POINTS` candidates; a capture whose photos hardly overlap gets fewer points."""
@@ -40,18 +44,88 @@ def seen_by(
     """
     counts = np.zeros(len(points), dtype=np.int64)
     for camera in cameras:
-        local = camera.world_to_cam(points)
-        if camera.projection.plain:
-            x, y, z = np.moveaxis(local, -1, 0)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-                ahead = z > 0
-        else:
-            u, v, _ = camera.project(local)
-            ahead = np.isfinite(u)
-        with np.errstate(invalid="ignore"):
-            counts += ahead & (u >= 0) & (u <= camera.W - 1) & (v >= 0) & (v <= camera.H - 1)
+        counts += in_image(points, camera)[0]
     return counts >= least
+
+
+def in_image(
+    points: Float64[np.ndarray, "N 3"], camera: Camera
+) -> tuple[Bool[np.ndarray, " N"], Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+    """Return which points lie in a camera's image, and their columns and rows there, px.
+
+    Args:
+        points: (N, 3) world units.
+        camera: The camera.
+    """
+    local = camera.world_to_cam(points)
+    if camera.projection.plain:
+        x, y, z = np.moveaxis(local, -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            ahead = z > 0
+    else:
+        u, v, _ = camera.project(local)
+        ahead = np.isfinite(u)
+    with np.errstate(invalid="ignore"):
+        return ahead & (u >= 0) & (u <= camera.W - 1) & (v >= 0) & (v <= camera.H - 1), u, v
+
+
+def thinned(points: Float64[np.ndarray, "N 3"], most: int) -> Int64[np.ndarray, " M"]:
+    """Choose points evenly in space: the first one in each cell of the finest grid that leaves few enough.
+
+    Args:
+        points: (N, 3) finite, any units.
+        most: Largest number of points.
+
+    Returns:
+        Their indices, ascending; all if there are not more.
+    """
+    if len(points) <= most:
+        return np.arange(len(points))
+    low = points.min(axis=0)
+    edge = float((points.max(axis=0) - low).max()) or 1.0
+    fine, coarse = (
+        0.0,
+        1.0,
+    )  # the logarithm of the number of cells along the longest edge, as a share of 20 bits
+    chosen = np.zeros(1, np.int64)
+    for _ in range(STEPS):
+        share = (fine + coarse) / 2.0
+        cells = np.minimum((points - low) * (2.0 ** (20.0 * share) / edge), 2.0**20 - 1).astype(np.int64)
+        found = np.unique((cells[:, 0] << 40) | (cells[:, 1] << 20) | cells[:, 2], return_index=True)[1]
+        if len(found) <= most:
+            fine, chosen = share, found
+        else:
+            coarse = share
+    return np.sort(chosen)
+
+
+def colored(points: Float64[np.ndarray, "N 3"], views: Sequence[View]) -> Float64[np.ndarray, "N 3"]:
+    """Colour points by photos: each takes the pixel of the nearest camera that has it in its image.
+
+    What hides a point is not known; it seldom stands before the nearest camera.
+
+    Args:
+        points: (N, 3) world units.
+        views: Views with photos.
+
+    Returns:
+        Colours, 0 to 1; grey for points that no photo shows.
+    """
+    nearest, of = np.full(len(points), np.inf), np.full(len(points), -1)
+    for number, view in enumerate(views):
+        distance = np.linalg.norm(points - view.camera.eye, axis=1)
+        closer = in_image(points, view.camera)[0] & (distance < nearest)
+        nearest[closer], of[closer] = distance[closer], number
+    colors = np.full((len(points), 3), 0.5)
+    for number, view in enumerate(views):
+        mine = np.flatnonzero(of == number)
+        if len(mine):
+            _, u, v = in_image(points[mine], view.camera)
+            image = view.read().image
+            scale = 255.0 if image.dtype == np.uint8 else 1.0
+            colors[mine] = image[np.rint(v).astype(int), np.rint(u).astype(int)] / scale
+    return colors
 
 
 def cloud_in_cube(cameras: Sequence[Camera], centre: Float64[np.ndarray, "3"], half_edge: float) -> Cloud:

@@ -216,7 +216,7 @@ def check_agreement(survey: Survey) -> list[Finding]:
     """Find poses that the photos contradict, as `gsplat_edu.survey.proof` compares them."""
     proof = survey.proof
     if proof is not None and proof.verdict is Verdict.MISREAD:
-        advice = "export the poses again with the other convention, or correct their file"
+        advice = "correct the file of the poses for other programs; training reads them as the photos show"
         return [Finding("misread poses", Severity.WARNING, str(proof), advice)]
     if proof is not None and proof.verdict is Verdict.DISAGREE:
         advice = "give the poses of these photos, or find new ones: gsplat-edu sfm"

@@ -8,7 +8,7 @@ from pathlib import Path
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.options.depth import add_depth, check_depth
-from gsplat_edu.options.poses import add_poses, posed_by
+from gsplat_edu.options.poses import add_poses, add_trust, posed_by
 from gsplat_edu.options.values import add_backend, number_text, whole_number_text
 from gsplat_edu.train.length import DEFAULT_QUALITY
 
@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     before = parser.add_argument_group("before training")
     add_poses(before)
+    add_trust(before)
     before.add_argument(
         "--no-forecast", action="store_true", help="skip the forecast of training time and memory"
     )

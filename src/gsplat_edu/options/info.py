@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.options.poses import add_poses, posed_by
+from gsplat_edu.options.poses import add_poses, add_trust, posed_by
 
 EXAMPLE = "example: gsplat-edu info captures/plush"
 
@@ -15,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     meant = "capture, run folder or scene file; without it, describe this computer and its GPUs"
     parser.add_argument("path", type=Path, metavar="PATH", nargs="?", help=meant)
     add_poses(parser)
+    add_trust(parser)
 
 
 def check(arguments: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""The option `--poses`: the file of a capture whose poses are read."""
+"""The options of a capture's poses: the file that they are read from, and whether the photos prove them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,20 @@ def add_poses(group: argparse._ActionsContainer) -> None:
         metavar="FILE",
         help="read the poses of this file in the capture's folder, such as cameras.xml (default: a COLMAP model or"
         " transforms.json, else the file that poses the most photos)",
+    )
+
+
+def add_trust(group: argparse._ActionsContainer, more: str = "") -> None:
+    """Add the option that keeps poses from being judged.
+
+    Args:
+        group: Receives it.
+        more: What else it does in a command.
+    """
+    group.add_argument(
+        "--trust-poses",
+        action="store_true",
+        help="read the poses as their file has them, without comparing them with the photos" + more,
     )
 
 

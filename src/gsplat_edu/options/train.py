@@ -21,7 +21,7 @@ from gsplat_edu.options.asked import (
 )
 from gsplat_edu.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.options.length import length_of, strategy_of
-from gsplat_edu.options.poses import add_poses, posed_by
+from gsplat_edu.options.poses import add_poses, add_trust, posed_by
 from gsplat_edu.options.settings import (
     add_setting,
     add_settings,
@@ -133,12 +133,8 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     _add_length(parser.add_argument_group("length and limits"))
     photos = parser.add_argument_group("photos")
     _add_photos(photos)
-    photos.add_argument(
-        "--keep-photos",
-        action="store_true",
-        help="also train on photos whose poses are certainly wrong (default: leave them out and say so)",
-    )
     add_poses(photos)
+    add_trust(photos, ", and train on photos whose poses are certainly wrong too")
     add_panorama(photos)
     add_scale(photos)
     _add_results(parser.add_argument_group("results"))
@@ -164,9 +160,9 @@ def _add_start(start: argparse._MutuallyExclusiveGroup) -> None:
     start.add_argument(
         "--points",
         type=Path,
-        metavar="X.ply",
-        help=f"start from these points instead of the capture's; {RANDOM_POINTS}: where the capture has none, do not"
-        " triangulate any",
+        metavar="X.ply|X.las",
+        help="start from these points instead of the capture's: PLY, PCD, LAS, LAZ, E57;"
+        f" {RANDOM_POINTS}: where the capture has none, do not triangulate any",
     )
 
 

@@ -9,6 +9,7 @@ from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset, DataSettings
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.parts import stored_config
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.part import parts
@@ -60,7 +61,7 @@ def run_reader(config: dict[str, Any], path: Path | None = None) -> CaptureReade
     Raises:
         CheckpointError: config.json does not name the dataset by a path of this computer, or its settings are damaged.
     """
-    data_settings(config)  # checks the section
+    reading = data_settings(config).reading
     if path is None:
         named = config["data"].get("path")
         path = stored_path(named)
@@ -72,21 +73,22 @@ def run_reader(config: dict[str, Any], path: Path | None = None) -> CaptureReade
             raise CheckpointError(
                 f"{named}: the run's dataset no longer exists; give its folder with --dataset PATH"
             )
-    return CaptureReader(path)
+    return CaptureReader(path, reading)
 
 
-def reader_for(path: Path, given: CaptureReader | None) -> CaptureReader:
-    """Return the reader that a caller was given, or make one if there is none.
+def reader_for(options: RunOptions, given: CaptureReader | None) -> CaptureReader:
+    """Return the reader that a caller was given, under the reading of a run, or make one if there is none.
 
     Args:
-        path: The capture.
-        given: Its reader, or None.
+        options: The run.
+        given: The reader of its capture, or None.
 
     Raises:
         ArgumentError: the reader is that of another capture.
     """
+    path, reading = options.data, options.data_settings.reading
     if given is None:
-        return CaptureReader(path)
+        return CaptureReader(path, reading)
     if given.path != path:
         raise ArgumentError(f"reader: reads {given.path}, but the run's capture is {path}; make one for that")
-    return given
+    return given.under(reading)

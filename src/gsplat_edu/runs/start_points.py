@@ -1,4 +1,4 @@
-"""Start points for a capture that has poses but no points: triangulated from its photos where COLMAP is installed."""
+"""Start points of a run: triangulated from the photos where a capture has none, or of a laser scan."""
 
 from __future__ import annotations
 
@@ -6,17 +6,30 @@ import dataclasses
 import importlib.util
 import os
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
+
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.text import install_command
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.point_files import read_points
 from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.reader import CaptureReader
+from gsplat_edu.data.visible_cloud import colored, seen_by, thinned
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.sfm.triangulate import triangulate
 
 NAME = "points.ply"
 """File of the triangulated points in a run's folder, in the capture's coordinates."""
+
+MOST_POINTS = 500_000
+"""Most points of a file that a run starts from; more are thinned evenly."""
+
+LEAST_SEEN = 500
+"""Fewer points of a file that the photos see mean that it has other coordinates than the capture."""
 
 CORE_SECONDS, TIME_SHARE = 3.0, 0.25
 """Expected processor time of a photo's features and matches, s, twice that of the machine of benchmarks/RESULTS.md; and
@@ -33,10 +46,12 @@ def with_start_points(
     progress: Progress = lambda stage, done, total: None,
     time_limit: float | None = None,
 ) -> RunOptions:
-    """Triangulate start points if the capture has none, and keep them in the run's folder.
+    """Make the start points that a capture lacks, or those of a scan, and keep them in the run's folder.
 
-    Only training photos take part. Without the extra `sfm`, or where photos match too little, the run starts from
-    random points, and a sentence says so.
+    Of a point cloud that is given, points that no photo sees are left out, the others thinned, and coloured by the
+    photos if they have no colour; a PLY with colours and few points stays as it is. Without one, points are
+    triangulated if the capture has none. Only training photos take part. Without the extra `sfm`, or where photos match
+    too little, the run starts from random points, and a sentence says so.
 
     Args:
         options: Options of the run.
@@ -53,11 +68,13 @@ def with_start_points(
         DatasetError: the capture or one of its photos cannot be read, or COLMAP failed.
         OSError: the file cannot be written.
     """
-    if options.points is not None or options.scene is not None:
+    if options.scene is not None:
         return options
     stored = options.folder.path / NAME
     if options.folder.exists():  # to be resumed; without --resume, it is refused later
         return dataclasses.replace(options, points=stored) if stored.is_file() else options
+    if options.points is not None:
+        return _with_given(options, options.points, reader, stored, say)
     dataset = Dataset.of(reader, options.data_settings)
     if dataset.measured or len(dataset.train) < 2:
         return options
@@ -79,6 +96,34 @@ def with_start_points(
     say(
         f"triangulated {len(cloud.points):,} start points from the given poses; --points random starts without"
     )
+    return dataclasses.replace(options, points=stored)
+
+
+def _with_given(options: RunOptions, path: Path, reader: CaptureReader, stored: Path, say: Say) -> RunOptions:
+    """Take over the points of a file, as far as training needs them."""
+    found = read_points(path)
+    if not found.scan and found.colors is not None and len(found.points) <= MOST_POINTS:
+        return options
+    settings = dataclasses.replace(options.data_settings, lens="undistort")
+    dataset = Dataset.of(reader, settings)
+    points = found.points - dataset.origin
+    chosen = np.flatnonzero(seen_by(points, [view.camera for view in dataset.train], least=1))
+    if len(chosen) < min(LEAST_SEEN, len(points)):
+        middle = ", ".join(f"{x:.6g}" for x in np.nanmedian(found.points, axis=0))
+        raise DatasetError(
+            f"--points: {path}: the photos see {len(chosen):,} of {len(points):,} points, whose middle is at"
+            f" ({middle}); bring them into the coordinates of the capture's poses"
+        )
+    chosen = chosen[thinned(points[chosen], MOST_POINTS)]
+    points = points[chosen]
+    colors = colored(points, dataset.train) if found.colors is None else found.colors[chosen]
+    stored.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(stored) as aside:
+        write_points_ply(aside, Cloud(points + dataset.origin, colors))
+    taken = (
+        f"{path}: training starts from {len(points):,} of {len(found.points):,} points that the photos see"
+    )
+    say(taken + (", coloured by the photos" if found.colors is None else ""))
     return dataclasses.replace(options, points=stored)
 
 

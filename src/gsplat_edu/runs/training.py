@@ -205,7 +205,7 @@ class CaptureRun:
         self.seconds = 0.0
         self._began: float | None = None  # during training: when the count of seconds started
         settings = as_trained(options.data_settings, options.config)
-        reader = reader_for(options.data, reader)
+        reader = reader_for(options, reader)
         capture = self._captured(reader, Dataset.of(reader, settings, points=options.points))
         self.dataset = capture.dataset
         for note in self.dataset.notes:

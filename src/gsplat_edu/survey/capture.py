@@ -98,6 +98,11 @@ class Survey:
     proof: Proof | None = None
 
     @property
+    def reading(self) -> str | None:
+        """The reading of the poses that the photos show to be right; None for that of the capture's format."""
+        return (self.proof and self.proof.reading) or None
+
+    @property
     def names(self) -> list[str]:
         """Names of the readable photos."""
         return [shot.name for shot in self.shots]
@@ -114,19 +119,24 @@ def prepare(
     sharpness: bool = True,
     depth: Path | None = None,
     left_out: Sequence[str] | None = None,
+    trust: bool = False,
 ) -> Survey:
-    """Read a capture and measure its photos, a few at a time.
+    """Read a capture and measure its photos, a few at a time; poses that were misread are read as the photos show.
 
     Args:
         reader: The capture.
         progress: Called with (photos done, total) in the calling thread.
         sharpness: Measure the photos' sharpness and compare them with the poses too, which takes most of the time.
+        trust: Do not compare them with the poses.
         depth: Where depth comes from that is judged too; see `gsplat_edu.data.depths.DepthSource`.
         left_out: Photos that are not used; None uses the capture's own list.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
+    proof = prove(reader, left_out) if sharpness and not trust else None
+    if proof is not None:
+        reader = reader.under(proof.reading or None)
     frames, left = _used(reader, left_out)
     headers = reader.headers
     shots, refused = list[Shot](), list[Refused]()
@@ -146,7 +156,7 @@ def prepare(
     if depth is not None and shots:
         judged = _judged_depth(reader, [(shot.name, shot.camera) for shot in shots], depth)
     survey = _survey(reader, shots, refused, left, judged)
-    return replace(survey, proof=prove(reader, left_out)) if sharpness and len(shots) > 1 else survey
+    return replace(survey, proof=proof) if len(shots) > 1 else survey
 
 
 class Undecided:

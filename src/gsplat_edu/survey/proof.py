@@ -15,9 +15,10 @@ from enum import Enum
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import DatasetError
-from gsplat_edu.data.capture import Frame, fits_camera, whole_panoramas
+from gsplat_edu.data.capture import Cloud, Frame, fits_camera, whole_panoramas
 from gsplat_edu.data.conventions import READINGS, mistake, readings_for
 from gsplat_edu.data.left_out import is_left_out, read_left_out
 from gsplat_edu.data.lens import Lens
@@ -52,6 +53,11 @@ BEYOND = 0.1
 
 IN_PAIRS = 0.8
 """...and in this share of the pairs."""
+
+
+SAME = 1e-6
+"""Relative difference of errors that are equal but for rounding: the readings differ by a turn of the whole world.
+The capture's points choose between them."""
 
 
 class Verdict(Enum):
@@ -145,14 +151,14 @@ def prove(reader: CaptureReader, left_out: Sequence[str] | None = None) -> Proof
     pairs = _matched(photos, _chosen(photos))
     if len(pairs) < FEWEST_PAIRS:
         return Proof(Verdict.UNCHECKED, float("nan"), len(pairs), sum(len(pair.a) for pair in pairs))
-    errors = {"": _errors(photos, pairs)}
+    read = {"": photos}
     for name in readings_for(frames):
         try:
-            read = whole_panoramas([READINGS[name](frame) for frame in frames])
+            read[name] = whole_panoramas([READINGS[name](frame) for frame in frames])
         except DatasetError:
             continue  # a focal length of zero, or a number out of range: nobody meant that
-        errors[name] = _errors(read, pairs)
-    return _judged(photos, pairs, errors)
+    errors = {name: _errors(read[name], pairs) for name in read}
+    return _judged(read, pairs, errors, reader.capture.cloud)
 
 
 def _fits(frame: Frame, reader: CaptureReader) -> bool:
@@ -245,14 +251,22 @@ def _angles(a: Float64[np.ndarray, "m 3"], b: Float64[np.ndarray, "m 3"]) -> Flo
 
 
 def _judged(
-    photos: Sequence[Frame], pairs: Sequence[_Pair], errors: dict[str, list[Float64[np.ndarray, "..."]]]
+    read: dict[str, list[Frame]],
+    pairs: Sequence[_Pair],
+    errors: dict[str, list[Float64[np.ndarray, "..."]]],
+    cloud: Cloud | None,
 ) -> Proof:
+    photos = read[""]
     medians = {name: float(np.median(np.concatenate(of_pairs))) for name, of_pairs in errors.items()}
     by_pair = {name: np.array([np.median(e) for e in of_pairs]) for name, of_pairs in errors.items()}
     used = {photo for pair in pairs for photo in (pair.one, pair.other)}
     unit = float(np.median([_coarseness(photos[photo]) for photo in sorted(used)]))
     given, matches = medians[""], sum(len(pair.a) for pair in pairs)
     best = min((name for name in medians if name), key=lambda name: medians[name], default="")
+    if best and cloud is not None:
+        equal = [name for name in medians if name and medians[name] <= medians[best] * (1.0 + SAME)]
+        points = cKDTree(cloud.points[np.isfinite(cloud.points).all(axis=1)])
+        best = min(equal, key=lambda name: _beside(read[name], pairs, points)) if points.n else best
     improved = float(np.mean(by_pair[best] < by_pair[""]))
     if (
         best
@@ -264,6 +278,22 @@ def _judged(
         return Proof(Verdict.MISREAD, given, len(pairs), matches, best, medians[best])
     verdict = Verdict.AGREE if given <= AGREES * unit else Verdict.DISAGREE
     return Proof(verdict, given, len(pairs), matches)
+
+
+def _beside(photos: Sequence[Frame], pairs: Sequence[_Pair], points: cKDTree) -> float:
+    """Return how far the matches, triangulated, are from the capture's points: a median, world units."""
+    found = []
+    for pair in pairs:
+        one, other = photos[pair.one], photos[pair.other]
+        a, b = (
+            rays @ photo.R
+            for rays, photo in zip(pair.rays_of((one.lens, other.lens)), (one, other), strict=True)
+        )
+        between, across = other.eye - one.eye, np.sum(a * b, axis=1)
+        parallel = np.maximum(1.0 - across**2, 1e-12)
+        along = (a @ between - across * (b @ between)) / parallel
+        found.append(points.query(one.eye + along[:, None] * a)[0])
+    return float(np.median(np.concatenate(found)))
 
 
 def _coarseness(frame: Frame) -> float:
