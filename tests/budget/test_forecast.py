@@ -22,6 +22,7 @@ from gsplat_edu.budget.costs import (
 )
 from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import pairs_at_first, probe, resident_bytes
+from gsplat_edu.budget.trial import without_changes
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
@@ -32,7 +33,7 @@ from gsplat_edu.parts.surface.part import TERMS_TIME
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH, GivenDepth
 from gsplat_edu.train.capacity import wanted_gaussians
-from gsplat_edu.train.config import recipe
+from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.train.initialize import random_ball
@@ -346,3 +347,19 @@ def test_the_process_knows_its_age_and_size():
     first = process_age()
     assert 0.0 < first <= process_age() < 1e6
     assert 2**20 < resident_bytes() < 2**50
+
+
+def test_a_trial_times_a_step_without_what_parts_say():
+    asked = {
+        "surface": True,
+        "appearance": "exposure",
+        "refine": "poses",
+        "sky": "shell",
+        "transients": "mask",
+    }
+    config = recipe(3000, strategy="fast", max_gaussians=100, outside_masks="empty", **asked)
+    timed = without_changes(config, 10, 100)
+    assert {name: getattr(timed, name) for name in asked} == {
+        name: getattr(TrainConfig, name) for name in asked
+    }
+    assert timed.outside_masks == "empty"  # no cost of its own: its time is that of the step

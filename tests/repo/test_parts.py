@@ -21,7 +21,7 @@ LOOPING = (
     "runs/options.py",
 )
 LOOPING += ("runs/identity.py", "runs/parts.py", "runs/pilot.py")
-LOOPING += ("budget/forecast.py", "runs/cleaning.py", "runs/lod_refinement.py")
+LOOPING += ("budget/forecast.py", "budget/trial.py", "runs/cleaning.py", "runs/lod_refinement.py")
 """Modules that ask each part for what they need of its settings, and of what the user asked of it."""
 
 OPTIONS = ("options/train.py", "options/block_parts.py", "options/settings.py", "options/length.py")

@@ -20,7 +20,7 @@ from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
+from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, joined_terms, make_objective
 from gsplat_edu.train.rendered import Needs
 from gsplat_edu.train.step import mean_over_views
 
@@ -72,6 +72,17 @@ def test_regularisers_match_the_paper(capture):
         without = run.stepper.parameters()[name].grad
         torch.testing.assert_close(with_all[name], without + getattr(twin, name).grad)
     assert torch.equal(with_all["means"], run.gaussians.means.grad)
+
+
+def test_a_term_of_a_part_replaces_no_other():
+    """Neither ours nor another part's."""
+    mean, other = (lambda rendered: rendered.image.mean()), (lambda rendered: rendered.image.max())
+    assert set(joined_terms({"mean": mean}, {"other": other})) == {"mean", "other"}
+    with pytest.raises(ArgumentError, match="^terms: two are named 'mean'"):
+        joined_terms({"mean": mean}, {"mean": other})
+    for taken in ("photo", "opacity", "scale"):
+        with pytest.raises(ArgumentError, match=f"^terms: two are named '{taken}'"):
+            make_objective(MCMC, others={taken: mean})
 
 
 def test_fast_regularises_the_opacity_of_visible_gaussians_if_they_are_few(capture):

@@ -22,9 +22,10 @@ from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, Views, training
-from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.config import BY_NAME, TrainConfig
 from gsplat_edu.train.density.surgery import split_children
 from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.part import flat_name, parts
 from gsplat_edu.train.resident import leaves_device
 from gsplat_edu.train.trainer import Trainer
 
@@ -107,7 +108,7 @@ def run_trial(
 
     untimed = 1 if make_run is None else len(views) + 1
     trainer = training(
-        _without_changes(config, untimed + TIMED_STEPS, len(gaussians)),
+        without_changes(config, untimed + TIMED_STEPS, len(gaussians)),
         Views(views),
         replace(backend, rasterize=counting, resident=None if make_run is None else counted),
         Start(gaussians, extent=extent),
@@ -121,8 +122,9 @@ def run_trial(
     return Trial(len(gaussians), pixels, most, np.diff(moments[untimed - 1 :]).tolist(), exchange)
 
 
-def _without_changes(config: TrainConfig, steps: int, gaussians: int) -> TrainConfig:
-    """Return a configuration of so many steps at full size that changes no density."""
+def without_changes(config: TrainConfig, steps: int, gaussians: int) -> TrainConfig:
+    """Return a configuration of so many steps at full size that changes no density, without what is not timed."""
+    untimed = {flat_name(part, name) for part, each in parts().items() for name in each.untimed}
     return config.changed(
         iterations=steps,
         batch=1,
@@ -133,8 +135,7 @@ def _without_changes(config: TrainConfig, steps: int, gaussians: int) -> TrainCo
         fast_start_factor=1.0,
         fast_stop=steps + 1,
         max_gaussians=max(gaussians, config.max_gaussians or 0),
-        surface=False,  # `costs.term_factors` adds the time of its terms
-        **dict.fromkeys(("refine", "appearance", "transients", "sky"), "none"),
+        **{name: BY_NAME[name].default for name in untimed},
     )
 
 

@@ -98,7 +98,7 @@ class Bench:
             OutOfTimeError: the time is over.
         """
         config = pilot_config(self.config)  # renders are alike for all
-        renderer, colors, scores = self.renderer(config), config.appearance != "none", []
+        renderer, colors, scores = self.renderer(config), config.corrects_colors, []
         for view in pilot.shown.test:
             self._check_time(self._steps)
             psnr = aligned_psnr(

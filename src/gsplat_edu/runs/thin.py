@@ -174,7 +174,7 @@ def _longer(scores: dict[int, float], length: int) -> list[int]:
 
 def _scored(gaussians: Gaussians, judges: Sequence[View], options: RunOptions) -> tuple[float, float] | None:
     """Return the mean PSNR and shifted PSNR, dB, with fitted exposures if the run has them; None without pixels."""
-    fitted = options.config.appearance != "none"
+    fitted = options.config.corrects_colors
     shifted = []
 
     def compare(view: View, score: ImageScore, image: Picture, truth: Picture) -> None:

@@ -22,7 +22,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.initialize import from_points, make_strategy
-from gsplat_edu.train.objective import Term, make_objective
+from gsplat_edu.train.objective import Term, joined_terms, make_objective
 from gsplat_edu.train.overlap import separate_views
 from gsplat_edu.train.part import parts as registered_parts
 from gsplat_edu.train.part_values import Masker, Setup
@@ -165,17 +165,18 @@ def _begun(setup: Setup) -> tuple[dict[str, Term], ViewModel, dict[str, Masker]]
     """Let all parts begin, in turn; return their terms, their view models as one, and what masks pixels.
 
     Raises:
-        ArgumentError: as for `Part.begin`.
+        ArgumentError: as for `Part.begin`, or two terms have one name.
     """
     terms, models, maskers = dict[str, Term](), list[ViewModel](), dict[str, Masker]()
     for name, part in registered_parts().items():
         settings = setup.config.settings_of(name)
         begun = part.begin(settings, dataclasses.replace(setup, view_model=chained(models)))
         if begun is not None:
-            terms |= begun.terms
+            terms = joined_terms(terms, begun.terms)
             models += [] if begun.view_model is None else [begun.view_model]
             maskers |= {} if begun.masker is None else {name: begun.masker}
-        terms |= {f"{name}.{own}": term for own, term in part.terms(settings, setup.extent).items()}
+        named = {f"{name}.{own}": term for own, term in part.terms(settings, setup.extent).items()}
+        terms = joined_terms(terms, named)
     return terms, chained(models), maskers
 
 

@@ -530,6 +530,11 @@ class TrainConfig:
         return self.start_opacity, self.start_scale
 
     @property
+    def corrects_colors(self) -> bool:
+        """Whether an image gets the exposure of its photo before they are compared."""
+        return self.appearance != "none"
+
+    @property
     def learning_rates(self) -> dict[str, float]:
         """Adam's rate of every raw parameter by name; for the means, the initial rate without the extent."""
         return {

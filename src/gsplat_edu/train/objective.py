@@ -95,6 +95,17 @@ def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
     return first
 
 
+def joined_terms(terms: Mapping[str, Term], others: Mapping[str, Term]) -> dict[str, Term]:
+    """Return the terms of both by name.
+
+    Raises:
+        ArgumentError: a name is in both.
+    """
+    if taken := sorted(set(terms) & set(others)):
+        raise ArgumentError(f"terms: two are named {taken[0]!r}; rename that of the part")
+    return {**terms, **others}
+
+
 def make_objective(
     config: TrainConfig,
     shell: Shell | None = None,
@@ -115,6 +126,9 @@ def make_objective(
         loss: Compares images and photos; see `photo_loss`.
         others: The terms of parts by name.
 
+    Raises:
+        ArgumentError: a part's term has the name of one of ours.
+
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
     terms: dict[str, Term] = {PHOTO: PhotoTerm(config.ssim_weight, loss)}
@@ -123,7 +137,7 @@ def make_objective(
         terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
         terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, FEW_VISIBLE)
-    return Objective(terms | dict(others or {}))
+    return Objective(joined_terms(terms, others or {}))
 
 
 @dataclass(frozen=True)

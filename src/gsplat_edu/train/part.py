@@ -33,7 +33,10 @@ class Part:
     config.json begin with the plug-in's name."""
 
     off_device: ClassVar[tuple[str, ...]] = ()
-    """Settings of which a device can only do the default."""
+    """Settings of which a device can only do the default: those that add a term, correct views or mask pixels."""
+
+    untimed: ClassVar[tuple[str, ...]] = ()
+    """Settings that have their default in the steps that a forecast times, as when `cost` adds their time."""
 
     def leaves_device(self, settings: Any, asked: str | None) -> str | None:  # noqa: ANN401
         """Return what of the part no device can do, as "appearance is exposure"; None if it can do all.
@@ -57,9 +60,10 @@ class Part:
         return None
 
     def terms(self, settings: Any, extent: float) -> Mapping[str, Any]:  # noqa: ANN401
-        """Return terms of the objective (`gsplat_edu.train.objective.Term`) by name.
+        """Return terms of the objective (`gsplat_edu.train.objective.Term`) by name, for a part that only has terms.
 
-        With the settings' defaults there must be none: every training asks.
+        Log and report call them PART.TERM; those that `begin` returns are called by their names as they are. With the
+        settings' defaults there must be none: every training asks.
 
         Args:
             settings: The run's `Settings`.
@@ -287,7 +291,8 @@ OWN_PARTS = {
     "given_depth": "gsplat_edu.parts.given_depth.part:GIVEN_DEPTH",
     "floaters": "gsplat_edu.parts.floaters.part:FLOATERS",
 }
-"""Entry points of our own parts, in the order in which they act: poses move a camera before its image is corrected."""
+"""Entry points of our own parts, in the order in which they act: poses move a camera before its image is corrected.
+A part that only adds terms may stand anywhere."""
 
 PLUGGED_PARTS: Mapping[str, Part] = plugins("parts")
 PLUGGED_STRATEGIES: Mapping[str, Strategy] = plugins("strategies")
@@ -307,6 +312,11 @@ def parts() -> Mapping[str, Part]:
         )
     own = {name: EntryPoint(name, value, "gsplat_edu.parts").load() for name, value in OWN_PARTS.items()}
     return own | dict(PLUGGED_PARTS)
+
+
+def flat_name(part: str, setting: str) -> str:
+    """Return the name of a part's setting in config.json: with the part's name before it if it is a plug-in."""
+    return f"{part}_{setting}" if part in PLUGGED_PARTS else setting
 
 
 def default_settings() -> dict[str, Any]:

@@ -259,9 +259,9 @@ class ResidentStepper:
         self._read()
         return self._host.state()
 
-    def loaded(self, parts: Mapping[str, dict[str, Tensor]], iteration: int) -> Loaded:
+    def loaded(self, tensors: Mapping[str, dict[str, Tensor]], iteration: int) -> Loaded:
         """Check the tensors of a checkpoint; see `Stepper.loaded`."""
-        return self._host.loaded(parts, iteration)
+        return self._host.loaded(tensors, iteration)
 
     def take_over(self, loaded: Loaded) -> None:
         """Continue from a checked state; see `Stepper.take_over`."""

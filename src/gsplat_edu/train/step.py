@@ -51,7 +51,9 @@ def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
 
 @dataclass(frozen=True)
 class StepParts:
-    """The parts of a step; `gsplat_edu.train.compose` makes those that a configuration asks for.
+    """What a step consists of; `gsplat_edu.train.compose` makes what a configuration asks for.
+
+    The parts of a training (`gsplat_edu.train.part.Part`) contribute terms, view models and maskers to it.
 
     Args:
         objective: The objective to minimise.
@@ -170,8 +172,12 @@ class Stepper(Protocol):
         """Return the tensors of a checkpoint by group and name, and the number of views of the steps taken."""
         ...
 
-    def loaded(self, parts: Mapping[str, dict[str, Tensor]], iteration: int) -> Loaded:
+    def loaded(self, tensors: Mapping[str, dict[str, Tensor]], iteration: int) -> Loaded:
         """Check the tensors of a checkpoint, without changing anything.
+
+        Args:
+            tensors: By group and name, as `state` returns them.
+            iteration: Images of the steps taken.
 
         Raises:
             ArgumentError: the state does not fit; the message names the entry.
@@ -265,7 +271,11 @@ class TensorStepper:
         return terms
 
     def _single_step(self, view: StepView, iteration: int) -> Terms:
-        """Take a step with one view, moving the Gaussians in the backward pass if the backend offers it."""
+        """Take a step with one view, moving the Gaussians in the backward pass if the backend offers it.
+
+        `RenderOutput.defer` then keeps that pass from the Gaussians until `apply` finishes it, with Adam's step in it.
+        The norms that density control observes are known only then.
+        """
         rendered, rows = self._rendered(view, iteration)
         defer = rendered.output.defer if self.fuses else None
         in_backward = None if defer is None else defer()
@@ -403,15 +413,15 @@ class TensorStepper:
         moments, steps = self.optimizer.state()
         return {"gaussians": self.gaussians.tensors(), "view_model": self._learned, **moments}, steps
 
-    def loaded(self, parts: Mapping[str, dict[str, Tensor]], iteration: int) -> Loaded:
+    def loaded(self, tensors: Mapping[str, dict[str, Tensor]], iteration: int) -> Loaded:
         """Check a state; see `Stepper.loaded`. The number of Gaussians may differ from the start's."""
-        gaussians = self._checked_gaussians(parts["gaussians"])
-        learned = check_entries("view_model", parts["view_model"], tuple(self._learned))
+        gaussians = self._checked_gaussians(tensors["gaussians"])
+        learned = check_entries("view_model", tensors["view_model"], tuple(self._learned))
         for name, like in self._learned.items():
             check_tensor_kind(f"view_model.{name}", learned[name], like.dtype, like.shape)
         parameters = gaussians.tensors() | self._learned
         optimizer = self._make_optimizer(parameters)
-        optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, parameters)
+        optimizer.load_state({moment: tensors[moment] for moment in MOMENTS}, iteration, parameters)
         return Loaded(gaussians, optimizer, learned)
 
     def take_over(self, loaded: Loaded) -> None:

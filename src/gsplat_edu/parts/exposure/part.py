@@ -29,7 +29,7 @@ from gsplat_edu.train.part_values import Begun, Setup
 class ExposurePart(Part):
     """Measures the exposure of each photo, and its vignetting if asked for."""
 
-    off_device = ("appearance",)
+    off_device = untimed = ("appearance",)
 
     def examine(self, survey: Survey) -> Examined:
         """Report photos that differ from their neighbours; nothing if they cannot be compared."""

@@ -77,7 +77,7 @@ def aligned_score(
         extent: Size of the scene, world units.
         say: Receives a sentence with the score.
     """
-    colors, background = config.appearance != "none", config.background
+    colors, background = config.corrects_colors, config.background
     scores = [aligned_psnr(gaussians, view, renderer, background, extent, colors=colors) for view in views]
     mean = mean_aligned_psnr(scores)
     if mean is None:

@@ -25,7 +25,7 @@ from gsplat_edu.train.trainer import Trainer
 class PosesPart(Part):
     """Refines poses, lenses and rolling shutters with the scene."""
 
-    off_device = ("refine",)
+    off_device = untimed = ("refine",)
 
     tried = "refine"
 

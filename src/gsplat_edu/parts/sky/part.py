@@ -17,6 +17,8 @@ from gsplat_edu.train.part_values import Setup
 class SkyPart(Part):
     """Starts a run with a shell of splats far behind the scene."""
 
+    untimed = ("sky",)
+
     def examine(self, survey: Survey) -> Examined:
         """Report a sky if there are photos to compare."""
         return Examined({"sky": check_sky(survey)} if len(survey.shots) > 1 else {})

@@ -28,7 +28,7 @@ GREY_BYTES = 2
 class SurfacePart(Part):
     """Makes normals and neighbouring photos agree with the depth, and Gaussians flat."""
 
-    off_device = ("surface",)
+    off_device = untimed = ("surface",)
 
     def cost(self, settings: TrainConfig, asked: str | None, capture: Any) -> Cost | None:  # noqa: ANN401
         """Return the time of the terms, and the room for the rays of lenses and for photos without colours."""

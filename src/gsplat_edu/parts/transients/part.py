@@ -25,7 +25,7 @@ from gsplat_edu.train.part_values import Begun, Setup
 class TransientsPart(Part):
     """Finds and masks what only single photos show."""
 
-    off_device = ("transients",)
+    off_device = untimed = ("transients",)
 
     def choose(self, setting: str, capture: Undecided) -> Remedy | None:
         """Choose `transients` by the number of photos."""
