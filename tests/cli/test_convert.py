@@ -182,7 +182,7 @@ def test_a_page_carries_a_mesh_that_moves_with_the_scene(convert, tmp_path):
         (["gone.ply", "out.ply"], "gone.ply: does not exist"),
         (
             ["IN", "out.obj"],
-            "known are .compressed.ply, .ply, .splat, .ksplat, .spz, .sog, .glb, .csv, .html",
+            "known are .compressed.ply, .ply, .splat, .ksplat, .spz, .sog, .glb, .usda, .usdc, .usdz, .csv, .html",
         ),
         (["IN", "."], "unknown scene format"),
         (["IN", "IN/out.ply"], "is a file; give a folder"),

@@ -41,7 +41,7 @@ class Activated(NamedTuple):
     means: Float[np.ndarray, "N 3"]
     quats: Float[np.ndarray, "N 4"]  # w, x, y, z
     scales: Float[np.ndarray, "N 3"]
-    opacities: Float[np.ndarray, "N"]
+    opacities: Float[np.ndarray, " N"]
     sh: Float[np.ndarray, "N K 3"]
 
     @classmethod
