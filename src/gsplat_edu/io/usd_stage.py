@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -35,13 +36,13 @@ SH = "radiance:sphericalHarmonics"
 """Beginning of the names of the harmonics' attributes."""
 
 ATTRIBUTES = {
-    "positions": ("point3", 3),
-    "orientations": ("quat", 4),
-    "scales": ("float3 half3", 3),
-    "opacities": ("float half", 0),
-    f"{SH}Coefficients": ("float3 half3", 3),
+    "positions": ("Vec3", 3),
+    "orientations": ("Quat", 4),
+    "scales": ("Vec3", 3),
+    "opacities": ("", 0),
+    f"{SH}Coefficients": ("Vec3", 3),
 }
-"""Beginnings of types, and numbers per item, of the attributes of splats; in halves, names end in h."""
+"""Beginnings of usd-core's types, and numbers per item, of the attributes of splats; in halves, names end in h."""
 
 KERNEL = "ParticleFieldKernelGaussianEllipsoidAPI"
 """Schema of fields whose particles are Gaussians in three dimensions."""
@@ -119,8 +120,8 @@ def main(path: str, found: str) -> None:
         facts = _facts(path, arrays, max(SMALL, MAX_EXPANSION * size))
     except RefusedError as error:
         facts, arrays = {"fault": str(error)}, {}
-    except (Tf.ErrorException, UnicodeDecodeError):  # the words of its own errors may be no UTF-8
-        facts, arrays = {"fault": "is damaged, or no USD file"}, {}
+    except (Tf.ErrorException, UnicodeDecodeError) as error:
+        facts, arrays = {"fault": f"is damaged, or no USD file{_place(path, error)}"}, {}
     del silent
     save_file(arrays, found, {"facts": json.dumps(facts)})
 
@@ -134,6 +135,15 @@ def _limit(size: int) -> None:
     seconds = SECONDS + size // BYTES_PER_SECOND
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _place(path: str, error: Exception) -> str:
+    """Return which line of a text usd-core complains about; nothing if it does not say."""
+    try:
+        line = re.search(rf"{re.escape(path)}:(\d+):", str(error))
+    except UnicodeDecodeError:  # it repeats what it could not read
+        return ""
+    return f": line {line[1]} cannot be read" if line else ""
 
 
 def _facts(path: str, arrays: dict[str, np.ndarray], room: int) -> dict[str, Any]:
@@ -150,8 +160,8 @@ def _facts(path: str, arrays: dict[str, np.ndarray], room: int) -> dict[str, Any
     for prim in _splats(stage):
         if any(UsdGeom.Xformable(over).TransformMightBeTimeVarying() for over in _and_above(prim)):
             raise RefusedError("has splats that move over time, and only still ones are read")
-        for name, (types, width) in ATTRIBUTES.items():
-            values = _values(prim, name, types, width)
+        for name, (kind, width) in ATTRIBUTES.items():
+            values = _values(prim, name, kind, width)
             room -= values.nbytes
             if room < 0:
                 raise RefusedError(f"shows its splats more than {MAX_EXPANSION} times")
@@ -254,7 +264,7 @@ def _splats(stage: Any) -> Iterator[Any]:  # noqa: ANN401
         raise RefusedError(f"has no splats that are shown (ParticleField3DGaussianSplat): {found}")
 
 
-def _values(prim: Any, name: str, types: str, width: int) -> np.ndarray:  # noqa: ANN401
+def _values(prim: Any, name: str, kind: str, width: int) -> np.ndarray:  # noqa: ANN401
     """Return the values of an attribute, or of the one in halves if it is empty."""
     from pxr import Usd
 
@@ -263,15 +273,14 @@ def _values(prim: Any, name: str, types: str, width: int) -> np.ndarray:  # noqa
         if attribute.GetNumTimeSamples() > 1:
             raise RefusedError("has splats that move over time, and only still ones are read")
         found = attribute.Get(Usd.TimeCode.EarliestTime())
-        if found is None or not len(found):
+        if found is None:
             continue
-        kind = str(attribute.GetTypeName())
-        best = np.array(found)
-        shape = (len(best), width) if width else (len(best),)
-        if not kind.startswith(tuple(types.split())) or best.dtype.kind != "f" or best.shape != shape:
-            raise RefusedError(f"has {name} of the type {shortened(printable(kind))}")
-        break
-    if types == "quat":
+        said, best = type(found).__name__, np.array(found)  # the attribute itself has the schema's type
+        if not said.startswith(kind) or best.dtype.kind != "f" or best.ndim != 1 + bool(width):
+            raise RefusedError(f"has {name} of the type {said}")
+        if len(best):
+            break
+    if kind == "Quat":
         best = best[:, [3, 0, 1, 2]]
     return np.ascontiguousarray(best, best.dtype if best.dtype == np.float64 else np.float32)
 
