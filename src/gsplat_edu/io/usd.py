@@ -121,7 +121,7 @@ def _layer(scene: Scene, values: Activated, *, filled: bool = True) -> Iterator[
     for (kind, name), array in _arrays(values).items():
         yield f"        {kind}[] {name} = ["
         for start in range(0, len(array) if filled else 0, BLOCK):
-            yield (", " if start else "") + _tuples(array[start : start + BLOCK])
+            yield ("," if start else "") + _tuples(array[start : start + BLOCK])
         yield "]"
         if name.startswith(SH):
             yield f' (\n            elementSize = {coefficients}\n            interpolation = "vertex"\n        )'
@@ -170,7 +170,7 @@ def _tuple(numbers: list[float]) -> str:
 def _tuples(array: Float32[np.ndarray, "..."]) -> str:
     """Return numbers, or rows of numbers, as text."""
     texts = array.astype(str).tolist()
-    return ", ".join(texts) if array.ndim == 1 else ", ".join(f"({', '.join(row)})" for row in texts)
+    return ",".join(texts) if array.ndim == 1 else ",".join(f"({','.join(row)})" for row in texts)
 
 
 def _write_crate(path: Path, scene: Scene, values: Activated) -> None:
