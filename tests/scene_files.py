@@ -1,5 +1,6 @@
 """Scenes and files shared by the tests of scene formats."""
 
+import importlib.util
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import SceneFormatError
-from gsplat_edu.io.formats import LOD_META, SOG_META, read_scene, write_scene
+from gsplat_edu.io.formats import FORMATS, LOD_META, SOG_META, read_scene, write_scene
 from gsplat_edu.io.lod import codec as lod
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.ply import save_ply
@@ -21,6 +22,9 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+IN_A_PROCESS = (".usda", ".usdc", ".usdz")
+"""Formats whose files are read in a process of their own, which takes a second to start."""
 
 RUN_UP = np.array([0.0, -0.6, 0.8])
 
@@ -73,6 +77,12 @@ def small_file(folder: Path, suffix: str, rest: int = 3) -> Path:
     write_scene(path, random_scene(40, rest))
     assert path.stat().st_size <= 16 * 1024
     return path
+
+
+def suffixes() -> list[str]:
+    """Return the suffixes of the formats that can be read here: those of USD need a library."""
+    there = importlib.util.find_spec("pxr") is not None
+    return [found.suffix for found in FORMATS if there or found.suffix not in IN_A_PROCESS]
 
 
 def small_folder(folder: Path) -> Path:

@@ -9,16 +9,16 @@ import torch
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
+from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.mesh_files import write_mesh
 from gsplat_edu.paths.keyframes import Keyframe, KeyframePath, write_path
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.viewer.export import read_back
-from scene_files import make_run, random_scene
+from scene_files import make_run, random_scene, suffixes
 
-SUFFIXES = [found.suffix for found in FORMATS] + [".html"]
+SUFFIXES = [*suffixes(), ".html"]
 
 
 @pytest.fixture
@@ -182,7 +182,7 @@ def test_a_page_carries_a_mesh_that_moves_with_the_scene(convert, tmp_path):
         (["gone.ply", "out.ply"], "gone.ply: does not exist"),
         (
             ["IN", "out.obj"],
-            "known are .compressed.ply, .ply, .splat, .ksplat, .spz, .sog, .glb, .csv, .html",
+            "known are .compressed.ply, .ply, .splat, .ksplat, .spz, .sog, .glb, .usda, .usdc, .usdz, .csv, .html",
         ),
         (["IN", "."], "unknown scene format"),
         (["IN", "IN/out.ply"], "is a file; give a folder"),

@@ -9,14 +9,14 @@ import torch
 from gsplat_edu.cli.main import main
 from gsplat_edu.cli.view import edits_file
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
+from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.paths.keyframes import Keyframe, KeyframePath
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.export import read_back
-from scene_files import make_run, random_scene
+from scene_files import make_run, random_scene, suffixes
 
-SUFFIXES = [found.suffix for found in FORMATS] + [".html"]
+SUFFIXES = [*suffixes(), ".html"]
 EYE = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 BALL = {"op": "select", "how": "replace", "by": "sphere", "center": [0, 0, 0], "radius": 0.6}
 DELETE = [BALL, {"op": "delete"}]

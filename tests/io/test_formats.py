@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from gsplat_edu.io.edit import Similarity
-from gsplat_edu.io.formats import FORMATS, file_in, losses, read_scene, stored_bytes, write_scene
-from scene_files import matched, random_scene
+from gsplat_edu.io.formats import file_in, losses, read_scene, stored_bytes, write_scene
+from scene_files import matched, random_scene, suffixes
 
 STEPS = {"means": 8 / 2**11, "log_scales": 1 / 16, "sh0": 0.03, "sh_rest": 8 / 256}
 """11 bits over a chunk's 8 units, bytes over 16 units, over the colours of SPZ, and over 8 units."""
@@ -18,7 +18,7 @@ def threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+@pytest.mark.parametrize("suffix", suffixes())
 def test_bytes_do_not_depend_on_threads(tmp_path, threads, suffix):
     """The scene has 40,000 splats, because torch splits work on more than 32,768 numbers among threads."""
     move = Similarity.of_matrix([[0, 0, 1, 0.1], [1, 0, 0, 0.2], [0, 1, 0, 0.3]])
@@ -31,7 +31,7 @@ def test_bytes_do_not_depend_on_threads(tmp_path, threads, suffix):
     assert written[0] == written[1]
 
 
-@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+@pytest.mark.parametrize("suffix", suffixes())
 def test_a_second_round_trip_gives_the_same_scene(tmp_path, suffix):
     write_scene(tmp_path / f"1{suffix}", random_scene(300))
     first = read_scene(tmp_path / f"1{suffix}")
@@ -46,7 +46,7 @@ def test_a_second_round_trip_gives_the_same_scene(tmp_path, suffix):
     assert (same.opacities - again.gaussians.opacities).abs().max() <= 1 / 255
 
 
-@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+@pytest.mark.parametrize("suffix", suffixes())
 def test_trainable_doubles_are_written_like_floats(tmp_path, suffix):
     scene = random_scene(300)
     for name, gaussians in (
@@ -63,7 +63,7 @@ def test_losses_of_a_format_are_reported(tmp_path):
     assert "up to degree 0; degrees up to 3 are dropped" in losses("a.splat", scene)[0]
 
 
-@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+@pytest.mark.parametrize("suffix", suffixes())
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_antialiasing_is_kept_or_reported_lost(tmp_path, suffix, antialiased):
     scene = replace(random_scene(3, 0), antialiased=antialiased)

@@ -11,16 +11,16 @@ import torch
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io import spz
 from gsplat_edu.io.edit import Filter, Similarity, joined
-from gsplat_edu.io.formats import FORMATS, LOD_META, SOG_META, TILESET, losses, read_scene, write_scene
+from gsplat_edu.io.formats import LOD_META, SOG_META, TILESET, losses, read_scene, write_scene
 from gsplat_edu.io.lod import tiles
 from gsplat_edu.io.ply import MEANS, OPACITY, QUATS, SCALES, SH0
 from gsplat_edu.scene.frame import origin_of, rotation_between
 from gsplat_edu.viewer import page
-from scene_files import random_scene
+from scene_files import random_scene, suffixes
 
 ORIGINS = [(1e3, -2e3, 10.0), (1e5, 2e5, -3e3), (500000.0, 4649776.0, 120.0), (3.9e6, 3.1e5, 5.02e6)]
 
-SUFFIXES = [known.suffix for known in FORMATS]
+SUFFIXES = suffixes()
 
 
 def written(path, scene):

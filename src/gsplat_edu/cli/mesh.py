@@ -22,8 +22,8 @@ from gsplat_edu.evaluate.surface import Comparison, SurfaceScores, score_surface
 from gsplat_edu.evaluate.topology import Topology
 from gsplat_edu.io.mesh_files import mesh_format_of, mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.mesh_glb import write_parts
-from gsplat_edu.io.mesh_usd import require_usd
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.usd_package import require_usd
 from gsplat_edu.jobs import emitter
 from gsplat_edu.mesh.convex import convex_parts, fit_of
 from gsplat_edu.mesh.depths import Progress, render_depths
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _make(arguments: argparse.Namespace, backend: Backend, console: Terminal, progress: Progress) -> None:
     if arguments.out.suffix.lower() == ".usdz":
-        require_usd()  # before the work of minutes
+        require_usd(".usdz")  # before the work of minutes
     truth = None if arguments.truth is None else read_mesh(arguments.truth)
     source, dataset = open_source(arguments.source), None
     if arguments.texture:

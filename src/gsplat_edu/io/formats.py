@@ -54,6 +54,9 @@ FORMATS: tuple[Format, ...] = (
     Format(".spz", "gsplat_edu.io.spz", "Niantic SPZ"),
     Format(".sog", "gsplat_edu.io.sog.codec", "PlayCanvas SOG"),
     Format(".glb", "gsplat_edu.io.glb", "glTF with KHR_gaussian_splatting"),
+    Format(".usda", "gsplat_edu.io.usd", "USD as text"),
+    Format(".usdc", "gsplat_edu.io.usd", "binary USD"),
+    Format(".usdz", "gsplat_edu.io.usd", "USD's package"),
     Format(".csv", "gsplat_edu.io.csv", "CSV of splats", metadata=False),
     *plugins("formats").values(),
 )

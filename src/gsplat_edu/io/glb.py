@@ -34,7 +34,7 @@ from jaxtyping import Float32
 from gsplat_edu.io import glb_reading
 from gsplat_edu.io.axes import half_turned, root_transform
 from gsplat_edu.io.glb_container import EXTENSION, GENERATOR, root_node, write_container
-from gsplat_edu.io.quantize import unit_quats
+from gsplat_edu.io.node_splats import Activated
 from gsplat_edu.io.scene import Scene, extras
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -43,9 +43,6 @@ POINTS, FLOAT, ARRAY_BUFFER = 0, 5126, 34962
 
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 """Type of an accessor by its number of components."""
-
-LARGEST_LOG_SCALE = 88.0
-"""exp of this is just below the largest float32."""
 
 
 def write(path: Path, scene: Scene) -> None:
@@ -69,20 +66,16 @@ def write(path: Path, scene: Scene) -> None:
 
 def _attributes(gaussians: Gaussians) -> dict[str, Float32[np.ndarray, "N C"]]:
     """Return the values of every attribute by name."""
-    raw = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
-    with np.errstate(over="ignore"):  # exp overflows to infinity: the opacity is 0
-        opacities = 1.0 / (1.0 + np.exp(-raw["logit_opacities"].astype(np.float64)))
-    scales = np.exp(np.minimum(raw["log_scales"].astype(np.float64), LARGEST_LOG_SCALE))
+    values = Activated.of(gaussians)
     arrays = {
-        "POSITION": raw["means"],
-        f"{EXTENSION}:ROTATION": unit_quats(raw["quats"])[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": scales,
-        f"{EXTENSION}:OPACITY": opacities[:, None],
+        "POSITION": values.means,
+        f"{EXTENSION}:ROTATION": values.quats[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": values.scales,
+        f"{EXTENSION}:OPACITY": values.opacities[:, None],
     }
-    coefficients = np.concatenate([raw["sh0"], raw["sh_rest"]], axis=1)
     for degree in range(gaussians.sh_degree + 1):
         for order in range(2 * degree + 1):
-            arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = coefficients[:, degree**2 + order]
+            arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = values.sh[:, degree**2 + order]
     return {name: array.astype("<f4") for name, array in arrays.items()}
 
 

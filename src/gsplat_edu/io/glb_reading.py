@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64
 
 from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io import spz
-from gsplat_edu.io.axes import POSITION_SIGNS, half_turned, root_transform
+from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
 from gsplat_edu.io.edit import Similarity, joined
 from gsplat_edu.io.glb_container import (
     EXTENSION,
@@ -28,12 +27,10 @@ from gsplat_edu.io.glb_container import (
     node_matrices,
     refuse,
 )
+from gsplat_edu.io.node_splats import Activated, is_same, moved, root_matrix
 from gsplat_edu.io.scene import Scene, read_extras
 from gsplat_edu.scene.frame import ORIGIN, Vector, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
-
-MOST_ENTRY = 1e30
-"""Largest entry of a transform: the cube of a larger scale would overflow."""
 
 ABOUT_Z = ("splat-transform",)
 """Beginnings of `asset.generator` of programs that turn scenes into glTF's axes by half a turn about z, not x."""
@@ -53,14 +50,8 @@ COMPONENTS = {
 """Component types of the attributes, n for normalised; positions in integers, either way, are those of
 KHR_mesh_quantization. Harmonics are float32."""
 
-OPAQUE = 2.0**-24
-"""Opacities are kept this far from 0 and 1 (half a float32 step at 1), so that their logits are finite."""
-
 KNOWN = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
 """Properties of the extension with the only values that are drawn here; one that is missing has this value."""
-
-SAME = 1e-12
-"""Transforms that differ by less, relative and absolute, are the same: a quaternion rounds its rotation."""
 
 SceneFrame = tuple[Vector | None, str | None, Vector]
 """Up, unit and origin of a scene."""
@@ -97,7 +88,7 @@ class _File(GlbFile):
         antialiased, frame = self._facts()
         placed = list(self._placed())
         up, unit, origin = frame if self._is_ours(frame, placed) else (None, None, ORIGIN)
-        root = _matrix(up, origin)
+        root = root_matrix(up, origin)
         meshes = self._document.get("meshes", [])
         if not placed and (self._body or meshes):
             elsewhere = any(map(_is_splats, (p for mesh in meshes for p in mesh["primitives"])))
@@ -126,9 +117,9 @@ class _File(GlbFile):
     def _is_ours(self, frame: SceneFrame, placed: Sequence[Placed]) -> bool:
         """Return whether the nodes still have the transform that we wrote for a frame."""
         up, _, origin = frame
-        root = _matrix(up, origin)
+        root = root_matrix(up, origin)
         ours = self._document["asset"].get("generator") == GENERATOR
-        return ours and all(np.allclose(part.matrix, root, rtol=SAME, atol=SAME) for part in placed)
+        return ours and all(is_same(part.matrix, root) for part in placed)
 
     def _placed(self) -> Iterator[Placed]:
         """Yield the primitives of splats with their transforms; other primitives are ignored."""
@@ -149,26 +140,12 @@ class _File(GlbFile):
         for name, only in KNOWN.items():
             if (value := kind.get(name, only)) != only:
                 self._refuse(f"has splats of {name} {str(value)[:40]}, but only {only} is supported")
-        if not np.abs(part.matrix).max() <= MOST_ENTRY:
-            self._refuse("has a node whose transform is NaN, infinite or absurdly large")
-        try:
-            move = Similarity.of_matrix(part.matrix)
-        except ArgumentError as error:
-            fault = str(error).removeprefix("matrix: ").partition(";")[0]
-            self._refuse(
-                f"has a node whose transform {fault}; splats can be turned, scaled evenly and shifted"
-            )
         own = (
             self._packed(kind["extensions"][SPZ_EXTENSION])
             if _is_packed(kind)
             else self._plain(part.primitive)
         )
-        if np.allclose(part.matrix, root, rtol=SAME, atol=SAME):
-            return own
-        moved = move.scene(own)
-        if not all(bool(tensor.isfinite().all()) for tensor in moved.gaussians.tensors().values()):
-            self._refuse("has a node whose transform takes splats beyond float32")
-        return moved
+        return moved(self._path, own, part.matrix, root)
 
     def _packed(self, extension: Mapping[str, Any]) -> Scene:
         """Return splats that are an SPZ, in glTF's axes: as CesiumJS does, its coordinates are taken as they are."""
@@ -206,13 +183,6 @@ class _File(GlbFile):
         return values.astype(np.float32)
 
 
-def _matrix(up: Vector | None, origin: Vector) -> Float64[np.ndarray, "4 4"]:
-    """Return the transform of the root of a file of ours."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = root_transform(up, origin)
-    return matrix
-
-
 def _is_splats(primitive: Mapping[str, Any]) -> bool:
     return EXTENSION in primitive.get("extensions", {})
 
@@ -240,18 +210,6 @@ def _gaussians(path: Path, arrays: Mapping[str, Float32[np.ndarray, "N C"]]) -> 
     count = len(values[0])
     if [value.shape for value in values] != [(count, width) for width in widths]:
         refuse(path, "has attributes of different numbers of splats")
-    means, quats, scales, opacities = (value.astype(np.float64) for value in values[:4])
-    if not ((scales >= 0).all() and ((opacities >= 0) & (opacities <= 1)).all()):
-        refuse(path, "has a negative scale or an opacity outside 0 to 1")
-    tiny = np.finfo(np.float32).smallest_subnormal
-    inside = np.clip(opacities[:, 0], OPAQUE, 1.0 - OPAQUE)
+    means, quats, scales, opacities = values[:4]
     sh = np.stack(values[4:], axis=1) if harmonics else np.empty((count, 1, 3))
-    tensors = (
-        means,
-        quats[:, [3, 0, 1, 2]],
-        np.log(np.maximum(scales, tiny)),
-        sh[:, :1],
-        sh[:, 1:],
-        np.log(inside / (1.0 - inside)),
-    )
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in tensors))
+    return Activated(means, quats[:, [3, 0, 1, 2]], scales, opacities[:, 0], sh).gaussians(path)

@@ -1,100 +1,46 @@
 """Meshes as USDZ: a package of USD that phones, Blender and other programs open.
 
-A USDZ is a ZIP archive without compression, whose files begin at multiples of 64 bytes, so that programs map them into
-memory. The first file, a binary layer of USD (usd-core writes it), holds the mesh, and a texture lies beside it. The
-layer's axes and unit are those of glTF (`gsplat_edu.io.mesh_glb`): y points up, and a known unit becomes the metre.
-Points are float32, which is all that a mesh of USD has; the transform of the root, in double, turns the scene's up
-direction to y and moves the mesh to its origin.
+The package's first file, a binary layer of USD (usd-core writes it), holds the mesh, and a texture lies beside it
+(`gsplat_edu.io.usd_package`). The layer's axes and unit are those of glTF (`gsplat_edu.io.mesh_glb`): y points up, and
+a known unit becomes the metre. Points are float32, which is all that a mesh of USD has; the transform of the root, in
+double, turns the scene's up direction to y and moves the mesh to its origin.
 
 Colours of vertices are linear in USD (displayColor), and left out beside a texture, as in glTF. A texture stays sRGB,
 as the diffuse colour of a UsdPreviewSurface. USD has no unlit material, so a viewer adds its own light to the photos'.
 The layer stores texture coordinates per corner of a face, so no vertex is repeated. They begin at the bottom left.
 
-Source: Pixar, "Usdz File Format Specification"; "UsdPreviewSurface Specification".
+Source: Pixar, "UsdPreviewSurface Specification".
 """
 
 from __future__ import annotations
 
-import struct
-import zipfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.files import written_aside
-from gsplat_edu.base.text import install_command
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.mesh_glb import linear
 from gsplat_edu.io.mesh_image import encoded
 from gsplat_edu.io.mesh_parts import Placement, turned_positions, vertex_normals
+from gsplat_edu.io.usd_package import require_usd, write_package
 from gsplat_edu.scene.frame import Vector
 from gsplat_edu.scene.mesh import Mesh
 
 LAYER = "mesh.usdc"
 """Name of the layer in the package."""
 
-ALIGNMENT = 64
-"""A file's content begins at a multiple of this, bytes."""
-
-LOCAL_HEADER = 30
-"""Bytes of the header before a file's name, in a ZIP archive."""
-
-PADDING = struct.Struct("<HH")
-"""Header of a field of zeros before a file's content: an identifier that no program assigns, and their number."""
-
-PADDING_ID = 0x1986
-
-EARLIEST = (1980, 1, 1, 0, 0, 0)
-"""Time of the files in the package: constant, so that the same mesh gives the same bytes."""
-
-LARGEST = 0xFFFFFFFF
-"""Bytes of a ZIP archive without extensions, which USDZ excludes."""
-
-
-def require_usd() -> None:
-    """Check that usd-core is there.
-
-    Raises:
-        ArgumentError: it is not installed.
-    """
-    try:
-        import pxr.Usd  # noqa: F401
-    except ImportError:
-        raise ArgumentError(
-            f".usdz: needs usd-core, which is not installed: {install_command('usd')}"
-        ) from None
-
 
 def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None, up: Vector | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
-    require_usd()
+    require_usd(".usdz")
     files, image = [], ""
     if mesh.texture is not None:
         image = "texture.png" if jpeg is None else "texture.jpg"
         files.append((image, encoded(mesh.texture.image, jpeg)))
     files.insert(0, (LAYER, _layer(path, mesh, Placement.of(mesh.vertices, unit, up), image)))
-    size = sum(len(data) + 4 * ALIGNMENT for _, data in files)
-    if size > LARGEST:
-        raise ArgumentError(f"{path}: {len(mesh.faces):,} faces do not fit into USDZ's 4 GiB; write a .ply")
-    with written_aside(path) as aside:
-        _pack(aside, files)
-
-
-def _pack(path: Path, files: list[tuple[str, bytes]]) -> None:
-    """Write an uncompressed archive of files, each aligned by a field of zeros in its header."""
-    offset = 0
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=False) as archive:
-        for name, data in files:
-            entry = zipfile.ZipInfo(name, EARLIEST)
-            entry.create_system = 0  # otherwise it would say on which system it was written
-            offset += LOCAL_HEADER + len(name) + PADDING.size
-            zeros = -offset % ALIGNMENT
-            entry.extra = PADDING.pack(PADDING_ID, zeros) + bytes(zeros)
-            archive.writestr(entry, data)
-            offset += zeros + len(data)
+    write_package(path, ((name, (data,)) for name, data in files), "write a .ply")
 
 
 def _layer(path: Path, mesh: Mesh, placement: Placement, image: str) -> bytes:

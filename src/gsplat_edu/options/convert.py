@@ -57,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="OUT",
         help="file to write; its suffix selects the format: .ply, .compressed.ply, .splat, .ksplat, .spz, .sog, .glb,"
-        " .csv or .html (a page that shows the scene); FOLDER/meta.json writes an unzipped SOG, FOLDER/lod-meta.json"
-        " levels of detail (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
+        " .usda, .usdz, .usdc (extra usd), .csv or .html (a page that shows the scene); FOLDER/meta.json writes an"
+        " unzipped SOG, FOLDER/lod-meta.json levels of detail (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
     )
     parser.add_argument("--merge", action="store_true", help="join several scenes into one")
     parser.add_argument(

@@ -27,7 +27,20 @@ from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 EDITS = "edits.json"
 """File of an entry with the edits of its scene."""
 
-FORMATS = ("ply", "compressed.ply", "splat", "ksplat", "spz", "sog", "glb", "csv", "html")
+FORMATS = (
+    "ply",
+    "compressed.ply",
+    "splat",
+    "ksplat",
+    "spz",
+    "sog",
+    "glb",
+    "usda",
+    "usdc",
+    "usdz",
+    "csv",
+    "html",
+)
 """Endings of exported scenes."""
 
 SURFACE, COLLIDER = "mesh.glb", "collider.glb"

@@ -48,7 +48,7 @@ PARTS = (JOBS, "trash", "uploads", "cache")
 EXPORTS = "exports"
 """Folder of an entry with the files that were exported from it."""
 
-SCENE_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".csv")
+SCENE_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".usda", ".usdc", ".usdz", ".csv")
 """Endings of scene files that can be taken in."""
 
 

@@ -26,6 +26,7 @@ from gsplat_edu.io.formats import (
 from gsplat_edu.io.lod import codec as lod_codec, tiles
 from gsplat_edu.io.lod.levels import LodOptions, build_levels
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.usd_package import require_usd
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
 from gsplat_edu.runs.lod_refinement import LevelScore, refine_levels
@@ -91,7 +92,8 @@ def check_target(name: str, path: Path) -> None:
         path: The file.
 
     Raises:
-        ArgumentError: the suffix belongs to no format, the path is a folder, or its parent folder is not writable.
+        ArgumentError: the suffix belongs to no format, or to one whose library is not installed, the path is a folder,
+            or its parent folder is not writable.
     """
     if path.suffix.lower() != PAGE:
         try:
@@ -100,6 +102,8 @@ def check_target(name: str, path: Path) -> None:
             folders = [f"FOLDER/{name}" for name in (SOG_META, *(found.suffix for found in LOD_FORMATS))]
             known = ", ".join([*(found.suffix for found in FORMATS), PAGE, *folders])
             raise ArgumentError(f"{name}: {path}: unknown scene format; known are {known}") from None
+    if path.suffix.lower() == ".usdc":
+        require_usd(f"{name}: {path}")
     if path.is_dir():
         raise ArgumentError(f"{name}: {path} is a folder; give a file name")
     check_folder(name, path.parent)

@@ -4,7 +4,7 @@ import { at, post, remove, upload } from "./api.js";
 import { announce, attempt, bytes, button, count, dateOf, errorLine, h, heading } from "./dom.js";
 
 const AT_ONCE = 3;
-const SCENES = /\.(ply|k?splat|spz|sog|glb|csv)$/i;
+const SCENES = /\.(ply|k?splat|spz|sog|glb|usd[acz]|csv)$/i;
 const VIDEOS = /\.(mp4|mov|m4v|avi|mkv|webm|mts|m2ts|mpg|mpeg|3gp|wmv)$/i; // a browser does not know the type of each
 const POSES = /(?:^|\/)(?:transforms(?:_train|_test|_val)?\.json|cameras\.(?:bin|txt))$/;
 const TAIL = 1 << 20; // bytes at the end of a zip file with the names of its files
