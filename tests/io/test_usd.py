@@ -389,10 +389,10 @@ def test_what_needs_usd_core_says_so(tmp_path, monkeypatch):
         write_scene(path, scene)
 
 
-def test_a_package_beyond_its_limit_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(usd_package, "LARGEST", 20_000)
+def test_a_package_beyond_its_limit_is_refused(tmp_path):
+    files = [("scene.usda", [bytes(10_000)] * 3)]
     with pytest.raises(ArgumentError, match=r"does not fit into the 2 GiB of a USDZ; write a \.usdc"):
-        write_scene(tmp_path / "a.usdz", random_scene(300))
+        usd_package.write_package(tmp_path / "a.usdz", files, "write a .usdc", most=20_000)
     assert list(tmp_path.iterdir()) == []
 
 

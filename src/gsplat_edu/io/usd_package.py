@@ -49,13 +49,16 @@ def require_usd(what: str) -> None:
         raise ArgumentError(f"{what}: needs usd-core, which is not installed: {install_command('usd')}")
 
 
-def write_package(path: Path, files: Iterable[tuple[str, Iterable[bytes]]], advice: str) -> None:
+def write_package(
+    path: Path, files: Iterable[tuple[str, Iterable[bytes]]], advice: str, most: int = LARGEST
+) -> None:
     """Write an uncompressed archive of files, each aligned by a field of zeros in its header.
 
     Args:
         path: Output file; parent folders are created.
         files: Name and content, in pieces, of each file.
         advice: What to do if they do not fit, for the message.
+        most: Most bytes of the package.
 
     Raises:
         ArgumentError: the package would exceed 2 GiB.
@@ -76,6 +79,6 @@ def write_package(path: Path, files: Iterable[tuple[str, Iterable[bytes]]], advi
             with archive.open(entry, "w") as file:
                 for piece in pieces:
                     offset += len(piece)
-                    if offset > LARGEST - len(name) - (1 << 10):  # leaves room for the directory
+                    if offset > most - len(name) - (1 << 10):  # leaves room for the directory
                         raise ArgumentError(f"{path}: does not fit into the 2 GiB of a USDZ; {advice}")
                     file.write(piece)
