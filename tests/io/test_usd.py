@@ -355,8 +355,8 @@ def test_prims_that_multiply_end_in_one_line(tmp_path):
     refused(tmp_path / "a.usda")
 
 
-def test_a_reader_that_crashes_is_named(tmp_path):
-    """Bit flips that crash usd-core 26.11: the first section begins beyond the end of the file."""
+def test_a_section_beyond_the_end_costs_one_line(tmp_path):
+    """Damage of this kind may crash usd-core, which therefore reads in a process of its own."""
     path = small_file(tmp_path, ".usdc")
     data = bytearray(path.read_bytes())
     toc = int.from_bytes(data[16:24], "little")
