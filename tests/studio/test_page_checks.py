@@ -4,8 +4,10 @@ import re
 
 import cv2
 import numpy as np
+import pytest
 
 from gsplat_edu.doctor.files import USUAL
+from gsplat_edu.sfm.source import expected_seconds
 from studio.pages import go
 
 BLURRED = "photo_04.jpg"
@@ -31,6 +33,20 @@ def test_the_screen_of_photos_says_how_many_are_usual_and_which_are_blurred(visi
     (finding,) = tab.locator(".findings li").all_inner_texts()
     assert re.match(r"1 of 14 photos show less detail .*first photo_04\.jpg", finding, re.DOTALL)
     assert tab.locator(".thumbs .mark:not(:empty)").all_inner_texts() == ["blurred"]
+
+
+def test_the_next_step_says_roughly_how_long_placing_takes(visitor, library):
+    folder = library[0].library.root / "photos" / "timed"
+    photographs(folder, 14)
+    tab = go(visitor().tab, "photos/timed")
+    takes = tab.locator(".next-step .quiet", has_text=re.compile("^takes roughly"))
+    takes.wait_for()
+    unit = {"s": 1, "min": 60}
+    number, named = takes.inner_text().split()[-2:]
+    assert int(number) * unit[named] == pytest.approx(expected_seconds(folder), abs=max(0.5 * unit[named], 1.0))
+    tab.locator("summary", has_text="More").click()
+    tab.get_by_label("the same poses to the bit").check()
+    takes.wait_for(state="detached")
 
 
 def test_few_photos_that_are_sharp(visitor, library):

@@ -26,14 +26,15 @@ def check_photos(entry: str, cache: str) -> dict[str, Any]:
         cache: Folder of what was measured.
 
     Returns:
-        done and total, numbers of photos; usual, the smallest and largest usual number; and once all are done the
-        findings, as the fields of events, else None.
+        done and total, numbers of photos; usual, the smallest and largest usual number; and once all are done seconds,
+        what placing them takes roughly, and the findings, as the fields of events. Before, both are None.
     """
     from msgspec.structs import asdict
 
     from gsplat_edu.doctor.diagnosis import event_of
     from gsplat_edu.doctor.files import USUAL
     from gsplat_edu.doctor.unplaced import Measured, examine_unplaced
+    from gsplat_edu.sfm.source import expected_seconds
 
     end = time.monotonic() + AT_ONCE
     names = sorted(photo_names(Path(entry)))
@@ -48,11 +49,11 @@ def check_photos(entry: str, cache: str) -> dict[str, Any]:
         done += 1
         if (kept := parse_json(read_bytes(target))) is not None:
             found.append(Measured(legible(name), tuple(kept["size"]), kept["detail"]))
+    facts = {"done": done, "total": len(names), "usual": USUAL}
     if done < len(names):
-        findings = None
-    else:
-        findings = [asdict(event_of(one)) for one in examine_unplaced(found, len(names))] if names else []
-    return {"done": done, "total": len(names), "usual": USUAL, "findings": findings}
+        return facts | {"findings": None, "seconds": None}
+    findings = [asdict(event_of(one)) for one in examine_unplaced(found, len(names))] if names else []
+    return facts | {"findings": findings, "seconds": expected_seconds(Path(entry)) if names else None}
 
 
 def _measure(name: str, path: Path, target: Path) -> None:

@@ -5,8 +5,8 @@ import { count, errorLine, h, patch, put, versioned, want } from "./dom.js";
 
 const LATER = "How well neighbouring photos overlap, and whether they are equally bright, shows once they are placed.";
 
-// marked(marks) gets the names of findings by photo.
-export function checks(entry, marked) {
+// marked(marks) gets the names of findings by photo; takes(seconds) how long placing the photos takes, or null.
+export function checks(entry, marked, takes) {
   const [said, list, line] = [h("p", { role: "status" }), h("ul", { class: "findings" }), errorLine()];
   let closed = false;
 
@@ -18,8 +18,9 @@ export function checks(entry, marked) {
     }
   }
 
-  function show({ total, usual: [least, most], findings }) {
+  function show({ total, usual: [least, most], findings, seconds }) {
     if (closed || !findings || !total) return;
+    takes(seconds);
     const fine = findings.some(({ name }) => name === "blurred") ? "" : "None is blurred. ";
     put(said, `${count(total, "photo")}; ${least} to ${most} are usual. ${fine}${LATER}`);
     const item = ({ name, severity, sentence, advice }) =>

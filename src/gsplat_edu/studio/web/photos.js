@@ -1,7 +1,7 @@
 // The screen of photos without poses: previews, and the first step, which finds the poses.
 
 import { checks } from "./checks.js";
-import { attempt, errorLine, h, heading, patch, put, want } from "./dom.js";
+import { attempt, duration, errorLine, h, heading, patch, put, want } from "./dom.js";
 import { gallery, unplaced } from "./gallery.js";
 import { intake } from "./intake.js";
 import { jobPlace, startJob } from "./jobs.js";
@@ -17,9 +17,17 @@ const MATCHERS = [
 export function photos(given) {
   const { store } = given;
   return withEntry(given, (entry, stage) => {
+    let seconds = null; // that placing the photos takes on all cores
     const head = entryHead(store, entry, "Photos");
     const pictures = gallery(entry.entry);
-    const seen = checks(entry.entry, (marks) => pictures.mark(marks));
+    const seen = checks(
+      entry.entry,
+      (marks) => pictures.mark(marks),
+      (taken) => {
+        seconds = taken;
+        tellTime();
+      },
+    );
     const line = errorLine();
     const job = jobPlace(store, entry.entry, ["sfm"], { main: true });
     const matcher = h(
@@ -36,6 +44,7 @@ export function photos(given) {
       {
         id: "find",
         "data-next": `sfm ${entry.entry}`,
+        onchange: () => tellTime(),
         onsubmit: (event) => {
           event.preventDefault();
           attempt(find, line, () => {
@@ -58,6 +67,13 @@ export function photos(given) {
         h("label", { class: "check" }, exact, " the same poses to the bit every time (one thread, slower)"),
       ),
     );
+
+    // Tells the next step how long it takes; nothing is known of a video, and little of a single thread.
+    function tellTime() {
+      form.dataset.takes = seconds && !exact.checked ? `takes roughly ${duration(seconds)}` : "";
+      store.changed();
+    }
+
     const add = entry.adopted ? null : intake(store, { kind: "photos", name: entry.name });
     const later = h(
       "div",
