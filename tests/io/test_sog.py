@@ -362,3 +362,16 @@ def test_axes_match_those_of_a_ply(tmp_path):
     assert (
         float(torch.corrcoef(torch.stack([same.sh_rest.flatten(), back.sh_rest[:500].flatten()]))[0, 1]) > 0.9
     )
+
+
+def test_a_palette_has_as_many_entries_as_asked_and_more_are_closer():
+    scene = random_scene(6000, 3)
+    vectors = scene.gaussians.sh_rest.reshape(6000, -1).numpy()
+    weights = np.ones(6000, dtype=np.float32)
+    errors = []
+    for most in (1024, 1500, 3000):
+        entries, labels = palette(vectors, weights, most)
+        assert 0.98 * most <= len(entries) <= most and labels.max() < len(entries)
+        errors.append(float(np.square(entries[labels] - vectors).sum()))
+    assert errors[0] > errors[1] > errors[2]
+    assert len(palette(vectors, weights, 60_000)[0]) == 6000

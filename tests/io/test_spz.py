@@ -472,3 +472,21 @@ def test_minimal_files_from_other_programs(name, z):
     assert read.sh_degree == 0
     assert read.means.tolist() == [[-1, 0, z], [0, 0, z], [-1, 0, 0], [0, 0, 0]]
     assert float(angles(read.quats, torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1)).max()) <= ANGLE_2
+
+
+def test_a_coarse_precision_rounds_positions_and_coefficients_and_zero_stays_zero(tmp_path):
+    """The tolerances follow from the definition: half a step of the bits that are kept."""
+    scene = random_scene(500, 15)
+    scene.gaussians.sh_rest[:7] = 0.0
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz.packed(scene, spz.Precision(1 / 32, (5, 4))))
+    back = spz.read(path).gaussians
+    step = 2.0 ** np.floor(np.log2(scene.gaussians.log_scales.median().exp().item() / 32))
+    places = back.means.double().numpy() / step
+    np.testing.assert_array_equal(places, np.rint(places))
+    assert float((back.means - scene.gaussians.means).abs().max()) <= step / 2 * 1.0001
+    given = scene.gaussians.sh_rest.clamp(-1.0, 0.96)
+    errors = (back.sh_rest.clamp(-1.0, 0.96) - given).abs()
+    assert float(errors[:, :3].max()) <= 0.5 / 16 + 1e-6 and float(errors[:, 3:].max()) <= 0.5 / 8 + 1e-6
+    assert float(back.sh_rest[:7].abs().max()) == 0.0
+    assert path.stat().st_size < 0.75 * len(spz.packed(scene))

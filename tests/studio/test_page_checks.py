@@ -43,7 +43,9 @@ def test_the_next_step_says_roughly_how_long_placing_takes(visitor, library):
     takes.wait_for()
     unit = {"s": 1, "min": 60}
     number, named = takes.inner_text().split()[-2:]
-    assert int(number) * unit[named] == pytest.approx(expected_seconds(folder), abs=max(0.5 * unit[named], 1.0))
+    assert int(number) * unit[named] == pytest.approx(
+        expected_seconds(folder), abs=max(0.5 * unit[named], 1.0)
+    )
     tab.locator("summary", has_text="More").click()
     tab.get_by_label("the same poses to the bit").check()
     takes.wait_for(state="detached")

@@ -131,6 +131,9 @@ PAGE_FACES: Final = 2_000_000
 """Most triangles of all meshes of a page. They take about 60 MB before compression. `gsplat-edu mesh` keeps to it
 unless told otherwise. Source: ours."""
 
+SIZED: Final = (".spz", ".sog", ".compressed.ply", ".html")
+"""Endings of the files that `convert --size` writes. Source: ours."""
+
 FAR_BELOW: Final = 0.1
 """A scene that was trained for less than this fraction of its length is not usable: splats have hardly moved."""
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Float64, Int32, Int64
 
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
@@ -38,11 +38,43 @@ def largest_weights(
         settings: The scene's render settings.
         backend: What renders; it has to collect statistics (`gsplat_edu.clean.evidence.judging_backend`).
     """
+    ids, found = _weights(gaussians, camera, settings, backend, "weight_max")
+    return ids, found["weight_max"]
+
+
+def visible_weights(
+    gaussians: Gaussians,
+    cameras: Iterable[Camera],
+    settings: RenderSettings,
+    backend: Backend,
+    progress: Callable[[], object] = lambda: None,
+) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+    """Return the sum of each splat's weights over all pixels of all cameras, (N,), and the largest of them, (N,).
+
+    Args:
+        gaussians: N Gaussians on the CPU.
+        cameras: The cameras, through any lens.
+        settings: The scene's render settings.
+        backend: As for `largest_weights`.
+        progress: Called after every camera.
+    """
+    total, largest = np.zeros(len(gaussians)), np.zeros(len(gaussians))
+    for camera in cameras:
+        ids, found = _weights(gaussians, camera, settings, backend, "weight_sum", "weight_max")
+        total[ids] += found["weight_sum"]
+        largest[ids] = np.maximum(largest[ids], found["weight_max"])
+        progress()
+    return total, largest
+
+
+def _weights(
+    gaussians: Gaussians, camera: Camera, settings: RenderSettings, backend: Backend, *names: str
+) -> tuple[Int64[np.ndarray, " M"], dict[str, Float[np.ndarray, " M"]]]:
     some = replace(gaussians, logit_opacities=gaussians.logit_opacities.detach().clone().requires_grad_())
     output = render(some, camera, settings=settings, backend=backend)
-    weights = output.collect("weight_max")
+    weights = output.collect(*names)
     torch.autograd.grad(output.image, some.logit_opacities, torch.zeros_like(output.image))
-    return output.visible.numpy(), weights()["weight_max"].numpy()
+    return output.visible.numpy(), {name: found.numpy() for name, found in weights().items()}
 
 
 def times_seen(

@@ -28,6 +28,7 @@ from gsplat_edu.options.convert import MOVES, photos_asked
 from gsplat_edu.options.values import numbers_text
 from gsplat_edu.paths.keyframes import read_path
 from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.runs.importance import MOST_CAMERAS, importance_of
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.sfm.scale_text import points_of
@@ -36,6 +37,7 @@ from gsplat_edu.viewer.edited import edited_meshes, edited_source, toured
 from gsplat_edu.viewer.page import Tour
 from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
 from gsplat_edu.viewer.page_proof import Proof, photos_of, seen_of, training_cameras
+from gsplat_edu.viewer.sizing import write_sized
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -92,13 +94,16 @@ def _convert(arguments: argparse.Namespace, console: Terminal) -> None:
         tour = toured(source, views, total, along)
         tour = _proven(replace(tour, meshes=meshes and meshes.moved(total)), source, arguments, bar, say)
         bar.update(steps, description=f"writing {arguments.out}")
-        if arguments.lod_refine is None:
+        written: str | None = None
+        if arguments.size is not None:
+            written = _write_sized(source, tour, arguments, bar, say)
+        elif arguments.lod_refine is None:
             export.write(arguments.out, source, tour, options)
         else:
             export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
         bar.advance(steps)
         emitter.report_output(arguments.out)
-        _say_written(arguments.out, source, meshes, say)
+        _say_written(arguments.out, source, meshes, say, written)
         if arguments.scale is not None:
             say(
                 f"1 unit of {arguments.out.name} = 1 {given.unit}; it was {given.apart / given.length:.6g} units before"
@@ -122,15 +127,42 @@ def _proven(
     return replace(tour, proof=proof)
 
 
-def _say_written(path: Path, source: Source, meshes: Meshes | None, say: Callable[[str], None]) -> None:
-    """Say what a written file contains, and the size of a page with a mesh."""
+def _write_sized(
+    source: Source, tour: Tour, arguments: argparse.Namespace, bar: Bar, say: Callable[[str], None]
+) -> str:
+    """Write the best file within --size; return what it contains, in words."""
+    task = bar.add_task("weighing splats", total=min(len(source.cameras), MOST_CAMERAS))
+    importance = importance_of(source, lambda: bar.advance(task))
+    bar.remove_task(task)
+    found = write_sized(arguments.out, source, tour, importance, arguments.size)
+    total, kept, degree = len(source.scene.gaussians), len(found.part.rows), found.setting.sh_degree
+    size = f"{len(found.data):,} of {arguments.size:,} bytes"
+    if found.whole:
+        return f"the whole scene in the format's full precision: {total:,} splats, SH degree {degree}, {size}"
+    shiny = found.part.with_harmonics
+    some = f" ({shiny:,} splats; the others 0)" if degree and shiny < kept else ""
+    return f"{kept:,} of {total:,} splats, SH degree {degree}{some}, {size}"
+
+
+def _say_written(
+    path: Path, source: Source, meshes: Meshes | None, say: Callable[[str], None], content: str | None
+) -> None:
+    """Say what a written file contains, and the size of a page with a mesh.
+
+    Args:
+        path: The file.
+        source: The scene.
+        meshes: Those of a page.
+        say: Called with each line.
+        content: What it contains, in words; None if it is the scene.
+    """
     count, degree = len(source.scene.gaussians), export.kept_degree(path, source.scene)
     more = ""
     if meshes is not None and meshes.stays:
         say("--edits: move some splats without the others; the mesh shows them where they were")
     if meshes is not None:
         more = f"; mesh of {len(meshes.surface.faces):,} triangles; {path.stat().st_size:,} bytes"
-    say(f"wrote {path}: {count:,} splats, SH degree {degree}{more}")
+    say(f"wrote {path}: {content or f'{count:,} splats, SH degree {degree}'}{more}")
     if export.has_levels(path):
         say(export.levels_line(path))
 

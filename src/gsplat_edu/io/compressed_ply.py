@@ -122,6 +122,20 @@ def write(path: Path, scene: Scene) -> None:
         ArgumentError: a parameter is NaN or infinite in float32, or a quaternion has zero length.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
+    data = packed(scene)
+    with written_aside(path) as aside:
+        aside.write_bytes(data)
+
+
+def packed(scene: Scene) -> bytes:
+    """Return the bytes of a compressed PLY.
+
+    Args:
+        scene: As for `write`.
+
+    Raises:
+        ArgumentError: as for `write`.
+    """
     gaussians = scene.gaussians.map(torch.Tensor.float)
     gaussians.check_finite()
     order = _order(gaussians.means.numpy(force=True))
@@ -140,11 +154,8 @@ def write(path: Path, scene: Scene) -> None:
     )
     bounds = np.concatenate([position_bounds, scale_bounds, color_bounds], axis=1, dtype="<f4")
     sh = _sh_bytes(tensors["sh_rest"])
-    with written_aside(path) as aside, aside.open("wb") as file:
-        file.write(_header(scene, len(order), len(bounds), sh.shape[1]))
-        file.write(bounds.tobytes())
-        file.write(np.stack(words, axis=1).astype("<u4").tobytes())
-        file.write(sh.tobytes())
+    head = _header(scene, len(order), len(bounds), sh.shape[1])
+    return b"".join([head, bounds.tobytes(), np.stack(words, axis=1).astype("<u4").tobytes(), sh.tobytes()])
 
 
 def _elements(path: Path, header: Header) -> tuple[Element, Element, Element | None]:

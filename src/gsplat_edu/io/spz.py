@@ -9,10 +9,10 @@ values.
 The writer uses the full precision of the format. Positions get the largest number of fractional bits that holds the
 scene, up to 24; other programs always use 12. Coefficients of the higher degrees use all 8 bits; other programs round
 them to 5 and 4 by default. On a trained scene that rounding lowers the PSNR against the original from 56 dB to 40 dB,
-and the file from 49 to 29 bytes per splat: fidelity is preferred here. Scenes beyond +-8,388,607 units are rejected.
-Scales are clamped to e^-10 to e^5.94, the coefficient of degree 0 to +-3.33, the others to -1 to 0.992. The
-antialiasing flag is always stored, so an unknown value reads back as false. Degree 4 of the harmonics is dropped on
-reading.
+and the file from 49 to 29 bytes per splat: fidelity is preferred here, and a `Precision` chooses otherwise. Scenes
+beyond +-8,388,607 units are rejected. Scales are clamped to e^-10 to e^5.94, the coefficient of degree 0 to +-3.33, the
+others to -1 to 0.992. The antialiasing flag is always stored, so an unknown value reads back as false. Degree 4 of the
+harmonics is dropped on reading.
 
 Axes are right, up, back; `gsplat_edu.io.axes.half_turned` converts them to ours. A scene whose up direction is another
 one is turned, by the rotation of `root_transform`, so that y is up in the file: splats, in double before they are
@@ -87,6 +87,24 @@ SH_COUNTS = (0, 3, 8, 15, 24)
 
 LEVEL = 12
 """Compression level of zstd, as in Niantic's library."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How finely positions and coefficients are stored; coarser values compress better, and any reader reads them.
+
+    Args:
+        position_step: Largest step of positions, as a fraction of the median scale of the splats; None for the finest
+            that the format has.
+        sh_bits: Bits of the coefficients of degree 1, and of the higher degrees; 1 to 8.
+    """
+
+    position_step: float | None = None
+    sh_bits: tuple[int, int] = (8, 8)
+
+
+FULL = Precision()
+"""The full precision of the format."""
 
 
 @dataclass(frozen=True)
@@ -320,7 +338,7 @@ def _decoded(header: _Header, streams: Streams) -> Gaussians:
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write an SPZ file of version 4.
+    """Write an SPZ file of version 4 in full precision.
 
     Args:
         path: Output file; parent folders are created.
@@ -330,18 +348,32 @@ def write(path: Path, scene: Scene) -> None:
         ArgumentError: a mean is beyond the format's range, or a quaternion has zero length.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
+    data = packed(scene)
+    with written_aside(path) as aside:
+        aside.write_bytes(data)
+
+
+def packed(scene: Scene, precision: Precision = FULL) -> bytes:
+    """Return the bytes of an SPZ file of version 4.
+
+    Args:
+        scene: The scene, in this package's axes, with finite parameters.
+        precision: How finely values are stored.
+
+    Raises:
+        ArgumentError: as for `write`.
+    """
     degree = scene.gaussians.sh_degree
     upright = _turned(half_turned(scene.gaussians), scene.up)
-    bits, streams = _encoded(upright, values.write_smallest_three)
+    bits, streams = _encoded(upright, values.write_smallest_three, precision)
     contents = [stream.tobytes() for stream in streams if stream.size]
-    packed = [zstandard.ZstdCompressor(level=LEVEL).compress(content) for content in contents]
+    compressed = [zstandard.ZstdCompressor(level=LEVEL).compress(content) for content in contents]
     records = _frame_record(scene)
     flags = (ANTIALIASED if scene.antialiased else 0) | (EXTENDED if records else 0)
     start = HEADER_4.size + len(records)
-    header = HEADER_4.pack(MAGIC, 4, len(scene.gaussians), degree, bits, flags, len(packed), start)
-    table = [TABLE_ROW.pack(len(a), len(b)) for a, b in zip(packed, contents, strict=True)]
-    with written_aside(path) as aside:
-        aside.write_bytes(b"".join([header, records, *table, *packed]))
+    header = HEADER_4.pack(MAGIC, 4, len(scene.gaussians), degree, bits, flags, len(compressed), start)
+    table = [TABLE_ROW.pack(len(a), len(b)) for a, b in zip(compressed, contents, strict=True)]
+    return b"".join([header, records, *table, *compressed])
 
 
 def _frame_record(scene: Scene) -> bytes:
@@ -372,7 +404,9 @@ def packed_version_2(scene: Scene) -> bytes:
 
 
 def _encoded(
-    gaussians: Gaussians, write_quats: Callable[[Float[np.ndarray, "N 4"]], UInt8[np.ndarray, "N B"]]
+    gaussians: Gaussians,
+    write_quats: Callable[[Float[np.ndarray, "N 4"]], UInt8[np.ndarray, "N B"]],
+    precision: Precision = FULL,
 ) -> tuple[int, tuple[UInt8[np.ndarray, "..."], ...]]:
     """Return the fractional bits of positions, and the streams in the format's order, of splats in its axes."""
     arrays = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
@@ -383,13 +417,15 @@ def _encoded(
             f"means: one is {far:,.0f} units from the origin along an axis, but SPZ ends at {values.LARGEST_FIXED:,};"
             " scale the scene down or move it"
         )
+    if precision.position_step is not None and len(gaussians):
+        bits = min(bits, values.bits_for(precision.position_step, arrays["log_scales"]))
     return bits, (
         values.write_fixed(arrays["means"], bits),
         logit_to_byte(np.clip(arrays["logit_opacities"], -100, 100).astype(np.float32)),
         values.write_colors(arrays["sh0"]),
         values.write_scales(arrays["log_scales"]),
         write_quats(arrays["quats"]),
-        values.write_harmonics(arrays["sh_rest"]),
+        values.write_harmonics(arrays["sh_rest"], precision.sh_bits),
     )
 
 

@@ -36,6 +36,9 @@ LARGEST_SMALL = 511 * np.sqrt(2.0)
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Components of (x, y, z, w) that are stored, by the index of the omitted one."""
 
+DEGREE_1 = 3
+"""SH coefficients per channel of degree 1."""
+
 SH_KEPT = (SH_MAX_DEGREE + 1) ** 2 - 1
 """SH coefficients per channel that are read; degree 4 of versions 3 and 4 is dropped."""
 
@@ -63,6 +66,17 @@ def fractional_bits(positions: Float[np.ndarray, "N 3"]) -> int | None:
         if np.rint(largest * 2.0**bits) <= LARGEST_FIXED:
             return bits
     return None
+
+
+def bits_for(step: float, log_scales: Float[np.ndarray, "N 3"]) -> int:
+    """Return the fewest fractional bits whose step is at most a fraction of the median scale; 0 to 24.
+
+    Args:
+        step: The fraction, above 0.
+        log_scales: (N, 3) logarithms of scales, N at least 1.
+    """
+    wanted = -(np.log2(step) + float(np.median(log_scales)) / np.log(2.0))
+    return int(np.clip(np.ceil(wanted), 0, MAX_FRACTIONAL_BITS))
 
 
 def write_fixed(positions: Float[np.ndarray, "N 3"], bits: int) -> UInt8[np.ndarray, "N 9"]:
@@ -142,9 +156,19 @@ def read_harmonics(data: UInt8[np.ndarray, "N B"]) -> Float32[np.ndarray, "N K 3
     return kept.astype(np.float32) / 128 - 1
 
 
-def write_harmonics(sh_rest: Float[np.ndarray, "N K 3"]) -> UInt8[np.ndarray, "N B"]:
-    """Encode the coefficients of the higher degrees as bytes."""
-    return _to_bytes(np.clip(sh_rest.reshape(len(sh_rest), sh_rest.shape[1] * 3), -1, 1) * 128 + 128)
+def write_harmonics(
+    sh_rest: Float[np.ndarray, "N K 3"], bits: tuple[int, int] = (8, 8)
+) -> UInt8[np.ndarray, "N B"]:
+    """Encode the coefficients of the higher degrees as bytes.
+
+    Args:
+        sh_rest: (N, K, 3) coefficients.
+        bits: Leading bits of a byte that are used, for degree 1 and for the higher degrees; zero stays zero.
+    """
+    steps = np.full((sh_rest.shape[1], 3), 2.0 ** (8 - bits[1]))
+    steps[:DEGREE_1] = 2.0 ** (8 - bits[0])
+    flat, units = np.clip(sh_rest.reshape(len(sh_rest), sh_rest.shape[1] * 3), -1, 1), steps.reshape(-1)
+    return _to_bytes(np.rint(flat * (128.0 / units)) * units + 128)
 
 
 def _to_bytes(values: Float[np.ndarray, "N B"]) -> UInt8[np.ndarray, "N B"]:

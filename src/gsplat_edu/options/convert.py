@@ -5,15 +5,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.constants import SH_MAX_DEGREE, SIZED
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range, whole_number
-from gsplat_edu.options.values import add_backend, add_meshes, number_text, numbers_text, whole_number_text
+from gsplat_edu.options.values import (
+    add_backend,
+    add_meshes,
+    bytes_text,
+    number_text,
+    numbers_text,
+    whole_number_text,
+)
 from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
 
-OFFERED = ("sh_degree", "min_opacity", "verify")
+OFFERED = ("sh_degree", "min_opacity", "size", "verify")
 """Options that requests may give."""
 
 MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 16 numbers, row by row)"
@@ -74,6 +81,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0.0,
         metavar="A",
         help="drop Gaussians with a lower opacity (default: 0)",
+    )
+    parser.add_argument(
+        "--size",
+        type=bytes_text,
+        metavar="BYTES",
+        help="write the best file of at most this size, as 500kB, 2MB or 1.5MiB, and at least 99 %% of it: with the"
+        f" splats that its pictures show most, stored as finely as fits; for {', '.join(SIZED)}",
     )
     parser.add_argument(
         "--crop",
@@ -193,9 +207,19 @@ def check(arguments: argparse.Namespace) -> None:
             )
     elif arguments.dataset is not None:
         raise ArgumentError(f"--dataset: has an effect only with --verify {VERIFY_PHOTOS}; add it")
+    _check_size(arguments)
     if arguments.dataset is not None and not arguments.dataset.exists():
         raise DatasetError(f"--dataset: {arguments.dataset} does not exist; give the folder of a capture")
     if arguments.edits is not None and len(arguments.sources) > 1:
         raise ArgumentError(
             "--edits: is for one scene; convert each scene with its edits, then merge the results"
         )
+
+
+def _check_size(arguments: argparse.Namespace) -> None:
+    if arguments.size is None:
+        return
+    if arguments.size < 1:
+        raise ArgumentError("--size: is 0 bytes; give more, for example 2MB")
+    if not arguments.out.name.lower().endswith(SIZED):
+        raise ArgumentError(f"--size: {arguments.out} cannot be fitted; write {', '.join(SIZED)}")

@@ -130,10 +130,7 @@ def write(
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     if path.suffix.lower() == PAGE:
-        tour = tour or page.Tour()
-        if len(source.scene.gaussians):
-            start = tour.start or page.usual_start(source.scene, source.cameras, source.held_out)
-            tour = replace(tour, poster=poster_jpeg(source, start.camera, tour.proof))
+        tour = with_poster(tour or page.Tour(), source)
         page.write(path, source.scene, source.cameras, source.settings, source.held_out, tour)
     elif path.name.lower() == LOD_META:
         lod_codec.write(path, source.scene, options)
@@ -141,6 +138,14 @@ def write(
         tiles.write(path, source.scene, options)
     else:
         write_scene(path, source.scene)
+
+
+def with_poster(tour: page.Tour, source: Source) -> page.Tour:
+    """Return a page's tour with a still of the scene, if there is something to see."""
+    if not len(source.scene.gaussians):
+        return tour
+    start = tour.start or page.usual_start(source.scene, source.cameras, source.held_out)
+    return replace(tour, poster=poster_jpeg(source, start.camera, tour.proof))
 
 
 def write_refined(

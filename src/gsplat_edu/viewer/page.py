@@ -127,12 +127,47 @@ def write(
         ArgumentError: a parameter is NaN or infinite.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
-    # the names of files tell a visitor nothing
-    shown = [(f"photo {i}", camera) for i, (_, camera) in enumerate(views, start=1)]
-    out = {f"photo {i}" for i, (name, _) in enumerate(views, start=1) if name in held_out}
-    pieces = _pieces(path.stem, scene, shown, settings, out, tour or Tour(), {"shared": True})
+    pieces = _shared(path.stem, scene, views, settings, held_out, tour or Tour())
     with written_aside(path) as aside, aside.open("wb") as file:
         file.writelines(pieces)
+
+
+def shared(
+    title: str,
+    scene: Scene,
+    views: Sequence[NamedCamera],
+    settings: RenderSettings | None,
+    held_out: Collection[str],
+    tour: Tour,
+) -> bytes:
+    """Return the bytes of a page that `write` writes.
+
+    Args:
+        title: Heading of the page.
+        scene: As for `write`.
+        views: As for `write`.
+        settings: As for `write`.
+        held_out: As for `write`.
+        tour: As for `write`.
+
+    Raises:
+        ArgumentError: a parameter is NaN or infinite.
+    """
+    return b"".join(_shared(title, scene, views, settings, held_out, tour))
+
+
+def _shared(
+    title: str,
+    scene: Scene,
+    views: Sequence[NamedCamera],
+    settings: RenderSettings | None,
+    held_out: Collection[str],
+    tour: Tour,
+) -> Iterator[bytes]:
+    """Yield a page to pass on: the names of files tell a visitor nothing."""
+    shown = [(f"photo {i}", camera) for i, (_, camera) in enumerate(views, start=1)]
+    out = {f"photo {i}" for i, (name, _) in enumerate(views, start=1) if name in held_out}
+    return _pieces(title, scene, shown, settings, out, tour, {"shared": True})
 
 
 def html(

@@ -164,12 +164,26 @@ def write(path: Path, scene: Scene) -> None:
     (files.write_folder if _in_folder(path) else files.write_bundle)(path, packed(scene))
 
 
-def packed(scene: Scene, *, sort: bool = True) -> dict[str, bytes]:
+def bundled(scene: Scene, entries: int | None = None) -> bytes:
+    """Return the bytes of a .sog.
+
+    Args:
+        scene: The scene, in this package's axes.
+        entries: Most entries of the palette, from 1,024 to 65,536; None for the usual number.
+
+    Raises:
+        ArgumentError: as for `write`.
+    """
+    return files.bundled(packed(scene, entries=entries))
+
+
+def packed(scene: Scene, *, sort: bool = True, entries: int | None = None) -> dict[str, bytes]:
     """Return the files of a SOG by name, meta.json first.
 
     Args:
         scene: The scene, in this package's axes.
         sort: Whether to sort the splats along a Morton curve; otherwise they keep their order.
+        entries: As for `bundled`.
 
     Raises:
         ArgumentError: as for `write`.
@@ -185,10 +199,10 @@ def packed(scene: Scene, *, sort: bool = True) -> dict[str, bytes]:
         raise ArgumentError(
             f"quats{first_index(zero)}: has zero length, so it is not a rotation; remove the splat"
         )
-    return _packed(replace(scene, gaussians=gaussians), sort)
+    return _packed(replace(scene, gaussians=gaussians), sort, entries)
 
 
-def _packed(scene: Scene, sort: bool) -> dict[str, bytes]:
+def _packed(scene: Scene, sort: bool, entries: int | None) -> dict[str, bytes]:
     values = {name: tensor.numpy(force=True) for name, tensor in scene.gaussians.tensors().items()}
     steps, span = positions_to_steps(values["means"])
     order = np.argsort(morton_codes(steps), kind="stable") if sort else np.arange(len(steps))
@@ -196,7 +210,7 @@ def _packed(scene: Scene, sort: bool) -> dict[str, bytes]:
     values = {name: array[order] for name, array in values.items()}
     scales, sh0 = codebook(values["log_scales"]), codebook(values["sh0"])
     harmonics, palette_images = _packed_harmonics(
-        values["sh_rest"], scene.gaussians.sh_degree, _weights(values)
+        values["sh_rest"], scene.gaussians.sh_degree, _weights(values), entries
     )
     meta = Meta(
         len(order), span, scales, sh0, harmonics, scene.antialiased, scene.up, scene.unit, scene.origin
@@ -229,7 +243,7 @@ def _weights(values: dict[str, Float32[np.ndarray, "..."]]) -> Float32[np.ndarra
 
 
 def _packed_harmonics(
-    sh_rest: Float32[np.ndarray, "N K 3"], degree: int, weights: Float32[np.ndarray, " N"]
+    sh_rest: Float32[np.ndarray, "N K 3"], degree: int, weights: Float32[np.ndarray, " N"], most: int | None
 ) -> tuple[Harmonics | None, dict[str, bytes]]:
     """Find a palette for the coefficients; without splats it still has one entry, as the format requires."""
     count, coefficients, _ = sh_rest.shape
@@ -237,7 +251,7 @@ def _packed_harmonics(
         return None, {}
     vectors = sh_rest.reshape(count, 3 * coefficients)
     if count:
-        entries, labels = palette(vectors, weights)
+        entries, labels = palette(vectors, weights, most)
     else:
         entries, labels = np.zeros((1, 3 * coefficients), dtype=np.float32), np.zeros(0, dtype=np.int64)
     numbers = codebook(entries)

@@ -155,12 +155,21 @@ def write_bundle(path: Path, contents: Mapping[str, bytes]) -> None:
     Raises:
         OSError: the file cannot be written. An existing file stays unchanged.
     """
-    with written_aside(path) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as bundle:
+    data = bundled(contents)
+    with written_aside(path) as aside:
+        aside.write_bytes(data)
+
+
+def bundled(contents: Mapping[str, bytes]) -> bytes:
+    """Return the bytes of that zip."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as bundle:
         for name, data in contents.items():
             entry = zipfile.ZipInfo(name)  # dated 1980
             entry.create_system = 3  # the same on every system
             entry.external_attr = 0o644 << 16
             bundle.writestr(entry, data)
+    return file.getvalue()
 
 
 def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:

@@ -96,29 +96,31 @@ def nearest_in_codebook(
 
 
 def palette(
-    vectors: Float32[np.ndarray, "N D"], weights: Float32[np.ndarray, " N"]
+    vectors: Float32[np.ndarray, "N D"], weights: Float32[np.ndarray, " N"], entries: int | None = None
 ) -> tuple[Float32[np.ndarray, "P D"], Int64[np.ndarray, " N"]]:
     """Choose vectors that represent many vectors with a small weighted mean square error.
 
     Args:
         vectors: N finite vectors, preferably with neighbours in the scene next to each other.
         weights: Weight of each vector's error, positive.
+        entries: Most entries, from `ALL_KEPT` to `MOST_ENTRIES`; None for the largest power of 2 that exceeds neither N
+            nor `MOST_ENTRIES`.
 
     Returns:
         P entries, and for each vector the index of its entry. If there are at most 1024 different vectors, or no more
-        than the palette has entries, all are kept; otherwise P is at most the largest power of 2 that exceeds neither N
-        nor 65,536.
+        than the palette has entries, all are kept.
     """
     count = len(vectors)
-    size = count if count <= ALL_KEPT else min(MOST_ENTRIES, 1 << (count.bit_length() - 1))
+    size = min(count, entries or min(MOST_ENTRIES, 1 << (count.bit_length() - 1)))
+    size = count if count <= ALL_KEPT else size
     vectors = vectors + np.float32(0.0)  # -0.0 becomes 0.0
     kept = _distinct(vectors, size)
     if kept is not None:
         return kept
     # squares of values near 1 neither overflow nor underflow; scaling by a power of 2 preserves all bits
     scale = np.float32(2.0 ** np.floor(np.log2(np.abs(vectors).max().astype(np.float64))))
-    entries, labels = _clustered(vectors / scale, weights, size)
-    return entries * scale, labels
+    found, labels = _clustered(vectors / scale, weights, size)
+    return found * scale, labels
 
 
 def _distinct(
