@@ -94,16 +94,10 @@ def _convert(arguments: argparse.Namespace, console: Terminal) -> None:
         tour = toured(source, views, total, along)
         tour = _proven(replace(tour, meshes=meshes and meshes.moved(total)), source, arguments, bar, say)
         bar.update(steps, description=f"writing {arguments.out}")
-        written: str | None = None
-        if arguments.size is not None:
-            written = _write_sized(source, tour, arguments, bar, say)
-        elif arguments.lod_refine is None:
-            export.write(arguments.out, source, tour, options)
-        else:
-            export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
+        content = _write(source, tour, options, arguments, backend, bar, say)
         bar.advance(steps)
         emitter.report_output(arguments.out)
-        _say_written(arguments.out, source, meshes, say, written)
+        _say_written(arguments.out, source, meshes, say, content)
         if arguments.scale is not None:
             say(
                 f"1 unit of {arguments.out.name} = 1 {given.unit}; it was {given.apart / given.length:.6g} units before"
@@ -127,9 +121,26 @@ def _proven(
     return replace(tour, proof=proof)
 
 
-def _write_sized(
-    source: Source, tour: Tour, arguments: argparse.Namespace, bar: Bar, say: Callable[[str], None]
-) -> str:
+def _write(
+    source: Source,
+    tour: Tour,
+    options: LodOptions,
+    arguments: argparse.Namespace,
+    backend: str,
+    bar: Bar,
+    say: Callable[[str], None],
+) -> str | None:
+    """Write OUT; return what it contains, in words, or None if it is the scene."""
+    if arguments.size is not None:
+        return _write_sized(source, tour, arguments, bar)
+    if arguments.lod_refine is None:
+        export.write(arguments.out, source, tour, options)
+    else:
+        export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
+    return None
+
+
+def _write_sized(source: Source, tour: Tour, arguments: argparse.Namespace, bar: Bar) -> str:
     """Write the best file within --size; return what it contains, in words."""
     task = bar.add_task("weighing splats", total=min(len(source.cameras), MOST_CAMERAS))
     importance = importance_of(source, lambda: bar.advance(task))

@@ -68,6 +68,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " unzipped SOG, FOLDER/lod-meta.json levels of detail (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
     )
     parser.add_argument("--merge", action="store_true", help="join several scenes into one")
+    _add_filters(parser)
+    parser.add_argument(
+        "--transform",
+        action="append",
+        default=[],
+        metavar="KIND=VALUE",
+        help=f"transform the scene after --crop: {MOVES}; may be repeated and is applied in order",
+    )
+    parser.add_argument(
+        "--scale",
+        metavar='"A B 1.20m"',
+        help="two points of the scene, after --transform, and their distance in m, cm or mm, which becomes the unit:"
+        f" {POINTS}",
+    )
+    parser.add_argument(
+        "--path",
+        type=Path,
+        metavar="FILE",
+        help="keyframes, as for render --path, that the page (OUT.html) plays; in the coordinates of IN",
+    )
+    add_meshes(parser)
+    _add_edits(parser)
+    _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json and OUT/tileset.json"))
+    add_backend(parser)
+
+
+def _add_filters(parser: argparse.ArgumentParser) -> None:
+    """Add the options that make a file smaller."""
     parser.add_argument(
         "--sh-degree",
         type=whole_number_text,
@@ -96,29 +124,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="keep only Gaussians whose centre lies in this box, in the coordinates of IN; write --crop=-1,... if the"
         " first number is negative",
     )
-    parser.add_argument(
-        "--transform",
-        action="append",
-        default=[],
-        metavar="KIND=VALUE",
-        help=f"transform the scene after --crop: {MOVES}; may be repeated and is applied in order",
-    )
-    parser.add_argument(
-        "--scale",
-        metavar='"A B 1.20m"',
-        help="two points of the scene, after --transform, and their distance in m, cm or mm, which becomes the unit:"
-        f" {POINTS}",
-    )
-    parser.add_argument(
-        "--path",
-        type=Path,
-        metavar="FILE",
-        help="keyframes, as for render --path, that the page (OUT.html) plays; in the coordinates of IN",
-    )
-    add_meshes(parser)
-    _add_edits(parser)
-    _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json and OUT/tileset.json"))
-    add_backend(parser)
 
 
 def _add_edits(parser: argparse.ArgumentParser) -> None:
