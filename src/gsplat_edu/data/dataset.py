@@ -107,7 +107,7 @@ class Dataset:
         Args:
             reader: The capture.
             settings: Resolution, split, background and memory.
-            points: A PLY that replaces the capture's initial points, in the capture's coordinates.
+            points: A file of points that replaces the capture's, in its coordinates; see `gsplat_edu.data.point_files`.
 
         Raises:
             DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.
@@ -194,7 +194,7 @@ def load_dataset(
     Args:
         path: A capture folder of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
         settings: Resolution, split, background and memory.
-        points: A PLY that replaces the capture's initial points, in the capture's coordinates.
+        points: A file of points that replaces the capture's, in its coordinates; see `gsplat_edu.data.point_files`.
 
     Raises:
         DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.

@@ -174,7 +174,7 @@ def with_depth(
         dataset: The dataset, derived from `reader` with the same `points`.
         reader: The capture.
         source: Where depth comes from.
-        points: A PLY that replaces the capture's points.
+        points: A file that replaces the capture's points.
 
     Raises:
         DatasetError: as for `judged_depths`.
@@ -196,7 +196,7 @@ def judged_depths(
         reader: The capture.
         cameras: Name and camera of each photo, as a dataset of the capture has them.
         source: Where depth comes from.
-        points: A PLY that replaces the capture's points.
+        points: A file that replaces the capture's points.
 
     Raises:
         DatasetError: there is no depth, a file is damaged or has another shape than its photo, maps agree with the

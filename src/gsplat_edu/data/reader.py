@@ -102,7 +102,7 @@ class CaptureReader:
 
         Args:
             points: A file that replaces the capture's start points, in its coordinates; see `read_points`. It is read
-            once.
+                once.
 
         Raises:
             DatasetError: the capture or the file cannot be read.

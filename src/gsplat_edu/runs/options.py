@@ -25,7 +25,7 @@ class RunOptions:
         out: The run's folder.
         config: The recipe.
         data_settings: How the capture is read.
-        points: A PLY to start from; the capture's own points if None.
+        points: A file of points to start from; the capture's own points if None.
         scene: A trained scene to start from instead of points: a scene file or the folder of a run.
         backend: Name of the rendering backend.
         eval_every: Iterations between evaluations on the test views; the end of the run scores all views. 0 scores none
