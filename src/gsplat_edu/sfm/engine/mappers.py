@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Container
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,12 +18,17 @@ ROUNDS = 5
 
 
 class Options(NamedTuple):
-    """Options common to all mappers; `known` if intrinsics and the rig's rotations are exact, as for panoramas."""
+    """Options common to all mappers; `known` if intrinsics and the rig's rotations are exact, as for panoramas.
+
+    The incremental mapper keeps the intrinsics of the cameras `fixed` and, if `holds`, the poses of its initial model.
+    """
 
     loose: bool
     threads: int
     seed: int
     known: bool = False
+    fixed: Collection[int] = ()
+    holds: bool = False
 
 
 def incremental(
@@ -46,6 +51,7 @@ def incremental(
     options.num_threads, options.random_seed = common.threads, common.seed
     options.min_model_size = 3  # accept small models, because the caller uses the best one
     options.multiple_models = not begin
+    options.constant_cameras, options.fix_existing_frames = set(common.fixed), common.holds
     if common.known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.ba_refine_sensor_from_rig = False
@@ -123,17 +129,18 @@ def repaired(
     return again if again.num_reg_images() >= model.num_reg_images() else pycolmap.Reconstruction(begin)
 
 
-def without_doubtful(model: pycolmap.Reconstruction, database: str) -> int:
+def without_doubtful(model: pycolmap.Reconstruction, database: str, trusted: Container[str] = ()) -> int:
     """Remove the photos with unreliable poses; return their number.
 
     Args:
         model: The model; modified.
         database: Database with the matches.
+        trusted: Names of the photos whose poses need no points, as long as their matches do not contradict them.
     """
     before = model.num_reg_images()
     for _ in range(ROUNDS):
         contradictory = agreement(model, database).contradictory(model)
-        doubtful = contradictory | set(unsupported(model))
+        doubtful = contradictory | set(unsupported(model, trusted))
         if not doubtful:
             break
         take_out(model, doubtful)
