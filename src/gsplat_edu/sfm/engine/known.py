@@ -111,7 +111,7 @@ def from_known_poses(
     if model.num_reg_images() < SURVIVING * len(trusted) or model.num_points3D() < SUPPORT:
         return None
     trusted &= {model.image(image).name for image in model.reg_image_ids()}
-    common = options._replace(fixed=known if holds else fixed, holds=holds)
+    common = options._replace(fixed=known if holds else fixed, holds=holds, unmatched=True)
     for loose in (False, True):
         model = _extended(tell, model, (database, photos), folder, common._replace(loose=loose), trusted)
     normal = _normal(given)

@@ -18,9 +18,16 @@ ROUNDS = 5
 
 
 class Options(NamedTuple):
-    """Options common to all mappers; `known` if intrinsics and the rig's rotations are exact, as for panoramas.
+    """Options common to all mappers, and of the incremental mapper if it starts from given poses.
 
-    The incremental mapper keeps the intrinsics of the cameras `fixed` and, if `holds`, the poses of its initial model.
+    Args:
+        loose: Use lower thresholds.
+        threads: Number of threads.
+        seed: Seed of all random draws.
+        known: Whether intrinsics and the rig's rotations are exact, as for panoramas.
+        fixed: Cameras whose intrinsics stay.
+        holds: Whether the poses of the initial model stay.
+        unmatched: Whether the initial model may have photos without matches.
     """
 
     loose: bool
@@ -29,6 +36,7 @@ class Options(NamedTuple):
     known: bool = False
     fixed: Collection[int] = ()
     holds: bool = False
+    unmatched: bool = False
 
 
 def incremental(
@@ -52,6 +60,7 @@ def incremental(
     options.min_model_size = 3  # accept small models, because the caller uses the best one
     options.multiple_models = not begin
     options.constant_cameras, options.fix_existing_frames = set(common.fixed), common.holds
+    options.load_all_images = common.unmatched
     if common.known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.ba_refine_sensor_from_rig = False
