@@ -195,8 +195,7 @@ def map_photos(
     Returns:
         The model: its "folder" below `folder`; the "names" of the photos whose pose counts; "doubtful", the photos
         whose pose does not; "unclear", those of them with an ambiguous focal length; "points"; "error" in px; the
-        "way" that made it; "given", the number of given poses, if it started from them; and the other entries of the
-        job "mapping".
+        "way" that made it; and the other entries of the job "mapping".
 
     Raises:
         DatasetError: no attempt places enough photos for a model, or the last one failed and none placed any.
@@ -220,7 +219,6 @@ def map_photos(
             model
             | {"folder": f"models/{number}/{model['folder']}", "way": f"{way}, {model['lens']}"}
             | {"per_photo": way.per_photo}
-            | ({"given": len(cameras.given["views"])} if cameras.given and way == FROM_GIVEN else {})
             for model in made
             if model["names"]
         ]
@@ -235,11 +233,12 @@ def map_photos(
 
 
 def _preferred(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Choose the model from given poses, in whose coordinates it is, unless it lacks many photos that another has."""
+    """Choose the model from given poses, the only one in their coordinates, unless another has many more photos."""
     best = best_model(found)
-    return next(
-        (one for one in found if "given" in one and len(one["names"]) >= ENOUGH * len(best["names"])), best
-    )
+    given = [
+        model for model in found if "held" in model and len(model["names"]) >= ENOUGH * len(best["names"])
+    ]
+    return given[0] if given else best
 
 
 def _agreed(found: Sequence[dict[str, Any]], connected: int) -> bool:

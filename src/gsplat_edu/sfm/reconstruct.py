@@ -466,7 +466,7 @@ class _Run:
         """Return the words of the summary about given poses, and say what became of them."""
         assert self.given is not None, "their model is made of them"
         program = self.given.program
-        if "given" not in model:
+        if "held" not in model:
             self._say(f"the poses of {program} are not used: without them, more photos have a pose")
             return ""
         if model["held"]:
@@ -485,7 +485,7 @@ class _Run:
         self, cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"], sights: Sequence[Sight]
     ) -> tuple[Similarity, Scale | None]:
         """Choose the world: that of the given poses if the model started from them."""
-        if self.given is not None and self.model.get("given"):
+        if self.given is not None and "held" in self.model:
             return in_given_world(sights, self.options.scale, self.given.reader.capture.scale)
         return placed(cameras, points, sights, self.options.scale, self._say)
 

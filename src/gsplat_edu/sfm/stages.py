@@ -53,7 +53,7 @@ class _Mapping(Facts, frozen=True):
     names: tuple[Text, ...]
     doubtful: tuple[Text, ...]
     unclear: tuple[Text, ...]
-    given: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0
+    held: bool = False
 
 
 FACTS: Mapping[str, type[Facts]] = {

@@ -26,11 +26,14 @@ SURVIVING = 0.5
 DETERMINED = 0.5
 """Smallest fraction of the given poses that points have to determine for the poses to be adjusted."""
 
-FITTED = 3.0
-"""A given pose takes part in the return to the given coordinates if it is at most this many times the median away."""
+FITS = 30
+"""Rounds of the fit to the given poses; with one wrong pose of ten, 10 rounds suffice."""
 
-FITS = 5
-"""Rounds of that fit."""
+NEGLIGIBLE = 1e-9
+"""Distances below this, in the spread of the given centres, count as this."""
+
+SHIFTS = 16
+"""The scale of a model is that of the distances from each photo to this many others."""
 
 
 def cameras_of(given: dict[str, Any], first: int) -> dict[str, pycolmap.Camera]:
@@ -237,8 +240,9 @@ def _extended(
 def _to_given(model: pycolmap.Reconstruction, given: dict[str, Any]) -> pycolmap.Sim3d:
     """Return the similarity from a model to the given poses, in the coordinates of `_normal`.
 
-    Each pose is compared as four points: the camera's centre, and the ends of its axes, as long as the centres are
-    spread. Centres alone would not determine the turn about the line on which a camera moved.
+    Each pose is compared as four points: the camera's centre, and the ends of its axes, which are as long as the given
+    centres are spread. Centres alone would not determine the turn about the line on which a camera moved. The sum of the distances
+    is minimised, by reweighted squares, so that a few wrong poses have little effect.
     """
     normal = _normal(given)
     images = {model.image(image).name: model.image(image) for image in sorted(model.reg_image_ids())}
@@ -246,22 +250,48 @@ def _to_given(model: pycolmap.Reconstruction, given: dict[str, Any]) -> pycolmap
     if len(views) < 2:
         return pycolmap.Sim3d()
     poses = [images[view["name"]].cam_from_world() for view in views]
-    found = _corners([(pose.rotation.matrix(), pose.inverse().translation) for pose in poses])
-    wanted = _corners([(np.array(view["rotation"]), normal * np.array(view["eye"])) for view in views])
-    used, fit = np.ones(len(views), dtype=bool), pycolmap.Sim3d()
+    eyes = np.array([pose.inverse().translation for pose in poses])
+    given_eyes = np.array([normal * np.array(view["eye"]) for view in views])
+    scale = _scale(eyes, given_eyes)
+    found = _corners(eyes, np.array([pose.rotation.matrix() for pose in poses]) / scale)
+    wanted = _corners(given_eyes, np.array([view["rotation"] for view in views]))
+    weights, fit = np.ones(len(views)), pycolmap.Sim3d()
     for _ in range(FITS):
-        better = pycolmap.estimate_sim3d(found[used].reshape(-1, 3), wanted[used].reshape(-1, 3))
-        if better is None:
-            break
-        fit = better
+        fit = _similarity(found, wanted, weights)
         moved = fit.scale * found @ fit.rotation.matrix().T + fit.translation
         away = np.sqrt(np.mean(np.sum((moved - wanted) ** 2, axis=2), axis=1))
-        used = away <= FITTED * np.median(away)
+        weights = 1.0 / np.maximum(away, NEGLIGIBLE)
     return fit
 
 
-def _corners(poses: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Return the centre of each camera and the ends of its axes (n, 4, 3)."""
-    eyes = np.stack([eye for _, eye in poses])
-    axes = _spread(eyes) * np.stack([R for R, _ in poses])  # rows: right, down, forward
+def _similarity(found: np.ndarray, wanted: np.ndarray, weights: np.ndarray) -> pycolmap.Sim3d:
+    """Return the similarity that minimises the weighted squared distances of points (Umeyama 1991).
+
+    Args:
+        found: (n, 4, 3) points.
+        wanted: (n, 4, 3) where they should be.
+        weights: (n,) weights.
+    """
+    w = (np.repeat(weights, 4) / (4.0 * weights.sum()))[:, None]
+    x, y = found.reshape(-1, 3), wanted.reshape(-1, 3)
+    x_mean, y_mean = (w * x).sum(axis=0), (w * y).sum(axis=0)
+    x, y = x - x_mean, y - y_mean
+    U, D, V = np.linalg.svd((w * y).T @ x)
+    sign = np.array([1.0, 1.0, np.linalg.det(U @ V)])
+    R = U @ np.diag(sign) @ V
+    s = float((D * sign).sum() / (w * x**2).sum())
+    return pycolmap.Sim3d(s, pycolmap.Rotation3d(R), y_mean - s * R @ x_mean)
+
+
+def _scale(found: np.ndarray, wanted: np.ndarray) -> float:
+    """Return the median ratio of the distances between centres (n, 3), which a few wrong ones hardly change."""
+    ratios = list[np.ndarray]()
+    for shift in range(1, min(len(found), SHIFTS + 1)):
+        apart = [np.linalg.norm(eyes - np.roll(eyes, shift, axis=0), axis=1) for eyes in (wanted, found)]
+        ratios.append(apart[0] / np.maximum(apart[1], NEGLIGIBLE))
+    return max(float(np.median(np.concatenate(ratios))), NEGLIGIBLE)
+
+
+def _corners(eyes: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the centre of each camera and the ends of its axes, right, down and forward (n, 4, 3)."""
     return np.concatenate([eyes[:, None], eyes[:, None] + axes], axis=1)
