@@ -241,8 +241,8 @@ def _to_given(model: pycolmap.Reconstruction, given: dict[str, Any]) -> pycolmap
     """Return the similarity from a model to the given poses, in the coordinates of `_normal`.
 
     Each pose is compared as four points: the camera's centre, and the ends of its axes, which are as long as the given
-    centres are spread. Centres alone would not determine the turn about the line on which a camera moved. The sum of the distances
-    is minimised, by reweighted squares, so that a few wrong poses have little effect.
+    centres are spread. Centres alone would not determine the turn about the line on which a camera moved. The sum of
+    the distances is minimised, by reweighted squares, so that a few wrong poses have little effect.
     """
     normal = _normal(given)
     images = {model.image(image).name: model.image(image) for image in sorted(model.reg_image_ids())}
