@@ -28,7 +28,9 @@ from gsplat_edu.viewer.export import read_back
 from gsplat_edu.viewer.page import Tour
 from gsplat_edu.viewer.sizing import write_sized
 
-PROGRAM = Path(__file__).parents[1] / "tests" / "npm" / "node_modules" / "@playcanvas" / "splat-transform" / "bin"
+PROGRAM = (
+    Path(__file__).parents[1] / "tests" / "npm" / "node_modules" / "@playcanvas" / "splat-transform" / "bin"
+)
 
 SIZES = (0.5, 1.0, 2.0, 4.0)
 """Budgets, MB of 10⁶ bytes."""
@@ -77,7 +79,9 @@ def main(run: str, *sizes: str) -> None:
             most = round(1e6 * size)
             write_sized(place / "ours.spz", source, Tour(), importance, most)
             ours = read_back(place / "ours.spz").relative_to(source.origin)
-            print(f"{size} MB, ours: {(place / 'ours.spz').stat().st_size:,} bytes, {scored(ours)}", flush=True)
+            print(
+                f"{size} MB, ours: {(place / 'ours.spz').stat().st_size:,} bytes, {scored(ours)}", flush=True
+            )
             for degree in range(4):
                 if not theirs(place / "scene.ply", degree, most, place / "theirs.spz"):
                     continue

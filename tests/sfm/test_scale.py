@@ -17,7 +17,7 @@ from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
-from gsplat_edu.sfm.scale import Sight, placed
+from gsplat_edu.sfm.scale import Sight, in_given_world, placed
 from gsplat_edu.sfm.scale_text import Mark, marks_of, points_of
 from lab.captures.textured_box import align_cameras, box_orbit, photograph_box
 from sfm.textured_box import LIMIT, cameras_of
@@ -266,3 +266,15 @@ def test_a_damaged_scale_is_named(tmp_path):
 
 def test_the_scale_of_a_dataset(done):
     assert load_dataset(done.out).scale is None
+
+
+def test_given_poses_keep_their_world_and_marks_change_only_its_unit():
+    a, b = (0.3, 0.2, 0.1), (-0.2, 0.4, 0.8)
+    marks = [";".join(pixel(number, point) for number in (0, 1, 2)) for point in (a, b)]
+    known = Scale("m", "GPS")
+    for choice, scale in (("auto", known), ("none", None)):
+        move, found = in_given_world(SIGHTS, choice, known)
+        assert found == scale and move.s == 1.0 and not move.t.any() and np.array_equal(move.R, np.eye(3))
+    move, found = in_given_world(SIGHTS, f"{marks[0]} {marks[1]} 50cm", known)
+    assert move.s * np.linalg.norm(np.subtract(a, b)) == pytest.approx(50.0, rel=1e-6)
+    assert found.unit == "cm" and not move.t.any() and np.array_equal(move.R, np.eye(3))

@@ -6,9 +6,10 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.base.constants import AUTO
+from gsplat_edu.options.poses import posed_by
 from gsplat_edu.options.values import whole_number_text
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA, SfmOptions
-from gsplat_edu.sfm.scale_text import MARKS
+from gsplat_edu.sfm.scale_text import MARKS, NONE
 
 EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
 
@@ -60,6 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_panorama(parser)
     add_scale(parser)
+    parser.add_argument(
+        "--poses",
+        metavar="FILE",
+        default=AUTO,
+        help="start from the poses of this file in the folder, refine them and add the other photos; auto takes those"
+        " that the folder comes with, if the photos agree with them; none searches for all (default: auto)",
+    )
     number("--max-features", "maximum number of features per photo", SfmOptions.max_features)
     number(
         "--max-image-size", "longest side of the photos for feature detection, px", SfmOptions.max_image_size
@@ -108,4 +116,7 @@ def options_from(arguments: argparse.Namespace) -> SfmOptions:
         arguments.threads,
         arguments.panorama,
         arguments.scale,
+        arguments.poses
+        if arguments.poses in (AUTO, NONE)
+        else posed_by(arguments.source, Path(arguments.poses)) or AUTO,
     )

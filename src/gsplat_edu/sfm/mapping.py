@@ -53,7 +53,8 @@ class Attempt:
     """The settings of one attempt at mapping.
 
     Args:
-        mapper: "incremental" (Schönberger and Frahm 2016) or "global" (Pan et al. 2024, GLOMAP).
+        mapper: "incremental" (Schönberger and Frahm 2016), "global" (Pan et al. 2024, GLOMAP), or "given": refine the
+            poses of some photos and register the others.
         model: COLMAP's camera model.
         free: Map with a freer lens, then drop it; held-out photos decide what is refined.
         per_photo: Give every photo its own camera.
@@ -68,10 +69,16 @@ class Attempt:
 
     def __str__(self) -> str:
         """Describe the attempt."""
+        if self.mapper == "given":
+            return "given poses"
         words = [f"{self.mapper} mapper"] + [self.model] * (self.model not in ("auto", RIG))
         words += ["a freer lens at first"] * self.free
         words += ["a camera per photo"] * self.per_photo + ["lower thresholds"] * self.loose
         return ", ".join(words)
+
+
+FROM_GIVEN = Attempt("given", "auto")
+"""The attempt that starts from given poses; it is made first."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +89,12 @@ class Cameras:
         shared: For each replaced camera, the number of its replacement: `shared_cameras`.
         rig: For faces of panoramas, the rig's "rotations" and the names of the faces of all "panoramas", as for
             `gsplat_edu.sfm.engine.database.with_rig`.
+        given: Poses of some photos: `gsplat_edu.sfm.given.GivenPoses.model`.
     """
 
     shared: dict[int, int]
     rig: dict[str, Any] | None = None
+    given: dict[str, Any] | None = None
 
 
 def attempts(mapper: str, model: str, photos: int, cameras: int, one_lens: bool) -> list[Attempt]:
@@ -217,10 +226,19 @@ def map_photos(
         if counting >= ENOUGH * connected or _agreed(found, connected):
             break
         say(f"{way}: {counting} of {total} photos have a pose that counts")
-    best = best_model(found) if found else {"names": []}
+    best = _preferred(found) if found else {"names": []}
     if len(best["names"]) < min(FEWEST, total):
         raise DatasetError(_without_poses(folder, total, connected))
     return best
+
+
+def _preferred(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Choose the model from given poses, the only one in their coordinates, unless another has many more photos."""
+    best = best_model(found)
+    given = [
+        model for model in found if "held" in model and len(model["names"]) >= ENOUGH * len(best["names"])
+    ]
+    return given[0] if given else best
 
 
 def _agreed(found: Sequence[dict[str, Any]], connected: int) -> bool:

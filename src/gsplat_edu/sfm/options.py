@@ -84,6 +84,7 @@ class SfmOptions:
         threads: Threads of COLMAP; 0 uses all.
         scale: "auto": scale and up from GPS in EXIF if the positions fit the cameras; "none"; or two points marked in
             photos and their distance, `gsplat_edu.sfm.scale_text.marks_of`.
+        poses: "auto": start from the poses that the folder comes with, if any; "none"; or the file with them.
         panorama: Whether the photos or frames are 360-degree panoramas; "auto": if their XMP or the
             pictures say so.
 
@@ -102,6 +103,7 @@ class SfmOptions:
     threads: int = 0
     panorama: str = "auto"
     scale: str = AUTO
+    poses: str | Path = AUTO
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -16,13 +16,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float64
+
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import remove_leftovers
 from gsplat_edu.base.records import record_of
 from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.data.scale import Scale
+from gsplat_edu.io.edit import Similarity
 from gsplat_edu.photos.decoding import UPRIGHT
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.candidates import Candidates
 from gsplat_edu.sfm.colmap import (
@@ -42,7 +47,8 @@ from gsplat_edu.sfm.diagnosis import (
     diagnosis,
     evidence,
 )
-from gsplat_edu.sfm.mapping import Cameras, attempts, map_photos, rig_attempts, shared_cameras
+from gsplat_edu.sfm.given import FEWEST_GIVEN, GivenPoses, find_given
+from gsplat_edu.sfm.mapping import FROM_GIVEN, Cameras, attempts, map_photos, rig_attempts, shared_cameras
 from gsplat_edu.sfm.masks import check_some_used, find_masks, unused_folders
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions, lens_choice
 from gsplat_edu.sfm.panoramas import (
@@ -66,6 +72,7 @@ from gsplat_edu.sfm.photos import (
     stored_mask,
 )
 from gsplat_edu.sfm.result import build_capture, note_published, publish, published
+from gsplat_edu.sfm.scale import Sight, in_given_world, placed
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
@@ -145,6 +152,7 @@ class _Run:
         self.stages = Stages(self.folder / "stages.json", say)
         self.video = is_video(options.source)
         self.panoramas: list[Panorama] | None = None
+        self.given: GivenPoses | None = None
         self.cameras: list[CameraGroup] = []
         """The photos by camera; empty for panoramas, whose faces have known cameras."""
         self.unit = 1
@@ -163,6 +171,8 @@ class _Run:
         self.whole = WholePhotos()
         if are_panoramas(files, options.panorama, self._say):
             files = self._faces(files)
+        elif not self.video:
+            self.given = find_given(source, options.poses, files, self._say)
         self.source = source = files[0].parent
         masks = find_masks(files)
         wanted = {
@@ -185,6 +195,8 @@ class _Run:
         forget = partial(forget_matches, database[0])
         facts = self._stage("matches", {"matcher": options.matcher}, self._match, [], forget)
         wanted = {"mapper": options.mapper, "camera_model": options.camera_model, "method": MAPPING}
+        if self.given is not None:
+            wanted["poses"] = self.given.digest()
         connected = facts["connected"]
         self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
         if line := moving_line(self.model.get("moving", 1.0)):
@@ -426,12 +438,13 @@ class _Run:
         options, total = self.options, len(self.photos)
         if self.panoramas is None:
             shared = shared_cameras(self.groups)
-            cameras = Cameras(shared)
+            cameras = Cameras(shared, given=self._given_model())
             used = len(self.groups) - len(shared)
             lens, _ = lens_choice(options.camera_model)
             ways = attempts(options.mapper, lens, total, used, self.video)
             if all(group.lens is not None for group in self.cameras):
                 ways = [way for way in ways if not way.free]  # a freer lens than a fisheye is none
+            ways = [FROM_GIVEN, *ways] if cameras.given else ways
         else:
             cameras, ways = Cameras({}, rig_of(self.photos)), rig_attempts(options.mapper)
         model = map_photos(
@@ -439,6 +452,8 @@ class _Run:
         )
         count, total = len(model["names"]) // self.unit, total // self.unit
         summary = f"{count} of {total} {self._kind} have a pose ({model['way']})"
+        if cameras.given is not None:
+            summary += self._said_of_given(model, cameras.given)
         unclear = len(set(model["unclear"]) - set(model["names"]))
         if left := total - count - unclear:
             others = f"{left} more" if unclear else f"the other {left}" if left > 1 else "the other one"
@@ -447,6 +462,33 @@ class _Run:
             summary += f"; the focal length of {unclear} of another size is unclear"
         return model | {"summary": summary}
 
+    def _said_of_given(self, model: Mapping[str, Any], given: Mapping[str, Any]) -> str:
+        """Return the words of the summary about given poses, and say what became of them."""
+        assert self.given is not None, "their model is made of them"
+        program = self.given.program
+        if "held" not in model:
+            self._say(f"the poses of {program} are not used: without them, more photos have a pose")
+            return ""
+        if model["held"]:
+            self._say(f"the photos match too little to refine the poses of {program}, which stay as they are")
+        more = len(set(model["names"]) - {view["name"] for view in given["views"]})
+        return f", {more} more than those of {program}"
+
+    def _given_model(self) -> dict[str, Any] | None:
+        """Return the given poses and lenses of the working copies; None if the photos do not agree with any."""
+        if self.given is None or (given := self.given.proven(self._say)) is None:
+            return None
+        model = given.model(self.photos, self.groups, self.options.max_image_size)
+        return model if len(model["views"]) >= FEWEST_GIVEN else None
+
+    def _placed(
+        self, cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"], sights: Sequence[Sight]
+    ) -> tuple[Similarity, Scale | None]:
+        """Choose the world: that of the given poses if the model started from them."""
+        if self.given is not None and "held" in self.model:
+            return in_given_world(sights, self.options.scale, self.given.reader.capture.scale)
+        return placed(cameras, points, sights, self.options.scale, self._say)
+
     def _finish(self) -> dict[str, Any]:
         facts = build_capture(
             self.model,
@@ -454,7 +496,7 @@ class _Run:
             self.source,
             self.folder,
             self._progress,
-            self.options.scale,
+            self._placed,
             self._say,
             self.whole,
         )

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.reading import parse_json, read_text
@@ -27,7 +26,8 @@ from gsplat_edu.data.colmap import read_cameras, read_images, read_points
 from gsplat_edu.data.images import PhotoFile, load_photo
 from gsplat_edu.data.lens import FISHEYE, Lens
 from gsplat_edu.data.panorama import FaceLens
-from gsplat_edu.data.scale import SCALE_FILE, write_scale
+from gsplat_edu.data.scale import SCALE_FILE, Scale, write_scale
+from gsplat_edu.io.edit import Similarity
 from gsplat_edu.photos.decoding import AT_ONCE, decode_mask, upright_image_size
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.gaussian_math import quat_to_R
@@ -35,7 +35,7 @@ from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.sfm.circle import Circle
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts
-from gsplat_edu.sfm.scale import Sight, placed as placed_world
+from gsplat_edu.sfm.scale import Sight
 from gsplat_edu.sfm.whole_photos import (
     DIM,
     WholePhotos,
@@ -54,6 +54,13 @@ PUBLISHED = "published.json"
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Effect of a clockwise quarter turn of the image on camera coordinates: right becomes down."""
+
+
+Placing = Callable[
+    [Sequence[Camera], Float64[np.ndarray, "N 3"], Sequence[Sight]], tuple[Similarity, Scale | None]
+]
+"""Chooses the world of a capture from its cameras and points, such as `gsplat_edu.sfm.scale.placed`: the transform into
+it, and its scale if known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +104,7 @@ def build_capture(
     source: Path,
     folder: Path,
     progress: Callable[[str, int, int], None],
-    scale: str = AUTO,
+    place: Placing,
     say: Callable[[str], None] = lambda sentence: None,
     whole: WholePhotos = WholePhotos(),  # noqa: B008
 ) -> dict[str, Any]:
@@ -109,8 +116,8 @@ def build_capture(
         source: Their folder.
         folder: Work folder; result/ in it is recreated.
         progress: Called with the number of photos written.
-        scale: As for `gsplat_edu.sfm.scale.placed`.
-        say: As for `gsplat_edu.sfm.scale.placed`; it also receives how far a fisheye sees.
+        place: Chooses the world of the capture.
+        say: Receives how far a fisheye sees.
         whole: What is known of photos that keep their lens.
 
     Returns:
@@ -129,7 +136,7 @@ def build_capture(
     cloud = read_points(found)
     if cloud is None:
         raise DatasetError(f"{found}: contains no points; the photos show too little in common")
-    move, known = placed_world(cameras, cloud.points, sights, scale, say)
+    move, known = place(cameras, cloud.points, sights)
     for line in _rims(entries):
         say(line)
     _write_photos(entries, source, result, whole, progress)

@@ -98,15 +98,10 @@ def placed(
     if choice == NONE:
         return move, None
     if choice != AUTO:
-        given = marks_of(choice)
-        a, b = (_point(letter, marks, sights) for letter, marks in (("A", given.a), ("B", given.b)))
-        apart = float(np.linalg.norm(a[0] - b[0]))
-        if apart == 0.0:
-            raise ArgumentError("--scale: A and B are one point")
-        found = _rescaled(move, given.length / apart)
-        detail = f"{given.length:g} {given.unit} between two points, marks off by {max(a[1], b[1]):.1f} px"
-        _check_near(cameras, found.s, given.unit, say)
-        return found, Scale(given.unit, "a given distance", detail)
+        factor, measured = _measured(sights, choice)
+        found = _rescaled(move, factor)
+        _check_near(cameras, found.s, measured.unit, say)
+        return found, measured
     # One entry for each place: the faces of a panorama have one centre and one position.
     there = {(sight.photo.place, *np.round(sight.eye, 9)): sight for sight in sights if sight.photo.place}
     places = [sight.photo.place for sight in there.values() if sight.photo.place]
@@ -122,6 +117,44 @@ def placed(
         )
         return move, None
     return _by_gps(move, fit)
+
+
+def in_given_world(
+    sights: Sequence[Sight], choice: str, known: Scale | None
+) -> tuple[Similarity, Scale | None]:
+    """Keep the world of a model that started from given poses; only marked points change it, by its unit.
+
+    Args:
+        sights: As for `placed`.
+        choice: As for `placed`; "auto" keeps the known scale.
+        known: The scale of the given poses, if it is known.
+
+    Returns:
+        As `placed`; the origin and the axes are those of the given poses.
+
+    Raises:
+        ArgumentError: a mark cannot be used.
+    """
+    kept = Similarity(np.eye(3), 1.0, np.zeros(3))
+    if choice in (AUTO, NONE):
+        return kept, known if choice == AUTO else None
+    factor, scale = _measured(sights, choice)
+    return _rescaled(kept, factor), scale
+
+
+def _measured(sights: Sequence[Sight], choice: str) -> tuple[float, Scale]:
+    """Return the factor that gives two marked points their distance, and the scale.
+
+    Raises:
+        ArgumentError: a mark cannot be used.
+    """
+    given = marks_of(choice)
+    a, b = (_point(letter, marks, sights) for letter, marks in (("A", given.a), ("B", given.b)))
+    apart = float(np.linalg.norm(a[0] - b[0]))
+    if apart == 0.0:
+        raise ArgumentError("--scale: A and B are one point")
+    detail = f"{given.length:g} {given.unit} between two points, marks off by {max(a[1], b[1]):.1f} px"
+    return given.length / apart, Scale(given.unit, "a given distance", detail)
 
 
 def _by_gps(move: Similarity, fit: GpsFit) -> tuple[Similarity, Scale]:

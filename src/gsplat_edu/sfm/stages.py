@@ -53,6 +53,7 @@ class _Mapping(Facts, frozen=True):
     names: tuple[Text, ...]
     doubtful: tuple[Text, ...]
     unclear: tuple[Text, ...]
+    held: bool = False
 
 
 FACTS: Mapping[str, type[Facts]] = {

@@ -75,7 +75,14 @@ def add_photo(database: pycolmap.Database, name: str, number: int, camera: int) 
     database.write_frame(frame, use_frame_id=True)
 
 
-def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: dict[int, int]) -> str:
+def with_cameras(
+    source: str,
+    target: str,
+    model: str,
+    per_photo: bool,
+    shared: dict[int, int],
+    known: dict[str, pycolmap.Camera] | None = None,
+) -> str:
     """Copy a database without descriptors, and assign new cameras to its photos.
 
     If photos of different sizes share a camera, their features are scaled to the camera's size. Fisheyes keep their
@@ -87,10 +94,13 @@ def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: 
         model: The camera model.
         per_photo: Whether every photo gets its own camera.
         shared: For each replaced camera, the number of its replacement, which has the same aspect ratio.
+        known: Cameras of photos whose lens is known, by the photos' names, of the photos' size, under numbers that
+            no camera of the database has.
 
     Returns:
         The path of the copy.
     """
+    known = known or {}
     with opened(source) as old, opened(target) as new, pycolmap.DatabaseTransaction(new):
         made = set[int]()
         scales = dict[int, np.ndarray]()
@@ -98,16 +108,12 @@ def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: 
             own = old.read_camera(image.camera_id)
             before = own if per_photo else old.read_camera(shared.get(image.camera_id, image.camera_id))
             number = image.image_id if per_photo else before.camera_id
+            if image.name in known:
+                before = known[image.name]
+                number = before.camera_id
             if number not in made:
                 made.add(number)
-                camera = pycolmap.Camera.create_from_model_name(
-                    number, model, before.mean_focal_length(), before.width, before.height
-                )
-                if is_wide(before):
-                    camera.model = before.model
-                    camera.params = list(before.params)
-                camera.has_prior_focal_length = before.has_prior_focal_length
-                add_camera(new, camera)
+                add_camera(new, before if image.name in known else _started(before, number, model))
             scale = np.array([before.width / own.width, before.height / own.height, 1.0])
             scales[image.image_id] = scale
             add_photo(new, image.name, image.image_id, number)
@@ -120,6 +126,18 @@ def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: 
             new.write_two_view_geometry(first, second, geometry)
             new.write_matches(first, second, old.read_matches(first, second))
     return target
+
+
+def _started(before: pycolmap.Camera, number: int, model: str) -> pycolmap.Camera:
+    """Return the camera with which mapping starts, with another lens model unless it is a fisheye."""
+    camera = pycolmap.Camera.create_from_model_name(
+        number, model, before.mean_focal_length(), before.width, before.height
+    )
+    if is_wide(before):
+        camera.model = before.model
+        camera.params = list(before.params)
+    camera.has_prior_focal_length = before.has_prior_focal_length
+    return camera
 
 
 def is_wide(camera: pycolmap.Camera) -> bool:

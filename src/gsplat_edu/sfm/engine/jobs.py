@@ -18,6 +18,7 @@ import pycolmap
 from .database import add_camera, add_photo, counted, opened, with_cameras, with_rig
 from .judge import agreement, scattered, steady_points
 from .kin import placed_anew
+from .known import add_posed, cameras_of, from_known_poses
 from .lenses import Kin, refined, simplified
 from .mappers import Options, Tell, all_at_once, incremental, repaired, without_doubtful
 from .turning import moving_share
@@ -165,12 +166,12 @@ def mapping(
         database: The database with features and matches; not changed.
         photos: Folder of the photos, for the colours of the points.
         out: An empty folder for the models.
-        attempt: "mapper": "incremental" or "global"; "model": the camera model, or "auto" to choose it by
-            cross-validation; "free": map with `FREE_LENS` before that choice; "per_photo": give every photo its own
-            camera; "loose": use lower thresholds.
+        attempt: "mapper": "incremental", "global", or "given" to start from known poses; "model": the camera model, or
+            "auto" to choose it by cross-validation; "free": map with `FREE_LENS` before that choice; "per_photo": give
+            every photo its own camera; "loose": use lower thresholds.
         cameras: "shared": for each replaced camera, the number of its replacement, which has the same aspect ratio.
             "rig": for faces of panoramas, "rotations" and "panoramas" as for `with_rig`, else None; their intrinsics
-            stay as they are.
+            stay as they are. "given": for the mapper "given", lenses and poses as for `from_known_poses`.
         threads: Number of threads, -1 for all.
         seed: Seed of all random draws.
 
@@ -179,12 +180,15 @@ def mapping(
         whose pose does not; "unclear", those of them with an ambiguous focal length; "points", their number; "steady",
         the number of points that three photos see; "agreement", the fraction of all matches that fit the poses; "lens",
         the refined lens of the camera with the most photos; "error", the mean reprojection error in px of the given
-        photos; and for panoramas "moving", as `moving_share` returns it.
+        photos; for panoramas "moving", as `moving_share` returns it; and for the mapper "given" whether the poses were
+        "held".
     """
     pycolmap.set_random_seed(seed)
     lens = FREE_LENS if attempt["free"] else FIRST_LENS if attempt["model"] == "auto" else attempt["model"]
     by_number = {int(camera): leader for camera, leader in cameras["shared"].items()}
     rig, copy = cameras["rig"], f"{out}/database.db"
+    if attempt["mapper"] == "given":
+        return {"models": _given(tell, database, photos, out, cameras, Options(False, threads, seed))}
     if rig is None:
         mapped = with_cameras(database, copy, lens, attempt["per_photo"], by_number)
     else:
@@ -201,6 +205,24 @@ def mapping(
         facts = _judged(mapped_model, mapped, photos, folder, attempt, options)
         models += [] if facts is None else [facts]
     return {"models": models}
+
+
+def _given(
+    tell: Tell, database: str, photos: str, out: str, cameras: dict[str, Any], options: Options
+) -> list[dict[str, Any]]:
+    """Map photos from known poses; return the model, or nothing if the photos do not support the poses."""
+    given, by_number = cameras["given"], {int(one): leader for one, leader in cameras["shared"].items()}
+    with opened(database) as db:
+        known = cameras_of(given, 1 + db.num_images())
+    copy, folder = f"{out}/database.db", Path(out) / "0"
+    folder.mkdir()
+    with_cameras(database, copy, FIRST_LENS, False, by_number, known)
+    found = from_known_poses(tell, copy, photos, folder, options, given)
+    if found is None:
+        return []
+    model, lenses, held = found
+    placed = sorted(view["name"] for view in given["views"])
+    return [_written(model, copy, folder, (placed, [], lenses)) | {"held": held}]
 
 
 def _judged(
@@ -412,17 +434,8 @@ def triangulation(
     model = pycolmap.Reconstruction()
     with opened(database) as db:
         for number, view in enumerate(views, 1):
-            model.add_camera_with_trivial_rig(_camera(_pinhole_key(view), number))
-            seen = (
-                np.array(db.read_keypoints(number))[:, :2]
-                if db.exists_keypoints(number)
-                else np.zeros((0, 2))
-            )
-            image = pycolmap.Image(
-                name=view["name"], keypoints=seen.astype(np.float64), camera_id=number, image_id=number
-            )
             matrix = np.column_stack([np.array(view["rotation"]), np.array(view["translation"])])
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+            add_posed(model, db, number, pycolmap.Rigid3d(matrix))
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads, pipeline.random_seed = threads, seed
     found = pycolmap.triangulate_points(model, database, photos, str(Path(out).parent), options=pipeline)

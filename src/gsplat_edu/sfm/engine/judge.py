@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import NamedTuple
 
 import numpy as np
@@ -70,15 +71,16 @@ def frames(model: pycolmap.Reconstruction) -> dict[int, list[int]]:
     return found
 
 
-def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
+def unsupported(model: pycolmap.Reconstruction, trusted: Container[str] = ()) -> dict[int, int]:
     """Find the photos whose poses do not count.
 
     Photos of one frame have one pose and count as one photo. A pose counts if the photo shares `SUPPORT` points, spread
     over the photo, with photos whose poses count; two such photos have to see `STEADY` of them. The search starts with
-    the two photos that share the most points.
+    the two photos that share the most points, or with the photos whose poses count in any case.
 
     Args:
         model: The model.
+        trusted: Names of the photos whose poses count in any case.
 
     Returns:
         By number of each such photo, the number of points that it shares with photos whose poses count.
@@ -87,8 +89,10 @@ def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
     seen = {frame: _together(model, images) for frame, images in photos.items()}
     longest = {frame: _longest(model, images[0]) for frame, images in photos.items()}
     size = 1 + max((int(points.max()) for points, _ in seen.values() if len(points)), default=0)
-    best = set[int]()
+    best = {frame for frame, images in photos.items() if any(model.image(i).name in trusted for i in images)}
     left = set(seen)
+    if best:
+        best = left = _extended(seen, left, best, size, longest)
     while len(left) > len(best):
         grown = _grown(seen, left, size, longest)
         if len(grown) > len(best):
@@ -114,7 +118,18 @@ def _grown(
     second = max(shared, key=lambda image: shared[image], default=first)
     if second == first or shared[second] < SUPPORT:
         return {first}
-    grown = {first, second}
+    return _extended(seen, left, {first, second}, size, longest)
+
+
+def _extended(
+    seen: dict[int, tuple[np.ndarray, np.ndarray]],
+    left: set[int],
+    start: set[int],
+    size: int,
+    longest: dict[int, int],
+) -> set[int]:
+    """Add the frames that the first ones support, those that these support, and so on."""
+    grown = set(start)
     while True:
         count = _counts(seen, grown, size)
         added = {

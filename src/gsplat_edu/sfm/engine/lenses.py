@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -84,7 +85,11 @@ class Kin(NamedTuple):
 
 
 def refined(
-    model: pycolmap.Reconstruction, climb: bool, threads: int, kin: dict[int, Kin] | None = None
+    model: pycolmap.Reconstruction,
+    climb: bool,
+    threads: int,
+    kin: dict[int, Kin] | None = None,
+    fixed: Collection[int] = (),
 ) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
     """Run a final bundle adjustment, with as much freedom for each camera as its photos support.
 
@@ -93,23 +98,25 @@ def refined(
         climb: Whether freer lens models are considered; a free principal point always is.
         threads: Number of threads.
         kin: Cameras that follow another one, by number.
+        fixed: Cameras whose intrinsics stay.
 
     Returns:
         The adjusted model, and the refined parameters of each camera, by number.
     """
     photos = Counter(model.image(image).camera_id for image in model.reg_image_ids())
     kin = {camera: one for camera, one in (kin or {}).items() if camera in photos}
-    chosen = {camera: _climbed(model, camera, climb, threads) for camera in sorted(set(photos) - set(kin))}
+    stay = set(kin).union(fixed)
+    chosen = {camera: _climbed(model, camera, climb, threads) for camera in sorted(set(photos) - stay)}
     result = copy.deepcopy(model)
     for camera, rung in chosen.items():
         _change(result.camera(camera), rung.model)
     for _ in range(FOLLOWED if kin else 1):
         _follow(result, kin)
-        adjust(result, threads, fixed=set(kin))
+        adjust(result, threads, fixed=stay)
     if any(rung.centre for rung in chosen.values()):
-        fixed = {camera for camera, rung in chosen.items() if not rung.centre} | set(kin)
+        centred = {camera for camera, rung in chosen.items() if not rung.centre}
         free = copy.deepcopy(result)
-        adjust(free, threads, centre=True, fixed=fixed)
+        adjust(free, threads, centre=True, fixed=centred | stay)
         if all(_believable(free.camera(camera)) for camera in chosen):
             result = free
         else:
@@ -120,7 +127,8 @@ def refined(
         _follow(result, kin)
         adjust(result, threads, fixed=set(photos))
     result.update_point_3d_errors()
-    names = {camera: str(rung) for camera, rung in chosen.items()}
+    names = {camera: model.camera(camera).model_name for camera in photos}
+    names |= {camera: str(rung) for camera, rung in chosen.items()}
     return result, names | {camera: names[one.main] for camera, one in kin.items()}
 
 

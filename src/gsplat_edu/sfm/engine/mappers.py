@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Container
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,12 +18,25 @@ ROUNDS = 5
 
 
 class Options(NamedTuple):
-    """Options common to all mappers; `known` if intrinsics and the rig's rotations are exact, as for panoramas."""
+    """Options common to all mappers, and of the incremental mapper if it starts from given poses.
+
+    Args:
+        loose: Use lower thresholds.
+        threads: Number of threads.
+        seed: Seed of all random draws.
+        known: Whether intrinsics and the rig's rotations are exact, as for panoramas.
+        fixed: Cameras whose intrinsics stay.
+        holds: Whether the poses of the initial model stay.
+        unmatched: Whether the initial model may have photos without matches.
+    """
 
     loose: bool
     threads: int
     seed: int
     known: bool = False
+    fixed: Collection[int] = ()
+    holds: bool = False
+    unmatched: bool = False
 
 
 def incremental(
@@ -46,6 +59,8 @@ def incremental(
     options.num_threads, options.random_seed = common.threads, common.seed
     options.min_model_size = 3  # accept small models, because the caller uses the best one
     options.multiple_models = not begin
+    options.constant_cameras, options.fix_existing_frames = set(common.fixed), common.holds
+    options.load_all_images = common.unmatched
     if common.known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.ba_refine_sensor_from_rig = False
@@ -123,17 +138,18 @@ def repaired(
     return again if again.num_reg_images() >= model.num_reg_images() else pycolmap.Reconstruction(begin)
 
 
-def without_doubtful(model: pycolmap.Reconstruction, database: str) -> int:
+def without_doubtful(model: pycolmap.Reconstruction, database: str, trusted: Container[str] = ()) -> int:
     """Remove the photos with unreliable poses; return their number.
 
     Args:
         model: The model; modified.
         database: Database with the matches.
+        trusted: Names of the photos whose poses need no points, as long as their matches do not contradict them.
     """
     before = model.num_reg_images()
     for _ in range(ROUNDS):
         contradictory = agreement(model, database).contradictory(model)
-        doubtful = contradictory | set(unsupported(model))
+        doubtful = contradictory | set(unsupported(model, trusted))
         if not doubtful:
             break
         take_out(model, doubtful)
