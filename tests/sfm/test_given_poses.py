@@ -20,7 +20,7 @@ from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.writers import write_model
 from gsplat_edu.options.sfm import options_from
 from gsplat_edu.photos.decoding import TURNS
-from gsplat_edu.sfm.given import GivenPoses, colmap_camera, find_given, quarter_turns, turned
+from gsplat_edu.sfm.given import GivenPoses, colmap_camera, find_given, leave_unused, quarter_turns, turned
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from lab.captures.textured_box import box_orbit, photograph_box
@@ -318,3 +318,15 @@ def test_the_digest_follows_every_number(photos, tmp_path):
     assert digest() == same
     others = {digest(eye=nudged), digest(lens=replace(BENT, fx=300.1)), digest(orientation=6)}
     assert len(others | {same}) == 4
+
+
+def test_poses_of_panoramas_are_left_unused_and_that_is_said(photos, tmp_path):
+    with_poses(tmp_path / "in", photos, list(photos.truth.items()))
+    said = []
+    leave_unused(tmp_path / "in", "auto", said.append)
+    leave_unused(tmp_path / "in", "none", said.append)
+    assert said == [
+        "not starting from the poses of COLMAP: a search for the poses of panoramas starts from none"
+    ]
+    with pytest.raises(DatasetError, match="omit --poses"):
+        leave_unused(tmp_path / "in", tmp_path / "in" / "cameras.xml", said.append)

@@ -179,6 +179,23 @@ def find_given(source: Path, poses: str | Path, files: Sequence[Path], say: Say)
     return None
 
 
+def leave_unused(source: Path, poses: str | Path, say: Say) -> None:
+    """Say that the poses of panoramas are not used, if there are any.
+
+    Args:
+        source: As for `find_given`.
+        poses: As for `find_given`.
+        say: Receives the sentence.
+
+    Raises:
+        DatasetError: the user chose a file of poses.
+    """
+    if poses not in (AUTO, NONE):
+        raise DatasetError(f"{poses}: a search for the poses of panoramas starts from none; omit --poses")
+    if poses == AUTO and (layout := layout_of(source)) is not None:
+        say(f"not starting from the poses of {layout}: a search for the poses of panoramas starts from none")
+
+
 def _startable(frame: Frame, reader: CaptureReader) -> bool:
     """Return whether COLMAP has a frame's lens, and the photo fits it."""
     try:

@@ -47,7 +47,7 @@ from gsplat_edu.sfm.diagnosis import (
     diagnosis,
     evidence,
 )
-from gsplat_edu.sfm.given import FEWEST_GIVEN, GivenPoses, find_given
+from gsplat_edu.sfm.given import FEWEST_GIVEN, GivenPoses, find_given, leave_unused
 from gsplat_edu.sfm.mapping import FROM_GIVEN, Cameras, attempts, map_photos, rig_attempts, shared_cameras
 from gsplat_edu.sfm.masks import check_some_used, find_masks, unused_folders
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions, lens_choice
@@ -170,6 +170,7 @@ class _Run:
         check_some_used(files)
         self.whole = WholePhotos()
         if are_panoramas(files, options.panorama, self._say):
+            leave_unused(source, options.poses, self._say)
             files = self._faces(files)
         elif not self.video:
             self.given = find_given(source, options.poses, files, self._say)
