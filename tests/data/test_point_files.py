@@ -190,6 +190,15 @@ def test_a_training_starts_from_a_scan(tmp_path, capsys, capture):
     trained(capsys, folder, tmp_path / "run", "--resume", "--iterations", 3)
 
 
+def test_few_points_are_enough_if_the_photos_see_them(tmp_path, capsys, capture):
+    folder, points = capture
+    write_pcd(
+        tmp_path / "few.pcd", Cloud(np.concatenate([points[:30], FAR[None]]), np.full((31, 3), 0.5)), "binary"
+    )
+    out = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "few.pcd")
+    assert "training starts from 30 of 31 points that the photos see" in out
+
+
 def test_a_scan_in_other_coordinates_is_refused(tmp_path, capsys, capture):
     folder, points = capture
     header = laspy.LasHeader(point_format=0, version="1.2")

@@ -28,8 +28,8 @@ NAME = "points.ply"
 MOST_POINTS = 500_000
 """Most points of a file that a run starts from; more are thinned evenly."""
 
-LEAST_SEEN = 500
-"""Fewer points of a file that the photos see mean that it has other coordinates than the capture."""
+LEAST_SEEN, LEAST_SHARE = 500, 0.01
+"""If the photos see fewer points of a file, and a smaller share of them, it has other coordinates than the capture."""
 
 CORE_SECONDS, TIME_SHARE = 3.0, 0.25
 """Expected processor time of a photo's features and matches, s, twice that of the machine of benchmarks/RESULTS.md; and
@@ -108,7 +108,7 @@ def _with_given(options: RunOptions, path: Path, reader: CaptureReader, stored: 
     dataset = Dataset.of(reader, settings)
     points = found.points - dataset.origin
     chosen = np.flatnonzero(seen_by(points, [view.camera for view in dataset.train], least=1))
-    if len(chosen) < min(LEAST_SEEN, len(points)):
+    if len(chosen) < min(LEAST_SEEN, LEAST_SHARE * len(points)):
         middle = ", ".join(f"{x:.6g}" for x in np.nanmedian(found.points, axis=0))
         raise DatasetError(
             f"--points: {path}: the photos see {len(chosen):,} of {len(points):,} points, whose middle is at"
