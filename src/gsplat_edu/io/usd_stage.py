@@ -66,7 +66,7 @@ LAST_WORDS = 200
 """Characters of what a failed process printed last that a message repeats."""
 
 
-class RefusedError(Exception):
+class UnreadableStageError(Exception):
     """What is wrong with a file."""
 
 
@@ -118,7 +118,7 @@ def main(path: str, found: str) -> None:
     arrays: dict[str, np.ndarray] = {}
     try:
         facts = _facts(path, arrays, max(SMALL, MAX_EXPANSION * size))
-    except RefusedError as error:
+    except UnreadableStageError as error:
         facts, arrays = {"fault": str(error)}, {}
     except (Tf.ErrorException, UnicodeDecodeError) as error:
         facts, arrays = {"fault": f"is damaged, or no USD file{_place(path, error)}"}, {}
@@ -152,19 +152,19 @@ def _facts(path: str, arrays: dict[str, np.ndarray], room: int) -> dict[str, Any
 
     layer = Sdf.Layer.FindOrOpen(path)
     if layer is None:
-        raise RefusedError("is damaged, or no USD file")
+        raise UnreadableStageError("is damaged, or no USD file")
     _check_references(layer, f"{path}[" if path.lower().endswith(".usdz") else None)
     stage = Usd.Stage.Open(layer)
     cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
     prims: list[dict[str, Any]] = []
     for prim in _splats(stage):
         if any(UsdGeom.Xformable(over).TransformMightBeTimeVarying() for over in _and_above(prim)):
-            raise RefusedError("has splats that move over time, and only still ones are read")
+            raise UnreadableStageError("has splats that move over time, and only still ones are read")
         for name, (kind, width) in ATTRIBUTES.items():
             values = _values(prim, name, kind, width)
             room -= values.nbytes
             if room < 0:
-                raise RefusedError(f"shows its splats more than {MAX_EXPANSION} times")
+                raise UnreadableStageError(f"shows its splats more than {MAX_EXPANSION} times")
             arrays[f"{len(prims)} {name}"] = values
         matrix = np.array(cache.GetLocalToWorldTransform(prim)).T  # USD multiplies rows
         degree = prim.GetAttribute(f"{SH}Degree").Get(Usd.TimeCode.EarliestTime())
@@ -204,18 +204,18 @@ def _check_references(layer: Any, inside: str | None) -> None:  # noqa: ANN401
         paths: list[Any] = []
         layer.Traverse(Sdf.Path.absoluteRootPath, paths.append)
         if any(path.IsPrimPath() and layer.GetPrimAtPath(path).HasInfo("clips") for path in paths):
-            raise RefusedError("has splats that move over time (clips), and only still ones are read")
+            raise UnreadableStageError("has splats that move over time (clips), and only still ones are read")
         for name in layer.GetCompositionAssetDependencies():
             whole = Sdf.ComputeAssetPathRelativeToLayer(layer, name)
             if inside is None or not whole.startswith(inside):
-                raise RefusedError(
+                raise UnreadableStageError(
                     f"refers to another file, {shortened(printable(name))}, which is not opened; make one file of"
                     " all with usdcat --flatten"
                 )
             if whole not in seen:
                 further = Sdf.Layer.FindOrOpen(whole)
                 if further is None:
-                    raise RefusedError(f"lacks {shortened(printable(name))}, to which it refers")
+                    raise UnreadableStageError(f"lacks {shortened(printable(name))}, to which it refers")
                 waiting.append(further)
 
 
@@ -230,7 +230,7 @@ def _splats(stage: Any) -> Iterator[Any]:  # noqa: ANN401
     """Yield the prims of splats that a renderer would show.
 
     Raises:
-        RefusedError: there is none, or one has another kernel.
+        UnreadableStageError: there is none, or one has another kernel.
     """
     from pxr import Usd, UsdGeom
 
@@ -238,7 +238,7 @@ def _splats(stage: Any) -> Iterator[Any]:  # noqa: ANN401
     prims = iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
     for number, prim in enumerate(prims):
         if number > MOST_PRIMS:
-            raise RefusedError(f"has more than {MOST_PRIMS:,} prims, instances included")
+            raise UnreadableStageError(f"has more than {MOST_PRIMS:,} prims, instances included")
         kind = prim.GetTypeName()
         if not kind.startswith("ParticleField"):
             others.add(kind)
@@ -251,7 +251,7 @@ def _splats(stage: Any) -> Iterator[Any]:  # noqa: ANN401
             hidden += 1
             continue
         if KERNEL not in prim.GetAppliedSchemas():
-            raise RefusedError(
+            raise UnreadableStageError(
                 f"has particles of the kind {shortened(printable(kind))}, which are no 3D Gaussians"
             )
         shown += 1
@@ -261,7 +261,7 @@ def _splats(stage: Any) -> Iterator[Any]:  # noqa: ANN401
         found = (
             f"its {hidden} prims of splats are invisible" if hidden else f"it holds {named or 'no shapes'}"
         )
-        raise RefusedError(f"has no splats that are shown (ParticleField3DGaussianSplat): {found}")
+        raise UnreadableStageError(f"has no splats that are shown (ParticleField3DGaussianSplat): {found}")
 
 
 def _values(prim: Any, name: str, kind: str, width: int) -> np.ndarray:  # noqa: ANN401
@@ -271,13 +271,13 @@ def _values(prim: Any, name: str, kind: str, width: int) -> np.ndarray:  # noqa:
     best = np.empty((0, width) if width else 0, np.float32)
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
         if attribute.GetNumTimeSamples() > 1:
-            raise RefusedError("has splats that move over time, and only still ones are read")
+            raise UnreadableStageError("has splats that move over time, and only still ones are read")
         found = attribute.Get(Usd.TimeCode.EarliestTime())
         if found is None:
             continue
         said, best = type(found).__name__, np.array(found)  # the attribute itself has the schema's type
         if not said.startswith(kind) or best.dtype.kind != "f" or best.ndim != 1 + bool(width):
-            raise RefusedError(f"has {name} of the type {said}")
+            raise UnreadableStageError(f"has {name} of the type {said}")
         if len(best):
             break
     if kind == "Quat":
