@@ -22,21 +22,6 @@ SUFFIXES = [*suffixes(), ".html"]
 
 
 @pytest.fixture
-def convert(capsys):
-    def call(*words, code=0):
-        try:
-            assert main(["convert", *map(str, words)]) == code
-        except SystemExit as stop:  # argparse exits by itself
-            assert stop.code == code
-        printed = capsys.readouterr()
-        if code:
-            assert printed.err.count("\n") == 1 and "Traceback" not in printed.err
-        return printed.err if code else printed.out
-
-    return call
-
-
-@pytest.fixture
 def plain(tmp_path):
     write_scene(tmp_path / "in.ply", random_scene(300))
     return tmp_path / "in.ply"

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from gsplat_edu.base.constants import SIZED
-from gsplat_edu.cli.main import main
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
@@ -19,21 +18,6 @@ from gsplat_edu.viewer.export import read_back
 from scene_files import make_run, random_scene
 
 SPLATS = 3000
-
-
-@pytest.fixture
-def convert(capsys):
-    def call(*words, code=0):
-        try:
-            assert main(["convert", *map(str, words)]) == code
-        except SystemExit as stop:  # argparse exits by itself
-            assert stop.code == code
-        printed = capsys.readouterr()
-        if code:
-            assert code == 2 and printed.err.count("\n") == 1 and "Traceback" not in printed.err
-        return printed.err if code else printed.out
-
-    return call
 
 
 @pytest.fixture(scope="module")
