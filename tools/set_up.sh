@@ -46,4 +46,7 @@ echo "== set-up: installing gsplat_edu$extra with the versions in constraints.tx
 .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".$extra" ||
     fail "the installation failed; the lines above say why"
 echo "$stamp" > ".venv/.set-up-$purpose"
+if [ "$purpose" = dev ] && [ -e .git ] && ! git config --get core.hooksPath > /dev/null; then
+    git config core.hooksPath tools/hooks
+fi
 echo "== set-up: done"

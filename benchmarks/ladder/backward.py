@@ -9,7 +9,6 @@ fixed order. Both replay the rung `tight`, tile by tile.
 from __future__ import annotations
 
 import ctypes
-import time
 from typing import NamedTuple
 
 import numpy as np
@@ -90,24 +89,6 @@ def slots(
     Arguments are those of `atomics`.
     """
     return _run_backward("backward_slots", splats, image, grad_image, threads, order)
-
-
-def seconds(rung: str, splats: Splats, image: np.ndarray, grad_image: np.ndarray, threads: int = 1) -> float:
-    """Time a rung, including the building of its lists; return the best of five.
-
-    Args:
-        rung: "atomics" or "slots".
-        splats: As for the rung.
-        image: As for the rung.
-        grad_image: As for the rung.
-        threads: As for the rung.
-    """
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        RUNGS[rung](splats, image, grad_image, threads)
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 RUNGS = {"atomics": atomics, "slots": slots}

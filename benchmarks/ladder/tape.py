@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import torch
@@ -11,8 +10,8 @@ from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN
 from ladder.splats import Splats
 
 
-def kept_bytes(loss_of: Callable[[], torch.Tensor]) -> tuple[int, float, float]:
-    """Differentiate a loss, and return the bytes that autograd kept for it, and the seconds there and back.
+def kept_bytes(loss_of: Callable[[], torch.Tensor]) -> int:
+    """Differentiate a loss, and return the bytes that autograd kept for it.
 
     Args:
         loss_of: Computes the loss, a scalar. Storage that several results share counts once.
@@ -24,12 +23,9 @@ def kept_bytes(loss_of: Callable[[], torch.Tensor]) -> tuple[int, float, float]:
         kept[storage.data_ptr()] = storage.nbytes()
         return tensor
 
-    start = time.perf_counter()
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        loss = loss_of()
-    middle = time.perf_counter()
-    loss.backward()
-    return sum(kept.values()), middle - start, time.perf_counter() - middle
+        loss_of().backward()
+    return sum(kept.values())
 
 
 def dense_image(

@@ -1,7 +1,8 @@
 # %% [markdown]
 # ## Exercises
 #
-# **Exercise 1 (a line).** Make every splat of `trained` a tenth larger in each direction, in place.
+# **Exercise 1 (a line).** Make `larger_by_a_tenth`: the scene `trained` with every splat a tenth larger in each
+# direction. `trained` itself stays as it is; exercise 2 draws it.
 
 # %%
 larger_by_a_tenth = Gaussians(**trained.tensors() | {"log_scales": trained.log_scales + np.log(1.1)})

@@ -2,12 +2,12 @@
 # ## Exercises
 #
 # **Exercise 1 (a line).** After which iteration did the scene first have more splats than it began with? Ask
-# `result.counts`.
+# `counts`.
 
 # %%
-grown_at = next(i for i, count in enumerate(result.counts) if count > result.counts[0])
+grown_at = next(i for i, count in enumerate(counts) if count > counts[0])
 
-assert max(result.counts[:grown_at]) == result.counts[0] < result.counts[grown_at]
+assert max(counts[:grown_at]) == counts[0] < counts[grown_at]
 
 # %% [markdown]
 # **Exercise 2 (a function).** The curve of the loss is noisy, because each iteration looks at another view; the
@@ -21,10 +21,10 @@ def smoothed(values, window):
     return (sums[window:] - sums[:-window]) / window
 
 
-curve = smoothed(result.losses, len(capture.train))  # about once through all views
-assert len(curve) == ITERATIONS - len(capture.train) + 1
-assert np.isclose(curve[-1], np.mean(result.losses[-len(capture.train) :]))
-assert np.abs(np.diff(curve)).mean() < 0.2 * np.abs(np.diff(result.losses)).mean()
+smooth = smoothed(curve, len(capture.train))  # about once through all views
+assert len(smooth) == ITERATIONS - len(capture.train) + 1
+assert np.isclose(smooth[-1], np.mean(curve[-len(capture.train) :]))
+assert np.abs(np.diff(smooth)).mean() < 0.2 * np.abs(np.diff(curve)).mean()
 
 # %% [markdown]
 # **Exercise 3 (open).** The threshold of [densification](../docs/GLOSSARY.md#densification) is 2e-4, in normalised

@@ -80,9 +80,9 @@ plt.show()
 # A camera seldom stands at the origin. It stands at $e$ and looks at some target. Its forward axis is
 # the unit vector there, its right axis is perpendicular to that and to the world's up, which is
 # $(0, -1, 0)$, and its down axis is perpendicular to both. A coordinate along a unit vector is a dot
-# product, so the three axes are the rows of a matrix $R$, and
+# product, so the three axes are the rows of a matrix $W$ (`camera.R`), and
 #
-# $$x_{cam} = R\,(x - e).$$
+# $$x_{cam} = W\,(x - e).$$
 
 # %%
 eye, target = np.array([1.0, -1.5, -4.0]), np.array([0.2, 0.1, 0.0])
@@ -184,10 +184,10 @@ plt.show()
 
 # %% [markdown]
 # How many holes there are can be known before anything is drawn. Points are scattered at random with $n$
-# on an area $A$. A pixel that sees the patch $a$ of the surface expects $\lambda = n\,a/A$ of them, and
+# on an area $a_0$. A pixel that sees the patch $a$ of the surface expects $m = n\,a/a_0$ of them, and
 # the chance that each of the $n$ has missed it is
 #
-# $$\left(1 - \frac{a}{A}\right)^n \approx e^{-\lambda}.$$
+# $$\left(1 - \frac{a}{a_0}\right)^n \approx e^{-m}.$$
 #
 # The patch follows from the ray. A pixel's ray is $e + t\,d$ with $d$ scaled so that $t$ is the depth; at
 # depth $t$ the pixel is $t/f$ wide, and a surface with normal $\nu$ that it meets at a slant shows it
@@ -195,7 +195,7 @@ plt.show()
 # $$a = \frac{t^2}{f^2\,|\nu \cdot d|}.$$
 #
 # A ray meets a ball twice: in front, and again behind. Holes in the front are not black. In
-# $e^{-\lambda_{front}}(1 - e^{-\lambda_{back}})$ of the cases they show the inside of the other side.
+# $e^{-m_{front}}(1 - e^{-m_{back}})$ of the cases they show the inside of the other side.
 
 # %%
 
@@ -345,7 +345,7 @@ for radius, slope in slopes.items():
 #
 # The figure has given it away: let a point cover more than one pixel. A disc of radius $r$ covers a pixel if its
 # centre is within $r$ of it. A pixel now sees the points of $\pi r^2$ pixels, and the fraction of holes is
-# $e^{-\lambda \pi r^2}$.
+# $e^{-m \pi r^2}$.
 
 # %%
 camera, ((lam_front, lam_back), cosine) = near_cameras[1], expected_points(near_cameras[1])

@@ -56,9 +56,9 @@ plt.show()
 # functions do that, so ask for one thing more. To evaluate it quickly for a whole image it should separate into
 # a factor for the columns and one for the rows, $g(x)\,g(y)$; and since a round blob must not reveal the
 # directions of the grid, the product may depend on $r^2 = x^2 + y^2$ alone. Take logarithms, with $g(x) =
-# e^{\ell(x^2)}$ and $\ell(0) = 0$:
+# e^{\eta(x^2)}$ and $\eta(0) = 0$:
 #
-# $$\ell(x^2) + \ell(y^2) = \ell(x^2 + y^2).$$
+# $$\eta(x^2) + \eta(y^2) = \eta(x^2 + y^2).$$
 #
 # A continuous function that turns sums into sums is a multiple of its argument. So there is one family, and no other:
 #
@@ -279,7 +279,7 @@ print(f"ripple left in one dimension: {2 * np.exp(-2 * np.pi**2 * DILATION):.4f}
 # times what it should. For large splats that is 1. For small ones it grows without bound: everything that is
 # far away gets fat and bright. The repair is in the same formula. Multiply the opacity by the inverse of that factor,
 #
-# $$\rho = \sqrt{\frac{\det\Sigma}{\det(\Sigma + \delta I)}},$$
+# $$\frac{o'}{o} = \sqrt{\frac{\det\Sigma}{\det(\Sigma + \delta I)}},$$
 #
 # as Mip-Splatting (Yu et al. 2024) does. In the package it is `opacity_compensation`, in
 # [gsplat_edu.scene.gaussian_math](../src/gsplat_edu/scene/gaussian_math.py).

@@ -168,7 +168,13 @@ assert drift[-1] > 0.1 and max(drift_quat) < 1e-14
 #
 # $$q\,(0, v)\,q^* = (0,\; v + 2w\,(a \times v) + 2\,a \times (a \times v)).$$
 #
-# This is linear in $v$ and keeps its length, and it moves continuously from the identity: a rotation, about the
+# Put in the three axes for $v$, and with $q = (w, x, y, z)$ the columns of a matrix come out:
+#
+# $$R(q) = \begin{pmatrix} 1 - 2(y^2 + z^2) & 2(xy - wz) & 2(xz + wy) \\
+# 2(xy + wz) & 1 - 2(x^2 + z^2) & 2(yz - wx) \\
+# 2(xz - wy) & 2(yz + wx) & 1 - 2(x^2 + y^2) \end{pmatrix}.$$
+#
+# The map is linear in $v$ and keeps its length, and it moves continuously from the identity: a rotation, about the
 # axis $a$. A vector perpendicular to $a$ is turned by the angle $\theta$ with $\cos\theta = 1 - 2|a|^2$, so
 # $w = \cos(\theta/2)$. And if every $q$ is divided by its length before use, all lists of four numbers but one are
 # rotations. A step can go anywhere.
@@ -318,8 +324,8 @@ assert shifts[0] > 5 * shifts[-1] and skews[0] > 0.5
 
 # %% [markdown]
 # > **Why this bound.** With $h$ the offset in depth, $1/z = (1 - h/m_z + h^2/m_z^2 - \dots)/m_z$. The second power
-# > gives the prediction, odd powers vanish in the mean, and the fourth brings $E[h^4] = 3\,\Sigma_{zz}^2$: three
-# > times $\Sigma_{zz}/m_z^2$ of the prediction. Twice that leaves room for the rest.
+# > gives the prediction, odd powers vanish in the mean, and the fourth brings $\mathrm{E}[h^4] = 3\,\Sigma_{zz}^2$:
+# > three times $\Sigma_{zz}/m_z^2$ of the prediction. Twice that leaves room for the rest.
 #
 # Both faults go with the size of the splat against its distance. Far away perspective is as good as affine. Near
 # the camera the image has its mean in one place, the image of its mean in another, and a long tail on one side. If
@@ -336,7 +342,7 @@ assert shifts[0] > 5 * shifts[-1] and skews[0] > 0.5
 # $$n^\top D\,n = 0, \qquad D = m m^\top - k^2 \Sigma.$$
 #
 # In the image these planes are lines, the tangents of the outline. A line $n_1 u + n_2 v + n_3 = 0$ is tangent to
-# an ellipse with centre $c$ and shape $M$ if $(n_1 c_1 + n_2 c_2 + n_3)^2 = (n_1, n_2)\,M\,(n_1, n_2)^\top$, a
+# an ellipse with centre $c$ and shape $G$ if $(n_1 c_1 + n_2 c_2 + n_3)^2 = (n_1, n_2)\,G\,(n_1, n_2)^\top$, a
 # quadratic form as well. So, as long as the whole shell is in front of the camera, $m_z > k\sqrt{\Sigma_{zz}}$, the
 # outline is an ellipse, and comparing the two, with $f = 1$,
 #

@@ -93,9 +93,9 @@ plt.show()
 # ## Linear up close
 #
 # A Gaussian survives linear maps, and this map is not linear. So we replace the map. Near the mean $m$, in camera
-# coordinates, the pinhole $\pi(x, y, z) = (f_x x/z + c_x,\; f_y y/z + c_y)$ is its tangent and a remainder,
+# coordinates, the pinhole $u(x, y, z) = (f_x x/z + c_x,\; f_y y/z + c_y)$ is its tangent and a remainder,
 #
-# $$\pi(m + h) = \pi(m) + J h + O(f\,|h|^2 / z^2).$$
+# $$u(m + h) = u(m) + J h + O(f\,|h|^2 / z^2).$$
 #
 # The tangent takes six derivatives. Moving sideways moves the image by focal length over depth; moving away pulls
 # the image towards $(c_x, c_y)$, the *principal point*, faster the further it is from there:
@@ -159,8 +159,8 @@ assert np.all(np.abs(sampled - by_hand) < 4 * standard_error)
 
 # %% [markdown]
 # This Gaussian is small and far away, and the camera is turned, so that a forgotten $W$ would show. An entry
-# $S_{ij}$ of the covariance of $n$ Gaussian samples has the variance $(S_{ii} S_{jj} + S_{ij}^2)/n$; four of its
-# roots are the tolerance, and the samples cannot tell the formula from the truth.
+# $\hat\Sigma_{ij}$ of the covariance of $n$ Gaussian samples has the variance $(\hat\Sigma_{ii} \hat\Sigma_{jj} +
+# \hat\Sigma_{ij}^2)/n$; four of its roots are the tolerance, and the samples cannot tell the formula from the truth.
 #
 # The close one of the opening is another matter. Below, it is moved away along its ray and keeps its size.
 
@@ -192,8 +192,9 @@ plt.show()
 # This is $1/(1 + x) = 1 - x + x^2 - \dots$ with $x = e c$, multiplied out. The first-order term has variance
 # $e^2 (1 + t^2)$, and that is the ellipse. Odd and even terms are uncorrelated. What the ellipse leaves out begins
 # with the variance of the second term, $e^4 (1 + 2t^2)$, and twice the covariance of the first with the third,
-# $2 e^4 (1 + 3t^2)$. The numbers are moments of normal numbers, $E[a^2] = 1$ and $E[c^4] = 3$: the second term, for
-# instance, has $t^2 (3 - 1)$ from $tc^2$ and 1 from $ac$. Together, as a fraction of the ellipse's own variance:
+# $2 e^4 (1 + 3t^2)$. The numbers are moments of normal numbers, $\mathrm{E}[a^2] = 1$ and $\mathrm{E}[c^4] = 3$: the
+# second term, for instance, has $t^2 (3 - 1)$ from $tc^2$ and 1 from $ac$. Together, as a fraction of the ellipse's
+# own variance:
 #
 # $$\text{relative error} = \frac{3 + 8 t^2}{1 + t^2}\; e^2 + O(e^4).$$
 #

@@ -107,11 +107,11 @@ print(f"mean error: added and clipped {off(np.clip(added, 0, 1)):.3f}, averaged 
 # $\alpha_i = o_i\, g_i(p)$. Seen over a colour $b$ it gives $\alpha c + (1 - \alpha)\, b$. Put a stack of layers on a
 # background, the last one first; each step takes the picture so far as its $b$. Unrolled, with index 1 in front:
 #
-# $$C = \sum_i T_i\, \alpha_i\, c_i + T_{N+1}\, b, \qquad T_i = \prod_{j < i} (1 - \alpha_j).$$
+# $$\hat c = \sum_i T_i\, \alpha_i\, c_i + T_{n+1}\, b, \qquad T_i = \prod_{j < i} (1 - \alpha_j).$$
 #
 # $T_i$ is the [*transmittance*](../docs/GLOSSARY.md#transmittance) in front of layer $i$, the share of light that
 # gets from there to the eye. It starts at 1 and only falls. That is the advantage of the sum over the recursion: it
-# can be evaluated from the front, keeping $C$ and $T$, and then we notice when nothing more can come.
+# can be evaluated from the front, keeping $\hat c$ and $T$, and then we notice when nothing more can come.
 
 
 # %%
@@ -202,9 +202,9 @@ assert max(differences) < 1e-12
 # goes to other colours than it would have: the image is wrong by at most $0.01\, c_{max}$.
 #
 # **Alpha below 1/255 is zero.** A Gaussian is nowhere zero; without a floor each splat is in each pixel. Dropping a
-# layer of alpha $\delta$ changes $C$ by $T \delta$ times a difference of colours, at most $\delta\, c_{max}$: less than
-# one step of an 8-bit image. But layers add up. The bound for a pixel is $c_{max} \sum \delta$ over what was dropped
-# there, and a scene made of veils that are all just below the floor is not drawn at all.
+# layer with its alpha $\alpha$ changes $\hat c$ by $T \alpha$ times a difference of colours, at most $\alpha\,
+# c_{max}$: less than one step of an 8-bit image. But layers add up. The bound for a pixel is $c_{max} \sum \alpha$
+# over what was dropped there, and a scene made of veils that are all just below the floor is not drawn at all.
 #
 # **Below a transmittance of 0.0001 compositing may stop** (next section). The weights of all that is left sum to at
 # most that $T$, so the pixel is wrong by at most $10^{-4}\, c_{max}$: a fortieth of a step.
@@ -291,7 +291,7 @@ plt.show()
 # ## What is left for the background
 #
 # The transmittance that remains after the last splat is an image of its own. It is where the background enters, once,
-# at the very end: $C = C_{splats} + T_{final}\, b$. It also tells where there was no scene.
+# at the very end: $\hat c = \hat c_{splats} + T_{final}\, b$. It also tells where there was no scene.
 
 # %%
 fig, axes = plt.subplots(2, 4, figsize=(11, 6.6), layout="constrained")

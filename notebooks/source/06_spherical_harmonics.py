@@ -94,7 +94,7 @@ assert np.abs(truth - best_constant).max() > 0.2
 # A function on the sphere has infinitely many values, and a splat should have few numbers. The smooth functions that
 # cost least to evaluate are polynomials in the components $x, y, z$ of $d$. There are fewer of them than it seems,
 # because $x^2 + y^2 + z^2 = 1$ makes many equal: $z^4$ is also $z^2 (1 - x^2 - y^2)$. How many are there up to
-# degree $L$ that differ somewhere on the sphere? Evaluate all monomials at random directions and ask for the rank.
+# degree $k$ that differ somewhere on the sphere? Evaluate all monomials at random directions and ask for the rank.
 #
 # > **Predict.** There are 20 monomials in three variables up to degree 3. How many of them are independent on the
 # > sphere?
@@ -111,7 +111,7 @@ for degree in range(4):
     assert rank == (degree + 1) ** 2 == num_coefficients(degree)
 
 # %% [markdown]
-# $(L + 1)^2$: one for degree 0, and three, five, seven more for the degrees after it. Any sixteen that span them would
+# $(k + 1)^2$: one for degree 0, and three, five, seven more for the degrees after it. Any sixteen that span them would
 # do. One choice is better than others. Measure functions by the integral over the sphere,
 #
 # $$\langle f, g \rangle = \int_{S^2} f\, g \; \mathrm{d}\Omega,$$
@@ -196,9 +196,9 @@ plt.show()
 # %% [markdown]
 # ## A lobe in sixteen numbers
 #
-# One splat's highlight is a lobe around an axis $a$: $f(d) = e^{\kappa (a \cdot d - 1)}$ with a width of about
-# $1/\sqrt{\kappa}$ radians. Its coefficients are sixteen integrals. What a fit of degree $L$ leaves out follows from
-# Pythagoras: $\|f - f_L\|^2 = \|f\|^2 - \sum_i c_i^2$. The lobe is no polynomial, so that the sum takes more
+# One splat's highlight is a lobe around an axis $a$: $f(d) = e^{\xi (a \cdot d - 1)}$ with a width of about
+# $1/\sqrt{\xi}$ radians. Its coefficients are sixteen integrals. What a fit of degree $k$ leaves out follows from
+# Pythagoras: $\|f - f_k\|^2 = \|f\|^2 - \sum_i c_i^2$. The lobe is no polynomial, so that the sum takes more
 # directions, and so many terms may round to $10^{-12}$.
 
 # %%

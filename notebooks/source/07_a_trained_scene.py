@@ -204,7 +204,7 @@ plt.show()
 # of no fences. A scale has to stay above zero. Cutting it off at a bound has no slope beyond the bound, so what has
 # once gone over never comes back. We need a function from all numbers to the positive ones, and one more requirement
 # selects it: equal steps should be equal factors, since ten per cent matter as much for a pebble as for a house. With
-# $f(x + \delta) = k(\delta) f(x)$ for all $x$, the slope is $f' = k'(0) f$, and that leaves the exponential.
+# $f(x + h) = k(h) f(x)$ for all $x$, the slope is $f' = k'(0) f$, and that leaves the exponential.
 #
 # $$s = e^{x}, \qquad \frac{\partial s}{\partial x} = s$$
 #

@@ -70,12 +70,12 @@ plt.show()
 # own transpose, and dilated as chapter 02 does it:
 #
 # $$R = \begin{pmatrix} \cos\theta & -\sin\theta \\ \sin\theta & \cos\theta \end{pmatrix}, \qquad
-# S = \begin{pmatrix} e^{s_1} & 0 \\ 0 & e^{s_2} \end{pmatrix}, \qquad M = R S, \qquad
-# \Sigma = M M^T + 0.3\, I, \qquad \Lambda = \Sigma^{-1}$$
+# S = \begin{pmatrix} e^{\tau_1} & 0 \\ 0 & e^{\tau_2} \end{pmatrix}, \qquad M = R S, \qquad
+# \Sigma = M M^\top + 0.3\, I, \qquad \Lambda = \Sigma^{-1}$$
 #
-# $$o = \frac{1}{1 + e^{-\ell}}, \qquad \alpha_i = \min\left(0.99,\; o_i\, e^{-d^T \Lambda_i d / 2}\right),
+# $$o = \frac{1}{1 + e^{-\ell}}, \qquad \alpha_i = \min\left(0.99,\; o_i\, e^{-d^\top \Lambda_i d / 2}\right),
 # \qquad d = x - \mu_i, \qquad T_i = \prod_{j < i} (1 - \alpha_j), \qquad
-# I = \sum_i T_i \alpha_i c_i + T_N b$$
+# \hat c = \sum_i T_i \alpha_i c_i + T_{n+1} b$$
 #
 # with $\alpha$ zero below 1/255, the background $b$ black, and the first splat in front.
 # [gsplat_edu.fit2d.splats](../src/gsplat_edu/fit2d/splats.py) evaluates each only in the box around its ellipse
@@ -106,9 +106,10 @@ assert gap < 1e-12
 # ## One number for how wrong
 #
 # Blame needs a number to be shared out. The mean of the squared differences over pixels and channels is one with a
-# slope everywhere, so that it can be checked; its slope by the image is short:
+# slope everywhere, so that it can be checked, and a short one; $m$ counts the pixels, $c^*$ is the photo's colour:
 #
-# $$L = \frac{1}{3HW} \sum (I - I^*)^2, \qquad g = \frac{\partial L}{\partial I} = \frac{2\,(I - I^*)}{3HW}$$
+# $$L = \frac{1}{3m} \sum (\hat c - c^*)^2, \qquad
+# g = \frac{\partial L}{\partial \hat c} = \frac{2\,(\hat c - c^*)}{3m}$$
 #
 # It is usually quoted in decibels, as the [peak signal-to-noise ratio](../docs/GLOSSARY.md#psnr) of what a screen
 # would show, clipped to 0 to 1: $\mathrm{PSNR} = -10 \log_{10} L$. Ten decibels more are a tenth of the error.
@@ -187,16 +188,16 @@ agrees("colors", np.einsum("nhw,hwc->nc", T * alpha, g))
 #
 # An alpha does two things to its pixel. It brings its own colour in, with weight $T_i$, and it keeps what is behind it
 # out. Everything behind carries the factor $1 - \alpha_i$, once; call what they bring together
-# $B_i = \sum_{j > i} w_j c_j + T_N b$. Without the factor it would be $B_i / (1 - \alpha_i)$, so
+# $\hat c_{>i} = \sum_{j > i} w_j c_j + T_{n+1} b$. Without the factor it would be $\hat c_{>i} / (1 - \alpha_i)$, so
 #
-# $$\frac{\partial I}{\partial \alpha_i} = T_i c_i - \frac{B_i}{1 - \alpha_i}$$
+# $$\frac{\partial \hat c}{\partial \alpha_i} = T_i c_i - \frac{\hat c_{>i}}{1 - \alpha_i}$$
 #
 # The sum behind looks as if the pixel had to be walked from back to front. It need not be. Only the product with $g$
 # counts, one number for a pixel, and it is known when the picture is done: before the first splat everything is still
-# behind, and $R = g \cdot I$. Then, from near to far, each splat takes its share out:
+# behind, and $r = g \cdot \hat c$. Then, from near to far, each splat takes its share out:
 #
-# $$R \leftarrow R - w_i\, g \cdot c_i, \qquad
-# \frac{\partial L}{\partial \alpha_i} = T_i\, g \cdot c_i - \frac{R}{1 - \alpha_i}$$
+# $$r \leftarrow r - w_i\, g \cdot c_i, \qquad
+# \frac{\partial L}{\partial \alpha_i} = T_i\, g \cdot c_i - \frac{r}{1 - \alpha_i}$$
 #
 # Where the clamp holds alpha at 0.99, and where the floor makes it zero, nothing behind alpha moves it, and the chain
 # ends. Elsewhere it goes on through the sigmoid, whose slope is $o(1 - o)$: alpha is proportional to $o$, so
@@ -215,28 +216,28 @@ agrees("logit_opacities", (1 - tiny.opacities) * h.sum(axis=(1, 2)))
 # %% [markdown]
 # ## Where it is, and what shape it has
 #
-# The exponent is $-\frac{1}{2} d^T \Lambda d$ with $d = x - \mu$. Moving the mean moves $d$ the other way, and the two
-# signs cancel: the slope is $\Lambda d$. A splat is pulled towards pixels where more of it would help, most by those
-# one standard deviation out, and not at all by its own centre.
+# The exponent is $-\frac{1}{2} d^\top \Lambda d$ with $d = x - \mu$. Moving the mean moves $d$ the other way, and the
+# two signs cancel: the slope is $\Lambda d$. A splat is pulled towards pixels where more of it would help, most by
+# those one standard deviation out, and not at all by its own centre.
 #
 # $$\frac{\partial L}{\partial \mu_i} = \Lambda_i \sum_{\text{pixels}} h\, d$$
 #
 # How it is stretched and turned is in the matrix. By $\Lambda$ the exponent is linear: its slope is
-# $-\frac{1}{2} d d^T$, a matrix, and summed over the pixels $H_i = \sum h\, d d^T$ are moments of the blame. Then the
-# inverse. From $\Lambda \Sigma = I$ follows $d\Lambda = -\Lambda\, d\Sigma\, \Lambda$, so the matrix passes between
-# two conics and changes its sign:
+# $-\frac{1}{2} d d^\top$, a matrix, and summed over the pixels $H_i = \sum h\, d d^\top$ are moments of the blame.
+# Then the inverse. From $\Lambda \Sigma = I$ follows $d\Lambda = -\Lambda\, d\Sigma\, \Lambda$, so the matrix passes
+# between two conics and changes its sign:
 #
 # $$\frac{\partial L}{\partial \Lambda} = -\frac{1}{2} H, \qquad
 # \frac{\partial L}{\partial \Sigma} = \frac{1}{2} \Lambda H \Lambda$$
 #
-# The dilation is a constant and adds nothing. $\Sigma = M M^T + \dots$ holds $M$ twice, and the matrix is symmetric:
+# The dilation is a constant and adds nothing. $\Sigma = M M^\top + \dots$ holds $M$ twice, and the matrix is symmetric:
 # $\partial L / \partial M = 2\, (\partial L / \partial \Sigma)\, M = \Lambda H \Lambda M$.
 #
-# Column $k$ of $M = R S$ is column $k$ of the rotation times $e^{s_k}$, and an exponential is its own slope: by $s_k$
-# the column's slope is the column. By the angle, every column turns: $\partial M / \partial \theta = Q M$, with $Q$ a
-# quarter turn.
+# Column $k$ of $M = R S$ is column $k$ of the rotation times $e^{\tau_k}$, and an exponential is its own slope: by
+# $\tau_k$ the column's slope is the column. By the angle, every column turns: $\partial M / \partial \theta = Q M$,
+# with $Q$ a quarter turn.
 #
-# $$\frac{\partial L}{\partial s_k} = \sum_i \left(\frac{\partial L}{\partial M} \odot M\right)_{ik}, \qquad
+# $$\frac{\partial L}{\partial \tau_k} = \sum_i \left(\frac{\partial L}{\partial M} \odot M\right)_{ik}, \qquad
 # \frac{\partial L}{\partial \theta} = \sum_{ik} \left(\frac{\partial L}{\partial M} \odot Q M\right)_{ik}, \qquad
 # Q = \begin{pmatrix} 0 & -1 \\ 1 & 0 \end{pmatrix}$$
 #
@@ -252,13 +253,14 @@ agrees("angles", (grad_factor * (np.array([[0, -1], [1, 0]]) @ M)).sum(axis=(1, 
 
 together = backward_2d(render_2d(tiny, TALL, WIDE), g).arrays()
 assert all(np.abs(together[name] - slopes).max() < TOLERANCE for name, slopes in measured.items())
-began = time.perf_counter()
+began = time.process_time()
 wrong = render_2d(start, height, width)
-rendered = time.perf_counter()
+rendered = time.process_time()
 slopes = backward_2d(wrong, squared_error(wrong.image, photo)[1]).arrays()
-one, both = rendered - began, time.perf_counter() - began
-print(f"the photo: a picture and all slopes in {1e3 * both:.0f} ms;", end=" ")
-print(f"by differences, {2 * 9 * COUNT:,} pictures in {2 * 9 * COUNT * one:.0f} s")
+one, both = rendered - began, time.process_time() - began
+print(f"a picture and all slopes take the processor as long as {both / one:.1f} pictures;", end=" ")
+print(f"differences take {2 * 9 * COUNT:,} of them")
+assert both < 0.1 * 2 * 9 * COUNT * one
 
 # %% [markdown]
 # ## Downhill, and stuck

@@ -134,9 +134,9 @@ print((LADDER / "naive.cpp").read_text())
 # It computes in float32 and the reference in float64, so "equal" needs a number. Let
 # $\epsilon = 2^{-24}$ be the largest relative error of one operation. The exponent is a sum of terms which
 # may cancel; each of them goes through fewer than ten operations, so the exponent is off by at most
-# $10 \, \epsilon S$ with
+# $10 \, \epsilon P$ with
 #
-# $$S = \tfrac{1}{2}(A \, dx^2 + C \, dy^2) + |B \, dx \, dy|.$$
+# $$P = \tfrac{1}{2}(A \, dx^2 + C \, dy^2) + |B \, dx \, dy|.$$
 #
 # The exponential turns this absolute error into a relative one of alpha. It adds a few roundings of its
 # own, for which $24 \, \epsilon$ is generous. Call the sum $d$. Transmittance is a product of factors

@@ -195,12 +195,12 @@ assert dark.counts.mattered < plain.counts.mattered / 2
 # oblique it is mostly empty. Nor does three sigma mean anything to a pixel. What means something is the
 # floor: alpha is at least 1/255 exactly where
 #
-# $$A \, dx^2 + 2 B \, dx \, dy + C \, dy^2 \le L, \qquad L = 2 \ln(255 \, o),$$
+# $$A \, dx^2 + 2 B \, dx \, dy + C \, dy^2 \le K, \qquad K = 2 \ln(255 \, o),$$
 #
 # an ellipse that shrinks with the opacity $o$ and does not exist for a splat that is too faint. In a row
 # of pixels $dy$ is fixed, and this is a quadratic inequality in $dx$:
 #
-# $$dx = \frac{-B \, dy \pm \sqrt{A L - (A C - B^2) \, dy^2}}{A}$$
+# $$dx = \frac{-B \, dy \pm \sqrt{A K - (A C - B^2) \, dy^2}}{A}$$
 #
 # No pixel outside is above the floor, and none inside is below it. Against brute force:
 

@@ -112,14 +112,14 @@ assert rows["left"][0] == rows["right"][0] and abs(rows["left"][1] - rows["right
 # %% [markdown]
 # Cameras side by side see a point in the same row, whatever its depth. After the step the rows differ: no Gaussian
 # looks like this to both, and a third camera has nothing to draw. The steps were taken on two pictures of a thing. They
-# have to be taken on the thing: on its mean $\mu$, log-scales $\ell$, quaternion $q$, logit $\lambda$ and coefficients
+# have to be taken on the thing: on its mean $\mu$, log-scales $\tau$, quaternion $q$, logit $\ell$ and coefficients
 # $k_i$. This is `to_screen`, with the camera's rotation $W$ and centre $e$; $\odot$ multiplies entry by entry.
 #
 # $$p = W(\mu - e), \quad u = f \odot \tfrac{p_{xy}}{p_z} + c_0, \quad n = \tfrac{q}{|q|}, \quad M = R(n)\,
-# \mathrm{diag}(e^{\ell}), \quad N = J(p)\, W M, \quad \Sigma = N N^\top + 0.3\, I, \quad \Lambda = \Sigma^{-1},$$
+# \mathrm{diag}(e^{\tau}), \quad N = J(p)\, W M, \quad \Sigma = N N^\top + 0.3\, I, \quad \Lambda = \Sigma^{-1},$$
 #
 # $$d = \tfrac{\mu - e}{|\mu - e|}, \qquad c = \max\bigl(0, \textstyle\sum_i b_i(d)\, k_i + 0.5\bigr), \qquad
-# o = \tfrac{1}{1 + e^{-\lambda}} .$$
+# o = \tfrac{1}{1 + e^{-\ell}} .$$
 #
 # Chapter 12 delivers derivatives by $u$, $\Lambda$, $c$ and $o$. Each link has to carry them one link further back.
 # Depth enters the picture only as an order, which does not change until two splats swap: it has no derivative.
@@ -129,12 +129,12 @@ assert rows["left"][0] == rows["right"][0] and abs(rows["left"][1] - rows["right
 # The loss $L$ is one number. Write $\bar X$ for $\partial L / \partial X$, an array of the shape of $X$ with one
 # derivative per entry (in code `X_bar`). A small change $dX$ changes the loss by the sum over its entries:
 #
-# $$dL = \langle \bar X, dX \rangle, \qquad \langle A, B \rangle = \sum_{ij} A_{ij} B_{ij} .$$
+# $$dL = \langle \bar X, dX \rangle, \qquad \langle X, Y \rangle = \sum_{ij} X_{ij} Y_{ij} .$$
 #
 # A link makes $Y$ from $X$, and $\bar Y$ is known. Write $dY$ by $dX$, put it into $\langle \bar Y, dY \rangle$, and
 # move everything but $dX$ to the other side. What stands there is $\bar X$. Factors move by
 #
-# $$\langle A, B\,C \rangle = \langle B^\top A,\; C \rangle = \langle A\,C^\top,\; B \rangle . $$
+# $$\langle X, Y\,Z \rangle = \langle Y^\top X,\; Z \rangle = \langle X\,Z^\top,\; Y \rangle . $$
 #
 # That is the chain rule, read from its end: no matrix $\partial Y / \partial X$ is built. If $X$ is used twice, its two
 # shares add. Below each link is checked alone, with $L = \langle \bar Y, Y \rangle$ for a $\bar Y$ drawn at random.
@@ -275,10 +275,10 @@ assert all(slope == 0 for slope, r in zip(slopes, at, strict=True) if r > edges_
 #
 # ## Rotation and scales
 #
-# Column $k$ of $M$ is $s_k = e^{\ell_k}$ times column $k$ of $R$, and an exponential is its own derivative:
-# $dM_{ik} = M_{ik}\, d\ell_k + s_k\, dR_{ik}$. So
+# Column $k$ of $M$ is $s_k = e^{\tau_k}$ times column $k$ of $R$, and an exponential is its own derivative:
+# $dM_{ik} = M_{ik}\, d\tau_k + s_k\, dR_{ik}$. So
 #
-# $$\bar\ell_k = \sum_i \bar M_{ik} M_{ik}, \qquad \bar R_{ik} = \bar M_{ik}\, s_k .$$
+# $$\bar\tau_k = \sum_i \bar M_{ik} M_{ik}, \qquad \bar R_{ik} = \bar M_{ik}\, s_k .$$
 #
 # $R(n)$ is quadratic in $n = (w, x, y, z)$. Its derivatives by the four are matrices with linear entries, and
 # $\bar n_j = \langle \bar R, \partial R / \partial n_j \rangle$, as if the four were free. What is free is $q$. From

@@ -67,14 +67,14 @@ print(f"budget: {COUNT} photos, {WIDTH} px, {ITERATIONS} iterations{' (reduced)'
 #
 # The third depth takes a flat splat for what it is, a piece of a plane. With the camera at the origin, the plane
 # through the mean $\mu_i$, whose normal $n_i$ is the shortest axis, holds the points $x$ with $n_i \cdot x = d_i$,
-# where $d_i = n_i \cdot \mu_i$. Composite the planes in place of the depths, $N = \sum w_i n_i$ and
-# $D = \sum w_i d_i$. The ray $r$, of depth 1, meets the plane $N \cdot x = D$ at the *[planar
+# where $d_i = n_i \cdot \mu_i$. Composite the planes in place of the depths, $\hat n = \sum w_i n_i$ and
+# $\hat d = \sum w_i d_i$. The ray $r$, of depth 1, meets the plane $\hat n \cdot x = \hat d$ at the *[planar
 # depth](../docs/GLOSSARY.md#planar-depth)*
 #
-# $$ z = \frac{D}{N \cdot r} . $$
+# $$ z = \frac{\hat d}{\hat n \cdot r} . $$
 #
-# If all splats of a pixel lie in one plane $(n, d)$, then $N = a\,n$ and $D = a\,d$ with $a = \sum w_i$. The factor
-# $a$ cancels, and the planar depth is exact on any slant
+# If all splats of a pixel lie in one plane $(n, d)$, then $\hat n = a\,n$ and $\hat d = a\,d$ with $a = \sum w_i$.
+# The factor $a$ cancels, and the planar depth is exact on any slant
 # ([gsplat_edu.render.planes](../src/gsplat_edu/render/planes.py)). Here are all three in two dimensions, $x$ across
 # and $z$ away from the camera.
 
@@ -178,16 +178,17 @@ assert np.abs(walls[:, 2]).max() < 1e-9 and walls[6, 0] < walls[3, 0] < walls[0,
 # %% [markdown]
 # They move away: the more splats there are, the fewer of the nearest it takes to fill the pixel. Only the median has a
 # place without bias, where $\ln 2 / \kappa$ is one half. The planar depth does not care as long as all splats lie in
-# the wall. Take them off it, or turn them, in the moving figure. Exercise 2 asks the package.
+# the wall. The page of this chapter on the site (`make site`) has a figure in which one takes them off it, or turns
+# them. Exercise 2 asks the package.
 #
 # ## Why splats thicken a surface
 #
-# A photo fixes the sum $\sum w_i c_i$ of a pixel, not where on the ray the splats lie. Move a splat by $\delta$ along
+# A photo fixes the sum $\sum w_i c_i$ of a pixel, not where on the ray the splats lie. Move a splat by $h$ along
 # the ray of one photo. Another photo, whose ray meets the first one at the angle $\varphi$, sees it move by about
-# $f \delta \sin\varphi / z$ pixels. Only a change of colour over these pixels reaches the loss: neighbouring photos
+# $f h \sin\varphi / z$ pixels. Only a change of colour over these pixels reaches the loss: neighbouring photos
 # allow much, and on a plain wall all of them do.
 #
-# How much do photos know? Take the exact depth and the exact normals, move the surface by $\delta$ along every ray,
+# How much do photos know? Take the exact depth and the exact normals, move the surface by $h$ along every ray,
 # and let a photo look through it at its neighbour. The plane of each 7 x 7 patch says where the patch is in the other
 # photo, and the correlation of both sets of values, `ncc`, says whether they show the same. The mean of
 # $1 - \mathrm{ncc}$ ignores brightness and contrast ([gsplat_edu.ops.patches](../src/gsplat_edu/ops/patches.py), after
@@ -226,14 +227,15 @@ plt.show()
 # splats that spread along the ray can fake highlights and fine texture. The surface becomes a thick layer.
 #
 # `--surface` of `gsplat-edu train` adds this loss of patches and, after Huang et al. 2024 (2DGS), one of normals. One
-# normal is $N = \sum w_i n_i$, the other is $m$ of the depth map, from the cross product of its differences. With
+# normal is $\hat n = \sum w_i n_i$, the other is $m$ of the depth map, from the cross product of its differences. With
 # $a = \sum w_i$, the loss of a pixel ([gsplat_edu.ops.surface](../src/gsplat_edu/ops/surface.py)) is
 #
-# $$ a\,(a - N \cdot m) . $$
+# $$ a\,(a - \hat n \cdot m) . $$
 #
-# $|N| \le a$ by the triangle inequality, with equality if and only if all $n_i$ are equal; then $N \cdot m = a$ if and
-# only if they equal $m$. So the loss is never negative, and it is 0 only if all splats of a pixel face the way the
-# depth map runs. It does not know where the surface is. Photos and patches do, once splats no longer hide others.
+# $|\hat n| \le a$ by the triangle inequality, with equality if and only if all $n_i$ are equal; then $\hat n \cdot m
+# = a$ if and only if they equal $m$. So the loss is never negative, and it is 0 only if all splats of a pixel face
+# the way the depth map runs. It does not know where the surface is. Photos and patches do, once splats no longer hide
+# others.
 
 
 # %%
@@ -279,7 +281,7 @@ assert after.angle < before.angle and (SHORT or np.all(np.array(far[1]) < far[0]
 # %% [markdown]
 # With photos alone, faint splats hang before the surface (red) and behind it (blue), and the mean depth averages over
 # them. The median ignores a veil of less than one half, so meshes are made of it. The planar depth is the worst: all
-# $d_i$ are negative, but where normals disagree, terms of $N \cdot r$ cancel.
+# $d_i$ are negative, but where normals disagree, terms of $\hat n \cdot r$ cancel.
 #
 # ## Many depths, one surface
 #
@@ -426,6 +428,10 @@ for name, (points, _) in samples.items():
 print(f"no photo sees {100 * (~seen).mean():.1f} % of the true surface")
 assert all(table["unseen"] < 0.5 for table in found.values())
 assert SHORT or found["with a surface"]["rods"] < found["with a surface"]["torus"]
+assert SHORT or found["with a surface"]["rods"] < found["photos alone"]["rods"]
+for finish in ("plain", "glossy"):
+    shares = {part: found[f"{finish}, with a surface"][part] for part in names}
+    assert SHORT or min(shares, key=shares.get) == "bowl"
 
 below = Camera.looking_at([0.9, 2.2, -2.6], [0, -0.1, 0], fx=500, fy=500, H=350, W=500)
 close = Camera.looking_at([0.5, -1.1, -2.4], [0.6, -0.35, -0.6], fx=640, fy=640, H=350, W=500)
@@ -439,9 +445,10 @@ plt.show()
 
 # %% [markdown]
 # The bowl is the worst where it is plain or glossy. Its inside has no texture, and a shade that changes slowly fits
-# any depth; a highlight even moves with the camera, as a point off the surface would. The glossy rods have lost their
-# bar and their brace, and all rods are thinner than the truncation: the front of one still votes behind its back. What
-# no photo sees, such as the floor's underside, is missing, and the yellow corner is seen by few photos.
+# any depth; a highlight even moves with the camera, as a point off the surface would. All rods are thinner than the
+# truncation: the front of one still votes behind its back. The losses of `--surface` do the textured rods harm: with
+# photos alone, the mesh has more of them. What no photo sees, such as the floor's underside, is missing, and the yellow
+# corner is seen by few photos.
 #
 # ## The next failure
 #

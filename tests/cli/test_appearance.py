@@ -39,7 +39,7 @@ def test_auto_reports_its_choice_and_a_resumed_run_keeps_it(uneven, tmp_path, ca
     assert "--appearance exposure: " in said and "photos differ in brightness or tint" in said
     assert stored(run) == "exposure"
     metrics = json.loads((run / "metrics.json").read_text())
-    assert metrics["appearance"] == "exposure" and metrics["test"]["psnr_fitted"] > 0
+    assert metrics["judged_by"] == "psnr_fitted" and metrics["test"]["psnr_fitted"] > 0
     assert "once their exposure is fitted" in (run / "report.html").read_text()
     assert main([*words[:-4], "--iterations", "8", "--resolution", "2", "--resume"]) == 0
     assert "--appearance" not in capsys.readouterr().out and stored(run) == "exposure"

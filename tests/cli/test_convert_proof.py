@@ -169,7 +169,7 @@ def test_a_capture_that_has_moved_is_given(made, tmp_path, capsys):
         (["RUN", "a.html", "--verify", "photos=0"], "has to be from 1 to 200"),
         (["RUN", "a.html", "--verify", "photos=many"], "put --verify behind OUT"),
         (["--verify", "RUN", "a.html"], "put --verify behind OUT"),
-        (["RUN", "a.html", "--dataset", "."], "--dataset: has an effect only with --verify photos"),
+        (["RUN", "a.html", "--dataset", "."], "--dataset: has an effect only with --size or --verify photos"),
         (["RUN", "a.html", "--verify", "photos", "--dataset", "nowhere"], "nowhere does not exist"),
     ],
 )

@@ -34,7 +34,7 @@ def test_a_run_writes_the_refined_capture_and_an_aligned_score(capture, tmp_path
     assert "the capture with its refined cameras" in said
     assert "poses aligned on every other square" in said
     assert json.loads((run / "metrics.json").read_text())["psnr_aligned"] > 0
-    assert "pose (and colours, with appearance) fitted on the other" in (run / "report.html").read_text()
+    assert "pose (and colours, if corrected) fitted on the other" in (run / "report.html").read_text()
     before, after = load_dataset(capture), load_dataset(run / "refined")
     assert [view.name for view in after.train] == [view.name for view in before.train]
     assert any(

@@ -17,11 +17,13 @@ from data.depth_maps import (
     write_maps,
 )
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.data.depths import CAPTURE, POINTS, DepthSource, with_depth
+from gsplat_edu.data.depths import CAPTURE, POINTS, SCAN, DepthSource, with_depth
+from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.reader import CaptureReader
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.data.sparse_depth import tracked_points
+from gsplat_edu.data.sparse_depth import sparse_depth, tracked_points
 
 EVERY = DataSettings(test_every=0)
 
@@ -218,3 +220,50 @@ def test_samples_fit_photos_of_any_size_and_distorted_ones(tmp_path):
     samples, small = dataset.train[0].depth(), small_camera(dataset.train[0].camera)
     columns = small.fx * samples.rays[:, 0] + small.cx
     assert np.abs(columns - np.rint(columns)).max() < 0.05 and columns.max() < SIZE[0] - 0.9
+
+
+def scan_of_all():
+    """Return the points that a scanner at every camera would measure, world units."""
+    points = []
+    for view, depth in zip(traced().views, exact_depths(), strict=True):
+        small = small_camera(view.camera)
+        v, u = np.nonzero(depth)
+        z = depth[v, u]
+        local = np.stack([(u - small.cx) / small.fx * z, (v - small.cy) / small.fy * z, z], axis=1)
+        points.append(local @ view.camera.R + view.camera.eye)
+    return np.concatenate(points)
+
+
+def test_a_scan_gives_depth_where_nothing_hides_it(tmp_path):
+    """A point that another surface hides would say that the photo sees farther than it does."""
+    folder, scan = write_capture(tmp_path / "capture", "transforms"), scan_of_all()
+    write_points_ply(tmp_path / "scan.ply", Cloud(scan, np.full(scan.shape, 0.5)))
+    reader = CaptureReader(folder)
+    dataset = Dataset.of(reader, EVERY, points=tmp_path / "scan.ply")
+    dataset, report = with_depth(dataset, reader, DepthSource(SCAN), tmp_path / "scan.ply")
+    assert report.used == 10 and "from the scan" in report.lines()[0]
+    for view, exact in zip(dataset.train, exact_depths(), strict=True):
+        samples, everything = view.depth(), sparse_depth(view.camera, scan)
+        assert not samples.sparse and len(samples) > (exact > 0).sum()
+        # beside an edge, the pixel that a point rounds to may show another surface
+        assert (
+            right_share(samples, view.camera, exact)
+            > 0.95
+            > 0.85
+            > right_share(everything, view.camera, exact)
+        )
+
+
+def right_share(samples, camera, exact):
+    """Return the share of samples within the slack of occlusion of the exact depth at their pixels."""
+    small = small_camera(camera)
+    u = np.rint(small.fx * samples.rays[:, 0] + small.cx).astype(int)
+    v = np.rint(small.fy * samples.rays[:, 1] + small.cy).astype(int)
+    inside = (u >= 0) & (u < SIZE[0]) & (v >= 0) & (v < SIZE[1])
+    true = exact[v[inside], u[inside]]
+    return (np.abs(samples.depths[inside] / np.maximum(true, 1e-9) - 1) < 0.06).mean()
+
+
+def test_a_scan_has_to_be_named(tmp_path):
+    with pytest.raises(DatasetError, match="takes the depth from the scan that --points names"):
+        given(write_capture(tmp_path, "transforms"), DepthSource(SCAN))

@@ -6,10 +6,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from data.pose_programs import MS_LENS, H, W, assert_reads, write_metashape
+from data.pose_programs import CAMERAS, MS_LENS, H, W, assert_reads, write_metashape
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.reader import layout_of, read_capture
 from gsplat_edu.data.readers.metashape import read
+from gsplat_edu.scene.earth import earth_centred, local_axes
 
 
 def seen(x, y, k4=0.0):
@@ -53,6 +54,41 @@ def test_cameras_without_a_transform_are_left_out_and_slaves_are_named(tmp_path)
     notes = list(map(str, read_capture(tmp_path).notes))
     assert notes[0] == "poses of Metashape: 6 of 6 photos"
     assert "right_0 (it is a slave of a rig, for which Metashape exports no pose; export" in notes[1]
+
+
+SYSTEMS = {
+    "geographic": 'GEOGCS["WGS 84",DATUM["World Geodetic System 1984"],AUTHORITY["EPSG","4326"]]',
+    "projected": 'PROJCS["UTM",GEOGCS["WGS 84",DATUM["World Geodetic System 1984"]],AUTHORITY["EPSG","32632"]]',
+}
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_earth_centred_poses_become_east_north_and_up(tmp_path, system):
+    place = (47.3769, 8.5417, 408.0)
+    axes, zero = local_axes(*place[:2]), earth_centred([place])[0]
+    there = [(name, R @ axes, axes.T @ eye + zero) for name, R, eye in CAMERAS]
+    write_metashape(tmp_path, there)
+    path = tmp_path / "cameras.xml"
+    path.write_text(path.read_text().replace("</chunk>", f"<reference>{SYSTEMS[system]}</reference></chunk>"))
+    capture = read_capture(tmp_path)
+    eyes = np.stack([frame.eye for frame in sorted(capture.frames, key=lambda each: each.name)])
+    truth = np.stack([eye for _, _, eye in sorted(CAMERAS)])
+    # seven digits before the point leave 1e-9 m; over a few metres, axes of places turn by less than 1e-6
+    np.testing.assert_allclose(eyes, truth - truth.mean(axis=0), atol=1e-5)
+    for eye, expected in zip(eyes, truth, strict=True):
+        np.testing.assert_allclose(
+            capture.scale.earth.rows @ [*eye, 1.0], axes.T @ expected + zero, atol=1e-6
+        )
+    assert capture.scale.unit == "m"
+
+
+def test_a_local_system_stays_as_it_is(tmp_path):
+    write_metashape(tmp_path)
+    path = tmp_path / "cameras.xml"
+    local = '<reference>LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["WGS 84"]]</reference>'
+    path.write_text(path.read_text().replace("</chunk>", f"{local}</chunk>"))
+    assert read_capture(tmp_path).scale is None
+    assert_reads(tmp_path, "Metashape", seen)
 
 
 @pytest.mark.parametrize(

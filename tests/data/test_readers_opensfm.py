@@ -1,5 +1,6 @@
 """OpenSfM's reconstruction.json: every projection that it has, the largest reconstruction, and a real one."""
 
+import json
 import re
 
 import numpy as np
@@ -8,9 +9,11 @@ from PIL import Image
 
 from data.pose_programs import CAMERAS, COLORS, POINTS, H, W, assert_reads, assert_refused, write_opensfm
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.data.conventions import READINGS, read_as
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.panorama import FACES
 from gsplat_edu.data.reader import read_capture
+from gsplat_edu.scene.earth import Earth
 
 FISHEYE = ("k1", "k2", "k3", "k4", "p1", "p2", "s0", "s2")
 TWO = {"focal_x": 0.9, "focal_y": 0.8, "c_x": 0.02, "c_y": -0.03}
@@ -140,3 +143,33 @@ def test_a_real_reconstruction(real):
         u, v = (view.camera.intrinsics.K @ (seen / seen[:, 2:]).T)[:2]
         inside.append(((seen[:, 2] > 0) & (abs(u - 500) < 500) & (abs(v - 375) < 375)).mean())
     assert min(inside) > 0.2 and np.mean(inside) > 0.6
+
+
+def test_the_reference_says_where_on_earth_the_zero_is(tmp_path):
+    write_opensfm(tmp_path)
+    path = tmp_path / "reconstruction.json"
+    (one,) = json.loads(path.read_text())
+    for place, known in (((47.0, 8.0, 400.0), True), ((0.0, 0.0, 0.0), False)):
+        one["reference_lla"] = dict(zip(("latitude", "longitude", "altitude"), place, strict=True))
+        path.write_text(json.dumps([one]))
+        scale = read_capture(tmp_path).scale
+        assert (scale is not None) == known
+        if known:
+            assert scale.unit == "m"
+            assert scale.earth == Earth.at_place(*place)
+
+
+@pytest.mark.parametrize(
+    ("reading", "stays"),
+    [("k1 and k2 are exchanged", True), ("the matrices are inverted", False)],
+)
+def test_a_place_on_earth_is_dropped_where_poses_are_read_into_another_world(tmp_path, reading, stays):
+    write_opensfm(tmp_path)
+    path = tmp_path / "reconstruction.json"
+    (one,) = json.loads(path.read_text())
+    one["reference_lla"] = {"latitude": 47.0, "longitude": 8.0, "altitude": 400.0}
+    path.write_text(json.dumps([one]))
+    name = next(name for name in READINGS if name.startswith(reading))
+    found = read_as(read_capture(tmp_path), name)
+    assert found.scale.unit == "m"
+    assert found.scale.earth == (Earth.at_place(47.0, 8.0, 400.0) if stays else None)

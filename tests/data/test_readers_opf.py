@@ -1,5 +1,7 @@
 """Pix4D's calibrated_cameras.json: poses, lenses, its list of photos and damage."""
 
+import json
+
 import pytest
 
 from data.pose_programs import OPF_LENS, assert_reads, assert_refused, write_opf
@@ -47,3 +49,21 @@ def test_the_list_of_photos_is_asked_for(tmp_path):
 def test_damaged_files_are_refused_in_one_line(tmp_path, change, says):
     write_opf(tmp_path)
     assert_refused(tmp_path / "calibrated_cameras.json", change, says)
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_the_reference_frame_says_where_on_earth_the_scene_is(tmp_path, swap):
+    write_opf(tmp_path)
+    move = {"scale": [1.0, 1.0, 1.0], "shift": [-500000.0, -4600000.0, -100.0], "swap_xy": swap}
+    frame = {"format": "application/opf-scene-reference-frame+json", "version": "1.0"}
+    path = tmp_path / "scene_reference_frame.json"
+    path.write_text(json.dumps({**frame, "crs": {"definition": "EPSG:32633"}, "base_to_canonical": move}))
+    earth = read_capture(tmp_path).scale.earth
+    east, north = (4600000.0, 500000.0) if swap else (500000.0, 4600000.0)
+    assert earth.place_of((0, 0, 0)) == f"{east:.2f} east, {north:.2f} north, 100.00 up in EPSG:32633"
+    path.write_text(json.dumps({**frame, "crs": {"definition": "Arbitrary (m)"}, "base_to_canonical": move}))
+    assert read_capture(tmp_path).scale is None
+    move["scale"][1] = 0
+    path.write_text(json.dumps({**frame, "crs": {"definition": "EPSG:32633"}, "base_to_canonical": move}))
+    with pytest.raises(DatasetError, match=r"scene_reference_frame\.json: its scale is 0"):
+        read_capture(tmp_path)

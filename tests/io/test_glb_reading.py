@@ -361,6 +361,34 @@ def test_our_tiles_are_read(tmp_path):
     torch.testing.assert_close(tile.gaussians.sh_rest, scene.gaussians.sh_rest, rtol=0, atol=0.1)
 
 
+@pytest.mark.parametrize(
+    "name", ["KHR_gaussian_splatting_compression_spz", "KHR_spz_gaussian_splats_compression"]
+)
+def test_older_drafts_of_spz_are_read_alike(tmp_path, name):
+    """The first one stands at the primitive and has neither kernel nor colour space."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = [(50, 3), (50, 4), (50, 3), (50, 1, 3), (50, 8, 3), (50,)]
+    scene = Scene(Gaussians(*(torch.randn(*shape, generator=generator) for shape in shapes)))
+    data = tiles.glb(scene)
+    (tmp_path / "new.glb").write_bytes(data)
+    size = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + size])
+    (primitive,) = document["meshes"][0]["primitives"]
+    base = primitive["extensions"].pop("KHR_gaussian_splatting")
+    (packed,) = base.pop("extensions").values()
+    alone = name.startswith("KHR_spz")
+    kinds = {name: packed} if alone else {"KHR_gaussian_splatting": {**base, "extensions": {name: packed}}}
+    primitive["extensions"] = kinds
+    document["extensionsUsed"] = document["extensionsRequired"] = [*kinds, *([] if alone else [name])]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    parts = [len(text).to_bytes(4, "little"), b"JSON", text, data[20 + size :]]
+    body = b"".join(parts)
+    (tmp_path / "old.glb").write_bytes(data[:8] + (12 + len(body)).to_bytes(4, "little") + body)
+    new, old = (read_scene(tmp_path / f"{kind}.glb").gaussians.tensors() for kind in ("new", "old"))
+    assert all(torch.equal(tensor, old[name]) for name, tensor in new.items())
+
+
 def test_files_of_splat_transform_are_turned_about_z(tmp_path):
     """It turns a PLY's (x, y, z) to (-x, -y, z), `Transform.PLY` in its source, with rotations and harmonics."""
     given, file = values(degree=3), Builder()

@@ -1,7 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { transposed } from "../../src/gsplat_edu/viewer/web/camera.js";
 import { eigenvectors, upOfCameras } from "../../src/gsplat_edu/viewer/web/edit_level.js";
 import {
   anglesOfRows,
@@ -10,6 +9,7 @@ import {
   rowsOfAngles,
   turnedRows,
 } from "../../src/gsplat_edu/viewer/web/edit_rotations.js";
+import { transposed } from "../../src/gsplat_edu/viewer/web/vectors.js";
 import { assertClose, vectors } from "./vectors.js";
 
 const IDENTITY = [

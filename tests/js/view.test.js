@@ -1,7 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { View, dot, fitted, plus } from "../../src/gsplat_edu/viewer/web/camera.js";
+import { View, fitted } from "../../src/gsplat_edu/viewer/web/camera.js";
+import { dot, plus } from "../../src/gsplat_edu/viewer/web/vectors.js";
 import { assertClose } from "./vectors.js";
 
 const PIXEL = 1 / 640; // of a drag, in those across the window

@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { cross, dot, plus, View } from "../../src/gsplat_edu/viewer/web/camera.js";
+import { View } from "../../src/gsplat_edu/viewer/web/camera.js";
 import { SortedSplats } from "../../src/gsplat_edu/viewer/web/sorted_splats.js";
 import {
   along,
@@ -16,6 +16,7 @@ import {
   turnedStand,
   wayOf,
 } from "../../src/gsplat_edu/viewer/web/xr.js";
+import { cross, dot, plus } from "../../src/gsplat_edu/viewer/web/vectors.js";
 import { assertClose } from "./vectors.js";
 
 const NEARLY = { absolute: 1e-6 }; // WebXR's matrices are float32

@@ -85,6 +85,33 @@ def test_its_options_and_command_stand_beside_ours(site):
     assert code == 2 and "--crisp-weight: is -1, but has to be at least 0" in errors
 
 
+QUESTION = """
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.train.setting import Question
+
+def check(path):
+    if not path.is_file():
+        raise ArgumentError(f"--outlines: {path} is no file; give a file of outlines")
+
+Crisp.question = Question(name="outlines", metavar="FILE", help="keep to outlines", check=check)
+"""
+
+
+def test_a_part_may_ask_for_a_file(site, tmp_path):
+    asking = tmp_path / "site"
+    shutil.copytree(site, asking)
+    with (asking / "gsplat_crisp" / "training.py").open("a") as module:
+        module.write(QUESTION)
+    code, said, errors = command("train", "--help-all", site=asking)
+    assert code == 0, errors
+    assert "--outlines FILE" in said
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    code, _, errors = command("train", photos, "--out", "y", "--outlines", "z", site=asking)
+    assert code == 2 and "--outlines: z is no file; give a file of outlines" in errors
+    assert "--outlines" not in command("doctor", "--help", site=asking)[1]
+
+
 def test_a_package_that_cannot_be_loaded_is_named(site, tmp_path):
     spoiled = tmp_path / "site"
     shutil.copytree(site, spoiled)

@@ -85,8 +85,8 @@ def test_the_training_on_record_is_that_of_the_chapter():
     assert read_data("density")["iteration"] == figure_data.DENSIFIED
     assert len(read_data("sphere")["means"]) == figure_data.SHELL
     notebook = (ROOT / "notebooks" / "09_train_in_3d.ipynb").read_text()
-    printed = re.findall(r"iter +(\d+)  L1 ([\d.]+)  K (\d+)", notebook)
-    assert len(printed) == 8
+    printed = re.findall(r"iter +(\d+)  L1 ([\d.]+)  K (\d+)", notebook)[:8]  # of the longer of two runs
+    assert [int(iteration) for iteration, _, _ in printed] == list(range(0, 800, 100))
     for iteration, loss, _ in printed[:3]:
         # Other kernels: the first losses agree to their digits, later ones drift with rounding.
         assert abs(record["losses"][int(iteration)] / float(loss) - 1) < 0.02, iteration

@@ -25,6 +25,7 @@ LOOPING += ("budget/forecast.py", "budget/trial.py", "runs/cleaning.py", "runs/l
 """Modules that ask each part for what they need of its settings, and of what the user asked of it."""
 
 OPTIONS = ("options/train.py", "options/block_parts.py", "options/settings.py", "options/length.py")
+OPTIONS += ("options/asked.py", "options/blocks.py")
 """Modules that read from the declarations of settings where an option belongs, and what may not be given with it."""
 
 COMMANDS = ("cli/train.py", "cli/blocks.py", "cli/doctor.py")
@@ -64,9 +65,26 @@ def test_parts_say_how_photos_are_compared_with_a_scene(module):
 
 @pytest.mark.parametrize("module", ["cli/train.py", *OPTIONS, *LOOPING])
 def test_what_users_ask_of_parts_is_named_by_its_options(module):
-    """`RunOptions.asked` carries it; `options/asked.py` and the parts know what it is."""
+    """`RunOptions.asked` carries it; the parts know what it is, and the registry which of them ask."""
     text = (SOURCE / module).read_text()
     assert not re.findall(r"given_depth|floaters|\bdepth\b(?!=False)|arguments\.clean|[\"']clean[\"']", text)
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        *(
+            "cli/doctor.py",
+            "runs/thin.py",
+            "survey/residuals.py",
+            "evaluate/verdict.py",
+            "evaluate/report.py",
+        ),
+        "parts/bench.py",
+    ],
+)
+def test_the_correction_of_exposures_is_named_by_its_part(module):
+    assert not re.findall(r"appearance|vignetting", (SOURCE / module).read_text())
 
 
 @pytest.mark.parametrize(

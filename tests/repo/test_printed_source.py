@@ -126,7 +126,7 @@ def test_source_is_found_in_the_chapters_that_print_it(monkeypatch):
     for source in SOURCES:
         path = ROOT / "notebooks" / f"{source.stem}.ipynb"
         printed[source.stem[:2]] = len(printed_source(nbformat.read(path, as_version=4).cells))
-    assert {chapter for chapter, count in printed.items() if count} == {"09", "10", "11", "12"}
+    assert {chapter for chapter, count in printed.items() if count} == {"10", "11", "12"}
 
 
 def notebook(*codes: str, output: str) -> list[nbformat.NotebookNode]:

@@ -49,7 +49,7 @@ def test_refined_levels_match_the_photos_better(run):
 def test_photos_are_reduced_by_the_factor_of_the_level(run):
     source = open_source(run)
     for factor, width in ((1.0, 64), (2.0, 32)):
-        train, test = lod_refinement._photos(source, lod_refinement.run_of(source.path), factor, "cpu")
+        train, test = lod_refinement.photos_of_run(source, lod_refinement.run_of(source.path), factor, "cpu")
         assert {view.camera.W for view in (*train, *test)} == {width} and len(test) == 2
         known = dict(source.cameras)
         for view in train:
@@ -80,7 +80,7 @@ def test_a_level_that_training_makes_worse_is_not_refined(run, monkeypatch):
     def spoilt(source, gaussians, views, steps, backend):
         return gaussians.map(lambda tensor: tensor + 1.0)
 
-    monkeypatch.setattr(lod_refinement, "_trained", spoilt)
+    monkeypatch.setattr(lod_refinement, "retrained", spoilt)
     source = open_source(run)
     root = build_levels(source.scene.gaussians, OPTIONS)
     said = []

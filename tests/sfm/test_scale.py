@@ -15,6 +15,7 @@ from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.earth import geodetic
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.scale import Sight, in_given_world, placed
@@ -131,6 +132,14 @@ def test_gps_gives_scale_and_up_end_to_end(tmp_path):
     scene = open_source(run).scene
     assert scene.up == (0.0, -1.0, 0.0) and scene.unit == "m"  # the cameras' mean up is 25 degrees off
     found = cameras_of(tmp_path / "out")
+    for name, camera in found.items():
+        latitude, longitude, height = geodetic(scene.earth.rows @ [*camera.eye, 1.0])
+        east, north, up = metres * ground @ truth[name].eye
+        np.testing.assert_allclose(
+            [111_194.0 * (latitude - 48.0), 74_628.0 * (longitude - 8.0), height - 300.0],
+            [north, east, up],
+            atol=1.0,  # m; the seconds of the photos have two digits, 0.3 m
+        )
     move = align_cameras(found, truth)  # from the capture to the box's world
     # One degree of latitude is 111.194 km on this ellipsoid, one of longitude 74.628 km, at most 0.05 % apart.
     assert 1 / move.s == pytest.approx(metres, rel=0.005)

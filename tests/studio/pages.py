@@ -207,7 +207,7 @@ def train_and_download(person, name, iterations):
     person.reach(f"#/runs/{name}/share")
     tab.get_by_role("radio", name=re.compile("^SPZ")).check()
     tab.get_by_role("button", name="Export", exact=True).click()
-    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    tab.locator(".exports .facts", has_text="your scene").wait_for()
     with tab.expect_download() as download:
         tab.get_by_role("link", name="Download").click()
     assert download.value.suggested_filename == f"{name}.spz"

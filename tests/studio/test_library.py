@@ -350,6 +350,7 @@ def test_a_capture_says_what_the_search_for_its_poses_found(page, studio):
         "photos": 3,
         "posed": 2,
         "unplaced": ["c"],
+        "beside": [["b", None]],
         "error": 0.364,
     }
     file.write_text(json.dumps({"stages": stages | {"faces": {"options": {}, "facts": {}}}}))

@@ -85,7 +85,7 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     person.reach("#/runs/box/share")
     tab.get_by_role("radio", name=re.compile("^SPZ")).check()
     tab.get_by_role("button", name="Export", exact=True).click()
-    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    tab.locator(".exports .facts", has_text="your scene").wait_for()
     with tab.expect_download() as download:
         tab.get_by_role("link", name="Download").click()
     convert = person.command("export of box.spz")
@@ -94,9 +94,9 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
 
     shown = tab.locator(".exports li").inner_text()
     tab.reload()
-    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    tab.locator(".exports .facts", has_text="your scene").wait_for()
     second = visitor_of(person, tab.url)
-    second.locator(".exports .facts", has_text="PSNR").wait_for()
+    second.locator(".exports .facts", has_text="your scene").wait_for()
     assert tab.locator(".exports li").inner_text() == second.locator(".exports li").inner_text() == shown
 
 
@@ -177,7 +177,7 @@ def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
     tab.get_by_role("button", name="Place the photos").click()
     place = person.place().removeprefix("#/photos/")
     sfm = person.command(f"cameras of {unquote(place)}")
-    onward = tab.get_by_role("link", name=re.compile("^Continue with the capture"))
+    onward = tab.get_by_role("link", name=re.compile("^See where the photos were taken"))
     onward.wait_for(timeout=240_000)
     found = re.compile(r"14 of 14 photos placed")
     tab.locator(".next", has_text=found).wait_for()

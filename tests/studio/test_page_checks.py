@@ -1,4 +1,4 @@
-"""In Chromium, photos that are not placed yet: how many there are, how many are usual, and which are blurred."""
+"""In Chromium, photos that are not placed yet: whether they are enough, sharp, equally bright and near enough."""
 
 import re
 
@@ -29,7 +29,9 @@ def test_the_screen_of_photos_says_how_many_are_usual_and_which_are_blurred(visi
     tab = go(visitor().tab, "photos/wall")
     said = tab.get_by_role("status").filter(has_text="are usual")
     said.wait_for()
-    assert said.inner_text().startswith(f"14 photos; {USUAL[0]} to {USUAL[1]} are usual. How well")
+    assert said.inner_text().startswith(
+        f"14 photos; {USUAL[0]} to {USUAL[1]} are usual. Each shares enough with the next one"
+    )
     (finding,) = tab.locator(".findings li").all_inner_texts()
     assert re.match(r"1 of 14 photos show less detail .*first photo_04\.jpg", finding, re.DOTALL)
     assert tab.locator(".thumbs .mark:not(:empty)").all_inner_texts() == ["blurred"]
@@ -57,6 +59,22 @@ def test_few_photos_that_are_sharp(visitor, library):
     tab.get_by_role("status").filter(has_text="None is blurred").wait_for()
     (finding,) = tab.locator(".findings li").all_inner_texts()
     assert "4 photos are few: the scene between them is guessed.\n\nTake more photos: at least 12" in finding
+
+
+def test_a_gap_in_the_order_of_the_photos_is_said(visitor, library):
+    folder = library[0].library.root / "photos" / "gap"
+    photographs(folder, 14)
+    other = cv2.resize(np.random.default_rng(8).integers(0, 255, (75, 100, 3), dtype=np.uint8), (800, 600))
+    for i in range(14, 17):
+        cv2.imwrite(str(folder / f"photo_{i}.jpg"), np.roll(other, 40 * i, axis=1))
+    tab = go(visitor().tab, "photos/gap")
+    said = tab.get_by_role("status").filter(has_text="are usual")
+    said.wait_for()
+    assert "shows once they are placed" not in said.inner_text()
+    (finding,) = tab.locator(".findings li", has_text="shares too little").all_inner_texts()
+    assert finding.startswith(
+        "1 place where a photo shares too little with the next one, first photo_13.jpg with photo_14.jpg."
+    )
 
 
 def test_the_usual_number_is_that_of_the_tour(request):

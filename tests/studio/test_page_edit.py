@@ -89,7 +89,7 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     tab.get_by_role("radio", name=re.compile("^SPZ")).check()
     assert tab.get_by_label("apply the edits").is_checked()
     tab.get_by_role("button", name="Export", exact=True).click()
-    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    tab.locator(".exports .facts", has_text="your scene").wait_for()
     with tab.expect_download() as download:
         tab.get_by_role("link", name="Download").click()
     out = tmp_path / "wall.spz"
@@ -121,6 +121,23 @@ def test_edits_saved_just_now_are_exported(visitor, wall_entry, library):
     tab.locator(".exports .name", has_text="at once.spz").wait_for()
     assert "--edits" in person.command("export of at once.spz")
     stored.unlink()
+
+
+def test_an_export_has_at_most_the_size_that_was_typed(visitor, wall_entry):
+    person = visitor()
+    tab = person.tab
+    tab.evaluate("location.hash = '#/scenes/wall/share'")
+    tab.get_by_role("button", name="Export", exact=True).wait_for()
+    size = tab.get_by_label("At most (MB)")
+    tab.get_by_role("radio", name=re.compile("^PLY")).check()
+    assert not size.is_visible(), "a PLY is exact"
+    tab.get_by_role("radio", name=re.compile("^SPZ")).check()
+    size.fill("0.01")
+    tab.get_by_label("Title and name of the file").fill("small")
+    tab.get_by_role("button", name="Export", exact=True).click()
+    tab.locator(".exports .name", has_text="small.spz").wait_for()
+    assert "--size 0.01MB" in person.command("export of small.spz")
+    assert (wall_entry / "exports" / "small.spz").stat().st_size <= 10_000
 
 
 def test_two_saves_at_once_are_no_conflict(visitor, wall_entry):

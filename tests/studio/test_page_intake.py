@@ -6,6 +6,7 @@ import re
 import cv2
 import pytest
 
+from data.pose_programs import CAMERAS, write_opensfm
 from lab.captures.textured_box import box_orbit, photograph_box
 from studio.pages import DROP, encoded, png
 
@@ -106,7 +107,7 @@ def test_a_dropped_video_becomes_a_capture(visitor, library, tmp_path):
     tab.get_by_label("Frames of the video").fill("30")
     unread = SearchUnread(tab)
     tab.get_by_role("button", name="Place the photos").click()
-    onward = tab.get_by_role("link", name=re.compile("^Continue with the capture"))
+    onward = tab.get_by_role("link", name=re.compile("^See where the photos were taken"))
     onward.wait_for(timeout=240_000)
     first = onward.element_handle()
     unread.ended = True
@@ -115,5 +116,15 @@ def test_a_dropped_video_becomes_a_capture(visitor, library, tmp_path):
     assert first.evaluate("link => link.isConnected"), "a press while the words come would be lost"
     onward.click()
     person.reach("#/captures/orbit")
-    tab.locator(".facts", has_text="COLMAP").wait_for()
+    tab.locator(".facts", has_text="30 of 30 photos placed").wait_for()
     tab.locator(".thumbs img").nth(20).wait_for()  # most of the 30 frames get a pose
+
+
+def test_a_dropped_folder_with_poses_of_another_program_becomes_a_capture(visitor, library, tmp_path):
+    write_opensfm(tmp_path / "yard")
+    (tmp_path / "yard" / "images" / CAMERAS[0][0]).unlink()
+    person = visitor()
+    drop_paths(person.tab, "header", tmp_path / "yard")
+    person.reach("#/captures/yard")
+    person.tab.get_by_text("Poses of OpenSfM: 5 of 5 photos").wait_for()
+    assert (library[0].library.root / "captures" / "yard" / "reconstruction.json").is_file()

@@ -70,7 +70,9 @@ def test_what_came_from_a_capture_is_renamed_with_it(visitor, library):
     tab = person.tab
     go(tab, "captures/toad")
     tab.locator("summary", has_text="Rename or remove").click()
-    too = tab.get_by_role("checkbox", name="rename what came from it, too: run toad, run toad-run-2")
+    too = tab.get_by_role(
+        "checkbox", name="rename what came from it, too: training toad, training toad-run-2"
+    )
     too.wait_for()
     assert too.is_checked()
     tab.get_by_label("Name", exact=True).fill("frog")

@@ -90,6 +90,8 @@ def shared_page(person, name, folder, patience):
     press_next(tab, "Make the file")
     with tab.expect_download() as download:
         press_next(tab, f"Save {name}.html")
+    filled = "(one) => one.querySelector('progress').offsetWidth === one.clientWidth"
+    assert tab.locator(".job .progress").first.evaluate(filled)  # what is done does not look half done
     assert download.value.suggested_filename == f"{name}.html"
     saved = folder / f"{name}.html"
     download.value.save_as(saved)  # the browser's own copy has no ending

@@ -35,7 +35,7 @@ def test_a_failed_search_for_poses_leaves_one_next_step_and_nothing_to_train(vis
     inside = tab.locator(".everything")
     inside.locator("summary", has_text="Everything in it (2)").click()
     assert (
-        inside.locator("li", has_text=f"Capture {BY_DAY}").locator(".badge").inner_text() == "not placed yet"
+        inside.locator("li", has_text=f"Cameras {BY_DAY}").locator(".badge").inner_text() == "not placed yet"
     )
     go(tab, "")
     project = tab.get_by_role("article", name=BY_DAY)
@@ -79,6 +79,7 @@ def test_photos_that_were_not_placed_come_first_and_the_next_step_leads_to_the_c
     missing = tab.get_by_role("group", name="photos that were not placed")
     missing.get_by_text("8 of 20 photos were not placed.").wait_for()
     assert "Take two more photos beside each of them" in missing.inner_text()
+    assert "Take two more beside 08.png." in missing.inner_text()
     until_in(
         tab,
         tab,

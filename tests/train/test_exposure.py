@@ -60,9 +60,10 @@ def test_exposures_are_recovered_and_held_out_quality_with_them(capture):
     found = stops(regained.view_model.log_gains()).numpy()
     wanted = np.log2(scales[kept])
     wanted = wanted - wanted.mean(axis=0)
-    # Exposures differ by up to 1.4 stops. 400 steps at 64 px leave errors of a tenth; "Planted
-    # faults" in benchmarks/RESULTS.md has those of real sizes.
-    assert np.abs(found - wanted).max() < 0.3 and np.sqrt(np.mean((found - wanted) ** 2)) < 0.15
+    # Exposures differ by up to 1.4 stops. 400 steps at 64 px leave errors of 0.13 stops, 0.30 at most (of four
+    # drawings of exposures the worst; 800 steps: 0.10 and 0.21), which the instructions of a CPU move by 0.01;
+    # "Planted faults" in benchmarks/RESULTS.md has those of real sizes.
+    assert np.abs(found - wanted).max() < 0.4 and np.sqrt(np.mean((found - wanted) ** 2)) < 0.2
     best, worst, ours = (fitted(run, held_out) for run in (plain, lost, regained))
     assert best - worst > 1.0, "uncorrected exposures reduce the quality"
     assert ours - worst > 0.7 * (best - worst)

@@ -93,7 +93,7 @@ def test_a_press_counts_although_the_photo_arrives_meanwhile(opened):
         with tab.expect_response(PHOTOS):
             route.continue_()
 
-    pressed_while(tab, "look through", arrive)
+    pressed_while(tab, "stand here", arrive)
     until(tab, "viewer.through === viewer.cameras.list[2]")
     tab.locator("#photo").wait_for()
 

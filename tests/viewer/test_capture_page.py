@@ -251,7 +251,7 @@ def test_gap_points_and_outlines_are_drawn_where_the_view_projects_them(opened, 
     gap = np.array(tab.evaluate("viewer.facts.gap"))
     view = view_of(tab)
     u, v, _ = view.project(view.world_to_cam(gap[len(gap) // 2]))
-    box = tab.locator("#stand").bounding_box()
+    box = tab.locator("#missing").bounding_box()
     assert box["x"] + box["width"] / 2 == pytest.approx(u + 0.5, abs=1)
     assert box["y"] < v
     assert "an arc of 120 degrees" in tab.inner_text("#gap")
@@ -325,7 +325,7 @@ def test_on_a_phone_everything_fits_and_is_large_enough(opened):
     tab.get_by_role("button", name="controls").tap()
     tab.evaluate("viewer.choose(2)")
     tab.locator("#photo").wait_for()
-    for name in ("Previous", "Next", "Look through", "Leave out", "close the photo"):
+    for name in ("Previous", "Next", "Stand here", "Leave out", "close the photo"):
         box = tab.get_by_role("button", name=name, exact=True).bounding_box()
         assert min(box["width"], box["height"]) >= 40, name
         assert box["x"] >= 0, name

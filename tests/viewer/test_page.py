@@ -159,6 +159,11 @@ def test_a_title_with_undecodable_bytes(random_gaussians):
     assert Elements(document).texts("title") == ["a?"]
 
 
+def test_no_empty_controls_are_shown_while_the_scene_is_unpacked(random_gaussians):
+    html = page.html(Scene(random_gaussians(3))).decode()
+    assert '<div id="tools" hidden>' in html and '<button id="fold" aria-expanded="false"' in html
+
+
 def test_nothing_is_fetched_from_elsewhere(random_gaussians, three_views):
     document = page.html(Scene(random_gaussians(3)), three_views)
     elements = Elements(document)

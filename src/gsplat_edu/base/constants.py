@@ -131,6 +131,22 @@ PAGE_FACES: Final = 2_000_000
 """Most triangles of all meshes of a page. They take about 60 MB before compression. `gsplat-edu mesh` keeps to it
 unless told otherwise. Source: ours."""
 
+SCENE_SUFFIXES: Final = (
+    ".ply",
+    ".compressed.ply",
+    ".splat",
+    ".ksplat",
+    ".spz",
+    ".sog",
+    ".glb",
+    ".usda",
+    ".usdz",
+    ".usdc",
+    ".rad",
+    ".csv",
+)
+"""Suffixes of the files that can hold a scene. Source: ours."""
+
 SIZED: Final = (".spz", ".sog", ".compressed.ply", ".html")
 """Endings of the files that `convert --size` writes. Source: ours."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.base.locks import locked_file
 from gsplat_edu.base.reading import read_text
 from gsplat_edu.cli.exporting import check_and_say
@@ -28,16 +28,18 @@ from gsplat_edu.options.convert import MOVES, photos_asked
 from gsplat_edu.options.values import numbers_text
 from gsplat_edu.paths.keyframes import read_path
 from gsplat_edu.render.backends import resolve_backend
-from gsplat_edu.runs.importance import MOST_CAMERAS, importance_of
-from gsplat_edu.runs.source import Source, open_source
+from gsplat_edu.runs.importance import BACKEND, MOST_CAMERAS, importance_of
+from gsplat_edu.runs.lod_refinement import photos_of_run
+from gsplat_edu.runs.source import Source, open_source, run_of
 from gsplat_edu.scene.frame import ORIGIN
+from gsplat_edu.scene.views import View
 from gsplat_edu.sfm.scale_text import points_of
 from gsplat_edu.viewer import export
 from gsplat_edu.viewer.edited import edited_meshes, edited_source, toured
 from gsplat_edu.viewer.page import Tour
 from gsplat_edu.viewer.page_mesh import Meshes, open_meshes
 from gsplat_edu.viewer.page_proof import Proof, photos_of, seen_of, training_cameras
-from gsplat_edu.viewer.sizing import write_sized
+from gsplat_edu.viewer.sizing import STEPS, write_sized
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -132,7 +134,7 @@ def _write(
 ) -> str | None:
     """Write OUT; return what it contains, in words, or None if it is the scene."""
     if arguments.size is not None:
-        return _write_sized(source, tour, arguments, bar)
+        return _write_sized(source, tour, arguments, bar, say)
     if arguments.lod_refine is None:
         export.write(arguments.out, source, tour, options)
     else:
@@ -140,19 +142,50 @@ def _write(
     return None
 
 
-def _write_sized(source: Source, tour: Tour, arguments: argparse.Namespace, bar: Bar) -> str:
+def _write_sized(
+    source: Source, tour: Tour, arguments: argparse.Namespace, bar: Bar, say: Callable[[str], None]
+) -> str:
     """Write the best file within --size; return what it contains, in words."""
     task = bar.add_task("weighing splats", total=min(len(source.cameras), MOST_CAMERAS))
     importance = importance_of(source, lambda: bar.advance(task))
     bar.remove_task(task)
-    found = write_sized(arguments.out, source, tour, importance, arguments.size)
+    photos = _photos_to_tune(source, arguments, say)
+    task = bar.add_task("choosing, then tuning" if photos else "choosing", total=STEPS if photos else None)
+    written = write_sized(
+        arguments.out, source, tour, importance, arguments.size, photos, lambda: bar.advance(task)
+    )
+    bar.remove_task(task)
+    found = written.file
     total, kept, degree = len(source.scene.gaussians), len(found.part.rows), found.setting.sh_degree
     size = f"{len(found.data):,} of {arguments.size:,} bytes"
     if found.whole:
         return f"the whole scene in the format's full precision: {total:,} splats, SH degree {degree}, {size}"
     shiny = found.part.with_harmonics
     some = f" ({shiny:,} splats; the others 0)" if degree and shiny < kept else ""
-    return f"{kept:,} of {total:,} splats, SH degree {degree}{some}, {size}"
+    how = (
+        f"{kept:,} splats, some merged, for {total:,}" if written.merged else f"{kept:,} of {total:,} splats"
+    )
+    tuned = "; training on its photos did not make it better, so it is untuned" if photos else ""
+    if written.tuned is not None:
+        tuned = "; tuned from {:.2f} to {:.2f} dB on its photos".format(*written.tuned)
+    return f"{how}, SH degree {degree}{some}, {size}{tuned}"
+
+
+def _photos_to_tune(
+    source: Source, arguments: argparse.Namespace, say: Callable[[str], None]
+) -> Sequence[View]:
+    """Return the training photos of the scene's run; none, with a sentence, where they do not show the scene."""
+    run = run_of(source.path)
+    if run is None:
+        return ()
+    if (change := _change(arguments)) is not None:
+        say(f"not tuned, because the photos do not show the scene after {change}")
+        return ()
+    try:
+        return photos_of_run(source, run, 1.0, BACKEND, arguments.dataset)[0]
+    except (CheckpointError, DatasetError) as error:
+        say(f"not tuned on the photos: {error}")
+        return ()
 
 
 def _say_written(
@@ -212,8 +245,6 @@ def _levels(arguments: argparse.Namespace) -> LodOptions:
         return LodOptions(**given)
     if "chunk" in given:
         raise ArgumentError("--lod-chunk: a tile is a file; set --lod-leaf")
-    if arguments.verify:
-        raise ArgumentError(f"--verify: {arguments.out} cannot be read back; verify another format")
     return tile_options(**given)
 
 
@@ -225,6 +256,14 @@ def _check_refining(arguments: argparse.Namespace) -> None:
         raise ArgumentError(f"--lod-refine: is {arguments.lod_refine}, but has to be at least 1")
     if arguments.out.name.lower() != LOD_META:
         raise ArgumentError(f"--lod-refine: {arguments.out} cannot be refined; write FOLDER/{LOD_META}")
+    if (change := _change(arguments)) is not None:
+        raise ArgumentError(
+            f"--lod-refine: the photos do not show the scene after {change}; refine without it"
+        )
+
+
+def _change(arguments: argparse.Namespace) -> str | None:
+    """Return what makes a scene another one than its run's photos show; None for nothing."""
     changes = {
         "several scenes": len(arguments.sources) > 1,
         "--transform": arguments.transform,
@@ -232,11 +271,7 @@ def _check_refining(arguments: argparse.Namespace) -> None:
         "--crop": arguments.crop is not None,
         "--edits": arguments.edits is not None,
     }
-    for name, given in changes.items():
-        if given:
-            raise ArgumentError(
-                f"--lod-refine: the photos do not show the scene after {name}; refine without it"
-            )
+    return next((name for name, given in changes.items() if given), None)
 
 
 def _filtered(source: Source, keep: Filter) -> Source:

@@ -27,7 +27,8 @@ from gsplat_edu.evaluate.verdict import measured_of
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed
-from gsplat_edu.options.asked import ASKED, asked_of
+from gsplat_edu.options.asked import asked_of, words_asked
+from gsplat_edu.parts.run_values import Compared
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, gpu_of, load_backend, resolve_backend
 from gsplat_edu.runs.dataset import data_settings, run_reader
@@ -132,9 +133,7 @@ def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
         words += ("--iterations", str(arguments.iterations))
     if arguments.resolution is not None:
         words += ("--resolution", f"{arguments.resolution:g}")
-    for part, value in asked_of(arguments).items():
-        words += (option_flag(ASKED[part]), value)
-    return words
+    return words + words_asked(arguments)
 
 
 def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
@@ -148,13 +147,12 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     gaussians = read_scene(scene).relative_to(dataset.origin).to(device_of(backend))
     renderer = functools.partial(render, settings=settings, backend=backend)
     used = stored_config(config)
+    shown = Compared(dataset, gaussians, settings, load_backend(backend)).photos(used)
     with _bar(console) as bar:
         task = bar.add_task("views", total=len(dataset.train) + len(dataset.test))
         train, test = (
-            residuals(
-                gaussians, views, renderer, settings.background, lambda: bar.advance(task), used.appearance
-            )
-            for views in (dataset.train, dataset.test)
+            residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task))
+            for views in (shown.train, shown.test)
         )
     extent = scene_extent([view.camera for view in dataset.train])
     trained = Trained(

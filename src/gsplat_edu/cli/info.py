@@ -130,6 +130,8 @@ def _scene_facts(path: Path) -> list[Fact]:
     if scene.origin != ORIGIN:
         where = ", ".join(f"{x:.15g}" for x in scene.origin)
         facts.append(("origin", f"{where}: added, in double, to the coordinates below"))
+    if scene.earth is not None:
+        facts.append(("on earth", f"zero at {scene.earth.place_of(scene.origin)}"))
     if scene.up is not None:
         facts.append(("up", ", ".join(f"{x:.4g}" for x in scene.up)))
     finite = gaussians.finite_rows()
@@ -253,6 +255,9 @@ def _dataset_facts(path: Path, trust: bool) -> list[Fact]:
         facts.append(("", f"middle 98 %: {_bounds(inner)}"))
     if dataset.scale is not None:
         facts.append(("units", str(dataset.scale)))
+        if dataset.scale.earth is not None:
+            middle = np.median(eyes, axis=0) + dataset.origin
+            facts.append(("on earth", f"photos around {dataset.scale.earth.place_of(middle)}"))
     if np.any(dataset.origin):
         facts.append(("origin", f"shifted to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
     return facts + [("note", str(note)) for note in dataset.notes]

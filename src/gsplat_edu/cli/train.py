@@ -294,7 +294,7 @@ def _planned(
     if arguments.backend == AUTO and num_processes() == 1:
         options = with_backend(options, reader, say)
     with progress_bar(console, "") as bar:
-        task = bar.add_task("trials of lengths", total=sum(LENGTHS), visible=False)
+        task = bar.add_task("finding the right length", total=sum(LENGTHS), visible=False)
 
         def progress() -> None:
             bar.update(task, advance=1, visible=True)

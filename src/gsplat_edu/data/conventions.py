@@ -204,7 +204,11 @@ def read_as(capture: Capture, reading: str) -> Capture:
     if reading not in READINGS:
         raise DatasetError(f"reading: {reading!r} is not known to this version; train again")
     frames = tuple(READINGS[reading](frame) for frame in capture.frames)
-    return replace(capture, frames=frames, notes=(*capture.notes, OtherReading(mistake(reading))))
+    scale = capture.scale
+    if scale is not None and any(np.any(a.eye != b.eye) for a, b in zip(frames, capture.frames, strict=True)):
+        scale = replace(scale, earth=None)  # the world is another one
+    notes = (*capture.notes, OtherReading(mistake(reading)))
+    return replace(capture, frames=frames, notes=notes, scale=scale)
 
 
 def readings_for(frames: Sequence[Frame]) -> tuple[str, ...]:

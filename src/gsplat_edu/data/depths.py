@@ -44,11 +44,12 @@ from gsplat_edu.data.sparse_depth import sparse_depth, tracked_points
 from gsplat_edu.data.tracks import visible_points
 from gsplat_edu.photos.decoding import turned, upright_size
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH, GivenDepth
+from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH, SCAN_AS_DEPTH, GivenDepth
 from gsplat_edu.scene.intrinsics import Intrinsics
 
-POINTS, CAPTURE = Path(POINTS_AS_DEPTH), Path(CAPTURE_AS_DEPTH)
-"""Sources of depth that are no folders: the points in COLMAP's tracks, and the maps that transforms.json names."""
+POINTS, CAPTURE, SCAN = Path(POINTS_AS_DEPTH), Path(CAPTURE_AS_DEPTH), Path(SCAN_AS_DEPTH)
+"""Sources of depth that are no folders: the points in COLMAP's tracks, the maps that transforms.json names, and the
+file of a scanner's points."""
 
 JUMP = 0.05
 """Pixels beside a jump of more than this fraction of the inverse depth are left out."""
@@ -101,7 +102,7 @@ class DepthReport:
         used: Number of photos with depth that is used.
         missing: Photos without a map, or with few points.
         fit: How maps become depth; None for points.
-        points: Median number of points of a photo, for `POINTS`.
+        points: Median number of points of a photo, for `POINTS` and `SCAN`.
     """
 
     source: Path
@@ -119,8 +120,8 @@ class DepthReport:
     def lines(self) -> list[str]:
         """Return a sentence for each fact."""
         if self.fit is None:
-            what = "from the points in their tracks"
-            first = f"depth of {self.used} of {self.photos} photos {what}, {self.points} in a photo"
+            what = "from the scan" if self.source == SCAN else "from the points in their tracks"
+            first = f"depth of {self.used} of {self.photos} photos {what}, {self.points} points in a photo"
             few = f"{len(self.missing)} photos see fewer than {FEW_POINTS} points: {matched(self.missing)}"
             return [first, *([few] if self.missing else [])]
         said = [f"depth maps of {self.used} of {self.photos} photos: {_kind_text(self.fit)}"]
@@ -162,7 +163,7 @@ class Depths:
 
 def depth_name(path: Path) -> str:
     """Return how config.json names the source of depth: the folder's full path, or the word."""
-    return str(path if path in (POINTS, CAPTURE) else path.resolve())
+    return str(path if path in (POINTS, CAPTURE, SCAN) else path.resolve())
 
 
 def with_depth(
@@ -202,6 +203,8 @@ def judged_depths(
         DatasetError: there is no depth, a file is damaged or has another shape than its photo, maps agree with the
             points in no unit, or they are of panoramas that are cut into faces.
     """
+    if source.path == SCAN:
+        return _of_scan(reader, cameras, points)
     seen = _seen(reader, cameras, points, source.path == POINTS)
     if source.path == POINTS:
         return _of_points(reader.path, cameras, seen)
@@ -270,10 +273,31 @@ def _of_points(path: Path, cameras: Sequence[tuple[str, Camera]], seen: Mapping[
             f"{path}: has no tracks of points that photos see; --depth points needs a COLMAP model with points3D and"
             " the observations in images"
         )
-    few = tuple(name for name, _ in cameras if name not in seen or len(seen[name]) < FEW_POINTS)
-    middle = int(np.median([len(each) for each in used.values()]))
+    return _depths(POINTS, cameras, used)
+
+
+def _of_scan(reader: CaptureReader, cameras: Sequence[tuple[str, Camera]], points: Path | None) -> Depths:
+    cloud = None if points is None else reader.placed(points).cloud
+    if cloud is None:
+        raise DatasetError(
+            "--depth scan: takes the depth from the scan that --points names; give --points FILE"
+        )
+    seen = {
+        name: sparse_depth(
+            camera,
+            cloud.points[visible_points(camera, cloud.points, MOST_SAMPLES).points],
+            triangulated=False,
+        )
+        for name, camera in cameras
+    }
+    return _depths(SCAN, cameras, {name: each for name, each in seen.items() if len(each)})
+
+
+def _depths(source: Path, cameras: Sequence[tuple[str, Camera]], used: Mapping[str, GivenDepth]) -> Depths:
+    few = tuple(name for name, _ in cameras if name not in used or len(used[name]) < FEW_POINTS)
+    middle = int(np.median([len(each) for each in used.values()] or [0]))
     views = {name: partial(_same, each) for name, each in used.items()}
-    return Depths(views, DepthReport(POINTS, len(cameras), len(used), few, points=middle))
+    return Depths(views, DepthReport(source, len(cameras), len(used), few, points=middle))
 
 
 def _same(depth: GivenDepth) -> GivenDepth:

@@ -1,15 +1,17 @@
-"""The scale of a capture's coordinates, if it is known: scale.json beside images/ and sparse/."""
+"""The scale of a capture's coordinates and their place on earth, if known: scale.json beside images/ and sparse/."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.base.records import record_of
+from gsplat_edu.scene.earth import Earth
 
 SCALE_FILE = "scale.json"
 """Name of the file in a capture's folder."""
@@ -24,18 +26,20 @@ class Scale:
         source: "GPS" or "a given distance".
         detail: Accuracy of the scale, in words.
         level: Whether up is (0, -1, 0) by GPS; otherwise it is the mean up direction of the photos.
+        earth: Where on earth the coordinates are; None if unknown.
     """
 
     unit: str
     source: str
     detail: str = ""
     level: bool = False
+    earth: Earth | None = None
 
     def __str__(self) -> str:
         """Return the sentence for the user."""
         return f"1 unit = 1 {self.unit}, from {self.source}" + f" ({self.detail})" * bool(self.detail)
 
-    def json(self) -> dict[str, str | bool]:
+    def json(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
         return asdict(self)
 

@@ -94,12 +94,15 @@ def _rows(
     return found
 
 
-def sparse_depth(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> GivenDepth:
+def sparse_depth(
+    camera: Camera, points: Float64[np.ndarray, "n 3"], *, triangulated: bool = True
+) -> GivenDepth:
     """Return the depth of points in a photo that sees them; points that its lens does not see are left out.
 
     Args:
         camera: The photo's camera, of any projection and shutter.
         points: World units, in the camera's coordinate frame.
+        triangulated: Whether photos gave the points, and not a scanner.
     """
     if not camera.pinhole:
         seen = camera.sight(points)
@@ -108,10 +111,10 @@ def sparse_depth(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> GivenDep
         if not camera.projection.wraps:
             inside &= (u >= 0) & (u <= camera.W - 1)
         places = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=1)
-        return GivenDepth(places[inside], np.asarray(seen.depth)[inside], sparse=True)
+        return GivenDepth(places[inside], np.asarray(seen.depth)[inside], sparse=triangulated)
     at = camera.world_to_cam(points)
     at = at[at[:, 2] > 0]
     rays, z = at[:, :2] / at[:, 2:], at[:, 2]
     u, v = camera.fx * rays[:, 0] + camera.cx, camera.fy * rays[:, 1] + camera.cy
     inside = (u >= 0) & (u <= camera.W - 1) & (v >= 0) & (v <= camera.H - 1)
-    return GivenDepth(rays[inside], z[inside], sparse=True)
+    return GivenDepth(rays[inside], z[inside], sparse=triangulated)

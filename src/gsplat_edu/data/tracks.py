@@ -49,8 +49,10 @@ class Track(NamedTuple):
     """Rows of the point in the `VisiblePoints` of those cameras."""
 
 
-def visible_points(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> VisiblePoints:
-    """Return the points that a camera sees, with occlusion by other points."""
+def visible_points(
+    camera: Camera, points: Float64[np.ndarray, "N 3"], most: int = MOST_SEEN
+) -> VisiblePoints:
+    """Return the points that a camera sees, with occlusion by other points; at most some number of them."""
     if camera.pinhole:
         at = camera.world_to_cam(points)
         before = np.flatnonzero(at[:, 2] > 0)
@@ -67,8 +69,8 @@ def visible_points(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> Visibl
     nearest = np.full(cells.max(initial=0) + 1, np.inf)
     np.minimum.at(nearest, cells, depth)
     shown = np.flatnonzero(depth <= (1 + DEPTH_SLACK) * nearest[cells])
-    if len(shown) > MOST_SEEN:
-        shown = shown[np.linspace(0, len(shown) - 1, MOST_SEEN).round().astype(np.int64)]
+    if len(shown) > most:
+        shown = shown[np.linspace(0, len(shown) - 1, most).round().astype(np.int64)]
     return VisiblePoints(rows[shown], np.stack([u, v], axis=-1)[shown] + 0.5)
 
 

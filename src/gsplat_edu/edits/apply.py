@@ -156,7 +156,10 @@ def placed(scene: Scene, views: Views) -> Scene:
     """
     if views.move is IDENTITY:
         return scene
-    moved = views.move.scene(replace(scene, origin=ORIGIN))
+    shift = np.eye(4)
+    shift[:3, 3] = scene.origin
+    earth = None if scene.earth is None else scene.earth.after(shift)
+    moved = views.move.scene(replace(scene, origin=ORIGIN, earth=earth))
     moved = replace(moved, gaussians=moved.relative_to(ORIGIN), origin=ORIGIN)
     up = WORLD_UP if views.upright else moved.up
     return replace(moved, up=up, unit=views.unit or moved.unit)

@@ -58,7 +58,7 @@ NAMES = {
     "num_gaussians": "Gaussians",
     "seconds": "training time",
     FULL_LENGTH: "iterations without a time limit",
-    "psnr_aligned": "test PSNR on half of each photo, pose (and colours, with appearance) fitted on the other (dB)",
+    "psnr_aligned": "test PSNR on half of each photo, pose (and colours, if corrected) fitted on the other (dB)",
 }
 """Labels for the keys of metrics.json that are not plain English."""
 

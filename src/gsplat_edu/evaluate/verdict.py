@@ -12,7 +12,13 @@ from typing import Any, NamedTuple
 
 from gsplat_edu.base.constants import FAR_BELOW
 
-MEASURES = ("psnr", "psnr_8bit", "ssim", "l1", "psnr_fitted")
+FITTED = "psnr_fitted"
+"""The score of renders that have the exposure of their photo (`gsplat_edu.evaluate.metrics`)."""
+
+JUDGED_BY = "judged_by"
+"""Key of metrics.json: the score that judges the run, if it is not the PSNR."""
+
+MEASURES = ("psnr", "psnr_8bit", "ssim", "l1", FITTED)
 """The scores of an image and of a split, by their names in metrics.json and in `ImageScore`."""
 
 SKIPPED = "not_scored"
@@ -296,8 +302,8 @@ def measured_of(metrics: Mapping[str, Any], config: Mapping[str, Any]) -> Measur
         metrics: The contents of metrics.json; empty if the run was not evaluated.
         config: The contents of config.json.
     """
-    fitted = metrics.get("appearance", "none") != "none"
-    key = "psnr_fitted" if fitted else "psnr"
+    fitted = metrics.get(JUDGED_BY) == FITTED
+    key = FITTED if fitted else "psnr"
     held_out, trained = (_gain_of_exposure(metrics, split) for split in ("test", "train"))
     counts = [_whole(_section(metrics, split), "num_images") for split in ("test", "train")]
     usual, began = _section(metrics, USUAL), _section(config, PHOTOS)
@@ -376,7 +382,7 @@ def _whole(contents: Mapping[str, Any], key: str) -> int | None:
 
 def _gain_of_exposure(metrics: Mapping[str, Any], split: str) -> float | None:
     """Return by how much a fit of the exposure raises the mean PSNR of a split, dB; None if that is unknown."""
-    before, after = (mean_of(metrics, split, key) for key in ("psnr", "psnr_fitted"))
+    before, after = (mean_of(metrics, split, key) for key in ("psnr", FITTED))
     return None if before is None or after is None else after - before
 
 

@@ -90,8 +90,8 @@ def read(path: Path) -> Scene:
     if COLOR_BOUNDS[0] in chunk.names:
         colors = _between(_bounds(path, chunks, COLOR_BOUNDS), colors)
     positions = _between(_bounds(path, chunks, POSITION_BOUNDS), _unpacked(splats["packed_position"]))
-    antialiased, up, unit, origin = read_comments(path, header.comments)
-    means, origin = split_origin(positions) if origin is None else (positions, origin)
+    antialiased, frame, is_placed = read_comments(path, header.comments)
+    means, origin = (positions, frame.origin) if is_placed else split_origin(positions)
     log_scales = _between(_bounds(path, chunks, SCALE_BOUNDS), _unpacked(splats["packed_scale"]))
     with np.errstate(over="ignore"):  # damaged colour bounds: `read_scene` reports infinities
         sh0 = ((colors - SH_OFFSET) / C0).astype(np.float32)
@@ -103,7 +103,7 @@ def read(path: Path) -> Scene:
         sh_rest=torch.from_numpy(_sh_rest(sh_rows, len(splats))),
         logit_opacities=torch.from_numpy(byte_to_logit((words & 255).astype(np.uint8))),
     )
-    return Scene(gaussians, antialiased, up, unit, origin)
+    return Scene(gaussians, antialiased, *frame._replace(origin=origin))
 
 
 def write(path: Path, scene: Scene) -> None:

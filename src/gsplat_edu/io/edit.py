@@ -67,6 +67,13 @@ class Similarity:
             )
         return cls(A / s, s, M[:3, 3])
 
+    @property
+    def _inverse(self) -> Float64[np.ndarray, "4 4"]:
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.R.T / self.s
+        matrix[:3, 3] = -matrix[:3, :3] @ self.t
+        return matrix
+
     def after(self, first: Similarity) -> Similarity:
         """Return the composition that applies `first` and then this one."""
         return Similarity(self.R @ first.R, self.s * first.s, self.s * self.R @ first.t + self.t)
@@ -112,7 +119,7 @@ class Similarity:
         )
 
     def scene(self, scene: Scene) -> Scene:
-        """Transform a scene: its Gaussians, origin and up direction; scaling drops its unit.
+        """Transform a scene: its Gaussians, origin, up direction and place on earth; scaling drops its unit.
 
         The new origin is that of the old zero if float32 needs one there (`gsplat_edu.scene.frame.origin_of`), else
         zero. It is applied in double, before the means are rounded.
@@ -130,6 +137,7 @@ class Similarity:
             up=up,
             unit=scene.unit if self.s == 1.0 else None,
             origin=origin,
+            earth=None if scene.earth is None else scene.earth.after(self._inverse),
         )
 
 
@@ -201,12 +209,14 @@ def joined(scenes: Sequence[Scene]) -> Scene:
         parts.append(replace(scene.relative_to(scenes[0].origin), sh_rest=rest))
     ups = {scene.up for scene in scenes}
     units = {scene.unit for scene in scenes}
+    earths = {scene.earth for scene in scenes}
     return Scene(
         Gaussians.concatenated(parts),
         said.pop() if said else None,
         ups.pop() if len(ups) == 1 else None,
         units.pop() if len(units) == 1 else None,
         scenes[0].origin,
+        earths.pop() if len(earths) == 1 else None,
     )
 
 

@@ -57,6 +57,7 @@ FORMATS: tuple[Format, ...] = (
     Format(".usda", "gsplat_edu.io.usd", "USD as text"),
     Format(".usdc", "gsplat_edu.io.usd", "binary USD"),
     Format(".usdz", "gsplat_edu.io.usd", "USD's package"),
+    Format(".rad", "gsplat_edu.io.rad", "Spark's RAD"),
     Format(".csv", "gsplat_edu.io.csv", "CSV of splats", metadata=False),
     *plugins("formats").values(),
 )
@@ -69,7 +70,7 @@ LOD_META = "lod-meta.json"
 """File that represents a folder with levels of detail."""
 
 TILESET = "tileset.json"
-"""File that represents a folder of 3D Tiles, which is written only."""
+"""File that represents a folder of 3D Tiles."""
 
 LOD_FORMATS: tuple[Format, ...] = (
     Format(LOD_META, "gsplat_edu.io.lod.codec", "PlayCanvas streamed SOG"),
@@ -125,6 +126,8 @@ def losses(path: str | Path, scene: Scene) -> list[str]:
         said.append(
             f"{path}: {found.name} cannot store the origin ({where}); add it, in double, to every coordinate"
         )
+    if scene.earth is not None and not found.metadata:
+        said.append(f"{path}: {found.name} cannot store where on earth the scene is: {scene.earth}")
     return said
 
 
@@ -139,12 +142,12 @@ def file_in(path: Path) -> Path:
     """Return the file that represents a scene stored as a folder; any other path as it is.
 
     Args:
-        path: A SOG, levels of detail, or the folder of a model that another program has written; a run of ours is no
-            scene.
+        path: A SOG, levels of detail, 3D Tiles, or the folder of a model that another program has written; a run of
+            ours is no scene.
     """
     if not path.is_dir():
         return path
-    for name in (SOG_META, LOD_META):
+    for name in (SOG_META, LOD_META, TILESET):
         if (path / name).is_file():
             return path / name
     if (path / RUN_CONFIG).is_file():
@@ -166,7 +169,7 @@ def read_scene(path: str | Path) -> Scene:
 
     Args:
         path: The file; for a SOG folder, the folder or its meta.json; for levels of detail, of which the finest is
-            read, the folder or its lod-meta.json.
+            read, the folder or its lod-meta.json or tileset.json.
 
     Returns:
         The scene, float32, in this package's axes.

@@ -14,9 +14,9 @@ z instead, so its files differ from ours by a half turn about y; they are recogn
 
 Files of any program are read as the extension says: splats of all nodes of the scene, with the nodes' transforms, as
 float32 or the integers that the extension (and KHR_mesh_quantization for positions) allows, interleaved or not, and SPZ
-of version 2 in the file (our tiles). Other primitives, other attributes and meshes outside the scene are ignored.
-Transforms that splats cannot follow (shear, mirror, uneven scale), other kernels, linear colours and other required
-extensions are refused by name.
+in the file, by any draft of its extension (our tiles have the last one). Other primitives, other attributes and meshes
+outside the scene are ignored. Transforms that splats cannot follow (shear, mirror, uneven scale), other kernels, linear
+colours and other required extensions are refused by name.
 
 Source: Khronos, "glTF 2.0 Specification" and the extension KHR_gaussian_splatting, in which scales are linear; drafts
 before April 2026 had logarithms, which are refused where one is negative.
@@ -82,7 +82,7 @@ def _attributes(gaussians: Gaussians) -> dict[str, Float32[np.ndarray, "N C"]]:
 def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]) -> dict[str, Any]:
     """Return the JSON: a scene of one node, one mesh, one primitive; a buffer view and an accessor per attribute."""
     asset: dict[str, Any] = {"version": "2.0", "generator": GENERATOR}
-    known = extras(scene.up, scene.unit, scene.origin)
+    known = extras(scene.frame)
     if scene.antialiased is not None:
         known["antialiased"] = scene.antialiased
     if known:

@@ -28,6 +28,12 @@ EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
 """Name of the extension whose splats are an SPZ of version 2."""
 
+SPZ_DRAFTS = (SPZ_EXTENSION, f"{EXTENSION}_compression_spz")
+"""Names that the drafts of this extension have had."""
+
+SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
+"""Name of its first draft, which stood at a primitive itself."""
+
 FILE_HEADER = struct.Struct("<4sII")
 """glTF, version 2, length of the file."""
 

@@ -20,7 +20,8 @@ from gsplat_edu.io.glb_container import (
     GENERATOR,
     MISREAD,
     NUMBERS,
-    SPZ_EXTENSION,
+    SPZ_ALONE,
+    SPZ_DRAFTS,
     WIDTHS,
     GlbFile,
     container,
@@ -28,8 +29,8 @@ from gsplat_edu.io.glb_container import (
     refuse,
 )
 from gsplat_edu.io.node_splats import Activated, is_same, moved, root_matrix
-from gsplat_edu.io.scene import Scene, read_extras
-from gsplat_edu.scene.frame import ORIGIN, Vector, as_origin
+from gsplat_edu.io.scene import Scene, SceneFrame, read_extras
+from gsplat_edu.scene.frame import as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 
 ABOUT_Z = ("splat-transform",)
@@ -38,7 +39,7 @@ ABOUT_Z = ("splat-transform",)
 PRIMITIVE = 256
 """Bytes that a primitive counts as at least: a file may repeat empty ones, too."""
 
-SUPPORTED = frozenset((EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization"))
+SUPPORTED = frozenset((EXTENSION, *SPZ_DRAFTS, SPZ_ALONE, "KHR_mesh_quantization"))
 """Extensions that a file may require."""
 
 COMPONENTS = {
@@ -53,7 +54,6 @@ KHR_mesh_quantization. Harmonics are float32."""
 KNOWN = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
 """Properties of the extension with the only values that are drawn here; one that is missing has this value."""
 
-SceneFrame = tuple[Vector | None, str | None, Vector]
 """Up, unit and origin of a scene."""
 
 HALF_TURN_ABOUT_Y = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3))
@@ -87,8 +87,8 @@ class _File(GlbFile):
             self._refuse(f"needs the extension {', '.join(unknown)[:80]}, which is not supported")
         antialiased, frame = self._facts()
         placed = list(self._placed())
-        up, unit, origin = frame if self._is_ours(frame, placed) else (None, None, ORIGIN)
-        root = root_matrix(up, origin)
+        frame = frame if self._is_ours(frame, placed) else SceneFrame()
+        root = root_matrix(frame.up, frame.origin)
         meshes = self._document.get("meshes", [])
         if not placed and (self._body or meshes):
             elsewhere = any(map(_is_splats, (p for mesh in meshes for p in mesh["primitives"])))
@@ -100,14 +100,14 @@ class _File(GlbFile):
         except ArgumentError as error:
             self._refuse(str(error).removeprefix("scenes: ").partition(";")[0])
         said = antialiased if antialiased is not None else whole.antialiased
-        if not any(origin):
-            origin = as_origin("origin", np.array(POSITION_SIGNS) * whole.origin + 0.0)
-        found = Scene(half_turned(whole.gaussians), said, up, unit, origin)
+        if not any(frame.origin):
+            frame = frame._replace(origin=as_origin("origin", np.array(POSITION_SIGNS) * whole.origin + 0.0))
+        found = Scene(half_turned(whole.gaussians), said, *frame)
         by = self._document["asset"].get("generator")
         return HALF_TURN_ABOUT_Y.scene(found) if str(by).startswith(ABOUT_Z) else found
 
     def _facts(self) -> tuple[bool | None, SceneFrame]:
-        """Return the metadata of our own files: whether to render antialiased; up, unit and origin."""
+        """Return the metadata of our own files: whether to render antialiased, and the frame."""
         extras = self._document["asset"].get("extras", {})
         antialiased = extras.get("antialiased")
         if antialiased not in (None, True, False):
@@ -116,8 +116,7 @@ class _File(GlbFile):
 
     def _is_ours(self, frame: SceneFrame, placed: Sequence[Placed]) -> bool:
         """Return whether the nodes still have the transform that we wrote for a frame."""
-        up, _, origin = frame
-        root = root_matrix(up, origin)
+        root = root_matrix(frame.up, frame.origin)
         ours = self._document["asset"].get("generator") == GENERATOR
         return ours and all(is_same(part.matrix, root) for part in placed)
 
@@ -136,15 +135,14 @@ class _File(GlbFile):
 
     def _moved(self, part: Placed, root: Float64[np.ndarray, "4 4"]) -> Scene:
         """Return the splats of a primitive in glTF's world, or in the root's coordinates if it has its transform."""
-        kind = part.primitive["extensions"][EXTENSION]
+        extensions = part.primitive["extensions"]
+        kind = extensions.get(EXTENSION, {})
         for name, only in KNOWN.items():
             if (value := kind.get(name, only)) != only:
                 self._refuse(f"has splats of {name} {str(value)[:40]}, but only {only} is supported")
-        own = (
-            self._packed(kind["extensions"][SPZ_EXTENSION])
-            if _is_packed(kind)
-            else self._plain(part.primitive)
-        )
+        within = {**extensions, **kind.get("extensions", {})}
+        packed = next((within[name] for name in (*SPZ_DRAFTS, SPZ_ALONE) if name in within), None)
+        own = self._plain(part.primitive) if packed is None else self._packed(packed)
         return moved(self._path, own, part.matrix, root)
 
     def _packed(self, extension: Mapping[str, Any]) -> Scene:
@@ -184,11 +182,7 @@ class _File(GlbFile):
 
 
 def _is_splats(primitive: Mapping[str, Any]) -> bool:
-    return EXTENSION in primitive.get("extensions", {})
-
-
-def _is_packed(kind: Mapping[str, Any]) -> bool:
-    return SPZ_EXTENSION in kind.get("extensions", {})
+    return not {EXTENSION, SPZ_ALONE}.isdisjoint(primitive.get("extensions", {}))
 
 
 def _gaussians(path: Path, arrays: Mapping[str, Float32[np.ndarray, "N C"]]) -> Gaussians:

@@ -75,8 +75,8 @@ def _frame(asset: dict[str, Any]) -> tuple[str | None, Vector | None]:
     """Return the unit and the scene's up direction: metres and None, except for our files."""
     if asset.get("generator") != GENERATOR:
         return "m", None
-    up, unit, _ = read_extras(asset.get("extras"))
-    return unit, up
+    frame = read_extras(asset.get("extras"))
+    return frame.unit, frame.up
 
 
 def _merged(points: Float64[np.ndarray, "N 3"]) -> tuple[Int64[np.ndarray, " V"], Int64[np.ndarray, " N"]]:

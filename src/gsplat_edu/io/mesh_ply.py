@@ -80,7 +80,7 @@ def read(path: Path) -> StoredMesh:
     data = read_bytes(path)
     file = BytesIO(data)
     header = read_elements(path, file)
-    _, _, unit, _ = read_comments(path, header.comments)
+    unit = read_comments(path, header.comments)[1].unit
     by_name = {element.name: element for element in header.elements}
     vertex, face = by_name.get("vertex"), by_name.get("face")
     if vertex is None or not set(COORDINATES) <= set(vertex.names):

@@ -90,9 +90,9 @@ def read(path: Path, finite: bool = True) -> Scene:
         header = read_elements(path, file)
     if any("packed_position" in element.names for element in header.elements):
         return compressed_ply.read(path)
-    antialiased, up, unit, origin = read_comments(path, header.comments)
-    gaussians, found = _load(path, finite, origin)
-    return Scene(gaussians, antialiased, up, unit, found)
+    antialiased, frame, is_placed = read_comments(path, header.comments)
+    gaussians, origin = _load(path, finite, frame.origin if is_placed else None)
+    return Scene(gaussians, antialiased, *frame._replace(origin=origin))
 
 
 def write(path: Path, scene: Scene) -> None:

@@ -5,8 +5,10 @@
     comment gsplat_edu up 0.0 -1.0 0.0
     comment gsplat_edu unit m
     comment gsplat_edu origin 500000.0 4649776.0 120.0
+    comment gsplat_edu earth EPSG:32633 1.0 0.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 0.0 1.0 0.0
 
-The origin has to be added, in double, to the coordinates of the vertices; other readers see the scene near zero.
+The origin has to be added, in double, to the coordinates of the vertices; other readers see the scene near zero. The
+last line says where on earth their sum is (`gsplat_edu.scene.earth`).
 
 Each line is written if its value is known. There is no standard spelling for antialiasing: Brush writes and reads the
 first line ("default" without antialiasing), Postshot writes the second, PlayCanvas' splat-transform reads both since
@@ -20,8 +22,9 @@ import re
 from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
-from gsplat_edu.io.scene import Scene, direction
-from gsplat_edu.scene.frame import ORIGIN, UNITS, Vector, as_origin
+from gsplat_edu.io.scene import Scene, SceneFrame, direction
+from gsplat_edu.scene.earth import Earth
+from gsplat_edu.scene.frame import ORIGIN, UNITS, as_origin
 
 OURS = "gsplat_edu"
 """First word of comments that are specific to this package."""
@@ -45,13 +48,13 @@ def comments(scene: Scene) -> list[str]:
         lines.append(f"comment {OURS} unit {scene.unit}")
     if scene.origin != ORIGIN:
         lines.append(f"comment {OURS} origin {' '.join(repr(float(x)) for x in scene.origin)}")
+    if scene.earth is not None:
+        lines.append(f"comment {OURS} earth {scene.earth}")
     return lines
 
 
-def read_comments(
-    path: Path, said: tuple[tuple[str, ...], ...]
-) -> tuple[bool | None, Vector | None, str | None, Vector | None]:
-    """Parse the comments of a header: whether the scene is antialiased, its up direction, its unit, and its origin.
+def read_comments(path: Path, said: tuple[tuple[str, ...], ...]) -> tuple[bool | None, SceneFrame, bool]:
+    """Parse the comments of a header: whether the scene is antialiased, its frame, and whether the origin is stated.
 
     Args:
         path: The file, for messages.
@@ -60,23 +63,28 @@ def read_comments(
     Raises:
         SceneFormatError: one of our comments is malformed.
     """
-    antialiased, up, unit, origin = None, None, None, None
+    antialiased, frame, placed = None, SceneFrame(), False
     for words in said:
         if found := ANTIALIASED.fullmatch(" ".join(words).lower()):
             mode, number = found.groups()
             antialiased = RENDER_MODES[mode] if mode else number == "1"
         elif words[:2] == (OURS, "up"):
-            up = direction(_numbers(words[2:]))
-            if up is None:
+            frame = frame._replace(up=direction(_numbers(words[2:])))
+            if frame.up is None:
                 raise _malformed(path, words, "a direction")
         elif words[:2] == (OURS, "origin"):
             try:
-                origin = as_origin("origin", _numbers(words[2:]) or ())
+                frame, placed = frame._replace(origin=as_origin("origin", _numbers(words[2:]) or ())), True
             except ArgumentError:
                 raise _malformed(path, words, "an origin") from None
         elif words[:2] == (OURS, "unit") and len(words) == 3 and words[2] in UNITS:
-            unit = words[2]
-    return antialiased, up, unit, origin
+            frame = frame._replace(unit=words[2])
+        elif words[:2] == (OURS, "earth"):
+            try:
+                frame = frame._replace(earth=Earth.parsed(" ".join(words[2:])))
+            except ArgumentError:
+                raise _malformed(path, words, "a place on earth") from None
+    return antialiased, frame, placed
 
 
 def _numbers(words: tuple[str, ...]) -> list[float] | None:

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from gsplat_edu.base.validation import ArrayLike
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.frame import ORIGIN, UNITS, Vector, as_origin, origin_of
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -28,6 +29,7 @@ class Scene:
         up: The scene's up direction, of length 1; None if unknown.
         unit: What one unit of the coordinates is, "m", "cm" or "mm"; None if unknown.
         origin: Position of the means' zero in the capture's coordinates, double; see `gsplat_edu.scene.frame`.
+        earth: Where on earth the coordinates are; None if unknown.
     """
 
     gaussians: Gaussians
@@ -35,6 +37,12 @@ class Scene:
     up: Vector | None = None
     unit: str | None = None
     origin: Vector = ORIGIN
+    earth: Earth | None = None
+
+    @property
+    def frame(self) -> SceneFrame:
+        """What is known of its coordinates."""
+        return SceneFrame(self.up, self.unit, self.origin, self.earth)
 
     def relative_to(self, origin: ArrayLike) -> Gaussians:
         """Return the Gaussians with means relative to another origin, computed in double: unchanged if it is the same.
@@ -53,6 +61,15 @@ class Scene:
         return replace(self.gaussians, means=moved)
 
 
+class SceneFrame(NamedTuple):
+    """What is known of a scene's coordinates, as for `Scene`."""
+
+    up: Vector | None = None
+    unit: str | None = None
+    origin: Vector = ORIGIN
+    earth: Earth | None = None
+
+
 def split_origin(means: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "N 3"], Vector]:
     """Split positions into an origin and coordinates that float32 resolves; see `origin_of`.
 
@@ -67,37 +84,38 @@ def split_origin(means: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "N 
     return (means - origin if origin.any() else means), (x, y, z)
 
 
-def extras(up: Vector | None, unit: str | None, origin: Vector) -> dict[str, Any]:
-    """Return what is known of a scene's frame as JSON: "up", "unit" and "origin", in this package's axes.
+def extras(frame: SceneFrame) -> dict[str, Any]:
+    """Return what is known of a scene's frame as JSON: "up", "unit", "origin" and "earth", in this package's axes.
 
     Args:
-        up: As for `Scene`.
-        unit: As for `Scene`.
-        origin: As for `Scene`.
+        frame: The scene's.
     """
     found: dict[str, Any] = {}
-    if up is not None:
-        found["up"] = [float(x) for x in up]
-    if unit is not None:
-        found["unit"] = unit
-    if origin != ORIGIN:
-        found["origin"] = [float(x) for x in origin]
+    if frame.up is not None:
+        found["up"] = [float(x) for x in frame.up]
+    if frame.unit is not None:
+        found["unit"] = frame.unit
+    if frame.origin != ORIGIN:
+        found["origin"] = [float(x) for x in frame.origin]
+    if frame.earth is not None:
+        found["earth"] = str(frame.earth)
     return found
 
 
-def read_extras(found: object) -> tuple[Vector | None, str | None, Vector]:
-    """Return up, unit and origin from the JSON that `extras` made.
+def read_extras(found: object) -> SceneFrame:
+    """Return a scene's frame from the JSON that `extras` made.
 
     Args:
         found: The JSON; what another program stores there counts as unknown.
 
     Raises:
-        ValueError: an origin is none; without it, the scene would lie elsewhere.
+        ValueError: an origin or a place on earth is none; without it, the scene would lie elsewhere.
     """
     entry: Mapping[str, Any] = found if isinstance(found, dict) else {}
     unit = entry.get("unit")
     origin = ORIGIN if entry.get("origin") is None else as_origin("origin", entry["origin"])
-    return direction(entry.get("up")), unit if unit in UNITS else None, origin
+    earth = Earth.parsed(entry.get("earth"))
+    return SceneFrame(direction(entry.get("up")), unit if unit in UNITS else None, origin, earth)
 
 
 def direction(found: object) -> Vector | None:

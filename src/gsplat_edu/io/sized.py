@@ -139,6 +139,10 @@ class Ranked:
         """Return the number of splats."""
         return len(self.gaussians)
 
+    def most_important(self, count: int) -> Int64[np.ndarray, " M"]:
+        """Return the indices of the most important splats, increasing; all if there are not more."""
+        return np.sort(self._order[:count])
+
     def steps(self, setting: Setting) -> int:
         """Return the last step of a setting, with which the scene is whole."""
         return 2 * len(self) - self._with_harmonics(len(self), setting)
@@ -146,7 +150,7 @@ class Ranked:
     def part(self, setting: Setting, step: int) -> Part:
         """Return what a file of a setting holds at a step."""
         count = min(step, len(self))
-        rows: Int64[np.ndarray, " M"] = np.sort(self._order[:count])
+        rows = self.most_important(count)
         gaussians = self.gaussians[torch.from_numpy(rows)]
         if setting.sh_degree < gaussians.sh_degree:
             coefficients = num_coefficients(setting.sh_degree) - 1

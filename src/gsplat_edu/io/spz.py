@@ -149,11 +149,11 @@ def read(path: Path) -> Scene:
     """
     stored, extensions = _opened(path, read_bytes(path))
     try:
-        up, unit, origin = read_extras(parse_json(extensions.get(FRAME, b"{}")))
+        frame = read_extras(parse_json(extensions.get(FRAME, b"{}")))
     except ValueError:
         raise _damaged(path, "its extension with the origin cannot be read") from None
-    gaussians = half_turned(_turned(stored.gaussians, up, back=True))
-    return Scene(gaussians, stored.antialiased, up or WORLD_UP, unit, origin)
+    gaussians = half_turned(_turned(stored.gaussians, frame.up, back=True))
+    return Scene(gaussians, stored.antialiased, *frame._replace(up=frame.up or WORLD_UP))
 
 
 def in_own_axes(path: Path, data: bytes) -> Scene:
@@ -378,7 +378,7 @@ def packed(scene: Scene, precision: Precision = FULL) -> bytes:
 
 def _frame_record(scene: Scene) -> bytes:
     """Return the extension with the scene's frame; nothing if the frame is that of the format."""
-    found = extras(None if scene.up == WORLD_UP else scene.up, scene.unit, scene.origin)
+    found = extras(scene.frame._replace(up=None) if scene.up == WORLD_UP else scene.frame)
     if not found:
         return b""
     content = json.dumps(found, separators=(",", ":"), sort_keys=True).encode("ascii")

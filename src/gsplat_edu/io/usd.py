@@ -38,10 +38,10 @@ from gsplat_edu.io.axes import POSITION_SIGNS, half_turned, root_transform
 from gsplat_edu.io.edit import joined
 from gsplat_edu.io.glb_container import GENERATOR, refuse
 from gsplat_edu.io.node_splats import Activated, is_same, moved, root_matrix
-from gsplat_edu.io.scene import Scene, extras, read_extras
+from gsplat_edu.io.scene import Scene, SceneFrame, extras, read_extras
 from gsplat_edu.io.usd_package import require_usd, write_package
 from gsplat_edu.io.usd_stage import MARK, SH, opened
-from gsplat_edu.scene.frame import ORIGIN, as_origin
+from gsplat_edu.scene.frame import as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 
 STARTS = {".usda": b"#usda ", ".usdc": b"PXR-USDC", ".usdz": b"PK\x03\x04"}
@@ -133,7 +133,7 @@ def _layer(scene: Scene, values: Activated, *, filled: bool = True) -> Iterator[
 
 def _mark(scene: Scene) -> Iterator[str]:
     """Yield the lines of our dictionary, in the order of the alphabet."""
-    known: dict[str, Any] = {"generator": GENERATOR, **extras(scene.up, scene.unit, scene.origin)}
+    known: dict[str, Any] = {"generator": GENERATOR, **extras(scene.frame)}
     if scene.antialiased is not None:
         known["antialiased"] = scene.antialiased
     for key in sorted(known):
@@ -221,27 +221,28 @@ def read(path: Path) -> Scene:
         refuse(path, facts["fault"])
     known = facts["mark"] or {}
     try:
-        up, unit, origin = read_extras(known)
+        frame = read_extras(known)
     except ValueError:
-        refuse(path, "has an origin that is none")
+        refuse(path, "has an origin or a place on earth that is none")
     if (antialiased := known.get("antialiased")) not in (None, True, False):
         refuse(path, f"says antialiased is {antialiased!r}"[:80])
     matrices = [np.array(prim["matrix"]) for prim in facts["prims"]]
-    root, whole = root_matrix(up, origin), np.eye(4)
+    root, whole = root_matrix(frame.up, frame.origin), np.eye(4)
     if not (known and facts["up"] == "Y" and all(is_same(matrix, root) for matrix in matrices)):
-        up, origin, root = None, ORIGIN, np.eye(4)
+        frame, root = SceneFrame(unit=frame.unit), np.eye(4)
         whole = Z_TO_Y if facts["up"] == "Z" else whole
-    if not (known and facts["meters"] == METERS.get(unit or "m")):
+    if not (known and facts["meters"] == METERS.get(frame.unit or "m")):
         unit, size = _unit(path, facts["meters"])
+        frame = frame._replace(unit=unit, earth=None)
         whole = np.diag([size, size, size, 1.0]) @ whole
     parts = [
         moved(path, Scene(_gaussians(path, prim, values)), whole @ matrix, root)
         for prim, matrix, values in zip(facts["prims"], matrices, arrays, strict=True)
     ]
     scene = joined(parts)
-    if not any(origin):
-        origin = as_origin("origin", np.array(POSITION_SIGNS) * scene.origin + 0.0)
-    return Scene(half_turned(scene.gaussians), antialiased, up, unit, origin)
+    if not any(frame.origin):
+        frame = frame._replace(origin=as_origin("origin", np.array(POSITION_SIGNS) * scene.origin + 0.0))
+    return Scene(half_turned(scene.gaussians), antialiased, *frame)
 
 
 def _unit(path: Path, meters: float | None) -> tuple[str | None, float]:

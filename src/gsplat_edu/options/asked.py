@@ -1,47 +1,49 @@
-"""Options of `gsplat-edu train` that ask something of a part of the training beside its settings."""
+"""Options of `gsplat-edu train` that ask something of a part of the training besides its settings."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from pathlib import Path
 
-from gsplat_edu.options.depth import add_depth, check_depth
-from gsplat_edu.scene.given_depth import CAPTURE_AS_DEPTH, POINTS_AS_DEPTH
-from gsplat_edu.train.setting import PURPOSE, Plain
+from gsplat_edu.base.text import option_flag
+from gsplat_edu.train.part import questions
+from gsplat_edu.train.setting import Question
 
-ASKED = {"given_depth": "depth", "floaters": "clean"}
-"""The options, by part."""
-
-OFFERED_ASKED = {
-    "depth": Plain(
-        "Depth to learn from",
-        {
-            "": "none",
-            POINTS_AS_DEPTH: "the points that photos share",
-            CAPTURE_AS_DEPTH: "the capture's own depth maps",
-        },
-        PURPOSE,
-    ),
-    "clean": None,
-}
+OFFERED_ASKED = {question.name: question.plain for question in questions().values()}
 """How pages ask for them, as `gsplat_edu.options.train.OFFERED` has it."""
 
-
-COMMON_ASKED = ("clean",)
+COMMON_ASKED = tuple(question.name for question in questions().values() if question.common)
 """Those that `--help` shows."""
 
 
 def add_of_photos(group: argparse._ActionsContainer) -> None:
-    """Add the options that say what else there is beside the photos."""
-    add_depth(group, "learn from depth")
+    """Add the options that say what else there is besides the photos: those that are paths."""
+    for question in questions().values():
+        if question.metavar:
+            _add(group, question, question.help)
 
 
 def add_of_results(group: argparse._ActionsContainer) -> None:
-    """Add the options that change the trained scene."""
-    group.add_argument(
-        "--clean",
-        action="store_true",
-        help="remove floaters and splats that no camera sees from the trained scene, as `gsplat-edu clean` does",
-    )
+    """Add the options that change the trained scene: the switches."""
+    for question in questions().values():
+        if not question.metavar:
+            _add(group, question, question.help)
+
+
+def add_about_capture(group: argparse._ActionsContainer) -> None:
+    """Add those that are also asked about a capture that is not trained."""
+    for question in questions().values():
+        if question.about_capture:
+            _add(group, question, question.about_capture)
+
+
+def _add(group: argparse._ActionsContainer, question: Question, text: str) -> None:
+    flag = option_flag(question.name)
+    if question.metavar:
+        group.add_argument(flag, type=Path, metavar=question.metavar, help=text)
+    else:
+        group.add_argument(flag, action="store_true", help=text)
 
 
 def check_asked(arguments: argparse.Namespace) -> None:
@@ -50,7 +52,9 @@ def check_asked(arguments: argparse.Namespace) -> None:
     Raises:
         ArgumentError: a folder does not exist.
     """
-    check_depth(arguments.depth)
+    for _, question, value in _given(arguments):
+        if question.metavar:
+            question.check(value)
 
 
 def asked_of(arguments: argparse.Namespace) -> dict[str, str]:
@@ -59,5 +63,20 @@ def asked_of(arguments: argparse.Namespace) -> dict[str, str]:
     Args:
         arguments: Those of a command that has some of the options.
     """
-    values = {part: getattr(arguments, name, None) for part, name in ASKED.items()}
-    return {part: "" if value is True else str(value) for part, value in values.items() if value}
+    return {part: str(value) if question.metavar else "" for part, question, value in _given(arguments)}
+
+
+def words_asked(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return the words of the command line that ask the same."""
+    return tuple(
+        word
+        for _, question, value in _given(arguments)
+        for word in (option_flag(question.name), *((str(value),) if question.metavar else ()))
+    )
+
+
+def _given(arguments: argparse.Namespace) -> Iterator[tuple[str, Question, Path]]:
+    """Yield part, option and value of each option that is given."""
+    for part, question in questions().items():
+        if value := getattr(arguments, question.name, None):
+            yield part, question, value

@@ -10,6 +10,8 @@ from gsplat_edu.base.text import option_flag
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.options.values import whole_number_text
 from gsplat_edu.runs.blocks_folder import MOST_BLOCKS, PLAN
+from gsplat_edu.train.config import WITH_OPTION
+from gsplat_edu.train.part import questions
 
 LEAST_VIEWS = 50
 """Default of --min-views."""
@@ -25,10 +27,11 @@ SPLIT, MERGE = UNTIL = ("split", "merge")
 
 UNUSED = {
     "points": "the coarse model starts from the capture's points",
-    "depth": "train the capture as a whole, with --resolution",
     "time_limit": "give --iterations or --quality",
     "max_memory": "use more blocks, or --resolution",
-    "refine": "refine the cameras of the whole first, with --resolution",
+    "view": "watch the table",
+    **{name: option.instead_in_blocks for name, option in WITH_OPTION.items() if option.instead_in_blocks},
+    **{each.name: each.instead_in_blocks for each in questions().values() if each.instead_in_blocks},
 }
 """Options of train that do not go with --blocks, and what to do instead."""
 
@@ -146,11 +149,8 @@ def check_blocks(arguments: argparse.Namespace) -> None:
             if getattr(arguments, name):
                 raise ArgumentError(f"--{name}: does not go with --until split; {advice}")
     for name, advice in UNUSED.items():
-        if getattr(arguments, name) not in (None, "none"):
+        if getattr(arguments, name) not in (None, False, "none"):
             raise ArgumentError(f"{option_flag(name)}: does not go with --blocks; {advice}")
-    for name, advice in (("view", "watch the table"), ("clean", "run `gsplat-edu clean` on the merged run")):
-        if getattr(arguments, name):
-            raise ArgumentError(f"--{name}: does not go with --blocks; {advice}")
     for name in ("min_views", "coarse_iterations", "workers"):
         if getattr(arguments, name, None) is not None:
             whole_number(option_flag(name), getattr(arguments, name), 1)

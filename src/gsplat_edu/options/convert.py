@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.base.constants import SH_MAX_DEGREE, SIZED
+from gsplat_edu.base.constants import SCENE_SUFFIXES, SH_MAX_DEGREE, SIZED
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.options.values import (
@@ -63,9 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "out",
         type=Path,
         metavar="OUT",
-        help="file to write; its suffix selects the format: .ply, .compressed.ply, .splat, .ksplat, .spz, .sog, .glb,"
-        " .usda, .usdz, .usdc (extra usd), .csv or .html (a page that shows the scene); FOLDER/meta.json writes an"
-        " unzipped SOG, FOLDER/lod-meta.json levels of detail (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
+        help=f"file to write; its suffix selects the format: {', '.join(SCENE_SUFFIXES)} or .html (a page that shows"
+        " the scene); .usdc needs the extra usd; FOLDER/meta.json writes an unzipped SOG, FOLDER/lod-meta.json levels"
+        " of detail (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
     )
     parser.add_argument("--merge", action="store_true", help="join several scenes into one")
     _add_filters(parser)
@@ -115,7 +115,8 @@ def _add_filters(parser: argparse.ArgumentParser) -> None:
         type=bytes_text,
         metavar="BYTES",
         help="write the best file of at most this size, as 500kB, 2MB or 1.5MiB, and at least 99 %% of it: with the"
-        f" splats that its pictures show most, stored as finely as fits; for {', '.join(SIZED)}",
+        " splats that its pictures show most, or fewer that were merged, stored as finely as fits, and trained on for"
+        f" a minute or two on the photos of a run; for {', '.join(SIZED)}",
     )
     parser.add_argument(
         "--crop",
@@ -153,7 +154,7 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
         "--dataset",
         type=Path,
         metavar="PATH",
-        help=f"the run's capture if it has moved, for --verify {VERIFY_PHOTOS}",
+        help=f"the run's capture if it has moved, for --size and --verify {VERIFY_PHOTOS}",
     )
 
 
@@ -210,8 +211,10 @@ def check(arguments: argparse.Namespace) -> None:
             raise ArgumentError(
                 f"--verify {VERIFY_PHOTOS}: is for the page of one run; convert one at a time"
             )
-    elif arguments.dataset is not None:
-        raise ArgumentError(f"--dataset: has an effect only with --verify {VERIFY_PHOTOS}; add it")
+    elif arguments.dataset is not None and arguments.size is None:
+        raise ArgumentError(
+            f"--dataset: has an effect only with --size or --verify {VERIFY_PHOTOS}; add one of them"
+        )
     _check_size(arguments)
     if arguments.dataset is not None and not arguments.dataset.exists():
         raise DatasetError(f"--dataset: {arguments.dataset} does not exist; give the folder of a capture")

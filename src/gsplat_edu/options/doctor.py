@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.options.depth import add_depth, check_depth
+from gsplat_edu.options.asked import add_about_capture, check_asked
 from gsplat_edu.options.poses import add_poses, add_trust, posed_by
 from gsplat_edu.options.values import add_backend, number_text, whole_number_text
 from gsplat_edu.train.length import DEFAULT_QUALITY
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="R",
         help="resolution of the forecast training: a divisor below 32, or the longest side in px",
     )
-    add_depth(before, "also judge the depth")
+    add_about_capture(before)
     after = parser.add_argument_group("after training")
     after.add_argument(
         "--dataset",
@@ -63,4 +63,4 @@ def check(arguments: argparse.Namespace) -> None:
     DataSettings(resolution=arguments.resolution)
     if arguments.iterations is not None:
         whole_number("--iterations", arguments.iterations, 1)
-    check_depth(arguments.depth)
+    check_asked(arguments)

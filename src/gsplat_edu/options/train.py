@@ -84,6 +84,11 @@ OFFERED = {
         },
         PHOTOS,
     ),
+    "trust_poses": Plain(
+        "Poses",
+        {"": "correct those that the photos show to be misread", "true": "use them as their file has them"},
+        PHOTOS,
+    ),
     **OFFERED_ASKED,
     **{setting.name: setting.option.plain for setting in SETTINGS if setting.option and setting.is_single},
     **dict.fromkeys(("quality", "resume", "test_every", "panorama", "scale", "eval_every", "save_every")),

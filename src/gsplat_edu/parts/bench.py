@@ -14,7 +14,7 @@ from gsplat_edu.evaluate.alignment import TensorRenderer, aligned_psnr
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.compose import training
-from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.train.config import TrainConfig, short_config
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.part import parts
 from gsplat_edu.train.trainer import Trainer
@@ -119,7 +119,5 @@ def pilot_config(config: TrainConfig, **changes: Any) -> TrainConfig:  # noqa: A
         config: The run's configuration.
         changes: What the pilot tries.
     """
-    alike = ("lens_rate", "appearance", "background", "jacobian_limit", "antialiased", "seed")
-    settings = {name: getattr(config, name) for name in alike}
     cap = min(config.max_gaussians or PILOT_CAP, PILOT_CAP)
-    return recipe(PILOT_STEPS, **{"strategy": "fast", "max_gaussians": cap, **settings, **changes})
+    return short_config(config, PILOT_STEPS, **{"max_gaussians": cap, **changes})

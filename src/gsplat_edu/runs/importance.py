@@ -52,19 +52,31 @@ class Importance:
 
 
 def importance_of(source: Source, progress: Callable[[], object] = lambda: None) -> Importance:
-    """Measure the importance of each splat.
+    """Measure the importance of each splat, and render the judges.
 
     Args:
         source: The scene, at least one splat.
         progress: Called after every camera of `MOST_CAMERAS`.
     """
-    gaussians = source.scene.gaussians
-    splats = visible_area(gaussians)
-    if source.cameras:
-        cameras = [camera for _, camera in source.probes(MOST_CAMERAS, SIDE)]
-        total, largest = visible_weights(gaussians, cameras, source.settings, load_backend(BACKEND), progress)
-        splats = total * largest
-    return Importance(splats, _renders(source))
+    return Importance(splat_importance(source, source.scene.gaussians, progress), _renders(source))
+
+
+def splat_importance(
+    source: Source, gaussians: Gaussians, progress: Callable[[], object] = lambda: None
+) -> Float64[np.ndarray, " N"]:
+    """Measure the importance of each of N splats, for example of merged ones.
+
+    Args:
+        source: The scene that they stand for: its cameras and settings.
+        gaussians: The splats, at least one.
+        progress: Called after every camera of `MOST_CAMERAS`.
+    """
+    if not source.cameras:
+        return visible_area(gaussians)
+    cameras = [camera for _, camera in source.probes(MOST_CAMERAS, SIDE)]
+    total, largest = visible_weights(gaussians, cameras, source.settings, load_backend(BACKEND), progress)
+    found: Float64[np.ndarray, " N"] = total * largest
+    return found
 
 
 def visible_area(gaussians: Gaussians) -> Float64[np.ndarray, " N"]:

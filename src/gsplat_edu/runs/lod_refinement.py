@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import FROM_SCENE, recipe
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.trainer import Trainer
 
 MOST_JUDGED = 8
 """Largest number of views that a level is scored on."""
@@ -111,11 +114,13 @@ def refine_levels(
     scores = []
     for level in range(len(leaves[0].levels)):
         factor = min(2.0 ** (level / 2), LARGEST_FACTOR)
-        views = _renders(source, factor, backend) if run is None else _photos(source, run, factor, backend)
+        views = (
+            _renders(source, factor, backend) if run is None else photos_of_run(source, run, factor, backend)
+        )
         merged = level_of(root, level)
         before = after = _score(source, merged, views[1] or views[0], backend)
         if level:
-            refined = _trained(source, merged, views[0], steps, backend)
+            refined = retrained(source, merged, views[0], steps, backend)
             after = _score(source, refined, views[1] or views[0], backend)
             if after > before:
                 changed[level] = _split(refined, [len(leaf.levels[level]) for leaf in leaves])
@@ -132,19 +137,33 @@ def _split(gaussians: Gaussians, sizes: Sequence[int]) -> list[Gaussians]:
     ]
 
 
-def _photos(source: Source, run: RunFolder, factor: float, backend: str) -> Split:
-    """Return the run's photos, reduced, at the cameras and the exposure of its scene."""
+def photos_of_run(
+    source: Source, run: RunFolder, factor: float, backend: str, capture: Path | None = None
+) -> Split:
+    """Return a run's photos, reduced, at the cameras and the exposure of its scene.
+
+    Args:
+        source: The scene.
+        run: Its run.
+        factor: By how much they are reduced.
+        backend: What renders the scene to compare exposures.
+        capture: Where the photos are now; None for where they were.
+
+    Raises:
+        CheckpointError: the run is damaged, or does not say where its capture is.
+        DatasetError: the capture cannot be read.
+    """
     config = run.read_config()
     settings = data_settings(config)
     reduced = replace(settings, resolution=_reduced(settings.resolution, factor))
     config["data"] = {**config["data"], "resolution": reduced.resolution}
-    dataset = run_dataset(config)
+    dataset = run_dataset(config, capture)
     known = dict(source.cameras)
     train, test = (
         tuple(view.with_camera(_posed(view.camera, known.get(view.name))) for view in views)
         for views in (dataset.train, dataset.test)
     )
-    dataset = replace(dataset, train=train, test=_spread(test))
+    dataset = replace(dataset, train=train, test=spread(test))
     shown = source.scene.gaussians.to(device_of(backend))
     dataset = Compared(dataset, shown, source.settings, load_backend(backend)).photos(stored_config(config))
     return dataset.train, dataset.test
@@ -162,7 +181,8 @@ def _posed(camera: Camera, known: Camera | None) -> Camera:
     return camera if known is None else Camera.posed(known.R, known.eye, camera.intrinsics, camera.shutter)
 
 
-def _spread(views: Sequence[View]) -> tuple[View, ...]:
+def spread(views: Sequence[View]) -> tuple[View, ...]:
+    """Return at most `MOST_JUDGED` views, evenly from all."""
     count = min(len(views), MOST_JUDGED)
     return tuple(views[i * len(views) // count] for i in range(count))
 
@@ -182,9 +202,27 @@ def _renders(source: Source, factor: float, backend: str) -> Split:
     return [view for i, view in enumerate(views) if i % EVERY], held
 
 
-def _trained(
-    source: Source, gaussians: Gaussians, views: Sequence[View], steps: int, backend: str
+def retrained(
+    source: Source,
+    gaussians: Gaussians,
+    views: Sequence[View],
+    steps: int,
+    backend: str,
+    progress: Callable[[], object] = lambda: None,
 ) -> Gaussians:
+    """Train splats that stand for a scene, without density control.
+
+    Args:
+        source: The scene: its render settings are those of the training.
+        gaussians: The splats, relative to the scene's origin.
+        views: The photos.
+        steps: Iterations.
+        backend: What trains.
+        progress: Called after every step.
+
+    Returns:
+        As many splats in the same order, on the CPU.
+    """
     settings = source.settings
     changes: dict[str, Any] = {**FROM_SCENE}
     config = recipe(
@@ -198,7 +236,12 @@ def _trained(
         jacobian_limit=settings.jacobian_limit,
     )
     trainer = training(config, Views(views), load_backend(backend), Start(gaussians))
-    trainer.run()
+
+    def stepped(trainer: Trainer, event: Event) -> None:
+        if isinstance(event, StepEvent):
+            progress()
+
+    trainer.run(callbacks=[stepped])
     return trainer.gaussians.map(lambda tensor: tensor.detach().cpu())
 
 
@@ -206,6 +249,6 @@ def _score(source: Source, gaussians: Gaussians, views: Sequence[View], backend:
     shown = functools.partial(render, settings=source.settings, backend=backend)
     with torch.no_grad():
         scores = score_views(
-            gaussians.to(device_of(backend)), _spread(views), shown, source.settings.background
+            gaussians.to(device_of(backend)), spread(views), shown, source.settings.background
         )
     return float(summarize(scores)["psnr"] or 0.0)

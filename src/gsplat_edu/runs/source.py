@@ -12,6 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.records import record_of
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.scene import Scene, direction
@@ -19,6 +20,7 @@ from gsplat_edu.paths.orbits import common_up, orbit_of_scene, resized
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.scene.camera import WORLD_UP, Camera
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.frame import ORIGIN, UNITS, Vector, as_origin
 from gsplat_edu.scene.gaussians import Gaussians
 
@@ -138,7 +140,7 @@ def _of_run(folder: RunFolder, path: Path) -> Source:
         cameras = tuple((name, camera) for name, _, camera in known)
         held_out = frozenset(name for name, split, _ in known if split == "test")
     up, unit = up_and_unit(config, [camera for _, camera in cameras])
-    scene = Scene(gaussians, settings.antialiased, up, unit, origin)
+    scene = Scene(gaussians, settings.antialiased, up, unit, origin, run_earth(folder, config))
     return Source(path, scene, cameras, settings, held_out)
 
 
@@ -156,6 +158,23 @@ def run_origin(folder: RunFolder, config: Mapping[str, Any]) -> Vector:
         return as_origin("origin", config.get("origin") or ORIGIN)
     except ArgumentError as error:
         raise CheckpointError(f"{folder.config}: {error}; fix the file") from None
+
+
+def run_earth(folder: RunFolder, config: Mapping[str, Any]) -> Earth | None:
+    """Return where on earth a run's coordinates are; None if it is unknown.
+
+    Args:
+        folder: The run.
+        config: The content of its config.json.
+
+    Raises:
+        CheckpointError: the file has no usable place.
+    """
+    try:
+        earth: Earth | None = record_of("", (config.get("scale") or {}).get("earth"), Earth | None)
+    except ArgumentError as error:
+        raise CheckpointError(f"{folder.config}: {error}; fix the file") from None
+    return earth
 
 
 def up_and_unit(config: Mapping[str, Any], cameras: Sequence[Camera]) -> tuple[Vector, str | None]:
@@ -183,9 +202,9 @@ def capture_scene(gaussians: Gaussians, dataset: Dataset, antialiased: bool) -> 
         dataset: The capture.
         antialiased: Whether they were trained for antialiased rendering.
     """
-    unit = None if dataset.scale is None else dataset.scale.unit
+    unit, earth = (None, None) if dataset.scale is None else (dataset.scale.unit, dataset.scale.earth)
     origin = as_origin("origin", dataset.origin)
-    return Scene(gaussians.map(Tensor.detach), antialiased, capture_up(dataset), unit, origin)
+    return Scene(gaussians.map(Tensor.detach), antialiased, capture_up(dataset), unit, origin, earth)
 
 
 def capture_up(dataset: Dataset) -> Vector:

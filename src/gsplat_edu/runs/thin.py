@@ -26,7 +26,7 @@ from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import planned_cap, training
-from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.train.config import TrainConfig, short_config
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.length import usual_iterations
 from gsplat_edu.train.trainer import Trainer
@@ -131,7 +131,7 @@ def try_lengths(
     shifted: dict[int, float] = {}
     cut = False
     for length in LENGTHS:
-        config = _config(options.config, length)
+        config = short_config(options.config, length)
         trainer = training(config, dataclasses.replace(dataset, train=kept), load_backend(options.backend))
 
         def step(trainer: Trainer, event: Event) -> None:
@@ -189,19 +189,3 @@ def _scored(gaussians: Gaussians, judges: Sequence[View], options: RunOptions) -
         score.psnr if not fitted or score.psnr_fitted is None else score.psnr_fitted for score in scores
     ]
     return math.fsum(values) / len(values), math.fsum(shifted) / len(shifted)
-
-
-def _config(config: TrainConfig, iterations: int) -> TrainConfig:
-    """Return the configuration of a trial: the recipe fast with the run's settings that change the image."""
-    return recipe(
-        iterations,
-        strategy="fast",
-        refine=config.refine,
-        appearance=config.appearance,
-        outside_masks=config.outside_masks,
-        background=config.background,
-        jacobian_limit=config.jacobian_limit,
-        antialiased=config.antialiased,
-        sh_degree=config.sh_degree,
-        seed=config.seed,
-    )

@@ -10,8 +10,9 @@ from jaxtyping import Float32
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import ArrayLike, float64_array
 
-POINTS_AS_DEPTH, CAPTURE_AS_DEPTH = "points", "capture"
-"""Sources of depth that are no folder: the points in COLMAP's tracks, and the maps that the capture names."""
+POINTS_AS_DEPTH, CAPTURE_AS_DEPTH, SCAN_AS_DEPTH = "points", "capture", "scan"
+"""Sources of depth that are no folder: the points in COLMAP's tracks, the maps that the capture names, and the point
+cloud that the training starts from."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -24,7 +25,7 @@ class GivenDepth:
         depths: (M,) depth of that projection, above 0, world units: z, or the distance from the camera's centre if the
             projection is `along_ray`.
         weights: (M,) at least 0; how much each depth counts. None for 1 each.
-        sparse: Whether these are the points of a capture instead of the pixels of a map.
+        sparse: Whether these are triangulated points instead of measured depth.
 
     Raises:
         ShapeError: the sizes differ.

@@ -13,9 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.io.edit import Similarity
-
-SEMI_MAJOR, FLATTENING = 6_378_137.0, 1.0 / 298.257223563
-"""The ellipsoid of GPS, m (NIMA TR8350.2, WGS 84). On a sphere, distances would be wrong by up to 0.5 %."""
+from gsplat_edu.scene.earth import earth_centred, local_axes
 
 FEWEST_PLACES = 6
 """Smallest number of photos with a position. A similarity has seven unknowns, and each position gives three numbers."""
@@ -75,23 +73,16 @@ def east_north_up(places: Sequence[tuple[float, float, float]]) -> Float64[np.nd
     Args:
         places: Latitude and longitude in degrees, and height in m, one per photo; at least one.
     """
-    latitude, longitude, height = np.array(places, dtype=np.float64).T
-    phi, lam = np.radians(latitude), np.radians(longitude)
-    e2 = FLATTENING * (2.0 - FLATTENING)
-    across = SEMI_MAJOR / np.sqrt(1.0 - e2 * np.sin(phi) ** 2)
-    flat = (across + height) * np.cos(phi)
-    centred = np.stack(
-        [flat * np.cos(lam), flat * np.sin(lam), (across * (1.0 - e2) + height) * np.sin(phi)], axis=1
-    )
-    a, b = phi[0], lam[0]
-    axes = np.array(
-        [
-            [-np.sin(b), np.cos(b), 0.0],
-            [-np.sin(a) * np.cos(b), -np.sin(a) * np.sin(b), np.cos(a)],
-            [np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)],
-        ]
-    )
-    return np.asarray((centred - centred.mean(axis=0)) @ axes.T)
+    axes, middle = local_frame(places)
+    return np.asarray((earth_centred(places) - middle) @ axes.T)
+
+
+def local_frame(
+    places: Sequence[tuple[float, float, float]],
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    """Return the axes, from earth-centred ones, and the earth-centred zero of `east_north_up`."""
+    latitude, longitude, _ = places[0]
+    return local_axes(latitude, longitude), earth_centred(places).mean(axis=0)
 
 
 def similarity(a: Float64[np.ndarray, "n 3"], b: Float64[np.ndarray, "n 3"]) -> Similarity | None:

@@ -16,8 +16,9 @@ from gsplat_edu.data.native_lens import native_intrinsics
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.io.edit import Similarity
 from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.sfm.align import upright
-from gsplat_edu.sfm.gps import TILT, GpsFit, east_north_up, fit_positions
+from gsplat_edu.sfm.gps import TILT, GpsFit, east_north_up, fit_positions, local_frame
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.scale_text import NONE, Mark, marks_of
 
@@ -116,7 +117,7 @@ def placed(
             f"{fit.residual:.3g} m (median) and spread over {fit.spread:.3g} m; the scale is arbitrary"
         )
         return move, None
-    return _by_gps(move, fit)
+    return _by_gps(move, fit, places)
 
 
 def in_given_world(
@@ -157,8 +158,10 @@ def _measured(sights: Sequence[Sight], choice: str) -> tuple[float, Scale]:
     return given.length / apart, Scale(given.unit, "a given distance", detail)
 
 
-def _by_gps(move: Similarity, fit: GpsFit) -> tuple[Similarity, Scale]:
-    """Take the scale, and up if it is determined, from a fit of GPS positions."""
+def _by_gps(
+    move: Similarity, fit: GpsFit, places: Sequence[tuple[float, float, float]]
+) -> tuple[Similarity, Scale]:
+    """Take the scale, and up and the place on earth if up is determined, from a fit of GPS positions."""
     level = bool(fit.tilt <= TILT)
     count, total = int(fit.inside.sum()), len(fit.inside)
     detail = (
@@ -166,12 +169,15 @@ def _by_gps(move: Similarity, fit: GpsFit) -> tuple[Similarity, Scale]:
     )
     detail += f", scale +-{100 * max(fit.error, 1e-4):.2g} %"
     detail += "; up from GPS, +z is north" if level else "; up from the cameras"
-    found = _rescaled(move, fit.move.s)
+    found, earth = _rescaled(move, fit.move.s), None
     if level:
         origin = -move.R.T @ move.t / move.s  # the point that `upright` moves to the origin
         R = LEVEL @ fit.move.R
         found = Similarity(R, fit.move.s, -fit.move.s * R @ origin)
-    return found, Scale("m", "GPS", detail, level)
+        axes, middle = local_frame(places)
+        zero = fit.move.s * fit.move.R @ origin + fit.move.t  # east, north and up of the new zero
+        earth = Earth.of(axes.T @ LEVEL.T, middle + axes.T @ zero)
+    return found, Scale("m", "GPS", detail, level, earth)
 
 
 def _rescaled(move: Similarity, s: float) -> Similarity:

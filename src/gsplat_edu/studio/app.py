@@ -16,7 +16,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
-from gsplat_edu.base.constants import LOOPBACK
+from gsplat_edu.base.constants import LOOPBACK, SIZED
 from gsplat_edu.options.offers import questions
 from gsplat_edu.server.guard import Guard
 from gsplat_edu.server.patience import Patience
@@ -105,8 +105,8 @@ def application(
 
 
 def _questions() -> Response:
-    """Return what the page asks for a training, as a module; it follows from the options of the command."""
-    text = f"export const GROUPS = {json.dumps(questions('train'))};\n"
+    """Return what the page asks for a training and which exports have a size, as a module; the commands say so."""
+    text = f"export const GROUPS = {json.dumps(questions('train'))};\nexport const SIZED = {json.dumps(SIZED)};\n"
     return Response(text, media_type=TYPES[".js"])
 
 

@@ -27,11 +27,22 @@ def routes() -> list[BaseRoute]:
     """Return the routes; they come before those of `gsplat_edu.studio.scene_routes`."""
     return [
         act("/api/captures/{name}/page", "GET", _page),
+        act("/api/captures/{name}/settle", "POST", _settle),
+        act("/api/captures/{name}/notes", "GET", _notes),
         act("/api/captures/{name}/region", "GET", _region),
         act("/api/captures/{name}/region", "POST", _change_region),
         act("/api/captures/{name}/mask", "GET", _mask),
         act("/api/captures/{name}/mask", "POST", _draw),
     ]
+
+
+def _settle(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    return studio.uploads.settle(request.path_params["name"])
+
+
+def _notes(studio: Studio, request: Request, body: Any) -> Any:  # noqa: ANN401
+    entry = studio.library.entry("captures", request.path_params["name"])
+    return studio.worker.ask("notes", capture=str(entry))
 
 
 def _mask(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401

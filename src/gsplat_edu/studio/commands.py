@@ -13,6 +13,7 @@ from typing import Any
 
 from msgspec import structs
 
+from gsplat_edu.base.constants import SCENE_SUFFIXES
 from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.text import as_file_name, legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
@@ -27,20 +28,7 @@ from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 EDITS = "edits.json"
 """File of an entry with the edits of its scene."""
 
-FORMATS = (
-    "ply",
-    "compressed.ply",
-    "splat",
-    "ksplat",
-    "spz",
-    "sog",
-    "glb",
-    "usda",
-    "usdc",
-    "usdz",
-    "csv",
-    "html",
-)
+FORMATS = (*(suffix.removeprefix(".") for suffix in SCENE_SUFFIXES), "html")
 """Endings of exported scenes."""
 
 SURFACE, COLLIDER = "mesh.glb", "collider.glb"

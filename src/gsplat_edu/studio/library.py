@@ -23,6 +23,7 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.constants import SCENE_SUFFIXES
 from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.base.links import is_inside, links_in, resolved
 from gsplat_edu.base.reading import open_file
@@ -48,7 +49,7 @@ PARTS = (JOBS, "trash", "uploads", "cache")
 EXPORTS = "exports"
 """Folder of an entry with the files that were exported from it."""
 
-SCENE_ENDINGS = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb", ".usda", ".usdc", ".usdz", ".csv")
+SCENE_ENDINGS = tuple(suffix for suffix in SCENE_SUFFIXES if suffix.count(".") == 1)
 """Endings of scene files that can be taken in."""
 
 
@@ -311,6 +312,21 @@ class Library:
             for one in self.trash():
                 if one["entry"] == self.name(path):
                     self._note_source(self.hidden("trash") / one["id"], target / EXPORTS)
+        self.changed()
+        return target
+
+    def move(self, name: str, kind: str, to: str) -> Path:
+        """Make an entry one of another kind.
+
+        Raises:
+            RefusedError: there is none, a job uses it, or the name is taken there.
+        """
+        with self.lock:
+            path = self.entry(kind, name)
+            self._check_free(path)
+            target = self.fresh(to, path.name)
+            path.rename(target)
+            self._promised.discard(path)  # what is made from it may have its name
         self.changed()
         return target
 

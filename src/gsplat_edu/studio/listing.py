@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
 import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +89,8 @@ def search_facts(path: Path) -> dict[str, Any] | None:
 
     Returns:
         photos, the number that it was given; posed, those with a pose, both null for panoramas; unplaced, the names of
-        those without one; and error, the mean reprojection error, px.
+        those without one; beside, for each of these the placed photos before and after it, by name, or null; and error,
+        the mean reprojection error, px.
     """
     file = path / "sfm" / "stages.json"
     try:
@@ -103,15 +106,25 @@ def _search_facts(file: Path, modified: int, size: int) -> dict[str, Any] | None
     try:
         stages = parse_json(read_text(file))["stages"]
         error = float(stages["capture"]["facts"]["error"])
-        given, posed = (len(stages[name]["facts"]["names"]) for name in ("photos", "mapping"))
+        names = sorted(map(str, stages["photos"]["facts"]["names"]))
+        posed = len(stages["mapping"]["facts"]["names"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     if not math.isfinite(error):
         return None
     faces = "faces" in stages
-    counts = {"photos": None if faces else given, "posed": None if faces else posed}
-    unplaced = [legible(name) for name in without_pose(file.parent.parent)]
-    return counts | {"unplaced": unplaced, "error": error}
+    counts = {"photos": None if faces else len(names), "posed": None if faces else posed}
+    unplaced = without_pose(file.parent.parent)
+    placed = sorted(set(names) - set(unplaced))
+    beside = [_neighbours(name, placed) for name in unplaced]
+    return counts | {"unplaced": [*map(legible, unplaced)], "beside": beside, "error": error}
+
+
+def _neighbours(name: str, placed: Sequence[str]) -> list[str | None]:
+    """Return the names before and after one in a sorted list; None beyond its ends."""
+    at = bisect.bisect(placed, name)
+    around = (placed[at - 1] if at else None, placed[at] if at < len(placed) else None)
+    return [None if each is None else legible(each) for each in around]
 
 
 def is_unfinished(path: Path) -> bool:

@@ -16,12 +16,15 @@ from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
+from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import PHOTO_ENDINGS
+from gsplat_edu.data.reader import layout_of
 from gsplat_edu.photos.image_files import is_image
 from gsplat_edu.server.refusal import RefusedError, conflict, too_large
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
-from gsplat_edu.studio.contents import size_of
+from gsplat_edu.studio.contents import files_within, size_of
 from gsplat_edu.studio.library import SCENE_ENDINGS, Library
+from gsplat_edu.studio.listing import is_unfinished
 from gsplat_edu.studio.names import below, checked_path
 from gsplat_edu.studio.unpack import ZipLimits, unpack
 
@@ -30,6 +33,9 @@ COUNTED_FOR = 5.0
 
 EXAMPLE_NAME = "garden"
 """Name of the capture that the studio brings along; `tools/build_example.py` makes it."""
+
+MOST_LEFT_OUT = 50
+"""Files left out that an answer names; of more, it has the number."""
 
 AT_ONCE = 16
 """Uploads that are received at the same time."""
@@ -67,6 +73,11 @@ class Limits:
         }
 
 
+def _is_photo(path: Path) -> bool:
+    """Return whether a file is a photo or a video by its ending."""
+    return path.suffix.lower() in (*PHOTO_ENDINGS, *VIDEO_ENDINGS)
+
+
 class Uploads:
     """Receives files for a library.
 
@@ -81,6 +92,7 @@ class Uploads:
         self._expected = 0  # bytes of the uploads that are being received
         self._running = 0
         self._used: int | None = None
+        self._unsettled: set[Path] = set()  # captures that were begun here; `settle` says what they are
         self._counted = 0.0  # when
 
     def used(self, *, fresh: bool = True) -> int:
@@ -134,7 +146,7 @@ class Uploads:
             raise RefusedError(
                 f"file: {path.name!r} is not a scene; scenes end in {', '.join(SCENE_ENDINGS)}"
             )
-        if kind == "photos" and ending not in (*PHOTO_ENDINGS, *VIDEO_ENDINGS):
+        if kind == "photos" and not _is_photo(path):
             raise RefusedError(
                 f"file: {path.name!r} is neither a photo nor a video by its ending; photos end in"
                 f" {', '.join(PHOTO_ENDINGS)}"
@@ -204,17 +216,52 @@ class Uploads:
         free = max(self._room(), 0)
         zipped = self.limits.zipped
         limits = ZipLimits(zipped.entries, min(zipped.total, free), zipped.ratio, zipped.free)
-        endings = (*PHOTO_ENDINGS, *VIDEO_ENDINGS)
-        wanted = (lambda path: path.suffix.lower() in endings) if kind == "photos" else (lambda path: True)
-        count, left_out = unpack(part, folder, limits, wanted)
+        count, left_out = unpack(part, folder, limits, _is_photo if kind == "photos" else lambda path: True)
         if not count:
             raise RefusedError("zip: holds nothing that can be used; pack photos, or a capture")
+        self._begin(self.library.place(kind, name))
         self.library.publish(folder, kind, name)
         self.recount()
         return {
             "entry": f"{kind}/{name}",
             "files": count,
-            "left_out": left_out[:50],
+            "left_out": left_out[:MOST_LEFT_OUT],
+            "num_left_out": len(left_out),
+        }
+
+    def settle(self, name: str) -> dict[str, Any]:
+        """Decide what a capture is that was just taken in: one with poses that a reader knows, or only photos.
+
+        Without poses, it becomes an entry of photos, without its other files. A capture that was there before this
+        studio was started stays what it is.
+
+        Returns:
+            Its entry, and the names of files that were left out.
+
+        Raises:
+            RefusedError: there is none, it is in use or adopted, or it has neither poses nor photos; then it goes to
+                the trash.
+        """
+        library, left_out = self.library, list[str]()
+        with library.lock:
+            entry = library.entry("captures", name)
+            if entry.is_symlink():
+                raise conflict(f"captures/{entry.name}: is adopted from elsewhere, and stays what it is")
+            kind, is_new = "captures", entry in self._unsettled
+            self._unsettled.discard(entry)
+            if is_new and layout_of(entry) is None and not is_unfinished(entry):
+                kind, paths = "photos", [Path(path) for path, _, _ in files_within(entry)]
+                left_out = sorted(path.as_posix() for path in paths if not _is_photo(path))
+                if len(left_out) == len(paths):
+                    library.discard(entry)
+                    raise RefusedError("upload: holds neither photos nor poses; add photos, or a capture")
+                moved = library.move(name, "captures", kind)
+                for path in left_out:
+                    (moved / path).unlink()
+        self.recount()
+        return {
+            "entry": f"{kind}/{legible(entry.name)}",
+            "left_out": [legible(path) for path in left_out[:MOST_LEFT_OUT]],
             "num_left_out": len(left_out),
         }
 
@@ -269,12 +316,18 @@ class Uploads:
             self._expected += size
             self._running += begins
 
+    def _begin(self, entry: Path) -> None:
+        """Remember an entry that does not exist yet."""
+        if not entry.exists():
+            self._unsettled.add(entry)
+
     def _place(self, part: Path, target: Path) -> None:
         if target.suffix.lower() in PHOTO_ENDINGS and not is_image(part):
             raise RefusedError(f"file: {target.name!r} is not an image that can be read; export it as JPEG")
         size = part.stat().st_size
         with self.library.lock:
             folder = target.parent
+            self._begin(self.library.root / Path(*target.relative_to(self.library.root).parts[:2]))
             if folder.is_dir() and sum(1 for _ in folder.iterdir()) >= self.limits.entry_files:
                 raise too_large(f"file: {folder.name} holds {self.limits.entry_files:,} files already")
             folder.mkdir(parents=True, exist_ok=True)

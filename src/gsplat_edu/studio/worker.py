@@ -317,6 +317,27 @@ def certain(capture: str) -> dict[str, Any]:
         return {"findings": []}
 
 
+def sentence(line: str) -> str:
+    """Return a line that begins with a capital, unless it begins with the name of a file."""
+    return line[:1].upper() + line[1:] if line.partition(" ")[0].isalpha() else line
+
+
+def notes(capture: str) -> dict[str, Any]:
+    """Return what the command line says when it reads a capture: whose poses, of how many photos, which files not.
+
+    Args:
+        capture: Folder of the capture; of one that cannot be read, its training says why.
+    """
+    from gsplat_edu.base.errors import DatasetError
+    from gsplat_edu.data.reader import read_capture
+
+    try:
+        said = [legible(str(note)) for note in read_capture(Path(capture)).notes]
+    except DatasetError:
+        return {"notes": []}
+    return {"notes": [sentence(line) for line in said]}
+
+
 def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
     """Write a photo's thumbnail; see `gsplat_edu.studio.pictures.make_thumbnail`."""
     from gsplat_edu.studio.pictures import make_thumbnail
@@ -348,6 +369,7 @@ def make_view_pictures(comparison: str, outs: dict[str, str], small: bool) -> di
 
 
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {
+    "notes": notes,
     "page": make_page,
     "live_page": make_live_page,
     "capture_page": make_capture_page,

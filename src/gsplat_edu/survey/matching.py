@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from gsplat_edu.data.capture import Frame
 from gsplat_edu.data.lens import PINHOLE_LIKE, Lens
@@ -90,13 +90,25 @@ def features_of(frame: Frame) -> Features:
         counts &= resized_mask(alpha >= 128, h, w)
     if frame.mask is not None:
         counts &= resized_mask(decode_mask(frame.mask), h, w)
+    return features_in(grey, frame.lens, counts)
+
+
+def features_in(grey: UInt8[np.ndarray, "h w"], lens: Lens, counts: Bool[np.ndarray, "h w"]) -> Features:
+    """Detect features in an image.
+
+    Args:
+        grey: (h, w) the image, at most `SIDE` long.
+        lens: The camera's intrinsics, of any size.
+        counts: (h, w) the pixels to look at.
+    """
+    h, w = grey.shape
     detector = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=CONTRAST)
     found, descriptors = detector.detectAndCompute(grey, counts.astype(np.uint8) * 255)
     at = np.array([point.pt for point in found], np.float64).reshape(-1, 2)
     if not found:
         return Features(at, np.zeros((0, 128), np.float32))
     at, first = np.unique(at, axis=0, return_index=True)  # a place with two directions gives two features
-    scale = np.array([frame.lens.W / w, frame.lens.H / h])
+    scale = np.array([lens.W / w, lens.H / h])
     sums = np.maximum(descriptors[first].sum(axis=1, keepdims=True), 1e-9)
     return Features((at + 0.5) * scale - 0.5, np.sqrt(descriptors[first] / sums))
 

@@ -30,7 +30,7 @@ CAUSES = (
     *RANKED,
     *("far points", "unseen points", "few points", "depth", "unexplained"),
     *("moved", "outside cut-outs", "floaters", "huge splats", "one side", "one height", "sky", "masks"),
-    *("resolution", "faint splats"),
+    *("resolution", "faint splats", "overlap", "brightness"),
 )
 """Names of the findings, causes before what they cause; the verdict ranks those of a run. Of two pieces of advice that
 contradict each other, that of the more serious finding counts, and of equally serious ones that of the earlier in this

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.base.validation import ArrayLike
-from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, outside_cut_out, photo_psnr, transparency_of
+from gsplat_edu.evaluate.metrics import Renderer, outside_cut_out, photo_psnr
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.shells import far_shell
@@ -55,7 +55,6 @@ def residuals(
     render: Renderer,
     background: ArrayLike,
     progress: Callable[[], None] = lambda: None,
-    appearance: str = "none",
 ) -> list[Residual]:
     """Render views and compare them with their photos.
 
@@ -65,8 +64,6 @@ def residuals(
         render: Renders Gaussians from a camera, with depth, over `background`.
         background: (3,) RGB behind transparent photos.
         progress: Called after every view.
-        appearance: The training's setting `appearance`: renders first get their photo's exposure, or exposure and
-            vignetting.
 
     Returns:
         In the order of the views.
@@ -86,12 +83,8 @@ def residuals(
                 veiled = _veiled(subject, view, alone, render)
             truth = photo.over(background)
             pixels = truth / 255.0 if truth.dtype == np.uint8 else np.asarray(truth, dtype=np.float64)
-            image = output.image
-            if appearance != "none":
-                shown, vignetting = transparency_of(photo, output, background), appearance == "vignetting"
-                image = at_exposure_of(truth, image, photo.mask, shown, vignetting=vignetting)
-            stops = _stops(pixels, image.double().numpy(force=True), photo.mask)
-            score = photo_psnr(photo, replace(output, image=image), background)
+            stops = _stops(pixels, output.image.double().numpy(force=True), photo.mask)
+            score = photo_psnr(photo, output, background)
             found.append(Residual(view.name, score, stops, veiled, outside_cut_out(photo, output)))
         progress()
     return found

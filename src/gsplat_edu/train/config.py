@@ -123,6 +123,7 @@ class TrainConfig:
         Whole(0),
         "Seed of the view order, splits, relocations, noise, and of the choice of start points over the cap.",
         option=Option(common=True),
+        in_trials=True,
     )
     means_rate: float = number(
         1.6e-4, _not_negative, "Initial learning rate of the means, times the scene's extent.", "2023"
@@ -159,6 +160,7 @@ class TrainConfig:
         "Highest degree of spherical harmonics.",
         "2023",
         option=Option(),
+        in_trials=True,
     )
     sh_every: int = number(
         1_000,
@@ -195,6 +197,7 @@ class TrainConfig:
             ),
             common=True,
         ),
+        in_trials=True,
     )
     sky: str = number(
         "none",
@@ -236,7 +239,9 @@ class TrainConfig:
                 PHOTOS,
                 again="Train and refine the camera positions",
             ),
+            instead_in_blocks="refine the cameras of the whole first, with --resolution",
         ),
+        in_trials=True,
     )
     transients: str = number(
         "none",
@@ -269,15 +274,20 @@ class TrainConfig:
                 again="Train with the other choice for masks",
             ),
         ),
+        in_trials=True,
     )
     pose_spread: float = number(
         1e-2,
         _positive,
         "How far off the given poses are expected to be, radians and fractions of the extent: where photos say little,"
         " they hold.",
+        in_trials=True,
     )
     lens_rate: float = number(
-        2e-4, _not_negative, "Initial learning rate of the intrinsics, relative; it falls to a hundredth."
+        2e-4,
+        _not_negative,
+        "Initial learning rate of the intrinsics, relative; it falls to a hundredth.",
+        in_trials=True,
     )
     region: str = number(
         "capture",
@@ -291,6 +301,7 @@ class TrainConfig:
         "Background colour, RGB, 0 to 1; photos with alpha are laid on it, and the scene learns it.",
         "2023",
         option=Option(),
+        in_trials=True,
     )
     random_background: bool = number(
         False, _flag, "Draw a new background colour for every iteration.", option=Option()
@@ -307,12 +318,14 @@ class TrainConfig:
         "Train for antialiased rendering: Mip-Splatting's opacity factor.",
         "Yu et al. 2024",
         option=Option(),
+        in_trials=True,
     )
     jacobian_limit: float | None = number(
         1.3,
         _at_least_1,
         "Clamp of the projection's Jacobian, in half fields of view; none clamps nothing.",
         "2023's code",
+        in_trials=True,
     )
     start_opacity: float = number(0.1, _opacity, "Opacity of the initial Gaussians.", "2023", only="start")
     start_scale: float = number(
@@ -625,6 +638,19 @@ def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **chang
     if length < SHORT_RUN:
         scaled["reset_every"] = 0
     return TrainConfig().changed(**{"iterations": iterations, **scaled, **changes})
+
+
+def short_config(config: TrainConfig, iterations: int, **changes: Any) -> TrainConfig:  # noqa: ANN401
+    """Return the configuration of a short training: the recipe fast with a run's settings that change the image.
+
+    Args:
+        config: The run's configuration.
+        iterations: Number of steps.
+        changes: Settings that differ from the run's, by their flat names.
+    """
+    values = config.flat()
+    kept = {setting.name: values[setting.name] for setting in SETTINGS if setting.in_trials}
+    return recipe(iterations, **{"strategy": "fast", **kept, **changes})
 
 
 def stretched(config: TrainConfig, iterations: int) -> TrainConfig:

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.plugins import package_of, plugins
+from gsplat_edu.train.setting import Question
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +32,9 @@ class Part:
     Settings: ClassVar[type] = NoSettings
     """Frozen dataclass whose fields `gsplat_edu.train.strategy_config.number` declares; their names in options and
     config.json begin with the plug-in's name."""
+
+    question: ClassVar[Question | None] = None
+    """An option with which the user asks the part for something besides its settings; the methods get it as `asked`."""
 
     off_device: ClassVar[tuple[str, ...]] = ()
     """Settings of which a device can only do the default: those that add a term, correct views or mask pixels."""
@@ -294,6 +298,12 @@ OWN_PARTS = {
 """Entry points of our own parts, in the order in which they act: poses move a camera before its image is corrected.
 A part that only adds terms may stand anywhere."""
 
+OWN_QUESTIONS = {
+    "given_depth": "gsplat_edu.parts.given_depth.question:DEPTH",
+    "floaters": "gsplat_edu.parts.floaters.question:CLEAN",
+}
+"""What our own parts ask for, as `Part.question`; apart, because the command line reads it without torch."""
+
 PLUGGED_PARTS: Mapping[str, Part] = plugins("parts")
 PLUGGED_STRATEGIES: Mapping[str, Strategy] = plugins("strategies")
 
@@ -310,8 +320,18 @@ def parts() -> Mapping[str, Part]:
             f"plug-in {taken[0]} of {package_of('parts', taken[0])}: has the name of a part of gsplat_edu;"
             " remove the package, or rename the entry point"
         )
-    own = {name: EntryPoint(name, value, "gsplat_edu.parts").load() for name, value in OWN_PARTS.items()}
-    return own | dict(PLUGGED_PARTS)
+    return _loaded(OWN_PARTS) | dict(PLUGGED_PARTS)
+
+
+@functools.cache
+def questions() -> Mapping[str, Question]:
+    """Return what parts ask for besides their settings, by part: ours, then those of plug-ins. Imports no torch."""
+    plugged = {name: part.question for name, part in PLUGGED_PARTS.items() if part.question is not None}
+    return _loaded(OWN_QUESTIONS) | plugged
+
+
+def _loaded(entry_points: Mapping[str, str]) -> dict[str, Any]:
+    return {name: EntryPoint(name, value, "gsplat_edu.parts").load() for name, value in entry_points.items()}
 
 
 def flat_name(part: str, setting: str) -> str:

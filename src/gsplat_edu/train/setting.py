@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.text import option_flag
@@ -66,11 +67,32 @@ class Option:
         plain: How pages ask for it; None if they do not. Those of the group `PHOTOS` are listed with the options of
             the photos, others with those of the recipe.
         common: Whether `--help` shows it, and not only `--help-all`.
+        instead_in_blocks: What to do instead where a training in blocks cannot have it; "" if it can.
     """
 
     auto: str = ""
     plain: Plain | None = None
     common: bool = False
+    instead_in_blocks: str = ""
+
+
+@dataclass(frozen=True)
+class Question(Option):
+    """An option of `gsplat-edu train` that asks a part for something besides its settings: a path, or a switch.
+
+    Args:
+        name: The option's name, for example "depth".
+        help: Its meaning.
+        metavar: What --help calls the path; "" for a switch.
+        check: Raises an `ArgumentError` for a path that cannot be used; reads no photo.
+        about_capture: Its meaning for `gsplat-edu doctor CAPTURE`; "" if that does not have it.
+    """
+
+    name: str = field(kw_only=True)
+    help: str = field(kw_only=True)
+    metavar: str = ""
+    check: Callable[[Path], object] = Path
+    about_capture: str = ""
 
 
 @dataclass(frozen=True)
@@ -91,6 +113,7 @@ class Setting:
         only: What uses the setting: the name of an option for a training with that option, "start" for one that starts
             from points, "course" for a training of the course (`gsplat_edu.train.course`), which the command line does
             not have; "" for any training.
+        in_trials: Whether the short trainings that choose another setting have its value too: it changes the image.
     """
 
     name: str
@@ -104,6 +127,7 @@ class Setting:
     check: Check
     option: Option | None
     only: str
+    in_trials: bool
 
     @property
     def meaning(self) -> str:

@@ -34,6 +34,7 @@ def number(
     milestone: bool = False,
     option: Option | None = None,
     only: str = "",
+    in_trials: bool = False,
 ) -> Any:  # noqa: ANN401
     """Declare a setting; see `gsplat_edu.train.setting.Setting` for the arguments."""
     metadata = {
@@ -43,6 +44,7 @@ def number(
         "milestone": milestone,
         "option": option,
         "only": only,
+        "in_trials": in_trials,
     }
     return dataclasses.field(default=default, metadata=metadata)
 

@@ -273,10 +273,10 @@ def read(path: Path) -> Scene:
     check_expansion(path, claimed, len(data))
     splats = _inflated(path, data, claimed)
     try:
-        up, unit, origin = read_extras(facts)
+        frame = read_extras(facts)
     except ValueError as error:
         raise SceneFormatError(f"{path}: {error}; the page is damaged, export it again") from None
-    return Scene(page_data.unpacked(path, splats, count, sh_degree), facts["antialiased"], up, unit, origin)
+    return Scene(page_data.unpacked(path, splats, count, sh_degree), facts["antialiased"], *frame)
 
 
 def _pieces(

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from gsplat_edu.io.edit import Similarity
 from gsplat_edu.io.formats import read_scene, stored_bytes, write_scene
 from gsplat_edu.io.lod import tiles
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.earth import Earth
 from scene_files import random_scene
 
 LEAF = 200
@@ -166,11 +168,29 @@ def test_nodes_above_the_coarsest_level_have_no_content(tmp_path):
             assert tile["geometricError"] > 1
 
 
-def test_tilesets_are_written_only(tmp_path):
+def test_a_tileset_has_the_size_of_its_files_and_a_splat(tmp_path):
     write_scene(tmp_path / "tileset.json", random_scene(30, 0))
     size = sum(file.stat().st_size for file in tmp_path.rglob("*.*") if file.is_file())
     assert stored_bytes(tmp_path / "tileset.json") == size
-    with pytest.raises(ArgumentError, match="tilesets are written but not read"):
-        read_scene(tmp_path / "tileset.json")
     with pytest.raises(ArgumentError, match="are none"):
         tiles.write(tmp_path / "b" / "tileset.json", random_scene(0, 0))
+
+
+def test_a_scene_whose_place_is_known_lies_there_and_reads_back(tmp_path):
+    earth = Earth.at_place(47.0, 8.0, 400.0)
+    scene = replace(
+        random_scene(30, 3), origin=(200.0, -50.0, 10.0), up=(0.0, 0.0, 1.0), unit="m", earth=earth
+    )
+    path = tmp_path / "tileset.json"
+    write_scene(path, scene)
+    root = np.array(json.loads(path.read_text())["root"]["transform"]).reshape(4, 4).T
+    means = np.sort(scene.gaussians.means.double().numpy() + scene.origin, axis=0)
+    # as another program sees it: from the tiles' axes (x, z, -y of ours) by the root to the globe
+    found = read_scene(path)
+    assert (found.earth, found.origin) == (earth, scene.origin)
+    tiles_axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=float)
+    there = root @ [*(tiles_axes @ (1.0, 2.0, 3.0)), 1.0]
+    np.testing.assert_allclose(there[:3], earth.rows @ [201.0, -48.0, 13.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(
+        np.sort(found.gaussians.means.double().numpy() + found.origin, axis=0), means, atol=1e-3
+    )

@@ -1,8 +1,9 @@
 """Agisoft Metashape's cameras as XML.
 
 A camera's `transform` takes camera to chunk coordinates, OpenCV axes; the transform of its component, or of the chunk,
-takes them to the world: X = s R x + t. With x and y of a ray, of a fisheye times theta / r, and d = 1 + k1 r² + ... +
-k4 r⁸:
+takes them to the world: X = s R x + t. If the chunk's reference system is one of WGS 84, this world is earth-centred,
+and the poses become metres east, north and up of the mean camera. With x and y of a ray, of a fisheye times theta / r,
+and d = 1 + k1 r² + ... + k4 r⁸:
 
 x' = d x + p1 (r² + 2 x²) + 2 p2 x y,   y' = d y + p2 (r² + 2 y²) + 2 p1 x y
 u = W / 2 + cx + (f + b1) x' + b2 y',   v = H / 2 + cy + f y'
@@ -15,6 +16,7 @@ Source: Agisoft Metashape's user manual, appendix "Camera models".
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -37,6 +39,7 @@ from gsplat_edu.data.readers.pose_file import (
     sized,
     xml_of,
 )
+from gsplat_edu.scene.earth import NEAR_SURFACE, Earth, geodetic, local_axes
 
 MODEL_OF = {"frame": PINHOLE_LIKE, "fisheye": "thin prism fisheye"}
 """Our models of Metashape's types of sensors, except for spherical ones."""
@@ -45,6 +48,10 @@ NUMBERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 """Numbers of a calibration that are read; missing ones are zero."""
 
 UNDISTORT = "export undistorted photos (Export > Undistort Photos), or calibrate without it"
+
+
+WGS84 = ("World Geodetic System 1984", "WGS_1984", "WGS 84")
+"""Names of the datum in well-known text."""
 
 
 class World(NamedTuple):
@@ -96,7 +103,25 @@ def read(path: Path) -> Poses:
         world = worlds.get(camera.get("component_id")) or whole
         lens = lenses.get(camera.get("sensor_id")) or no_lens("its sensor is not in the file")
         shots.append(_shot(where, name, transform, world or AS_IS, lens))
-    return Poses(path, shots, None, notes, tuple(without))
+    shots, earth = _on_earth(shots) if _is_on_earth(chunk) else (shots, None)
+    return Poses(path, shots, None, notes, tuple(without), earth)
+
+
+def _is_on_earth(chunk: Element) -> bool:
+    """Return whether a chunk has a reference system, geographic or projected, of WGS 84."""
+    system = chunk.findtext("reference") or ""
+    return not system.startswith("LOCAL_CS") and any(name in system for name in WGS84)
+
+
+def _on_earth(shots: list[Shot]) -> tuple[list[Shot], Earth | None]:
+    """Take shots from earth-centred axes to east, north and up of their middle; far from the surface, as they are."""
+    middle = np.mean([shot.eye for shot in shots], axis=0)
+    latitude, longitude, height = geodetic(middle)
+    if abs(height) > NEAR_SURFACE:
+        return shots, None
+    axes = local_axes(latitude, longitude)
+    moved = [replace(shot, R=shot.R @ axes.T, eye=axes @ (shot.eye - middle)) for shot in shots]
+    return moved, Earth.of(axes.T, middle)
 
 
 def _why(camera: Element) -> str | None:

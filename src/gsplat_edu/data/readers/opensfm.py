@@ -2,7 +2,8 @@
 
 A shot's `rotation` is the axis of a rotation times its angle in radians, and with `translation` it takes world to
 camera coordinates: x_cam = R x + t, OpenCV axes. Focal lengths and principal points are fractions of the photo's longer
-side; principal points are relative to its middle.
+side; principal points are relative to its middle. The world is metres east, north and up of `reference_lla`, unless
+that is zero, which OpenSfM writes for photos without GPS.
 
 Source: OpenSfM's documentation, "Geometric Models"; `camera_from_json` in its io.py; camera_distortions_functions.h.
 """
@@ -33,6 +34,7 @@ from gsplat_edu.data.readers.pose_file import (
     panorama,
     sized,
 )
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.gaussian_math import quat_to_R
 
 NAME = "reconstruction.json"
@@ -97,12 +99,21 @@ class PointEntry(Foreign, frozen=True):
     color: Triple = (128.0, 128.0, 128.0)
 
 
+class Reference(Foreign, frozen=True):
+    """A place: degrees, and metres above the ellipsoid."""
+
+    latitude: Number = 0.0
+    longitude: Number = 0.0
+    altitude: Number = 0.0
+
+
 class Reconstruction(Foreign, frozen=True):
     """Photos that see one another: `CameraEntry`, `ShotEntry` and `PointEntry` by their names."""
 
     cameras: dict[str, Any]
     shots: dict[Text, Any]
     points: dict[str, Any] = {}  # noqa: RUF012 - msgspec copies the default
+    reference_lla: Reference | None = None
 
 
 def holds(path: Path, head: bytes) -> bool:
@@ -131,7 +142,11 @@ def read(path: Path) -> Poses:
         shots.append(Shot(name, R, -R.T @ np.array(shot.translation), lens))
     points = each_of(path, "point", largest.points, PointEntry).values()
     cloud = cloud_of([point.coordinates for point in points], [point.color for point in points])
-    return Poses(path, shots, cloud, notes)
+    place = largest.reference_lla
+    earth = None
+    if place is not None and (place.latitude or place.longitude):
+        earth = Earth.at_place(place.latitude, place.longitude, place.altitude)
+    return Poses(path, shots, cloud, notes, earth=earth)
 
 
 def rotation(axis: Triple) -> np.ndarray:

@@ -2,10 +2,11 @@
 
 calibrated_cameras.json has poses and lenses, camera_list.json beside it the photos. Omega, phi and kappa, degrees, make
 the camera-to-world rotation Rx(omega) Ry(phi) Rz(kappa) of cameras that look along -z, with +y up. The principal
-point is measured from the photo's corner, px; the coefficients are OpenCV's.
+point is measured from the photo's corner, px; the coefficients are OpenCV's. scene_reference_frame.json, if there is
+one, names a coordinate reference system, and how the scene's coordinates come from it.
 
-Source: the OPF specification 1.0, "Calibrated camera format" and "Camera list"; Pix4D's support, article
-202559089, on the parameters of cameras.
+Source: the OPF specification 1.0, "Calibrated camera format", "Camera list" and "Scene reference frame"; Pix4D's
+support, article 202559089, on the parameters of cameras.
 """
 
 from __future__ import annotations
@@ -36,8 +37,11 @@ from gsplat_edu.data.readers.pose_file import (
 )
 from gsplat_edu.data.readers.realitycapture import turn
 from gsplat_edu.photos.decoding import image_size
+from gsplat_edu.scene.earth import Earth, code_of
 
 CALIBRATED, LIST = b"application/opf-calibrated-cameras+json", b"application/opf-camera-list+json"
+
+REFERENCE = b"application/opf-scene-reference-frame+json"
 
 
 class Internals(Foreign, frozen=True):
@@ -86,6 +90,27 @@ class CameraList(Foreign, frozen=True):
     cameras: list[Listed]
 
 
+class Crs(Foreign, frozen=True):
+    """A coordinate reference system: its code or its well-known text."""
+
+    definition: str
+
+
+class BaseToCanonical(Foreign, frozen=True):
+    """From the reference system to the scene: x and y swapped if need be, times the scale, plus the shift."""
+
+    shift: Triple
+    scale: Triple = (1.0, 1.0, 1.0)
+    swap_xy: bool = False
+
+
+class ReferenceFrame(Foreign, frozen=True):
+    """The file with the reference system."""
+
+    crs: Crs
+    base_to_canonical: BaseToCanonical
+
+
 def holds(path: Path, head: bytes) -> bool:
     """Return whether a file has calibrated cameras."""
     return path.suffix.lower() == ".json" and CALIBRATED in head
@@ -113,13 +138,34 @@ def read(path: Path) -> Poses:
         R = OPENGL @ (turn(0, omega) @ turn(1, phi) @ turn(2, kappa)).T
         lens = lenses.get(camera.sensor_id) or no_lens("its sensor is not in the file")
         shots.append(Shot(uri, R, np.array(camera.position), lens))
-    return Poses(path, shots)
+    return Poses(path, shots, earth=_earth(path))
+
+
+def _beside(path: Path, kind: bytes) -> Path | None:
+    """Return the JSON file of a kind in the folder of a file; None if there is none."""
+    files = [each for each in entries(path.parent) if each.suffix.lower() == ".json" and is_file(each)]
+    return next((each for each in files if kind in head_of(each)), None)
+
+
+def _earth(path: Path) -> Earth | None:
+    """Return where on earth the scene is; None if no file beside the poses says it by a code."""
+    found = _beside(path, REFERENCE)
+    if found is None:
+        return None
+    frame: ReferenceFrame = json_of(found, ReferenceFrame)
+    move, crs = frame.base_to_canonical, code_of(frame.crs.definition)
+    if crs is None:
+        return None
+    if not all(move.scale):
+        raise DatasetError(f"{found}: its scale is 0; {AGAIN}")
+    swap = np.eye(3)[[1, 0, 2]] if move.swap_xy else np.eye(3)
+    back = swap @ np.diag(1.0 / np.array(move.scale))
+    return Earth.of(back, -back @ np.array(move.shift), crs)
 
 
 def _uris(path: Path) -> dict[int, str]:
     """Return the names of photos by the numbers of their cameras."""
-    files = [each for each in entries(path.parent) if each.suffix.lower() == ".json" and is_file(each)]
-    found = next((each for each in files if LIST in head_of(each)), None)
+    found = _beside(path, LIST)
     if found is None:
         raise DatasetError(f"{path}: lacks its list of photos; put camera_list.json beside it")
     listed: CameraList = json_of(found, CameraList)

@@ -29,6 +29,7 @@ from gsplat_edu.data.lens import MAX_SIDE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.notes import Note
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.photos.decoding import image_size
+from gsplat_edu.scene.earth import Earth
 
 HEAD = 4096
 """Bytes at the start of a file by which its program is recognized."""
@@ -79,6 +80,7 @@ class Poses:
         cloud: Its points; None if it has none.
         notes: What the user should know about the file.
         without: Names of photos that cannot be posed, with the reason.
+        earth: Where on earth the world is, in metres; None if the file does not say.
     """
 
     path: Path
@@ -86,6 +88,7 @@ class Poses:
     cloud: Cloud | None = None
     notes: tuple[Note, ...] = ()
     without: tuple[tuple[str, str], ...] = field(default=())
+    earth: Earth | None = None
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from gsplat_edu.data.readers.realitycapture import TABLE, XMP
 from gsplat_edu.data.readers.record3d import RECORD3D
 from gsplat_edu.data.readers.rgbd import SCANNET, SEVEN_SCENES
 from gsplat_edu.data.readers.tum import TUM
-from gsplat_edu.data.scale import read_scale
+from gsplat_edu.data.scale import Scale, read_scale
 
 PROGRAMS = (
     *(OPENSFM, METASHAPE, TABLE, XMP, OPENMVG, MESHROOM, OPF, BUNDLER, VISUALSFM, LLFF),
@@ -118,7 +118,7 @@ def read_poses(path: Path, files: list[Found]) -> Capture:
         capture.frames,
         capture.cloud,
         (*said, *others, *capture.notes),
-        scale=read_scale(folder),
+        scale=read_scale(folder) or capture.scale,
     )
 
 
@@ -163,4 +163,7 @@ def _capture(folder: Path, photos: PhotoNames, program: PoseProgram, poses: Pose
     if missing:
         notes.append(MissingPhotos(len(missing), len(missing) + len(problems) + posed, missing[0]))
     frames, mask_notes = with_masks(folder, frames)
-    return posed, Capture(program.name, tuple(frames), poses.cloud, (*notes, *mask_notes))
+    scale = (
+        None if poses.earth is None else Scale("m", f"the georeference of {program.name}", earth=poses.earth)
+    )
+    return posed, Capture(program.name, tuple(frames), poses.cloud, (*notes, *mask_notes), scale=scale)

@@ -178,10 +178,16 @@ def merged_pairs(a: Blobs, b: Blobs) -> Blobs:
 
 
 def halved(gaussians: Gaussians) -> tuple[Gaussians, Int64[np.ndarray, " N"]]:
-    """Merge N Gaussians into ceil(N / 2).
+    """Merge N Gaussians into ceil(N / 2); see `merged_to`."""
+    return merged_to(gaussians, -(-len(gaussians) // 2))
+
+
+def merged_to(gaussians: Gaussians, target: int) -> tuple[Gaussians, Int64[np.ndarray, " N"]]:
+    """Merge Gaussians into fewer.
 
     Args:
         gaussians: N finite Gaussians.
+        target: Their number afterwards, at least 1; more than N leaves them as they are.
 
     Returns:
         The merged Gaussians, float32; Gaussians without a partner keep their bits. And for each of the N, the index of
@@ -190,7 +196,6 @@ def halved(gaussians: Gaussians) -> tuple[Gaussians, Int64[np.ndarray, " N"]]:
     count = len(gaussians)
     owners = np.arange(count)
     blobs = blobs_of(gaussians)
-    target = -(-count // 2)
     untouched = np.arange(count)  # row of the original; -1 if merged
     while len(blobs.means) > target:
         first, second = _partners(blobs)

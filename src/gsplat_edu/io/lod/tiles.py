@@ -18,8 +18,8 @@ how Cesium knows splats. Accessors describe the unpacked values and have no buff
 Axes: SPZ and glTF right, up, back; tiles right, forward, up, because glTF's y becomes 3D Tiles' z. CesiumJS takes the
 coordinates of the SPZ as they are, and so do we. The draft of the extension would turn them by half a turn about y on
 unpacking; a program that does so shows the scene turned about the vertical. The root's transform turns the scene's up
-direction to +z and moves it to its origin, in double. It does not place the scene on the globe: no capture here stores
-where on Earth it is.
+direction to +z and moves it to its origin, in double; if the scene's earth-centred coordinates are known, it takes the
+scene to its place on the globe instead.
 
 Source: OGC, "3D Tiles 1.1"; Khronos, KHR_gaussian_splatting_compression_spz_2 (draft); CesiumJS' loader, for the axes
 and the accessors.
@@ -42,16 +42,16 @@ from gsplat_edu.base.files import named_failure, written_aside
 from gsplat_edu.io.axes import POSITION_SIGNS, root_transform
 from gsplat_edu.io.glb import FLOAT, POINTS
 from gsplat_edu.io.glb_container import CHUNK_HEADER, EXTENSION, FILE_HEADER, GENERATOR, SPZ_EXTENSION
+from gsplat_edu.io.lod import tiles_reading
 from gsplat_edu.io.lod.levels import Leaf, LodOptions, Node, build_levels, leaves_of, level_of
 from gsplat_edu.io.lod.meta import rounded
-from gsplat_edu.io.scene import Scene
+from gsplat_edu.io.lod.tiles_reading import FROM_SCENE, FROM_Y_UP
+from gsplat_edu.io.scene import Scene, extras
 from gsplat_edu.io.spz import packed_version_2
+from gsplat_edu.scene.earth import EARTH_CENTRED
 from gsplat_edu.scene.gaussians import Gaussians
 
 CONTENT_EXTENSION = "3DTILES_content_gltf"
-
-FROM_Y_UP = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
-"""Takes glTF's axes to those of tiles, whose z is glTF's y."""
 
 PIXELS = 16.0
 """Screen-space error in px beyond which Cesium refines a tile, unless told otherwise."""
@@ -88,16 +88,12 @@ def write(path: Path, scene: Scene, options: LodOptions | None = None) -> None:
                 tile.write_bytes(glb(replace(scene, gaussians=gaussians)))
         tree["transform"] = _root_matrix(scene)
         with named_failure(path):
-            aside.write_bytes(_document(tree))
+            aside.write_bytes(_document(tree, extras(scene.frame)))
 
 
 def read(path: Path) -> Scene:
-    """Refuse: tilesets are only written.
-
-    Raises:
-        ArgumentError: always.
-    """
-    raise ArgumentError(f"{path}: tilesets are written but not read; give the scene that it was made from")
+    """Read the finest tiles of a tileset; see `gsplat_edu.io.lod.tiles_reading.read`."""
+    return tiles_reading.read(path)
 
 
 def tile_options(smallest: int | None = None, leaf: int | None = None) -> LodOptions:
@@ -218,18 +214,22 @@ def _box(low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]) -> list[
 
 
 def _root_matrix(scene: Scene) -> list[float]:
-    """Return the transform that turns up to the z of tiles and adds the origin: 4 x 4, column by column."""
-    turn, shift = root_transform(scene.up, scene.origin)
+    """Return the transform to the globe, or else to z up and the origin: 4 x 4, column by column."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = FROM_Y_UP @ turn @ FROM_Y_UP.T, FROM_Y_UP @ shift
+    if scene.earth is not None and scene.earth.crs == EARTH_CENTRED:
+        A, b = scene.earth.rows[:, :3], scene.earth.rows[:, 3]
+        matrix[:3, :3], matrix[:3, 3] = A @ FROM_SCENE.T, A @ scene.origin + b
+    else:
+        turn, shift = root_transform(scene.up, scene.origin)
+        matrix[:3, :3], matrix[:3, 3] = FROM_Y_UP @ turn @ FROM_Y_UP.T, FROM_Y_UP @ shift
     return [float(number) + 0.0 for number in matrix.T.reshape(-1)]
 
 
-def _document(tree: dict[str, Any]) -> bytes:
+def _document(tree: dict[str, Any], known: dict[str, Any]) -> bytes:
     used = [EXTENSION, SPZ_EXTENSION]
     *_, a, _, _, _, c, _, _, _, b = tree["boundingVolume"]["box"]
     document = {
-        "asset": {"version": "1.1", "generator": GENERATOR},
+        "asset": {"version": "1.1", "generator": GENERATOR, "extras": known},
         "extensionsUsed": [CONTENT_EXTENSION],
         "extensionsRequired": [CONTENT_EXTENSION],
         "extensions": {CONTENT_EXTENSION: {"extensionsUsed": used, "extensionsRequired": used}},

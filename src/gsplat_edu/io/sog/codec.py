@@ -92,7 +92,7 @@ def read(path: Path) -> Scene:
         sh_rest=torch.from_numpy(_read_harmonics(path, source, meta, pixels)),
         logit_opacities=torch.from_numpy(byte_to_logit(colors[:, 3])),
     )
-    return Scene(gaussians, meta.antialiased, meta.up, meta.unit, meta.origin)
+    return Scene(gaussians, meta.antialiased, *meta.frame)
 
 
 def read_meta(path: Path) -> Meta:
@@ -212,9 +212,7 @@ def _packed(scene: Scene, sort: bool, entries: int | None) -> dict[str, bytes]:
     harmonics, palette_images = _packed_harmonics(
         values["sh_rest"], scene.gaussians.sh_degree, _weights(values), entries
     )
-    meta = Meta(
-        len(order), span, scales, sh0, harmonics, scene.antialiased, scene.up, scene.unit, scene.origin
-    )
+    meta = Meta(len(order), span, scales, sh0, harmonics, scene.antialiased, scene.frame)
     opacities = logit_to_byte(values["logit_opacities"])[:, None]
     images = {
         meta.means[0]: (steps & 255).astype(np.uint8),

@@ -18,10 +18,9 @@ from jaxtyping import Float32
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.reading import parse_json
 from gsplat_edu.base.records import Record, record_of
-from gsplat_edu.io.scene import extras, read_extras
+from gsplat_edu.io.scene import SceneFrame, extras, read_extras
 from gsplat_edu.io.sog.palette import CODEBOOK, MOST_ENTRIES
 from gsplat_edu.io.sog.values import LARGEST_LOG, Range
-from gsplat_edu.scene.frame import ORIGIN, Vector
 
 VERSION = 2
 
@@ -83,9 +82,7 @@ class Meta:
         sh0: (256,) coefficients of degree 0 that bytes select.
         harmonics: The palette; None for a scene of degree 0.
         antialiased: Whether the scene was trained with antialiasing; None if unspecified.
-        up: Up direction, of length 1; None if unspecified.
-        unit: Unit of the coordinates; None if unspecified.
-        origin: Position of the coordinates' zero.
+        frame: What is known of the coordinates.
         means: Names of the images with low and high bytes.
         quats: Name of the image of rotations.
         log_scales: Name of the image of scales.
@@ -98,9 +95,7 @@ class Meta:
     sh0: Float32[np.ndarray, "256"]
     harmonics: Harmonics | None
     antialiased: bool | None
-    up: Vector | None
-    unit: str | None = None
-    origin: Vector = ORIGIN
+    frame: SceneFrame
     means: tuple[str, ...] = MEANS
     quats: tuple[str, ...] = QUATS
     log_scales: tuple[str, ...] = SCALES
@@ -126,12 +121,12 @@ class Meta:
 def to_json(meta: Meta) -> bytes:
     """Write a meta.json; equal scenes give equal bytes.
 
-    Codebook values are written with the fewest digits that restore the same float32. Up, unit and origin are stored in
+    Codebook values are written with the fewest digits that restore the same float32. The frame is stored in
     asset.extras, which other readers ignore. Antialiasing is stored twice: as "antialias" from the specification, and
     as "model", which PlayCanvas' splat-transform reads and writes since 3.2 and omits for the default model.
     """
     asset: dict[str, object] = {"generator": GENERATOR}
-    if frame := extras(meta.up, meta.unit, meta.origin):
+    if frame := extras(meta.frame):
         asset["extras"] = frame
     document: dict[str, object] = {"version": VERSION, "asset": asset, "count": meta.count}
     if meta.antialiased is not None:
@@ -181,12 +176,12 @@ def from_json(path: Path, data: bytes) -> Meta:
             f"{path}: is SOG of {said}, but only version 2 is supported; export it as version 2"
         )
     try:
-        return _read(record_of("", document, _Document), *read_extras(_at(document, "asset.extras")))
+        return _read(record_of("", document, _Document), read_extras(_at(document, "asset.extras")))
     except ValueError as error:
         raise SceneFormatError(f"{path}: its metadata is damaged ({error}); get the file again") from None
 
 
-def _read(document: _Document, up: Vector | None, unit: str | None, origin: Vector) -> Meta:
+def _read(document: _Document, frame: SceneFrame) -> Meta:
     antialiased, means, palette = document.antialias, document.means, document.harmonics
     if antialiased is None and document.model in MODELS:
         antialiased = document.model == ANTIALIASED_MODEL
@@ -199,9 +194,7 @@ def _read(document: _Document, up: Vector | None, unit: str | None, origin: Vect
         if palette
         else None,
         antialiased=antialiased,
-        up=up,
-        unit=unit,
-        origin=origin,
+        frame=frame,
         means=means.files,
         quats=document.quats.files,
         log_scales=document.scales.files,

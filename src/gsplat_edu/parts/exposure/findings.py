@@ -19,8 +19,16 @@ from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.text import Told
 from gsplat_edu.data.sparse_depth import tracked_points
 from gsplat_edu.data.tracks import visible_points
-from gsplat_edu.io.mesh_glb import linear
-from gsplat_edu.scene.camera import Camera
+from gsplat_edu.survey.brightness import (
+    JUMP,
+    PAIRS,
+    SIGMAS,
+    Difference,
+    agreed,
+    difference_of,
+    occupied,
+    stops_between,
+)
 from gsplat_edu.survey.capture import Survey
 from gsplat_edu.survey.finding import FEWER_PHOTOS, Examined, Finding, Remedy, Severity, counted
 from gsplat_edu.survey.geometry import facing_away
@@ -32,13 +40,6 @@ EXPOSURE = "exposure"
 
 CORRECTED = (("appearance", "exposure"),)
 """Options of a training that corrects exposures."""
-
-ENOUGH = 3
-"""A photo with fewer neighbours than this is not compared."""
-
-JUMP = 0.4
-"""Exposure jumps if it differs from the neighbours' by more than this, stops: a grey of 128 becomes 113, an error of
-25 dB. Of 97 phone photos with automatic exposure, 93 stay below it."""
 
 DIFFERING = 0.08
 """Warn, and correct exposures, when more than this share of neighbouring pairs differs by a jump but no photo jumps:
@@ -52,26 +53,12 @@ TINT = 0.25
 """White balance jumps if one channel differs from the mean of the three by more than this, stops. The limit is lower
 than `JUMP` because hue differences are more visible; a phone varies by 0.1."""
 
-AGREEING = 0.75
-"""This share of the neighbours must show at least half of the difference, so that a shadow's edge does not count."""
-
 DIFFERENT = 0.25
 """A photo differs if its brightness or a channel's tint is off its neighbours' by more than this, stops."""
 
 SHARE = 0.1
 """Correct exposures if at least this fraction of the photos differs. snowmiku97, taken by a phone whose exposure
 drifts, has 0.06, and the scene follows with view-dependent colour. Random gains of +-0.7 stops give 0.4."""
-
-PAIRS = 20
-"""Two photos are compared if they share at least this many points."""
-
-ACROSS = 4
-"""Cells across and down a photo. Points of one cell share their surface and its shading, so that they count as one
-independent sample of the ratio of two photos."""
-
-SIGMAS = 3.0
-"""A difference counts only if it exceeds this multiple of its standard error, 1.25 * 1.48 MAD / sqrt(cells): gloss, and
-points that one photo hides, spread the ratios; an exposure changes all of them by one factor."""
 
 SMOOTH = 1.0
 """Sigma of the blur applied to thumbnails, px: about the error of points and poses."""
@@ -161,20 +148,6 @@ def _advice(corrected: bool, worst: str, then: str) -> str:
     return f"check {worst}: if its exposure or tint jumped, remove it; {then}" if worst else then
 
 
-class Difference(NamedTuple):
-    """How much brighter one photo is than another."""
-
-    stops: float
-    """The difference, stops."""
-    error: float
-    """Its standard error, stops; 0 if it is known from EXIF."""
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether the difference is not explained by its error."""
-        return abs(self.stops) > SIGMAS * self.error
-
-
 class Gains:
     """Brightness and tint of each photo relative to its neighbours.
 
@@ -193,14 +166,16 @@ class Gains:
     @cached_property
     def light(self) -> Float64[np.ndarray, " C"]:
         """(C,) how much brighter each photo is, stops; 0 if it cannot be compared or its neighbours disagree."""
-        return np.array([_agreed(list(differences.values())) for differences in self._light])
+        return np.array([agreed(list(differences.values())) for differences in self._light])
 
     @cached_property
     def tint(self) -> Float64[np.ndarray, " C"]:
         """(C,) largest difference of a channel from the mean of the three, stops; 0 as for `light`."""
         by_channel = [
             [
-                _agreed([_difference(r.stops[:, c] - r.stops.mean(axis=1), r.cells) for r in ratios.values()])
+                agreed(
+                    [difference_of(r.stops[:, c] - r.stops.mean(axis=1), r.cells) for r in ratios.values()]
+                )
                 for ratios in self._ratios
             ]
             for c in range(3)
@@ -242,7 +217,7 @@ class Gains:
         for i, ratios in enumerate(self._ratios):
             differences = {}
             for j in () if i in self._away else self._survey.geometry.neighbours[i].tolist():
-                shown = _difference(ratios[j].stops.mean(axis=1), ratios[j].cells) if j in ratios else None
+                shown = difference_of(ratios[j].stops.mean(axis=1), ratios[j].cells) if j in ratios else None
                 here, there = exposures[i], exposures[j]
                 recorded = None if here is None or there is None else here - there
                 if (difference := _combined(recorded, shown)) is not None:
@@ -264,11 +239,12 @@ class Gains:
             ratios = {}
             for j in () if i in self._away else self._survey.geometry.neighbours[i].tolist():
                 _, here, there = np.intersect1d(rows, seen[j], assume_unique=True, return_indices=True)
-                stops = np.log2(linear(colors[i][here] / 255.0) / linear(colors[j][there] / 255.0))
+                stops = stops_between(colors[i][here], colors[j][there])
                 good = np.isfinite(stops).all(axis=1)
                 if good.sum() >= PAIRS:
                     camera = self._survey.geometry.cameras[i]
-                    ratios[j] = Ratios(stops[good], _occupied(camera, points[rows[here[good]]]))
+                    u, v, _ = camera.project(camera.world_to_cam(points[rows[here[good]]]))
+                    ratios[j] = Ratios(stops[good], occupied(np.stack([u, v], axis=1), (camera.W, camera.H)))
             found.append(ratios)
         return tuple(found)
 
@@ -314,21 +290,6 @@ def _points_seen(survey: Survey) -> tuple[Float64[np.ndarray, "N 3"], list[Int64
     return points, [visible_points(camera, points).points for camera in survey.geometry.cameras]
 
 
-def _occupied(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> int:
-    """Count the cells of a camera's image that points lie in."""
-    u, v, _ = camera.project(camera.world_to_cam(points))
-    columns, rows = (
-        np.clip((at + 0.5) * ACROSS // side, 0, ACROSS - 1) for at, side in ((u, camera.W), (v, camera.H))
-    )
-    return len(np.unique(columns + ACROSS * rows))
-
-
-def _difference(stops: Float64[np.ndarray, " n"], cells: int) -> Difference:
-    """Return the median of ratios and its standard error: 1.25 sigma / sqrt(cells), sigma = 1.48 MAD."""
-    median = float(np.median(stops))
-    return Difference(median, 1.2533 * 1.4826 * float(np.median(np.abs(stops - median))) / math.sqrt(cells))
-
-
 def _combined(recorded: float | None, shown: Difference | None) -> Difference | None:
     """Return the difference that EXIF records, or none where points contradict it; without EXIF, what points show."""
     if recorded is None:
@@ -338,16 +299,6 @@ def _combined(recorded: float | None, shown: Difference | None) -> Difference | 
         if most < 0.5 * abs(recorded):  # somebody evened the photos out, or a flash did
             return Difference(0.0, 0.0)
     return Difference(recorded, 0.0)
-
-
-def _agreed(differences: Sequence[Difference]) -> float:
-    """Return the neighbours' median if it is certain and most of them show at least half of it, otherwise 0."""
-    if len(differences) < ENOUGH:
-        return 0.0
-    values, errors = np.array(differences).T
-    middle = Difference(float(np.median(values)), float(np.median(errors)))
-    agree = np.mean(values * np.sign(middle.stops) > 0.5 * abs(middle.stops)) >= AGREEING
-    return middle.stops if middle.is_certain and agree else 0.0
 
 
 class Beforehand(NamedTuple):

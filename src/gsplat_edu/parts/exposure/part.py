@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.evaluate.verdict import FITTED, JUDGED_BY
 from gsplat_edu.parts.exposure.findings import (
     EXPOSURE as CHECK,
     check_exposure,
@@ -61,8 +62,8 @@ class ExposurePart(Part):
         return at_exposure_of_scene(scene.dataset, scene.gaussians, shown, background, vignetting=vignetting)
 
     def scored(self, settings: TrainConfig) -> dict[str, str]:
-        """Say what is corrected, if anything is."""
-        return {} if settings.appearance == "none" else {"appearance": settings.appearance}
+        """Say that fitted colours judge the run, if exposures are corrected."""
+        return {JUDGED_BY: FITTED} if settings.corrects_colors else {}
 
     def begin(self, settings: TrainConfig, setup: Setup) -> Begun | None:
         """Return the view model that corrects the images."""

@@ -1,7 +1,20 @@
 // The screen of a capture: previews, the doctor's findings, and the start of a training with its forecast.
 
 import { at, get } from "./api.js";
-import { attempt, button, duration, errorLine, forecastText, h, heading, link, patch, put, want } from "./dom.js";
+import {
+  attempt,
+  button,
+  duration,
+  errorLine,
+  forecastText,
+  h,
+  heading,
+  link,
+  patch,
+  put,
+  versioned,
+  want,
+} from "./dom.js";
 import { choices } from "./choices.js";
 import { doctor } from "./doctor.js";
 import { gallery, unplaced } from "./gallery.js";
@@ -36,7 +49,7 @@ export function capture(given) {
 
 // A capture that has no poses: its search runs, or was stopped, or failed.
 function search(store, stage, entry) {
-  const head = entryHead(store, entry, "Capture");
+  const head = entryHead(store, entry);
   const job = [...store.jobs.values()]
     .filter(({ job: { work } }) => work.command === "sfm" && work.outputs[0] === entry.entry)
     .at(-1);
@@ -55,7 +68,7 @@ function search(store, stage, entry) {
 
 // The screen of a capture with poses.
 function training(store, stage, entry) {
-  const head = entryHead(store, entry, "Capture");
+  const head = entryHead(store, entry);
   const line = errorLine();
   const pictures = gallery(
     entry.entry,
@@ -87,10 +100,12 @@ function training(store, stage, entry) {
   const start = startForm(store, entry, () => taken.draw());
   const later = h("div", { class: "later", hidden: true }, management(store, entry));
   const missing = h("div", {});
+  const said = h("ul", { class: "plain quiet", "aria-label": "what was read", hidden: true });
   const runs = h("ul", { class: "plain" });
-  const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
+  const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Trained from these photos"), runs);
   stage.append(
     head.element,
+    said,
     missing,
     h("div", { class: "watch" }, taken.element, start.element),
     past,
@@ -99,12 +114,24 @@ function training(store, stage, entry) {
     line,
     later,
   );
+  const notes = versioned(
+    line,
+    () => get(at(entry.entry, "notes")),
+    ({ notes: lines }) => {
+      said.hidden = !lines.length;
+      patch(
+        said,
+        lines.map((text) => want("li", {}, text)),
+      );
+    },
+  );
   let version = entry.modified;
   return {
     close: () => taken.close(),
     update(now) {
       head.update(now);
       patch(missing, unplaced(now, now.made_from));
+      notes.read(now.modified);
       checked.update(now);
       start.update(now);
       if (now.modified !== version) taken.changed();
@@ -151,7 +178,7 @@ function startForm(store, entry, draw) {
     id: "run-name",
     type: "text",
     autocomplete: "off",
-    placeholder: "a free one after the capture",
+    placeholder: "a free one after the photos",
   });
   const go = h("button", { "data-own": "" }, "Start training");
   const measure = button("Forecast time and memory", () => forecast());
@@ -209,7 +236,13 @@ function startForm(store, entry, draw) {
       },
       h("fieldset", {}, h("legend", {}, "Quality"), h("div", { class: "choices" }, qualities)),
       forecastLine,
-      h("details", {}, h("summary", {}, "More"), h("label", { class: "wide" }, "Name of the run", name), more.element),
+      h(
+        "details",
+        {},
+        h("summary", {}, "More"),
+        h("label", { class: "wide" }, "Name of the training", name),
+        more.element,
+      ),
       h("div", { class: "row" }, go, measure),
       line,
     ),

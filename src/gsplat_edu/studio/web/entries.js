@@ -2,7 +2,7 @@
 
 import { bytes, count, whole } from "./dom.js";
 
-export const KINDS = { photos: "Photos", captures: "Capture", runs: "Run", scenes: "Scene" };
+export const KINDS = { photos: "Photos", captures: "Cameras", runs: "Training", scenes: "Scene" };
 
 export const addressOf = ({ kind, name }) => `#/${kind}/${encodeURIComponent(name)}`;
 
@@ -16,8 +16,7 @@ export function factsOf(entry) {
     return [
       photos,
       videos,
-      kind === "captures" ? (entry.layout ?? "not placed") : "",
-      searchOf(entry),
+      kind === "captures" ? searchOf(entry) || entry.layout || "not placed" : "",
       bytes(entry.bytes),
     ];
   }
@@ -32,7 +31,6 @@ export function factsOf(entry) {
           ? `${whole(done)} of ${whole(entry.planned)} iterations`
           : "no iterations yet",
     entry.verdict?.grade ?? "",
-    entry.num_gaussians ? `${whole(entry.num_gaussians)} splats` : "",
     entry.edited ? "edited" : "",
   ];
 }

@@ -139,9 +139,12 @@ export function unplaced({ search }, photos) {
   if (!names.length) return null;
   const whole = search.photos === null ? "" : ` of ${search.photos}`;
   const [were, each] = names.length === 1 ? ["was", "it"] : ["were", "each of them"];
-  const figure = (name) => {
+  const figure = (name, index) => {
     const image = photos && want("img", { src: thumbOf(photos, name, 128), alt: "", width: 96, height: 72 });
-    return want("figure", { "data-key": name }, image, want("figcaption", {}, name));
+    const [before, after] = search.beside[index];
+    const where = before && after ? `between ${before} and ${after}` : `beside ${before ?? after}`;
+    const place = (before ?? after) && want("span", { class: "quiet" }, `Take two more ${where}.`);
+    return want("figure", { "data-key": name }, image, want("figcaption", {}, name, " ", place));
   };
   const advice = `Take two more photos beside ${each}, which share most of what they show, add them to the photos, and place the photos again. What only ${names.length === 1 ? "this photo shows" : "these photos show"} will be missing.`;
   return want(

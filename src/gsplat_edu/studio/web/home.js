@@ -41,7 +41,7 @@ function card(store, project) {
       else bar.removeAttribute("value");
     }
     next.update(now, now.next);
-    const shown = entries.find(({ entry }) => entry === now.picture);
+    const shown = entries.find(({ entry }) => entry === now.picture && !store.arriving.has(entry));
     if (shown) picture(top, shown);
     else image.hidden = true;
   };

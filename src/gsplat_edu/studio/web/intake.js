@@ -4,11 +4,8 @@ import { at, post, remove, upload } from "./api.js";
 import { announce, attempt, bytes, button, count, dateOf, errorLine, h, heading } from "./dom.js";
 
 const AT_ONCE = 3;
-const SCENES = /\.(ply|k?splat|spz|sog|glb|usd[acz]|csv)$/i;
+const SCENES = /\.(ply|k?splat|spz|sog|glb|usd[acz]|rad|csv)$/i;
 const VIDEOS = /\.(mp4|mov|m4v|avi|mkv|webm|mts|m2ts|mpg|mpeg|3gp|wmv)$/i; // a browser does not know the type of each
-const POSES = /(?:^|\/)(?:transforms(?:_train|_test|_val)?\.json|cameras\.(?:bin|txt))$/;
-const TAIL = 1 << 20; // bytes at the end of a zip file with the names of its files
-const ZIPPED_POSES = /transforms(?:_train)?\.json|cameras\.(?:bin|txt)/;
 const IGNORED = /(?:^|\/)(?:\.[^/]*|Thumbs\.db|desktop\.ini)$/i;
 const HEAD = 1 << 18; // bytes at the start of a photo in which its EXIF data lie
 const TAKEN = /((?:19|20)\d\d):(0[1-9]|1[0-2]):(0[1-9]|[12]\d|3[01]) \d\d:\d\d:\d\d\0/g; // a date of EXIF, in every format
@@ -35,10 +32,7 @@ async function filesOf(transfer) {
   return found;
 }
 
-async function hasPoses(file) {
-  const tail = await file.slice(Math.max(0, file.size - TAIL)).arrayBuffer();
-  return ZIPPED_POSES.test(new TextDecoder("latin1").decode(tail));
-}
+const isPhotoOrVideo = ({ file, path }) => /^(?:image|video)\//.test(file.type) || VIDEOS.test(path);
 
 // The day on which a photo was taken: the earliest date in its EXIF data, which a program that changed it later has not
 // replaced; else that of its file.
@@ -54,7 +48,8 @@ export async function namedByDay(files) {
   return `Photos of ${dateOf(await dayOf(byName[0].file))}`;
 }
 
-// Splits files into entries to make: {kind, name, files: [{file, path}], zip}.
+// Splits files into entries to make: {kind, name, files: [{file, path}], zip, unsettled}. Files beside photos may be the
+// poses of any program: the studio decides, once they are there, whether that is a capture or only photos.
 async function sorted(files, wanted) {
   const groups = new Map();
   for (const { file, path } of files) {
@@ -72,11 +67,12 @@ async function sorted(files, wanted) {
     const zip = single && /\.zip$/i.test(top);
     let kind = "photos";
     if (single && !zip) kind = "scenes";
-    else if (zip ? await hasPoses(own[0].file) : own.some(({ path }) => POSES.test(path))) kind = "captures";
-    if (wanted !== "auto" && !(single && !zip)) kind = wanted;
+    else if (wanted !== "auto") kind = wanted;
+    else if (zip || !own.every(isPhotoOrVideo)) kind = "captures";
+    const unsettled = wanted === "auto" && kind === "captures";
     const video = !top && own.length === 1 && VIDEOS.test(own[0].path);
     const stem = single || video ? own[0].path.replace(/\.[^.]+$/, "") : top;
-    found.push({ kind, name: stem || (await namedByDay(own)), files: own, zip });
+    found.push({ kind, name: stem || (await namedByDay(own)), files: own, zip, unsettled });
   }
   return found;
 }
@@ -86,7 +82,7 @@ const promised = async (kind, wish) => (await post("/api/names", { kind, wish })
 
 // One upload of many files: its progress, and the files that were refused.
 class Batch {
-  constructor(store, { kind, name, files, zip }) {
+  constructor(store, { kind, name, files, zip, unsettled }) {
     Object.assign(this, { store, kind, name, files, zip, sent: new Map(), refused: 0 });
     this.stopping = new AbortController();
     this.total = files.reduce((sum, { file }) => sum + file.size, 0);
@@ -97,7 +93,7 @@ class Batch {
     this.element = h(
       "article",
       { class: "job card" },
-      heading(3, `${kind}/${name}`),
+      heading(3, unsettled ? name : `${kind}/${name}`),
       h("div", { class: "progress" }, this.bar, this.text, this.stop),
       this.errors,
     );
@@ -126,12 +122,16 @@ class Batch {
       const address = this.zip ? at(this.kind, this.name, "zip") : at(this.kind, this.name, "files", path);
       const answer = await upload(address, file, (some) => this.note(file, some), this.stopping.signal);
       this.note(file, file.size);
-      for (const name of answer.left_out ?? []) this.refuse(name, new Error("left out: neither a photo nor a video"));
+      this.leaveOut(answer.left_out ?? []);
       return true;
     } catch (error) {
       if (!this.stopping.signal.aborted) this.refuse(path, error);
       return false;
     }
+  }
+
+  leaveOut(names) {
+    for (const name of names) this.refuse(name, new Error("left out: neither a photo nor a video"));
   }
 
   note(file, some) {
@@ -186,9 +186,20 @@ export function intake(store, into = null) {
       const batch = new Batch(store, group);
       batches.append(batch.element);
       uploading += 1;
+      const coming = `${group.kind}/${group.name}`;
+      if (group.unsettled) store.arriving.add(coming);
       const done = await batch.run().finally(() => (uploading -= 1));
       if (!into && !done) await remove(at("names", group.kind, group.name)).catch(() => {}); // nobody waits for it
-      await store.refresh();
+      try {
+        if (done && group.unsettled) {
+          const settled = await post(at("captures", group.name, "settle"), {});
+          group.kind = settled.entry.split("/")[0];
+          batch.leaveOut(settled.left_out);
+        }
+      } finally {
+        await store.refresh();
+        if (store.arriving.delete(coming)) store.changed(); // no earlier: an older list still has its former kind
+      }
       if (done && !batch.refused) batch.element.remove();
       if (done && !batch.refused) landed ??= `#/${group.kind}/${encodeURIComponent(group.name)}`;
     }

@@ -18,7 +18,7 @@ export function photos(given) {
   const { store } = given;
   return withEntry(given, (entry, stage) => {
     let seconds = null; // that placing the photos takes on all cores
-    const head = entryHead(store, entry, "Photos");
+    const head = entryHead(store, entry);
     const pictures = gallery(entry.entry);
     const seen = checks(
       entry.entry,
@@ -92,11 +92,7 @@ export function photos(given) {
           "section",
           { "aria-label": "cameras" },
           heading(2, "Cameras"),
-          h(
-            "p",
-            {},
-            "The first step finds where each photo was taken (structure from motion). Photos need to overlap.",
-          ),
+          h("p", {}, "The first step finds where each photo was taken. Photos need to overlap."),
           form,
           line,
           job.element,
@@ -121,7 +117,11 @@ export function photos(given) {
         form.hidden = Boolean(job.view?.active);
         const made = store.madeBy(job.view);
         if (made) {
-          const open = want("a", { href: addressOf(made), class: "button" }, `Continue with the capture ${made.name}`);
+          const open = want(
+            "a",
+            { href: addressOf(made), class: "button" },
+            `See where the photos were taken: ${made.name}`,
+          );
           patch(next, open, " ", want("span", {}, searchOf(made)));
           patch(missing, unplaced(made, entry.entry));
         }

@@ -60,20 +60,12 @@ export function management(store, entry) {
 }
 
 // The top of an entry's screen.
-export function entryHead(store, entry, kindTitle) {
+export function entryHead(store, entry) {
   const [facts, problem] = [h("span", {}), errorLine()];
-  const from = h("span", { class: "from", hidden: true }, " · Trained from the capture ", link("", "#/"));
+  const from = h("span", { class: "from", hidden: true }, " · Trained from the photos of ", link("", "#/"));
   const line = h("p", { class: "quiet facts" }, facts, from);
   const next = nextStep(store);
-  const element = h(
-    "div",
-    { class: "head" },
-    h("p", { class: "kind" }, kindTitle),
-    heading(1, entry.name),
-    line,
-    next.element,
-    problem,
-  );
+  const element = h("div", { class: "head" }, heading(1, entry.name), line, next.element, problem);
   return {
     element,
     // source: the entry that this one was made from, or null

@@ -1,4 +1,4 @@
-// Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
+// Exports of a run or a scene: every format with its size and how it looks, the page for others, a video.
 
 import { at, get } from "./api.js";
 import {
@@ -20,6 +20,7 @@ import { hasDraft } from "./draft.js";
 import { jobPlace, startJob } from "./jobs.js";
 import { addressOf } from "./entries.js";
 import { meshes, newestOf } from "./mesh.js";
+import { SIZED } from "./questions.js"; // made by the server: the endings of files that a size can be given for
 import { discard } from "./undo.js";
 
 const FORMATS = [
@@ -31,6 +32,14 @@ const FORMATS = [
   ["splat", "SPLAT", "without view-dependent colour"],
   ["glb", "GLB", "glTF with Gaussians"],
 ];
+
+const [SAME, CLOSE] = [40, 30]; // dB: root mean square differences of 1 % and of 3 % of the whole range
+
+// How an exported file looks beside its scene.
+function likeness(psnr) {
+  if (psnr >= SAME) return "looks the same as your scene";
+  return psnr >= CLOSE ? "looks nearly the same as your scene" : "looks different from your scene";
+}
 
 const isVideo = (file) => /\.mp4$/i.test(file);
 
@@ -45,6 +54,8 @@ export function share({ place, store, entry }) {
     autocomplete: "off",
     onchange: () => (title.value ? localStorage.setItem(known, title.value) : localStorage.removeItem(known)),
   });
+  const most = h("input", { id: "most", type: "number", min: 0, step: "any", placeholder: "any size" });
+  const withSize = h("label", {}, "At most (MB) ", most);
   const edits = h("input", { type: "checkbox", checked: true });
   const withEdits = h("label", { class: "check", hidden: true }, edits, " apply the edits");
   const surface = h("input", { type: "checkbox" });
@@ -84,12 +95,14 @@ export function share({ place, store, entry }) {
     return startJob(store, { subject: entry.entry, to: title.value, ...(edited ? { edits: true } : {}), ...more });
   };
 
-  const isPage = () => new FormData(form).get("format") === "html";
+  const formatOf = () => new FormData(form).get("format");
+  const isPage = () => formatOf() === "html";
 
   function explain() {
     const page = isPage();
     withMesh.hidden = !page || !shown.surface;
     withProof.hidden = !page || entry.kind !== "runs";
+    withSize.hidden = !SIZED.includes(`.${formatOf()}`);
     put(
       note,
       page
@@ -101,6 +114,7 @@ export function share({ place, store, entry }) {
   form.append(
     h("fieldset", {}, h("legend", {}, "Format"), h("div", { class: "choices" }, choices)),
     h("p", { class: "row" }, h("label", { for: "title" }, "Title and name of the file"), title, withEdits, withMesh),
+    h("p", { class: "row" }, withSize),
     withProof,
     note,
     unsaved,
@@ -108,17 +122,16 @@ export function share({ place, store, entry }) {
   );
   form.addEventListener("submit", (event) => {
     event.preventDefault();
-    const format = new FormData(form).get("format");
+    const format = formatOf();
+    const options = {
+      ...(isPage() && !withProof.hidden && proof.checked ? { verify: "photos" } : {}),
+      ...(!withSize.hidden && most.value ? { size: `${most.value}MB` } : {}),
+    };
     const files =
       isPage() && shown.surface && surface.checked ? Object.entries(shown).filter(([, found]) => found) : [];
     const along = Object.fromEntries(files.map(([name, { file }]) => [name, file]));
     attempt(make, line, () =>
-      start({
-        command: "convert",
-        format,
-        ...along,
-        ...(isPage() && !withProof.hidden && proof.checked ? { options: { verify: "photos" } } : {}),
-      }),
+      start({ command: "convert", format, ...along, ...(Object.keys(options).length ? { options } : {}) }),
     );
   });
   explain();
@@ -135,7 +148,7 @@ export function share({ place, store, entry }) {
         await discard(store, at(entry.entry, "exports", file), file);
       });
     const href = at(entry.entry, "exports", file);
-    const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
+    const isCompared = psnr !== null && !isVideo(file);
     return want(
       "li",
       { "data-key": `${file} ${modified} ${by}`, class: "card" },
@@ -143,7 +156,11 @@ export function share({ place, store, entry }) {
         "div",
         { class: "row" },
         want("strong", { class: "name" }, file),
-        want("span", { class: "quiet facts" }, [bytes(size), isVideo(file) ? "" : exact].filter(Boolean).join(" · ")),
+        want(
+          "span",
+          { class: "quiet facts", title: isCompared ? `PSNR ${decibels(psnr)} against the scene` : null },
+          [bytes(size), isCompared && likeness(psnr)].filter(Boolean).join(" · "),
+        ),
         want("a", { href, class: "button", download: file }, "Download"),
         want("button", { type: "button", onclick }, "Move to the trash"),
       ),

@@ -69,6 +69,7 @@ export class Store extends EventTarget {
     super();
     Object.assign(this, {
       library: null,
+      arriving: new Set(), // entries that this tab uploads, whose kind the studio has yet to decide
       jobs: new Map(),
       damaged: new Map(),
       heard: new Map(),

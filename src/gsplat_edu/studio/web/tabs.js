@@ -12,13 +12,13 @@ import { look, watch } from "./watch.js";
 const RUN = { "": ["Watch", watch], judge: ["Judge", judge], edit: ["Edit", edit], share: ["Share", share] };
 const SCENE = { "": ["View", look], edit: ["Edit", edit], share: ["Share", share] };
 
-export const run = (given) => tabbed(given, "Run", RUN);
-export const scene = (given) => tabbed(given, "Scene", SCENE);
+export const run = (given) => tabbed(given, RUN);
+export const scene = (given) => tabbed(given, SCENE);
 
-function tabbed(given, title, tabs) {
+function tabbed(given, tabs) {
   const { store } = given;
   return withEntry(given, (entry, stage) => {
-    const head = entryHead(store, entry, title);
+    const head = entryHead(store, entry);
     const base = `#/${entry.kind}/${encodeURIComponent(entry.name)}`;
     const links = new Map(
       Object.entries(tabs).map(([tab, [text]]) => [tab, link(text, tab ? `${base}/${tab}` : base)]),

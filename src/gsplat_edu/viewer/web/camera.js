@@ -2,6 +2,7 @@
 // forward).
 
 import { Region } from "./region.js";
+import { dot, plus, turned } from "./vectors.js";
 
 const ORBIT_STEP = Math.PI / 180;
 const NEAREST = 0.01; // distance to the pivot, in initial distances
@@ -9,20 +10,6 @@ const FARTHEST = 3; // the same, and of the pivot from the initial one, in dista
 
 const AMONG = 1.1; // distance from the subject up to which the eye is among the photos' cameras, in that of the farthest
 const YIELD = 0.1; // beyond it, a move outward shrinks by a factor of e per this distance
-
-export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-export const plus = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
-export const transposed = (rows) => [0, 1, 2].map((i) => rows.map((row) => row[i]));
-export const radians = (degrees) => (degrees * Math.PI) / 180;
-
-// Rotates a vector about an axis of length 1 by the right-hand rule (Rodrigues' formula).
-export function turned(vector, axis, angle) {
-  const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
-  const around = cross(axis, vector);
-  const along = dot(axis, vector) * (1 - cos);
-  return vector.map((value, i) => value * cos + around[i] * sin + axis[i] * along);
-}
 
 // Most that a wide window enlarges the image beyond fitting it: at most a fifth of its height is cropped.
 const MOST_CROPPED = 1.25;

@@ -306,17 +306,17 @@ class CaptureView {
       points: this.panel.showsPoints ? points : 0,
     });
     this.region.paint(camera);
-    this.stand(camera);
+    this.markMissing(camera);
     if (this.through) this.lay(camera);
   }
 
   // Puts the mark where photos are missing.
-  stand(camera) {
+  markMissing(camera) {
     const { gap } = this.facts;
     const place = gap && projected(gap[gap.length >> 1], camera);
-    element("stand").hidden = !place;
+    element("missing").hidden = !place;
     if (place)
-      [element("stand").style.left, element("stand").style.top] = place.map((px) => `${(px + 0.5) / this.dense}px`);
+      [element("missing").style.left, element("missing").style.top] = place.map((px) => `${(px + 0.5) / this.dense}px`);
   }
 
   // Lays the photo over the place of its camera's image.

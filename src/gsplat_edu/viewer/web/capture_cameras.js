@@ -1,6 +1,6 @@
 // The cameras of a capture: the lines that draw them, their colours, and which one is under the pointer.
 
-import { dot, plus } from "./camera.js";
+import { dot, plus } from "./vectors.js";
 
 const GRASP = 8; // CSS px: a line this near to the pointer is under it
 const MOST_FINDINGS = 6; // with colours of their own; further ones share the last

@@ -3,13 +3,13 @@
 // It has the members that `Gizmo` and `Overlay` need of an editor's tools. The box is in the page's coordinates; the
 // server's file has those of the capture, which differ by `facts.origin`.
 
-import { plus } from "./camera.js";
 import { SMALL, tellFrame } from "./capture_panel.js";
 import { element } from "./common.js";
 import { Gizmo } from "./edit_gizmo.js";
 import { numberFields } from "./edit_gizmo_panel.js";
 import { Overlay } from "./edit_overlay.js";
 import { boxHandles, boxLines, sideAt, sideDragged } from "./edit_shapes.js";
+import { plus } from "./vectors.js";
 
 const ELSEWHERE = {
   saved: "Another tab has saved a box. Yours is not saved yet; saving it replaces the other one.",
@@ -145,7 +145,7 @@ export class RegionTool {
       Object.assign(stroke, { handle, box: this.shape });
     }
     this.keep(event);
-    viewer.canvas.focus();
+    viewer.canvas.focus({ preventScroll: true });
     viewer.canvas.setPointerCapture(event.pointerId);
     this.stroke = stroke;
     this.redraw();

@@ -60,7 +60,7 @@ export class Controls {
   }
 
   press(event) {
-    this.canvas.focus();
+    this.canvas.focus({ preventScroll: true }); // a page around this one stays where it is
     this.canvas.setPointerCapture(event.pointerId);
     const pans = event.button !== 0 || event.shiftKey;
     const [x, y] = [event.clientX, event.clientY];

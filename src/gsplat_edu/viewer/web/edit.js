@@ -1,6 +1,5 @@
 // The editor: a list of operations on a scene, its state, and everything that the tools and the panel can do.
 
-import { cross, dot, plus } from "./camera.js";
 import { element } from "./common.js";
 import { ViewCube } from "./edit_cube.js";
 import { FlagTexture } from "./edit_draw.js";
@@ -16,6 +15,7 @@ import { EditHistory } from "./edit_state.js";
 import { EditTools } from "./edit_tools.js";
 import { EditTour } from "./edit_tour.js";
 import { Keyframes, readKeyframe } from "./keyframes.js";
+import { cross, dot, plus } from "./vectors.js";
 
 const EDIT_FORMAT = { format: "gsplat_edu edits", version: 1 };
 const [SH_C0, SH_HALF] = [0.28209479177387814, 0.5]; // colour = SH_C0 sh0 + SH_HALF

@@ -1,8 +1,8 @@
-// Points of a picture in the cells of a grid, and a budget of tests, exactly as in gsplat_edu/edits/cells.py.
-
-import { extent } from "./edit_member.js";
+// Points of a picture: those that a camera sees, in the cells of a grid, and a budget of tests, exactly as in
+// gsplat_edu/edits/cells.py.
 
 const CELLS = 64; // along each axis
+const EDIT_NEAR = 0.05; // world units: splats at this camera depth or closer are not seen in a picture
 export const MOST_TESTS = 1e10; // of a splat, for a list of operations
 
 // Counts the tests of a list of operations.
@@ -66,4 +66,24 @@ function cellAxis(values) {
 
 function cellPlace(value, { low, scale }) {
   return scale === 0 ? 0 : Math.min(Math.max(Math.floor((value - low) * scale), 0), CELLS - 1);
+}
+
+// Calls found(i, u, v, z) for every splat in front of a picture's camera: u = (fx x) / z + cx, v = (fy y) / z + cy.
+export function eachSeen({ camera }, { count, means }, found) {
+  const [ex, ey, ez] = camera.position;
+  const [[r00, r01, r02], [r10, r11, r12], [r20, r21, r22]] = camera.rotation; // camera to world: columns are the axes
+  const { fx, fy, cx, cy } = camera;
+  for (let i = 0, k = 0; i < count; ++i, k += 3) {
+    const [a, b, c] = [means[k] - ex, means[k + 1] - ey, means[k + 2] - ez];
+    const z = r02 * a + r12 * b + r22 * c;
+    if (!(z > EDIT_NEAR)) continue;
+    const x = r00 * a + r10 * b + r20 * c;
+    const y = r01 * a + r11 * b + r21 * c;
+    found(i, (fx * x) / z + cx, (fy * y) / z + cy, z);
+  }
+}
+
+// The smallest and the largest number.
+export function extent(numbers) {
+  return numbers.reduce(([low, high], x) => [Math.min(low, x), Math.max(high, x)], [Infinity, -Infinity]);
 }

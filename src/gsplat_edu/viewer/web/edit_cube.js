@@ -1,9 +1,8 @@
 // What tells directions in the editor: a cube that turns with the view, whose sides are views along the scene's axes, and
 // a grid on the ground.
 
-import { cross, dot, plus, transposed } from "./camera.js";
 import { element } from "./common.js";
-import { unit } from "./region.js";
+import { cross, dot, plus, transposed, unit } from "./vectors.js";
 
 const CUBE_SIDES = ["front", "back", "right", "left", "top", "bottom"];
 

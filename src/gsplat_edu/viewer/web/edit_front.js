@@ -3,7 +3,7 @@
 
 import { ratioBounds } from "./camera.js";
 import { SOLID } from "./draw.js";
-import { eachSeen, extent } from "./edit_member.js";
+import { eachSeen, extent } from "./edit_cells.js";
 import { alphaAt, footprintOf, splatsWithin } from "./edit_pixel.js";
 import { hundredths } from "./edit_shapes.js";
 

@@ -3,11 +3,11 @@
 // What it moves is the shape of the tool: {center, rotation, ...} with the columns of `rotation` as axes. A sphere has no
 // rotation, so its handle has no rings.
 
-import { cross, dot, plus, pointAt, radians, transposed } from "./camera.js";
+import { pointAt } from "./camera.js";
 import { GIZMO_PARTS, GizmoPanel } from "./edit_gizmo_panel.js";
 import { turnedRows } from "./edit_rotations.js";
 import { boxHandles, CIRCLE, HANDLE, seenAt, seenLine, uprightAxes } from "./edit_shapes.js";
-import { unit } from "./region.js";
+import { cross, dot, plus, radians, transposed, unit } from "./vectors.js";
 
 const [GIZMO_ARROW, GIZMO_RING, GIZMO_MIDDLE] = [88, 64, 9]; // CSS pixels: an arrow's length, the radii of rings and middle
 const GIZMO_REACH = { mouse: 9, pen: 12, touch: 22 }; // CSS pixels within which a pointer takes hold of a part

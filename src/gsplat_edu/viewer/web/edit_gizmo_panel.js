@@ -1,8 +1,8 @@
 // The part of the editor's panel that belongs to the handle: its buttons for the keyboard, and angles as numbers.
 
-import { radians, transposed } from "./camera.js";
 import { element } from "./common.js";
 import { anglesOfRows, degrees, orthonormal, product3, rowsOfAngles } from "./edit_rotations.js";
+import { radians, transposed } from "./vectors.js";
 
 // The parts in the order in which the key goes through them.
 export const GIZMO_PARTS = [

@@ -1,10 +1,9 @@
 // Levels the scene by the directions of its cameras: people hold cameras level, so the images' x axes are horizontal.
 
-import { cross, dot, plus, transposed, turned } from "./camera.js";
 import { element } from "./common.js";
 import { degrees } from "./edit_rotations.js";
 import { EDIT_UP, normalOf, rotated } from "./edit_shapes.js";
-import { unit } from "./region.js";
+import { cross, dot, plus, transposed, turned, unit } from "./vectors.js";
 
 const LEAST_CAMERAS = 3;
 const LEAST_SPREAD = 0.1; // root mean square of the x axes' second coordinate: 6 degrees from one common direction

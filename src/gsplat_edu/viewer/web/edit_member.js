@@ -3,26 +3,9 @@
 // Both sides compute with the float32 parameters as float64 numbers, by +, -, *, / and comparisons only, in the order
 // written here, so both find the same splats to the last one. NaN belongs to no region.
 
-import { Cells, EditWork } from "./edit_cells.js";
+import { Cells, EditWork, eachSeen, extent } from "./edit_cells.js";
 import { inFront } from "./edit_front.js";
 import { listMembers } from "./edit_near.js";
-
-const EDIT_NEAR = 0.05; // world units: splats at this camera depth or closer are not seen in a picture
-
-// Calls found(i, u, v, z) for every splat in front of a picture's camera: u = (fx x) / z + cx, v = (fy y) / z + cy.
-export function eachSeen({ camera }, { count, means }, found) {
-  const [ex, ey, ez] = camera.position;
-  const [[r00, r01, r02], [r10, r11, r12], [r20, r21, r22]] = camera.rotation; // camera to world: columns are the axes
-  const { fx, fy, cx, cy } = camera;
-  for (let i = 0, k = 0; i < count; ++i, k += 3) {
-    const [a, b, c] = [means[k] - ex, means[k + 1] - ey, means[k + 2] - ez];
-    const z = r02 * a + r12 * b + r22 * c;
-    if (!(z > EDIT_NEAR)) continue;
-    const x = r00 * a + r10 * b + r20 * c;
-    const y = r01 * a + r11 * b + r21 * c;
-    found(i, (fx * x) / z + cx, (fy * y) / z + cy, z);
-  }
-}
 
 // The splats seen within bounds, as {at, u, v}: indices, columns and rows.
 function seenWithin(region, values, [lowU, highU], [lowV, highV]) {
@@ -92,10 +75,6 @@ function brushMembers(region, values, work) {
     [ax, ay] = [bx, by];
   }
   return inside;
-}
-
-export function extent(numbers) {
-  return numbers.reduce(([low, high], x) => [Math.min(low, x), Math.max(high, x)], [Infinity, -Infinity]);
 }
 
 // Calls test(k, i) for every splat; k is the index of its first coordinate.

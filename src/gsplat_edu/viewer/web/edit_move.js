@@ -1,9 +1,9 @@
 // Moves and turns the selected splats: their state, as gsplat_edu/edits/moves.py computes it, and how the page draws it.
 
-import { dot, plus } from "./camera.js";
 import { element, nearestTexture } from "./common.js";
 import { SELECTED } from "./edit_flags.js";
 import { product3 } from "./edit_rotations.js";
+import { dot, plus } from "./vectors.js";
 
 const EYE3 = [
   [1, 0, 0],

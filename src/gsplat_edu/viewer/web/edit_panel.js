@@ -1,6 +1,5 @@
 // The editor's panel: tools, their options, the list of operations.
 
-import { plus } from "./camera.js";
 import { element, icon, refill } from "./common.js";
 import { EditFloaters, FLOATERS_PANEL } from "./edit_floaters.js";
 import { FRONT_ROW } from "./edit_front.js";
@@ -14,6 +13,7 @@ import { length3, shortNumber } from "./edit_shapes.js";
 import { POINTS_OF } from "./edit_tools.js";
 import { TOUR_ROW } from "./edit_tour.js";
 import { want } from "./patch.js";
+import { plus } from "./vectors.js";
 
 // Tools: name, what its button is called, its key and what it does, and its icon.
 const TOOLS = [

@@ -1,11 +1,12 @@
 // What is at one pixel, found by the processor: a click need not wait until the pictures before it are drawn.
 
-import { cross, dot, plus, ratioBounds } from "./camera.js";
+import { ratioBounds } from "./camera.js";
 import { SOLID } from "./draw.js";
 import { SELECTED } from "./edit_flags.js";
 import { turnSince } from "./edit_move.js";
 import { product3 } from "./edit_rotations.js";
 import { length3, rotated } from "./edit_shapes.js";
+import { cross, dot, plus } from "./vectors.js";
 
 const DEVIATIONS = 3.4; // beyond these, a splat of any opacity is below 1/255
 

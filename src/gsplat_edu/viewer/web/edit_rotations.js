@@ -1,7 +1,6 @@
 // Rotations of the editor's shapes, by rows and by angles.
 
-import { cross, dot, plus, transposed, turned } from "./camera.js";
-import { unit } from "./region.js";
+import { cross, dot, plus, transposed, turned, unit } from "./vectors.js";
 
 const GIMBAL = 1 - 1e-12; // sine of the tilt beyond which heading and roll turn about the same axis
 

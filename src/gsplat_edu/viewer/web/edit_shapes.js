@@ -1,8 +1,7 @@
 // Geometry of the editor: cameras, boxes and lines as an edits file describes them.
 
-import { cross, dot, plus, transposed } from "./camera.js";
 import { SELECTED } from "./edit_flags.js";
-import { unit } from "./region.js";
+import { cross, dot, plus, transposed, unit } from "./vectors.js";
 
 export const EDIT_UP = [0, -1, 0]; // the world's up direction
 const [BOX_LOW, BOX_HIGH] = [0.02, 0.98]; // quantiles of the splats that a new box encloses

@@ -1,10 +1,11 @@
 // The editor's tools: what pointers and keys in the picture do.
 
-import { plus, pointAt } from "./camera.js";
+import { pointAt } from "./camera.js";
 import { frontOf } from "./edit_front.js";
 import { CURSOR_STEP, Gizmo } from "./edit_gizmo.js";
 import { depthAtPixel } from "./edit_pixel.js";
 import { EditPolygon } from "./edit_polygon.js";
+import { plus } from "./vectors.js";
 import {
   boxHandles,
   boxLines,
@@ -96,7 +97,7 @@ export class EditTools {
     }
     this.take(event);
     this.cursor = null;
-    this.viewer.canvas.focus();
+    this.viewer.canvas.focus({ preventScroll: true });
     this.press(event.pointerId, event.clientX, event.clientY, event.pointerType);
   }
 

@@ -1,7 +1,8 @@
 // The capture's cameras over the scene: outlines of what they see, at a fixed depth. Those of held-out photos are dashed.
 
-import { dot, plus, pointAt } from "./camera.js";
+import { pointAt } from "./camera.js";
 import { element } from "./common.js";
+import { dot, plus } from "./vectors.js";
 
 const OUTLINE_SHARE = 0.06; // depth of an outline, of the distance from the start view to the pivot
 const OUTLINE_NEAR = 1e-3; // of that depth: lines are cut this close to the eye

@@ -1,8 +1,8 @@
 // The scene in a headset (WebXR): a button starts a session where the browser has one, in which both eyes see the scene.
 
-import { plus } from "./camera.js";
 import { element, fail, say } from "./common.js";
 import { offer } from "./seen.js";
+import { plus } from "./vectors.js";
 import { eyeCamera, headOf, metreOf, placed, Push, pushes, standAt, turnedStand, wayOf } from "./xr.js";
 
 const MODE = "immersive-vr";

@@ -1,11 +1,11 @@
 // The camera path of the page: views that the user saves, or the path that came with the page.
 
-import { plus, radians, transposed } from "./camera.js";
 import { element, icon, refill } from "./common.js";
 import { want } from "./patch.js";
 import { PathCurve } from "./path.js";
 import { appended, grown } from "./path_edits.js";
 import { Timeline } from "./timeline.js";
+import { plus, radians, transposed } from "./vectors.js";
 
 export class Keyframes {
   // actions: view() for the current camera, goToView(camera), playPath() to start or stop, pathChanged().

@@ -4,9 +4,9 @@
 // A new level is written beside the old one, sorted, and only then shown in its place. So a picture is complete at any
 // time, and at most `budget` splats are drawn. Memory for one more batch is reserved.
 
-import { dot } from "./camera.js";
 import { element, fail } from "./common.js";
 import { Sorter } from "./sorter.js";
+import { dot } from "./vectors.js";
 
 const SLOT = 32; // splats per piece of texture memory
 const BATCH = 65536; // most splats that are decoded and sorted at once, unless a run has more

@@ -1,10 +1,10 @@
 // Meshes beside the splats: a line across the picture has the splats on its left and the surface on its right. A
 // collider lies translucent over both. page_mesh.py writes the data.
 
-import { plus } from "./camera.js";
 import { element, linked, nearestTexture } from "./common.js";
 import { edgesOf, rayMeets } from "./mesh_rays.js";
 import { inflated } from "./scene.js";
+import { plus } from "./vectors.js";
 
 const COLORINGS = { tint: 0, vertices: 1, texture: 2, lines: 3 }; // as in mesh.frag.glsl
 const CLAY = [0.75, 0.74, 0.72, 1]; // of a surface without colours

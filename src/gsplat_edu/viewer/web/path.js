@@ -1,6 +1,6 @@
 // Smooth camera motion through keyframes: the formulas of gsplat_edu/paths/curve.py, which explains them.
 
-import { plus, radians } from "./camera.js";
+import { plus, radians } from "./vectors.js";
 
 const CHORDS = 64; // per segment; their sum approximates its length
 const SAME = 1e-9; // fraction of the length below which consecutive keyframes count as one place

@@ -1,7 +1,7 @@
 // The directions from which a scene was captured, as seen from the pivot. A drag beyond them is damped because no photo
 // shows what lies there.
 
-import { dot, plus } from "./camera.js";
+import { dot, plus, unit } from "./vectors.js";
 
 const MOST_EYES = 300; // cameras; more are subsampled evenly
 const NEIGHBOURS = 3; // per camera: directions on the way to each count as captured
@@ -13,10 +13,6 @@ const COVERED = 1.5; // a drag across the window turns by this multiple of the c
 const LEAST_TURN = Math.PI / 4;
 const MOST_TURN = Math.PI;
 
-export const unit = (a) => {
-  const length = Math.hypot(...a);
-  return a.map((value) => value / length);
-};
 const angleOf = (cosine) => Math.acos(Math.min(1, Math.max(-1, cosine)));
 
 export class Region {

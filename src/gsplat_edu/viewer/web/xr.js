@@ -3,8 +3,7 @@
 // A stand {axes, origin, metre} maps it to the scene, p -> origin + metre (p0 axes[0] + p1 axes[1] + p2 axes[2]): axes are
 // directions of the scene, and metre is one in the scene's units. Matrices are WebXR's: 4 x 4, by columns.
 
-import { cross, dot, plus, radians, turned } from "./camera.js";
-import { unit } from "./region.js";
+import { cross, dot, plus, radians, turned, unit } from "./vectors.js";
 
 const IN_METRES = { m: 1, cm: 100, mm: 1000 }; // units of a scene in a metre
 const AWAY = 2; // metres to the subject of a scene of unknown size
