@@ -2,11 +2,11 @@
 
     python course/build_notebooks.py                      every chapter, with the full budget
     python course/build_notebooks.py 09 --out DIR         chapters whose names start with 09, into another folder
-    python course/build_notebooks.py --prose 02           only the text: outputs stay, because no code has changed
+    python course/build_notebooks.py --prose 02           text and exercises: the outputs stay
 
-A chapter's exercises are in notebooks/exercises/NN_name.py: a markdown cell for each question, behind it a code cell
-with the solution. The solutions run in the kernel after the chapter's cells, and appear at the end of the notebook,
-folded.
+A chapter's exercises are in notebooks/solutions/NN_name.py: a markdown cell for each question, behind it a code cell
+with the solution and one that checks it. The notebook gets the question, the names and signatures of the solution, and
+the check. Behind the chapter's cells the build runs every check on the solution, and on answers that it must refuse.
 
 GSPLAT_EDU_BUDGET=reduced in the environment shortens the trainings. A cell that raises, or a figure without titles and
 labels (course/chapter_figures.py), stops the build with exit code 1 and leaves the existing notebook unchanged.
@@ -15,9 +15,11 @@ labels (course/chapter_figures.py), stops the build with exit code 1 and leaves 
 from __future__ import annotations
 
 import argparse
+import ast
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import jupytext
 import nbformat
@@ -26,7 +28,7 @@ from nbclient.exceptions import CellExecutionError
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "notebooks" / "source"
-EXERCISES = ROOT / "notebooks" / "exercises"
+SOLUTIONS = ROOT / "notebooks" / "solutions"
 HERE = str(ROOT / "course")
 STRICT_FIGURES = f"import sys; sys.path.append({HERE!r}); import chapter_figures; chapter_figures.install()"
 """Code that the kernel executes before the first cell."""
@@ -34,50 +36,128 @@ STRICT_FIGURES = f"import sys; sys.path.append({HERE!r}); import chapter_figures
 CELL_TIMEOUT = 3600  # seconds; the full training of chapter 09 takes minutes on two cores
 
 
-FOLDED = """{question}
+class Exercise(NamedTuple):
+    """An exercise of a chapter.
 
-<details>
-<summary>Solution</summary>
+    Attributes:
+        question: Markdown.
+        solution: Python that defines what the question asks for.
+        check: Python that raises unless the solution's names have the properties that were asked for.
+    """
 
-```python
-{code}
-```
-
-</details>"""
-"""An exercise in the notebook; blank lines end the HTML, so that Jupyter and the site highlight the code."""
+    question: str
+    solution: str
+    check: str
 
 
-def solutions(source: Path) -> list[tuple[str, str]]:
+CHECKED = '{check}\nprint("Exercise {number} is solved.")'
+"""The cell behind a reader's answer."""
+
+SOLVED = "One solution of each exercise is in [solutions/{name}](solutions/{name})."
+"""The end of a notebook."""
+
+REFUSED = """def refuses(code):
+    try:
+        exec(code, dict(globals()))
+    except Exception:
+        return True
+    return False
+
+
+assert refuses({code!r}), {complaint!r}
+"""
+"""A cell of the build: code with a wrong answer has to raise."""
+
+CONSTANTS = ("None", "0.0", "1.0", "True")
+"""Answers that no check may accept."""
+
+
+def exercises(source: Path) -> list[Exercise]:
     """Read a chapter's exercises.
 
     Args:
-        source: The chapter; its exercises have the same file name in notebooks/exercises.
-
-    Returns:
-        Question (markdown) and solution (Python) of each; empty if the chapter has none.
+        source: The chapter; its exercises have the same file name in notebooks/solutions.
 
     Raises:
-        ValueError: a question without a solution, or a solution without a question.
+        ValueError: the cells are not questions, each with a solution and a check behind it.
     """
-    path = EXERCISES / source.name
+    path = SOLUTIONS / source.name
     if not path.exists():
         return []
     cells = jupytext.read(path, fmt="py:percent").cells
-    if [cell.cell_type for cell in cells] != ["markdown", "code"] * (len(cells) // 2):
-        raise ValueError(f"{path}: write a markdown cell for each question, behind it one code cell")
-    return [(ask.source, answer.source) for ask, answer in zip(cells[::2], cells[1::2], strict=True)]
+    if [cell.cell_type for cell in cells] != ["markdown", "code", "code"] * (len(cells) // 3):
+        raise ValueError(
+            f"{path}: write a markdown cell for each question, behind it one code cell with the solution and one that "
+            "checks it"
+        )
+    texts = [cell.source for cell in cells]
+    return [Exercise(*three) for three in zip(texts[::3], texts[1::3], texts[2::3], strict=True)]
+
+
+def stub(solution: str, value: str | None = None) -> str:
+    """Return what a reader begins with: the solution's imports, names and signatures without what they are.
+
+    Args:
+        solution: Python: imports, assignments to a name, and functions.
+        value: Code of a constant which the names are, and which the functions return; by default, names are `...`
+            and functions raise NotImplementedError.
+
+    Raises:
+        ValueError: the solution has another statement, whose stub would be unclear.
+    """
+    lines = []
+    for node in ast.parse(solution).body:
+        match node:
+            case ast.Import() | ast.ImportFrom():
+                lines.append(ast.unparse(node))
+            case ast.Assign(targets=[ast.Name(name)]):
+                lines.append(f"{name} = {value or '...'}")
+            case ast.FunctionDef(name):
+                node.body = node.body[:1] if ast.get_docstring(node) else []
+                node.body += ast.parse(
+                    f"return {value}" if value else f"raise NotImplementedError({f'write {name}'!r})"
+                ).body
+                lines.append(f"\n\n{ast.unparse(node)}" if lines else ast.unparse(node))
+            case _:
+                raise ValueError(f"a solution has imports, names and functions, not: {ast.unparse(node)}")
+    return "\n".join(lines)
 
 
 def assembled(source: Path) -> nbformat.NotebookNode:
-    """Return the notebook that a chapter becomes, without outputs: its cells, and its exercises folded."""
+    """Return the notebook that a chapter becomes, without outputs: its cells, then those of its exercises."""
     notebook = jupytext.read(source)
-    folded = [FOLDED.format(question=ask, code=answer) for ask, answer in solutions(source)]
-    notebook.cells += [nbformat.v4.new_markdown_cell(text) for text in folded]
     for number, cell in enumerate(notebook.cells):
         cell["id"] = f"cell-{number:02d}"  # random by default
         cell["metadata"] = {}  # a tag could allow a cell to raise
+    asked = exercises(source)
+    for number, exercise in enumerate(asked, 1):
+        check = CHECKED.format(check=exercise.check, number=number)
+        notebook.cells += [
+            nbformat.v4.new_markdown_cell(exercise.question, id=f"exercise-{number}-question"),
+            nbformat.v4.new_code_cell(stub(exercise.solution), id=f"exercise-{number}-answer"),
+            nbformat.v4.new_code_cell(check, id=f"exercise-{number}-check"),
+        ]
+    if asked:
+        text = SOLVED.format(name=source.name)
+        notebook.cells.append(nbformat.v4.new_markdown_cell(text, id="exercise-solutions"))
     notebook.metadata = {"kernelspec": notebook.metadata["kernelspec"], "language_info": {"name": "python"}}
     return notebook
+
+
+def executed(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    """Return the cells of a chapter's notebook that the build executes: its code, without that of the exercises."""
+    return [cell for cell in notebook.cells if cell.cell_type == "code" and cell["id"].startswith("cell-")]
+
+
+def proofs(source: Path) -> list[str]:
+    """Return code that runs behind a chapter: checks refuse empty and constant answers, and accept the solutions."""
+    code = []
+    for number, (_, solution, check) in enumerate(exercises(source), 1):
+        for value in (None, *CONSTANTS):
+            complaint = f"the check of exercise {number} accepts {value or 'the stub'} as an answer"
+            code.append(REFUSED.format(code=f"{stub(solution, value)}\n{check}", complaint=complaint))
+        code += [solution, check]
+    return code
 
 
 def execute(notebook: nbformat.NotebookNode) -> None:
@@ -99,26 +179,27 @@ def execute(notebook: nbformat.NotebookNode) -> None:
 
 
 def build(source: Path, out: Path) -> None:
-    """Execute one chapter and the solutions of its exercises, and write it atomically.
+    """Execute one chapter and the proofs of its exercises, and write it atomically.
 
     Args:
         source: The chapter, jupytext percent.
         out: Folder of the notebook.
 
     Raises:
-        CellExecutionError: a cell or a solution raised.
-        ValueError: see `solutions`.
+        CellExecutionError: a cell or a proof raised.
+        ValueError: see `exercises`.
     """
     notebook = assembled(source)
-    length = len(notebook.cells)
-    notebook.cells += [nbformat.v4.new_code_cell(answer) for _, answer in solutions(source)]
+    whole = notebook.cells
+    kept = [cell for cell in whole if cell["id"].startswith("cell-")]
+    notebook.cells = kept + [nbformat.v4.new_code_cell(code) for code in proofs(source)]
     execute(notebook)
-    del notebook.cells[length:]
+    notebook.cells = kept + whole[len(kept) :]
     _write(notebook, source, out)
 
 
 def renew_prose(source: Path, out: Path) -> None:
-    """Replace the markdown of an executed notebook and keep its outputs.
+    """Replace the markdown and the exercises of an executed notebook and keep its outputs.
 
     Args:
         source: The chapter, jupytext percent.
@@ -130,14 +211,13 @@ def renew_prose(source: Path, out: Path) -> None:
     existing = out / f"{source.stem}.ipynb"
     if not existing.exists():
         raise ValueError(f"{existing} does not exist; build it without --prose")
-    notebook, executed = assembled(source), nbformat.read(existing, as_version=4)
-    before = [cell for cell in executed.cells if cell.cell_type == "code"]
-    after = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    notebook, shipped = assembled(source), nbformat.read(existing, as_version=4)
+    before, after = executed(shipped), executed(notebook)
     if [cell.source for cell in before] != [cell.source for cell in after]:
         raise ValueError(f"{source.stem}: its code has changed; build it without --prose")
     for old, new in zip(before, after, strict=True):
         new.outputs, new.execution_count = old.outputs, old.execution_count
-    notebook.metadata = executed.metadata
+    notebook.metadata = shipped.metadata
     _write(notebook, source, out)
 
 
@@ -152,7 +232,11 @@ def main() -> int:
     """Build the requested chapters."""
     parser = argparse.ArgumentParser(description="Execute the chapters into notebooks.")
     parser.add_argument("names", nargs="*", help="beginnings of chapter names, for example 09 (default: all)")
-    parser.add_argument("--prose", action="store_true", help="replace the text only; refused if code changed")
+    parser.add_argument(
+        "--prose",
+        action="store_true",
+        help="replace the text and the exercises only; refused if code changed",
+    )
     parser.add_argument("--out", type=Path, default=ROOT / "notebooks", help="folder (default: notebooks)")
     arguments = parser.parse_args()
     chosen = tuple(arguments.names) or ("",)

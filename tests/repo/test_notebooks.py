@@ -252,7 +252,7 @@ def test_shipped_notebooks_match_their_source_and_were_executed(source):
     shipped = nbformat.read(ROOT / "notebooks" / f"{source.stem}.ipynb", as_version=4)
     cells = build_notebooks.assembled(source).cells
     assert [(c.cell_type, c.source) for c in shipped.cells] == [(c.cell_type, c.source) for c in cells]
-    code = [cell for cell in shipped.cells if cell.cell_type == "code"]
+    code = build_notebooks.executed(shipped)
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), (
         "executed from top to bottom"
     )
