@@ -18,10 +18,11 @@ SEED ?= $(shell date +%s)
 FILES ?= tests
 ROUNDS ?= 10
 
-.PHONY: help demo test test-slow stress soak check sanitize bench notebooks site wheels clean
+.PHONY: help demo course test test-slow stress soak check sanitize bench notebooks site wheels clean
 
 help:
 	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
+	@echo "make course      open the chapters in JupyterLab (JUPYTER=--no-browser: print its address only)"
 	@echo "make test        every test without a browser and without a whole training: the first tier"
 	@echo "make test-slow   the second tier: browser journeys, whole trainings, poses of photos, kills, the site, chapters, sanitizers"
 	@echo "make stress      repeat the tests of the second tier (FILES=...) ten times (ROUNDS=...) with slow tabs beside eight busy processes"
@@ -38,6 +39,11 @@ demo:
 	@tools/set_up.sh demo
 	@echo "== demo: training the sphere from 24 of its own renders"
 	@$(BIN)/gsplat-edu demo --out $(OUT)
+
+course:
+	@tools/set_up.sh course
+	@echo "== course: JupyterLab with the first chapter; Ctrl+C twice ends it"
+	@$(BIN)/jupyter lab --LabApp.default_url=/lab/tree/notebooks/01_points.ipynb $(JUPYTER)
 
 test:
 	@tools/set_up.sh dev

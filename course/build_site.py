@@ -45,7 +45,7 @@ USE = {
 }
 """Documents for users, with their titles in the sidebar."""
 
-LEARN = {"docs/GLOSSARY.md": "Glossary"}
+LEARN = {"notebooks/README.md": "The course", "docs/GLOSSARY.md": "Glossary"}
 """Documents beside the chapters."""
 
 BUILD_ON = {
@@ -323,7 +323,8 @@ def _contents(chapters: list[Path]) -> str:
         section: [f"{title} <{name.removesuffix('.md')}>" for name, title in documents.items()]
         for section, documents in sections.items()
     }
-    entries["Learn"] = [*(str(page.with_suffix("")) for page in chapters), *entries["Learn"]]
+    first, *others = entries["Learn"]
+    entries["Learn"] = [first, *(str(page.with_suffix("")) for page in chapters), *others]
     return "\n".join(
         _toctree(f"caption: {section}\n:hidden:\n:maxdepth: 2", pages) for section, pages in entries.items()
     )

@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "LICENCES.md"
-EXTRAS = ("sfm", "heic", "cluster", "gpu", "mesh", "depth", "usd")
+EXTRAS = ("sfm", "course", "heic", "cluster", "gpu", "mesh", "depth", "usd")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {
@@ -75,13 +75,18 @@ WORDS = {
     "Apache 2.0": "Apache-2.0",
     "Apache License 2.0": "Apache-2.0",
     "Apache 2": "Apache-2.0",
+    "Apache License, Version 2.0": "Apache-2.0",
+    "Apache Software License": "Apache-2.0",
     "BSD": "BSD-3-Clause",
     "BSD 3-Clause": "BSD-3-Clause",
     "BSD 3-Clause License": "BSD-3-Clause",
     "BSD-2-Clause": "BSD-2-Clause",
+    "ISC license": "ISC",
     "MIT License": "MIT",
+    "MIT license": "MIT",
     "The MIT License": "MIT",
     "PSF": "PSF-2.0",
+    "PSFL": "PSF-2.0",
 }
 """What packages without an SPDX expression write, and the expression that it means."""
 
@@ -117,7 +122,7 @@ def licence(package: Distribution) -> str:
     if expression:
         return expression
     stated = (package.metadata.get("License") or "").strip()
-    if stated and "\n" not in stated and len(stated) < 60:
+    if stated != "UNKNOWN" and stated and "\n" not in stated and len(stated) < 60:
         return WORDS.get(stated, stated)
     named = [
         CLASSIFIERS.get(line.rsplit(" :: ", 1)[1], line.rsplit(" :: ", 1)[1])

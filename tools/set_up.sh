@@ -1,6 +1,7 @@
 #!/bin/sh
 # Make .venv and install the package into it, or say that it is there already.
 #   tools/set_up.sh demo    what `make demo` needs
+#   tools/set_up.sh course  what the chapters and JupyterLab need as well
 #   tools/set_up.sh dev     what `make test`, `make check` and `make notebooks` need as well
 #   tools/set_up.sh wheels  what `make wheels` needs: it compiles nothing for this .venv
 # PYTHON names the interpreter (default: python3).
@@ -25,7 +26,7 @@ usable() {
     [ -z "${PYTHON:-}" ] || [ "$("$PYTHON" --version 2>&1)" = "$(.venv/bin/python --version 2>&1)" ]
 }
 
-if usable && { stands "$purpose" || { [ "$purpose" = demo ] && stands dev; }; }; then
+if usable && { stands "$purpose" || { [ "$purpose" != wheels ] && stands dev; } || { [ "$purpose" = demo ] && stands course; }; }; then
     echo "== set-up: already installed in .venv, skipped"
     exit 0
 fi

@@ -19,6 +19,9 @@
 # in whole arrays: for each step of the formula one array of pixels times splats is written, and read back
 # by the next step. Before anything is made clever it is worth knowing what the plainest possible program
 # costs. So here is the time of one image, on one thread, and what became of all those evaluations.
+#
+# > **Needs.** A clone of the repository and a C++ compiler, with which the page builds kernels of `benchmarks/ladder`.
+# > Triton and wgpu, two packages that `make course` installs, run the kernels for GPUs.
 
 # %%
 import importlib.util

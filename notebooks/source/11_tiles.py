@@ -17,6 +17,9 @@
 # The naive kernel of [chapter 10](10_the_naive_kernel.ipynb) is right, and its time is a constant times
 # pixels times splats. Here is what a pixel gets for it: on the left how many splats it reads, in the
 # middle how many of them are above the floor where it is, on the right the image that comes of it.
+#
+# > **Needs.** A clone of the repository and a C++ compiler, with which the page builds kernels of `benchmarks/ladder`.
+# > Triton and wgpu, two packages that `make course` installs, run the kernels for GPUs.
 
 # %%
 import os

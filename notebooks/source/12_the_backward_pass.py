@@ -17,6 +17,9 @@
 # [Chapter 11](11_tiles.ipynb) draws fast. [Chapter 09](09_train_in_3d.ipynb) learns, with gradients that were
 # borrowed from autograd. Autograd can differentiate anything because it writes down everything: each intermediate
 # result stays until the way back needs it. How much is that for the dense renderer?
+#
+# > **Needs.** A clone of the repository and a C++ compiler, with which the page builds kernels of `benchmarks/ladder`.
+# > Triton and wgpu, two packages that `make course` installs, run the kernels for GPUs.
 
 # %%
 import functools

@@ -22,6 +22,9 @@
 # The photos of this page show a house in a garden ([lab.captures.garden](../lab/captures/garden.py)). A ray
 # tracer takes them of solid walls, roofs and tree crowns, so no set of splats can match them exactly. The window panes
 # mirror the sky, and the sky is infinitely far away, as outdoors.
+#
+# > **Needs.** A clone of the repository, whose `lab` takes the photos, a C++ compiler, with which the page builds a
+# > kernel of `benchmarks/ladder`, and pycolmap, which `make course` installs.
 
 # %%
 import itertools

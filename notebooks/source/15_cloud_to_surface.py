@@ -21,6 +21,8 @@
 #
 # The scene is `solids` ([lab.captures.solids_photos](../lab/captures/solids_photos.py)): a bowl, rods, slots and a
 # torus on a floor, photographed by a ray tracer. The exact distance of any point to the surface is known.
+#
+# > **Needs.** A clone of the repository, whose `lab` takes the photos.
 
 # %%
 import os
