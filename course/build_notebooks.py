@@ -8,6 +8,9 @@ A chapter's exercises are in notebooks/solutions/NN_name.py: a markdown cell for
 with the solution and one that checks it. The notebook gets the question, the names and signatures of the solution, and
 the check. Behind the chapter's cells the build runs every check on the solution, and on answers that it must refuse.
 
+An assignment's answers are in notebooks/solutions/assignments; `--assignments` writes its file without them to
+notebooks/assignments.
+
 GSPLAT_EDU_BUDGET=reduced in the environment shortens the trainings. A cell that raises, or a figure without titles and
 labels (course/chapter_figures.py), stops the build with exit code 1 and leaves the existing notebook unchanged.
 """
@@ -29,6 +32,7 @@ from nbclient.exceptions import CellExecutionError
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "notebooks" / "source"
 SOLUTIONS = ROOT / "notebooks" / "solutions"
+ASSIGNMENTS = ROOT / "notebooks" / "assignments"
 HERE = str(ROOT / "course")
 STRICT_FIGURES = f"import sys; sys.path.append({HERE!r}); import chapter_figures; chapter_figures.install()"
 """Code that the kernel executes before the first cell."""
@@ -144,6 +148,22 @@ def assembled(source: Path) -> nbformat.NotebookNode:
     return notebook
 
 
+def template(solution: str) -> str:
+    """Return an assignment without the answers: its functions raise NotImplementedError behind their docstrings."""
+    lines = solution.splitlines()
+    functions = [node for node in ast.parse(solution).body if isinstance(node, ast.FunctionDef)]
+    for node in reversed(functions):
+        begin = node.body[0].end_lineno if ast.get_docstring(node) else node.lineno
+        lines[begin : node.end_lineno] = [f'    raise NotImplementedError("write {node.name}")']
+    return "\n".join(lines) + "\n"
+
+
+def write_assignments() -> None:
+    """Write notebooks/assignments: the files of notebooks/solutions/assignments without the answers."""
+    for path in sorted((SOLUTIONS / "assignments").glob("*.py")):
+        (ASSIGNMENTS / path.name).write_text(template(path.read_text("utf-8")), "utf-8")
+
+
 def executed(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     """Return the cells of a chapter's notebook that the build executes: its code, without that of the exercises."""
     return [cell for cell in notebook.cells if cell.cell_type == "code" and cell["id"].startswith("cell-")]
@@ -237,8 +257,12 @@ def main() -> int:
         action="store_true",
         help="replace the text and the exercises only; refused if code changed",
     )
+    parser.add_argument("--assignments", action="store_true", help="write the assignments only")
     parser.add_argument("--out", type=Path, default=ROOT / "notebooks", help="folder (default: notebooks)")
     arguments = parser.parse_args()
+    if arguments.assignments:
+        write_assignments()
+        return 0
     chosen = tuple(arguments.names) or ("",)
     sources = [path for path in sorted(SOURCES.glob("*.py")) if path.stem.startswith(chosen)]
     if not sources:

@@ -37,6 +37,7 @@ NEEDED = {
     "doctor": "a",
     "leave-out": "a",
     "mask": "a b",
+    "grade": "a",
     "info": "a",
     "demo": "",
 }
@@ -64,6 +65,7 @@ OUT_OF_RANGE = [
     "mesh a b.stl",
     "mesh a b.glb --voxel 0",
     "studio --jobs 0",
+    "grade nowhere.py",
 ]
 
 

@@ -117,7 +117,7 @@ def test_a_notebook_asks_and_checks_without_the_answer(source):
 
 
 def test_exercises_belong_to_chapters():
-    written = {path.name for path in (ROOT / "notebooks" / "solutions").glob("*")}
+    written = {path.name for path in (ROOT / "notebooks" / "solutions").glob("*.py")}
     assert written == {path.name for path in SOURCES}
 
 

@@ -87,6 +87,25 @@ def test_a_removed_mesh_is_undone_at_once_or_from_the_trash(visitor, library, wa
     assert mesh.read_bytes() == b"eight minutes"
 
 
+def test_the_open_trash_shows_what_another_tab_removes_and_restores(visitor, library, wall_entry):
+    exports = wall_entry / "exports"
+    shutil.rmtree(exports, ignore_errors=True)  # of another test of this library
+    exports.mkdir()
+    (exports / "wall.mesh.glb").write_bytes(b"eight minutes")
+    watching, tab = visitor().tab, visitor().tab
+    go(watching, "trash")
+    row = watching.get_by_text("wall.mesh.glb, a file of scenes/wall")
+    watching.get_by_role("heading", name="Trash").wait_for()
+    assert not row.is_visible()
+    go(tab, "scenes/wall/share")
+    tab.locator(".exports li", has_text="wall.mesh.glb").get_by_role(
+        "button", name="Move to the trash"
+    ).click()
+    row.wait_for()
+    tab.get_by_role("button", name="Undo", exact=True).click()
+    row.wait_for(state="detached")
+
+
 def test_an_exported_page_carries_the_mesh_on_request(visitor, library, wall_entry):
     exports = wall_entry / "exports"
     shutil.rmtree(exports, ignore_errors=True)  # of another test of this library

@@ -123,6 +123,12 @@ def shortened(text: str, most: int = 80) -> str:
     return f"{text[: most - 3 - end]}...{text[len(text) - end :]}"
 
 
+def first_line(error: BaseException) -> str:
+    """Return the kind of an error and the first line that it says."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0] if lines else 'no message'}"
+
+
 def bounded(line: str) -> str:
     """Return a line for people of limited length; values that it quotes may be of any length, and are shortened.
 

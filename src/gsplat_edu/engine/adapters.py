@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gsplat_edu.engine.failures import first_line
+from gsplat_edu.base.text import first_line
 from gsplat_edu.engine.llvm import load_triton
 
 INSTALL = 'pip install "gsplat-edu[gpu]"'

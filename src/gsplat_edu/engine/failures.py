@@ -6,6 +6,7 @@ import logging
 from typing import Any, Protocol, runtime_checkable
 
 from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.base.text import first_line
 
 PATIENCE = 1.0
 """Seconds between two looks at a device that has not answered: wgpu waits for ever for one that is lost."""
@@ -96,9 +97,3 @@ def _is_of_wgpu(error: BaseException) -> bool:
     import wgpu
 
     return isinstance(error, (wgpu.GPUError, RuntimeError))
-
-
-def first_line(error: BaseException) -> str:
-    """Return the kind of an error and the first line that it says."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0] if lines else 'no message'}"

@@ -1,7 +1,7 @@
 // What was removed, until the trash is emptied.
 
 import { at, get, post, remove } from "./api.js";
-import { agreed, attempt, button, errorLine, h, heading, link, patch, want } from "./dom.js";
+import { agreed, attempt, button, errorLine, h, heading, link, patch, versioned, want } from "./dom.js";
 
 const said = (kind, name, entry) => {
   if (kind === "jobs") return `job ${name} of the list`;
@@ -16,16 +16,11 @@ export function trash({ main, store }) {
     attempt(clear, line, async () => {
       if (!(await agreed("Empty the trash?", "What is in it is deleted for good.", "Delete everything"))) return;
       await remove("/api/trash");
-      await read();
-      store.refresh();
+      await store.refresh();
     }),
   );
 
-  let questions = 0;
-  async function read() {
-    const asked = ++questions;
-    const { trash: found } = await get("/api/trash");
-    if (asked !== questions) return; // the answer is older than that to a later question
+  function show({ trash: found }) {
     empty.hidden = found.length > 0;
     clear.hidden = !found.length;
     patch(
@@ -34,9 +29,7 @@ export function trash({ main, store }) {
         const onclick = ({ currentTarget }) =>
           attempt(currentTarget, line, async () => {
             await post(at("trash", id, "restore"));
-            await read();
-            store.refresh();
-            if (kind === "jobs") await store.readJobs();
+            await Promise.all([store.refresh(), kind === "jobs" && store.readJobs()]);
           });
         const when = new Date(1000 * removed).toLocaleString("en");
         return want(
@@ -58,6 +51,7 @@ export function trash({ main, store }) {
     line,
     h("p", {}, link("Back to the projects", "#/")),
   );
-  attempt(null, line, read);
-  return {};
+  // Each answer about the library is a new object: it comes after every change, those of other screens and tabs too.
+  const held = versioned(line, () => get("/api/trash"), show);
+  return { update: () => held.read(store.library) };
 }
