@@ -1,0 +1,388 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 16 - Where Gaussians come from and go
+#
+# [Chapter 09](09_train_in_3d.ipynb) learned a sphere with a rule that it took from a paper: copy a small splat that is
+# pulled, cut a large one in two, drop the faint ones. [Chapter 14](14_photos_to_scene.ipynb) used another rule
+# and did not explain it. This page explains all strategies of the package. Each of them answers a failure of the one
+# before, so each failure is measured first.
+#
+# The scene is a bumpy egg with a horn: 1,200 Gaussians, photographed from a ring of cameras. Every sixth photo is
+# held out. A training begins with 100 points on the egg and none on the horn.
+
+# %%
+import os
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from scipy.stats import spearmanr
+
+from gsplat_edu import Camera
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.evaluate.metrics import psnr, score_views, summarize
+from gsplat_edu.ops.losses import l1_ssim
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.train import Start, Views, training
+from gsplat_edu.train.config import FOR_FAST, recipe
+from gsplat_edu.train.density.mcmc import NOISE_SHARPNESS, NOISE_THRESHOLD, shared_shape
+from gsplat_edu.train.density.surgery import long_axis_children, split_children
+from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent
+from gsplat_edu.train.initialize import from_points
+from gsplat_edu.train.schedule import photo_factor, planned_counts
+
+SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
+SIZE, ITERATIONS, SEEDS = (64, 400, 1) if SHORT else (96, 1500, 3)
+CAP, EVERY, EXTENT = 800, 25, 3.2
+print(f"budget: {ITERATIONS} iterations, {SIZE} px, {SEEDS} seeds{' (reduced)' if SHORT else ''}")
+
+views, cloud, cloud_colors = procedural_capture(SIZE, 26, height=SIZE, splats=1200)
+held_out = views[3::6]
+photos = [view for view in views if view not in held_out]
+on_horn = (cloud[:, 0] > 0.55) & (cloud[:, 1] < -0.2)
+first = [part[~on_horn][:100] for part in (cloud, cloud_colors)]
+RATES = {name: value for name, value in FOR_FAST.items() if "rate" in name}
+print(f"{len(photos)} photos to train on, {len(held_out)} held out, {len(first[0])} points; {RATES}")
+
+# %% [markdown]
+# All strategies train with the same learning rates here, those of the fast recipe; otherwise a comparison of strategies
+# would be one of rates (the last table says how large that effect is). Density control acts every 25 iterations
+# instead of every 100, because a run of 1,500 iterations is twenty times shorter than that of the papers.
+
+
+# %%
+def config_of(strategy, iterations=ITERATIONS, **changes):
+    common = {"max_gaussians": CAP, "sh_degree": 0, "densify_every": EVERY}
+    return recipe(iterations, strategy=strategy, **(common | RATES | changes))
+
+
+def quality(gaussians, judged=held_out):
+    return summarize(score_views(gaussians, judged, render, (0.0, 0.0, 0.0)))["psnr"]
+
+
+def train_with(strategy, start=None, shown=None, **changes):
+    config, events = config_of(strategy, **changes), []
+    start = from_points(*first, config) if start is None else start
+    trainer = training(config, Views(shown or photos), load_backend("cpu"), Start(start, extent=EXTENT))
+    kinds = DensifyEvent, RelocateEvent, ResetEvent
+    result = trainer.run(callbacks=[lambda _, e: events.append(e) if isinstance(e, kinds) else None])
+    run = SimpleNamespace(gaussians=trainer.gaussians, config=config, events=events, start=len(start))
+    run.losses, run.counts, run.held_out = result.losses, result.counts, quality(trainer.gaussians)
+    return run
+
+
+fixed = train_with("none")
+print(f"{len(fixed.gaussians)} splats, as at the start: {fixed.held_out:.2f} dB held out")
+
+# %% [markdown]
+# ## A fixed number is stuck
+#
+# With a fixed set, splats only move and stretch. The loss $L$ of a photo reaches a splat at its centre $u$ on the image
+# as a sum over pixels $p$, and the *score* of a splat is the mean, over the photos $v$ that show it, of its length:
+#
+# $$g_v = \sum_p \frac{\partial L_v}{\partial c_p} \cdot \frac{\partial c_p}{\partial u}, \qquad
+# \text{score} = \operatorname{mean}_v |g_v| .$$
+#
+# Each pixel pulls the splat towards where it would repair that pixel. In a place that one splat can explain, the
+# pulls end: the splat follows them and arrives. A score that stays large says that the photos keep disagreeing about
+# where the splat should be. The length is taken in each photo before the mean, because the pulls of two photos may cancel
+# although neither is satisfied. Within one photo the sum still has signs. A splat between two dots is pulled equally
+# to both sides. AbsGS (Ye et al. 2024) therefore adds up absolute values. The package measures both
+# ([render.output](../src/gsplat_edu/render/output.py): `means2d_grad_norms`, and `collect("absgrad")`).
+
+
+# %%
+def ball(mean, scale, opacity, color=(1.0, 1.0, 1.0)):
+    logit = float(np.log(opacity / (1 - opacity)))
+    mean, color = (torch.tensor([row], dtype=torch.float32) for row in (mean, color))
+    sh0, quats = (color - 0.5)[:, None] / 0.28209479, torch.tensor([[1.0, 0, 0, 0]])
+    scales = torch.full((1, 3), float(np.log(scale)))
+    return Gaussians(mean, quats, scales, sh0, torch.zeros(1, 0, 3), torch.tensor([logit]))
+
+
+def pulls(gaussians, view):
+    """Render a view; return the picture, who is visible, and the statistics of each visible splat."""
+    leaves = gaussians.trainable()
+    output, photo = render(leaves, view.camera, backend="cpu"), torch.as_tensor(view.image)
+    errors = (output.image.detach() - photo / 255).abs().mean(dim=-1)
+    collected = output.collect("absgrad", "weight_sum", "error_sum", errors=errors)
+    l1_ssim(output.image, photo).backward()
+    table, half = collected(), torch.tensor([view.camera.W / 2, view.camera.H / 2])
+    signed, absolute = output.means2d_grad_norms(), (table["absgrad"] * half).norm(dim=1)
+    columns = signed, absolute, table["error_sum"], table["weight_sum"], torch.ones_like(signed)
+    return output.image.detach().numpy(), output.visible, torch.stack(columns)
+
+
+stage = Camera.looking_at([0, 0, -3], [0, 0, 0], 64, 64, H=64, W=64)
+dots = Gaussians.concatenated([ball((x, 0, 0), 0.12, 0.9) for x in (-0.5, 0.5)])
+dotted = SimpleNamespace(
+    camera=stage, image=(255 * render(dots, stage).image).clamp(0, 255).to(torch.uint8).numpy()
+)
+offsets = np.linspace(-1, 1, 41)
+walk = np.array([pulls(ball((x, 0, 0), 0.4, 0.6), dotted)[2][:2, 0].numpy() for x in offsets])
+
+sums = torch.zeros(5, len(fixed.gaussians))
+for view in photos:
+    _, visible, columns = pulls(fixed.gaussians, view)
+    sums.index_add_(1, visible, columns)
+score, absolute, error = (sums[[0, 1]] / sums[4].clamp(min=1)).tolist() + [(sums[2] / sums[3]).tolist()]
+score, absolute, error = map(np.array, (score, absolute, error))
+
+view = held_out[1]
+picture = pulls(fixed.gaussians, view)[0]
+p = (fixed.gaussians.means.detach().numpy() - view.camera.eye) @ view.camera.R.T
+u = view.camera.fx * p[:, :2] / p[:, 2:] + [view.camera.cx, view.camera.cy]
+fig, axes = plt.subplots(1, 4, figsize=(14, 3.4), layout="constrained")
+for ax, (title, image) in zip(axes, {"held-out photo": view.image, "100 splats": picture}.items(), strict=False):
+    ax.imshow(np.clip(image, 0, 255 if image.dtype == np.uint8 else 1), interpolation="nearest")
+    ax.set(title=title, xticks=[], yticks=[])
+axes[2].imshow(np.abs(picture - view.image / 255).mean(axis=-1), cmap="magma")
+axes[2].scatter(*u.T, s=4e4 * score, facecolors="none", edgecolors="cyan", linewidths=0.7)
+axes[2].set(title="error; circles: score", xticks=[], yticks=[])
+for line, label in zip(walk.T, ("length of the sum", "sum of absolute values"), strict=True):
+    axes[3].plot(offsets, line, label=label)
+axes[3].set(title="a splat on its way past two dots", xlabel="centre of the splat", ylabel="pull, per NDC")
+axes[3].legend()
+plt.show()
+
+agreement = spearmanr(score, error)[0]
+cancelled = 1 - score.sum() / absolute.sum()
+print(f"between the dots: {walk[20, 0]:.1e} signed, {walk[20, 1]:.1e} absolute")
+print(f"trained scene: {100 * cancelled:.0f} % of the pull cancels within the photos")
+print(f"score and error under the splat: rank correlation {agreement:.2f}")
+assert walk[20, 0] < 0.1 * walk[:, 0].max() and walk[20, 1] > 5 * walk[20, 0]
+assert cancelled > 0.3
+
+# %% [markdown]
+# The horn has become a smear of splats of the egg. Between the dots nothing pulls, although nothing is right there; and
+# in the trained scene, too, a good part of the pull cancels. Is the score nevertheless a good choice? The test is to
+# use it: split the same number of splats, chosen in different ways, and train on with the new number fixed.
+
+
+# %%
+def split_rows(gaussians, rows):
+    """Replace these splats by two each."""
+    stay = torch.ones(len(gaussians), dtype=torch.bool)
+    stay[rows] = False
+    return Gaussians.concatenated([gaussians[stay], *long_axis_children(gaussians[~stay])]).map(torch.detach)
+
+
+few = len(score) // 4
+choices = {"highest score": score, "absolute values": absolute, "largest error": error, "lowest score": -score}
+after = {}
+for name, key in choices.items():
+    rows = torch.tensor(np.argsort(-key)[:few].copy())
+    run = train_with("none", split_rows(fixed.gaussians, rows), iterations=ITERATIONS // 3)
+    after[name] = run.held_out
+    print(f"{few} splits by {name:16} {after[name]:.2f} dB")
+assert SHORT or after["highest score"] > after["lowest score"] + 0.5
+
+# %% [markdown]
+# The signed score is as good as the absolute one here, and both are far better than its opposite. It isn't a measure of
+# the error: the rank correlation above is small. An error that no movement reduces is no reason to be split, and a
+# splat may be pulled hard by an error that lies beside it. (In this package, no strategy uses absolute values: on four
+# captures they were no better, says [RECIPE.md](../docs/RECIPE.md).)
+#
+# ## A birth changes the picture
+#
+# The rule of Kerbl et al. 2023 ([density.adc](../src/gsplat_edu/train/density/adc.py)): a splat with a score above
+# $2 \cdot 10^{-4}$ is **cloned** if its largest scale is at most a hundredth of the scene's extent, since it is too
+# small to cover the place, and **split** otherwise, since it covers too much. A clone is an equal splat at the same
+# place. A split draws two children from the parent's own density and replaces it:
+#
+# $$\mu' = \mu + R\,(s \odot n), \quad n \text{ standard normal}, \qquad s' = s / 1.6, \qquad o' = o .$$
+#
+# Two equal splats of the shape $g$ (1 at the centre) let through the product of what each lets through. Where the
+# parent had $\alpha = o\,g$, the two have
+#
+# $$1 - (1 - o\,g)^2 = \alpha + \alpha\,(1 - \alpha) > \alpha .$$
+#
+# Rota Bulò et al. 2024 ("Revising Densification in Gaussian Splatting") correct that by $o' = 1 - \sqrt{1 - o}$, so
+# that $1 - (1 - o')^2 = o$. It holds at the centre only. As a function of $g$, $1 - (1 - o' g)^2$ is concave and
+# meets $o\,g$ at $g = 0$ and $g = 1$; between them it lies above, and the splat gets wider. This package does not
+# correct clones of `adc`. Its two other strategies were made so that a birth leaves the picture (nearly) alone:
+# `mcmc` also shrinks the copies, and `fast` splits along the longest axis $e$ of scale $s_e$, without a draw,
+# ([density.surgery](../src/gsplat_edu/train/density/surgery.py)):
+#
+# $$\mu' = \mu \pm \frac{s_e}{\sqrt 2}\, e, \qquad s_e' = \frac{s_e}{\sqrt 2}, \qquad o' = 1 - (1 - o)^{1/\sqrt 2} .$$
+#
+# The variance along $e$ stays: that of a child, $s_e^2 / 2$, plus that of the two centres, $s_e^2 / 2$. So does the mass
+# for small $o$, because $2 \cdot (o / \sqrt 2)(s_e / \sqrt 2) = o\, s_e$.
+#
+# > **Predict.** All hundred splats of the trained scene have children at once, in each of these ways. Which picture
+# > stays closest to the one before? Does the worst one come from a random draw or from a copy?
+
+
+# %%
+def with_opacity(gaussians, opacities, shrink):
+    changed = {"logit_opacities": torch.logit(opacities), "log_scales": gaussians.log_scales + torch.log(shrink)}
+    changed = {name: raw.to(gaussians.means) for name, raw in changed.items()}
+    return Gaussians(**(gaussians.tensors() | changed))
+
+
+def families(parents):
+    """Give every Gaussian children, in five ways."""
+    o, generator = parents.opacities.double(), torch.Generator().manual_seed(16)
+    pair, factor = shared_shape(o, torch.full((len(o),), 2))
+    same = torch.ones_like(factor)[:, None]
+    revised, shared = with_opacity(parents, 1 - (1 - o).sqrt(), same), with_opacity(parents, pair, factor[:, None])
+    return {
+        "clone": [parents, parents],
+        "clone, opacity revised": [revised, revised],
+        "clone, revised and shrunk (mcmc)": [shared, shared],
+        "split at random (adc)": [split_children(parents, 1.6, generator) for _ in range(2)],
+        "split along the axis (fast)": long_axis_children(parents),
+    }
+
+
+parents = fixed.gaussians.map(torch.detach)
+with torch.no_grad():
+    pictures = [render(parents, view.camera).image for view in held_out]
+kept = {}
+for name, children in families(parents).items():
+    grown = Gaussians.concatenated(children)
+    with torch.no_grad():
+        now = [render(grown, view.camera).image for view in held_out]
+    kept[name] = np.mean([psnr(new, old.clamp(0, 1).numpy()) for new, old in zip(now, pictures, strict=True)])
+    brighter = sum(new.mean() for new in now) / sum(old.mean() for old in pictures)
+    later = train_with("none", grown, iterations=ITERATIONS // 10).held_out
+    print(f"{name:33} {kept[name]:6.2f} dB from the picture before, light x {brighter:.2f};", end=" ")
+    print(f"{quality(grown):.2f} dB held out, {ITERATIONS // 10} iterations later {later:.2f}")
+    assert name != "clone" or brighter > 1.03
+ways = sorted(kept, key=kept.get)
+assert SHORT or (ways[0], ways[-1]) == ("split at random (adc)", "clone, revised and shrunk (mcmc)")
+assert SHORT or kept[ways[0]] + 2 < kept["clone"] < kept[ways[-1]] - 2
+
+x = torch.linspace(-3.5, 3.5, 141, dtype=torch.float64)
+one = ball((0, 0, 0), 1.0, 0.9).map(torch.Tensor.double)
+fig, axes = plt.subplots(1, 2, figsize=(12, 3.6), layout="constrained", sharey=True)
+for ax, names in zip(axes, (list(kept)[:3], list(kept)[3:]), strict=True):
+    ax.plot(x, 0.9 * torch.exp(-x * x / 2), "k", linewidth=3, alpha=0.4, label="parent")
+    for name in names:
+        clear = torch.ones_like(x)
+        for child in families(one)[name]:
+            away = (x - child.means[0, 0]) / child.scales[0, 0]
+            clear *= 1 - child.opacities[0] * torch.exp(-away * away / 2)
+        ax.plot(x, 1 - clear, label=name)
+    ax.set(title="alpha of a parent and of its two children", xlabel="place, standard deviations of the parent")
+    ax.legend(loc="lower center", fontsize=8)
+axes[0].set_ylabel("alpha")
+plt.show()
+
+# %% [markdown]
+# The random split does the most harm, the clone makes the scene brighter, and the shrunk copies come closest to the
+# picture before. This is the step up that chapter 09 saw after each densification. It need not be a loss for good:
+# children that stand apart can fit what one splat could not. Equal copies at one place have to come apart first.
+#
+# ## Deaths, and those that nothing kills
+#
+# A splat whose opacity has fallen below $0.005$ is **pruned**: at half an 8-bit step it shows nowhere, and costs
+# as much time as any other. But only a gradient makes a splat faint, and the gradient of an opacity carries the
+# transmittance in front of the splat as a factor. What lies behind an opaque surface, or in front of a single camera, is
+# pulled by nobody. Here 60 opaque splats are hidden in the middle of the egg at the start.
+#
+# Therefore `adc` also **resets** opacities: every 3,000 iterations all that are above $0.01$ are set to it, and Adam's
+# moments of opacity are forgotten. Light reaches everything, and each splat has to earn its opacity again.
+# Adam moves a logit by about its rate, $0.1$ here, so it takes some
+# $(\operatorname{logit} 0.5 - \operatorname{logit} 0.01) / 0.1 = 46$ iterations until a splat is half opaque again.
+
+
+# %%
+def with_hidden(config, count=60):
+    start, rng = from_points(*first, config), np.random.default_rng(16)
+    direction = rng.normal(size=(count, 3))
+    place = 0.15 * direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(size=(count, 1))
+    buried = from_points(place, np.full(place.shape, 0.5), config)
+    opaque, size = torch.full((count,), 0.88), torch.full((count, 3), 0.05)
+    changed = {"logit_opacities": torch.logit(opaque), "log_scales": size.log()}
+    return Gaussians.concatenated([start, Gaussians(**(buried.tensors() | changed))])
+
+
+def in_the_middle(gaussians):
+    """Return the opacities around the middle of the egg, the largest first."""
+    near = gaussians.means.norm(dim=1) < 0.25
+    return gaussians.opacities[near].detach().sort(descending=True).values.numpy()
+
+
+def smoothed(losses):
+    return np.convolve(losses, np.ones(len(photos)) / len(photos), mode="valid")
+
+
+def haunted(strategy, **changes):
+    return train_with(strategy, with_hidden(config_of(strategy, **changes)), **changes)
+
+
+RESET = ITERATIONS // 5
+cases = {"none": {}, "adc": {}, "adc, resets": {"reset_every": RESET}, "mcmc": {}, "fast": {}}
+buried = {name: haunted(name.split(",")[0], **changes) for name, changes in cases.items()}
+buried["mcmc, no weights"] = haunted("mcmc", mcmc_opacity_weight=0.0, mcmc_scale_weight=0.0)
+buried["fast, no weight"] = haunted("fast", fast_opacity_weight=0.0)
+opaque = {name: int((in_the_middle(run.gaussians) > 0.1).sum()) for name, run in buried.items()}
+for name, run in buried.items():
+    print(f"{name:17} {opaque[name]:3d} opaque splats in the middle, {run.held_out:.2f} dB held out")
+
+plain, reset = (smoothed(buried[name].losses) for name in ("adc", "adc, resets"))
+before, peak = reset[RESET - len(photos)], reset[RESET : RESET + 30].max()
+recovery = int(np.argmax(reset[RESET + 1 :] < before))
+print(f"a reset multiplies the loss by {peak / before:.1f}; it is back after {recovery} iterations")
+
+fig, axes = plt.subplots(1, 2, figsize=(13, 3.6), layout="constrained")
+for name, curve in (("no resets", plain), ("resets", reset)):
+    axes[0].semilogy(curve, label=name)
+axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel="loss, mean over as many as photos")
+for name in ("adc", "adc, resets", "mcmc", "fast", "mcmc, no weights", "fast, no weight"):
+    values = in_the_middle(buried[name].gaussians)
+    axes[1].plot(np.arange(1, len(values) + 1), values, ".-", label=name)
+axes[1].set(title="opacities in the middle of the egg at the end", xlabel="splats, sorted", ylabel="opacity")
+for ax in axes:
+    ax.legend(fontsize=8)
+plt.show()
+assert SHORT or (peak > 2 * before and 10 < recovery < 150)
+assert SHORT or (opaque["adc, resets"] < 0.6 * opaque["adc"] and opaque["adc"] > 40)
+assert SHORT or max(opaque["mcmc"], opaque["fast"]) < 0.3 * opaque["adc, resets"] + 5
+
+# %% [markdown]
+# Without resets, the buried splats stay to the end, opaque and useless. Resets remove most of them. They cost several
+# times the loss for dozens of iterations, each time; `recipe` leaves them out of runs under 3,000 iterations, and this
+# page asked for them. Once there has been a reset, `adc` also prunes splats larger than a tenth of the extent. The
+# two other strategies have no resets and far fewer survivors; what does it there, is below.
+#
+# ## A budget
+#
+# Nothing in these rules knows when there are enough. The threshold decides, and a lower error needs ever more splats.
+# With a cap, the package clones and splits as many as there is room for, the highest scores first (`over_cap` is
+# "strongest"). The course's own setting, "cut", selects all and drops what exceeds the cap from the end.
+
+# %%
+capped = train_with("adc")
+budgets = {
+    "capped": capped,
+    "capped, cut": train_with("adc", over_cap="cut"),
+    "no cap": train_with("adc", max_gaussians=None),
+    "no cap, threshold x 4": train_with("adc", max_gaussians=None, grad_threshold=8e-4),
+}
+for name, run in budgets.items():
+    print(f"{name:22} {len(run.gaussians):6d} splats, {run.held_out:.2f} dB held out")
+full_at = next((i for i, count in enumerate(capped.counts) if count == CAP), ITERATIONS)
+print(f"the cap is reached after iteration {full_at}, when the loss is {smoothed(capped.losses)[full_at]:.3f}", end=" ")
+print(f"(at the end {smoothed(capped.losses)[-1]:.3f})")
+assert len(budgets["no cap"].gaussians) > 3 * CAP and len(capped.gaussians) <= CAP
+assert SHORT or full_at < ITERATIONS / 5
+assert SHORT or len(budgets["no cap"].gaussians) > 3 * len(budgets["no cap, threshold x 4"].gaussians)
+assert SHORT or abs(budgets["no cap"].held_out - budgets["no cap, threshold x 4"].held_out) < 1.5
+assert SHORT or budgets["capped, cut"].held_out < capped.held_out - 5
