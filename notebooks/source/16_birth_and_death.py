@@ -291,8 +291,8 @@ plt.show()
 #
 # ## Deaths, and those that nothing kills
 #
-# A splat whose opacity has fallen below $0.005$ is **pruned**: at half an 8-bit step it shows nowhere, and costs
-# as much time as any other. But only a gradient makes a splat faint, and the gradient of an opacity carries the
+# A splat whose opacity has fallen below $0.005$ is **pruned**: that is hardly above the floor of $1/255$, below which
+# nothing is drawn, and it costs as much time as any other. But only a gradient makes a splat faint, and the gradient of an opacity carries the
 # transmittance in front of the splat as a factor. What lies behind an opaque surface, or in front of a single camera, is
 # pulled by nobody. Here 60 opaque splats are hidden in the middle of the egg at the start.
 #
@@ -344,7 +344,7 @@ print(f"a reset multiplies the loss by {peak / before:.1f}; it is back after {re
 fig, axes = plt.subplots(1, 2, figsize=(13, 3.6), layout="constrained")
 for name, curve in (("no resets", plain), ("resets", reset)):
     axes[0].semilogy(curve, label=name)
-axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel="loss, mean over as many as photos")
+axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel=f"loss, mean of {len(photos)} iterations")
 for name in ("adc", "adc, resets", "mcmc", "fast", "mcmc, no weights", "fast, no weight"):
     values = in_the_middle(buried[name].gaussians)
     axes[1].plot(np.arange(1, len(values) + 1), values, ".-", label=name)
@@ -352,9 +352,10 @@ axes[1].set(title="opacities in the middle of the egg at the end", xlabel="splat
 for ax in axes:
     ax.legend(fontsize=8)
 plt.show()
+assert recipe().adc.reset_every == 3000 and recipe().adc.reset_opacity == 0.01 and recipe(2999).adc.reset_every == 0
 assert SHORT or (peak > 2 * before and 10 < recovery < 150)
 assert SHORT or (opaque["adc, resets"] < 0.6 * opaque["adc"] and opaque["adc"] > 40)
-assert SHORT or max(opaque["mcmc"], opaque["fast"]) < 0.3 * opaque["adc, resets"] + 5
+assert SHORT or max(opaque["mcmc"], opaque["fast"]) < 0.4 * opaque["adc"]
 
 # %% [markdown]
 # Without resets, the buried splats stay to the end, opaque and useless. Resets remove most of them. They cost several
@@ -386,3 +387,223 @@ assert SHORT or full_at < ITERATIONS / 5
 assert SHORT or len(budgets["no cap"].gaussians) > 3 * len(budgets["no cap, threshold x 4"].gaussians)
 assert SHORT or abs(budgets["no cap"].held_out - budgets["no cap, threshold x 4"].held_out) < 1.5
 assert SHORT or budgets["capped, cut"].held_out < capped.held_out - 5
+
+# %% [markdown]
+# Without a cap, the threshold decides: four times as high, it makes a fraction of the splats, for nearly the same picture. With
+# a cap, the budget is spent within the first fifth of the run, where the errors were at that time; from then on nobody
+# is born until somebody is pruned. With "cut", every splat that is split dies first, and its children stand at the end
+# of the list: that ruins a scene in which many are split at once.
+#
+# ## The number as given, the places as drawn
+#
+# `mcmc` (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo") turns the question round. The
+# cap is the number, and splats are samples of a distribution of scenes. A move that leaves the picture alone is
+# allowed at any time. So a dead splat, with an opacity of at most $0.005$, is not removed but **relocated** onto a
+# living one ([relocation](../docs/GLOSSARY.md#relocation)), drawn in proportion to opacity. New ones are added in the
+# same way, five percent at a time, up to the cap ([density.mcmc](../src/gsplat_edu/train/density/mcmc.py)).
+#
+# What do $n$ splats in one place have to be, to look like the one of opacity $o$ and scale $s$ before? At the
+# centre, $1 - (1 - o')^n = o$, so
+#
+# $$o' = 1 - (1 - o)^{1/n} .$$
+#
+# That is the revised opacity for any $n$. Section 2 showed what it lacks: width. Let $g_t = e^{-t^2/2}$ be the shape
+# along a line through the centre, and expand:
+#
+# $$1 - (1 - o' g_t)^n = \sum_{k=1}^{n} \binom{n}{k} (-1)^{k+1} o'^k g_t^k, \qquad
+# \int g_t^k \, s' dt = s' \sqrt{2\pi / k} .$$
+#
+# The integral along the line has to be the parent's, $o\,s \sqrt{2\pi}$. So all scales shrink by the same factor:
+#
+# $$\frac{s'}{s} = o \Big/ \sum_{k=1}^{n} \binom{n}{k} \frac{(-1)^{k+1} o'^k}{\sqrt k} .$$
+#
+# The paper writes a double sum, over the splats that were there before the $i$-th; it collapses, because
+# $\sum_{i=k}^{n} \binom{i-1}{k-1} = \binom{n}{k}$. The terms alternate and grow, so the package stops at 51.
+
+
+# %%
+def together(opacity, count, shrink):
+    """Alpha of so many equal splats in one place, along a line through their centre."""
+    return 1 - (1 - opacity * torch.exp(-((line / shrink) ** 2) / 2)) ** count
+
+
+line = torch.linspace(-12, 12, 24001, dtype=torch.float64)
+shown = (line.abs() < 3.5).numpy()
+fig, axes = plt.subplots(1, 3, figsize=(13, 3.6), layout="constrained")
+for count, color in ((2, "C0"), (5, "C1"), (51, "C2")):
+    for o in (0.05, 0.5, 0.95):
+        each, factor = shared_shape(torch.tensor([o], dtype=torch.float64), torch.tensor([count]))
+        wide, right = together(each, count, 1.0), together(each, count, factor)
+        before, unshrunk, now = o * np.sqrt(2 * np.pi), torch.trapezoid(wide, line), torch.trapezoid(right, line)
+        print(f"o = {o:4}, n = {count:2}: o' = {float(each):.4f}, s'/s = {float(factor):.4f},", end=" ")
+        print(f"integral x {float(unshrunk) / before:.3f} by opacity alone, x {float(now) / before:.9f} with the scale")
+        assert abs(now / before - 1) < 1e-6 and abs(1 - (1 - each) ** count - o) < 1e-12
+        assert unshrunk > before and factor < 1
+    axes[0].plot(line[shown], wide[shown], color, label=f"n = {count}")
+    axes[1].plot(line[shown], right[shown], color, label=f"n = {count}")
+for ax, title in zip(axes, ("opacity alone", "opacity and scale"), strict=False):
+    ax.plot(line[shown], 0.95 * torch.exp(-(line[shown] ** 2) / 2), "k--", label="one, o = 0.95")
+    ax.set(title=title, xlabel="place, standard deviations", ylabel="alpha")
+    ax.legend()
+opacities = np.linspace(0, 0.2, 400)
+axes[2].plot(opacities, 1 / (1 + np.exp(-NOISE_SHARPNESS * (NOISE_THRESHOLD - opacities))))
+axes[2].set(title="how much of the noise a splat gets", xlabel="opacity", ylabel="gate")
+plt.show()
+assert (NOISE_SHARPNESS, NOISE_THRESHOLD) == (100, 0.005)
+
+# %% [markdown]
+# The line's integral stays to rounding. An integral over the whole ellipse does not: its powers have $1/k$ where the
+# line has $1/\sqrt k$, so the shrunk copies are a little too small (exercise 2). That is why they were not perfect above.
+#
+# Samples have to explore. After each step the means get **noise**,
+#
+# $$\mu \leftarrow \mu + \gamma\, a\, \frac{1}{1 + e^{-100\,(0.005 - o)}}\; \Sigma\, n, \qquad n \text{ standard normal},$$
+#
+# with $\gamma$ the rate of the means and $a$ a factor of $5 \cdot 10^5$. The covariance keeps it inside the splat's own shape:
+# far along a wall, little across it. The gate is there because a splat that shows has been fitted, and a shift would
+# harm the picture; the shift of a splat that nobody sees costs nothing. It walks until a photo pulls it.
+#
+# And who dies? Two **weights** are added to the loss, on the mean opacity and the mean scale:
+#
+# $$L + 0.01 \operatorname{mean}(o) + 0.01 \operatorname{mean}(s) .$$
+#
+# They pull each splat down, whether or not a photo shows it. What no photo holds up fades to $0.005$ and is relocated:
+# that is what emptied the egg above. Without the weights, the buried splats stay opaque; and since places are drawn by
+# opacity and not by error, they attract newborns, and the budget ends inside the egg.
+
+# %%
+assert SHORT or opaque["mcmc, no weights"] > 2 * opaque["adc"] and opaque["mcmc, no weights"] > 5 * opaque["mcmc"]
+without = {
+    "as it is": buried["mcmc"],
+    "without noise": haunted("mcmc", mcmc_noise=0.0),
+    "without weights": buried["mcmc, no weights"],
+}
+for name, run in without.items():
+    moved = sum(event.num_relocated for event in run.events)
+    print(f"mcmc {name:16} {run.held_out:.2f} dB held out, {moved} relocations, {len(run.gaussians)} splats")
+assert SHORT or without["as it is"].held_out > 2 + max(
+    without[name].held_out for name in ("without noise", "without weights")
+)
+assert buried["mcmc"].config.mcmc.noise == 5e5 and buried["mcmc"].config.min_opacity == 0.005
+
+# %% [markdown]
+# ## Born where it is wrong, as many as planned
+#
+# Each strategy has half of what is wanted. `adc` knows where splats are missing and not how many there will be; `mcmc`
+# knows how many and draws the places by opacity. The strategy of the package's own recipe, `fast`
+# ([density.fast](../src/gsplat_edu/train/density/fast.py)), joins the halves:
+#
+# - **A plan.** With $m$ splats at the start and the cap $c$, the number at iteration $t$ is
+#   $m + (c - m)\,(t - t_0) / (t_1 - t_0)$, from $t_0$, where density control begins, to $t_1$ at three fifths of the run. No
+#   threshold exists.
+# - **The highest scores.** Every time, the faint are pruned, and as many splats are split as the plan has room for, in
+#   the order of their scores. A death is thus a birth elsewhere: a relocation to where the error pulls.
+# - **A split that keeps the picture**, along the longest axis as above. Nothing is drawn at random.
+# - **A weight instead of resets**: $0.002 \operatorname{mean}(o)$ until $t_1$, and pruning below $0.02$. The weight
+#   does to buried splats what it did in `mcmc`; it is weaker, and it ends with the plan, because later no death is
+#   replaced.
+#
+# The recipe has more that is not density control: photos begin at a quarter of their size and grow, and rates fall to a
+# tenth at the end. To keep the causes apart, one row of the table below switches both off.
+#
+# > **Predict.** Same start, photos, rates, cap and iterations. Which strategy has the most births, the one that is the
+# > best on the held-out photos? And how far apart are two seeds of the same strategy?
+
+
+# %%
+def tally(events):
+    """Count births and deaths; a split is one death and two births, a relocation one of each."""
+    born = died = 0
+    for event in events:
+        if isinstance(event, DensifyEvent):
+            born += event.num_cloned + event.num_split_children
+            died += event.num_pruned + event.num_split_children // 2
+        elif isinstance(event, RelocateEvent):
+            born, died = born + event.num_added + event.num_relocated, died + event.num_relocated
+    return born, died
+
+
+own = {name: getattr(recipe(), name) for name in RATES}
+rows = {
+    "none": {},
+    "adc": {},
+    "adc, resets": {"reset_every": RESET},
+    "mcmc": {},
+    "fast, density control only": {"fast_start_factor": 1.0, "fast_decay": 1.0},
+    "fast": {},
+    "adc, rates of 2023": own,
+    "mcmc, rates of 2023": own,
+}
+every, means = {}, {}
+print(f"{'mean of ' + str(SEEDS) + ' seeds':27} held out, dB   spread   splats     born     died")
+for name, changes in rows.items():
+    every[name] = [train_with(name.split(",")[0], seed=seed, **changes) for seed in range(SEEDS)]
+    results, counts = [run.held_out for run in every[name]], [tally(run.events) for run in every[name]]
+    means[name] = np.mean(results)
+    born, died = counts[0]
+    print(f"{name:27} {means[name]:13.2f} {np.ptp(results):8.2f} {len(every[name][0].gaussians):8d}", end=" ")
+    print(f"{born:8d} {died:8d}")
+    assert every[name][0].start + born - died == len(every[name][0].gaussians) <= CAP
+
+plan = every["fast"][0].config
+moments = np.arange(ITERATIONS)
+planned = planned_counts(plan, 100, CAP, moments)
+due = [event for event in every["fast"][0].events if event.iteration <= plan.fast.stop]
+assert all(event.num_gaussians <= planned[event.iteration] for event in due)
+assert len(every["fast"][0].gaussians) > 0.97 * CAP and plan.fast.stop == 3 * ITERATIONS // 5
+assert (plan.fast.opacity_weight, plan.min_opacity) == (0.002, 0.02)
+assert (photo_factor(plan, 0), photo_factor(plan, ITERATIONS - 1)) == (4.0, 1.0)
+
+fig, axes = plt.subplots(1, 3, figsize=(14, 3.8), layout="constrained")
+for name in ("none", "adc", "mcmc", "fast"):
+    run = every[name][0]
+    (line,) = axes[0].plot(run.counts, label=name)
+    steps = [0] + [event.iteration for event in run.events] + [ITERATIONS - 1]
+    totals = [tally(run.events[: k + 1])[0] for k in range(len(run.events))]
+    axes[1].step(steps, [0, *totals, (totals or [0])[-1]], where="post", color=line.get_color(), label=name)
+axes[0].plot(moments, planned, "k:", label="the plan of fast")
+axes[0].set(title="who is there", xlabel="iteration", ylabel="number of splats")
+axes[1].set(title="who was ever born", xlabel="iteration", ylabel="births so far")
+for place, (name, runs) in enumerate(every.items()):
+    axes[2].plot([run.held_out for run in runs], [place] * len(runs), "k|", markersize=14)
+axes[2].set(title="held-out photos, a line for each seed", xlabel="PSNR, dB")
+axes[2].set(yticks=range(len(every)), yticklabels=list(every), ylabel="strategy")
+axes[2].invert_yaxis()
+for ax in axes[:2]:
+    ax.legend(fontsize=8)
+plt.show()
+
+fig, axes = plt.subplots(1, 5, figsize=(14, 3.2), layout="constrained")
+axes[0].imshow(view.image, interpolation="nearest")
+for ax, name in zip(axes[1:], ("none", "adc", "mcmc", "fast"), strict=True):
+    with torch.no_grad():
+        ax.imshow(render(every[name][0].gaussians, view.camera).image.clamp(0, 1).numpy(), interpolation="nearest")
+for ax, title in zip(axes, ("held-out photo", "none", "adc", "mcmc", "fast"), strict=True):
+    ax.set(title=title, xticks=[], yticks=[])
+plt.show()
+full = {name: next((i for i, n in enumerate(every[name][0].counts) if n == CAP), None) for name in ("adc", "mcmc")}
+print(f"the cap is reached: adc after {full['adc']} iterations, mcmc after {full['mcmc']}")
+
+# %% [markdown]
+# ## The next failure
+
+# %%
+sizes, few_photos = CAP * 2.0 ** np.arange(-2, 5 if not SHORT else 2), photos[::4]
+curves = {}
+for name, shown in (("all photos", photos), ("a quarter of the photos", few_photos)):
+    runs = [train_with("fast", shown=shown, max_gaussians=int(size)) for size in sizes]
+    curves[name] = [quality(run.gaussians, shown) for run in runs], [run.held_out for run in runs]
+    print(name, len(shown), np.round(curves[name], 2).tolist())
+fig, axes = plt.subplots(1, 2, figsize=(12, 3.8), layout="constrained")
+for ax, (name, lines) in zip(axes, curves.items(), strict=True):
+    for line, label in zip(lines, ("photos trained on", "held-out photos"), strict=True):
+        ax.semilogx(sizes, line, "o-", label=label)
+    ax.axvline(1200, color="black", linewidth=0.8, label="Gaussians in the truth")
+    ax.set(title=f"fast, {name}", xlabel="cap", ylabel="PSNR, dB")
+    ax.legend()
+plt.show()
+front = [v for v in photos if v.camera.eye[2] < 0]
+back = [v for v in photos if v.camera.eye[2] > 1.5]
+for strategy in ("adc", "mcmc", "fast"):
+    run = train_with(strategy, shown=front)
+    print(strategy, len(front), quality(run.gaussians, front), quality(run.gaussians, back))
