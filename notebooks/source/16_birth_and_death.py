@@ -98,12 +98,12 @@ print(f"{len(fixed.gaussians)} splats, as at the start: {fixed.held_out:.2f} dB 
 # $$g_v = \sum_p \frac{\partial L_v}{\partial c_p} \cdot \frac{\partial c_p}{\partial u}, \qquad
 # \text{score} = \operatorname{mean}_v |g_v| .$$
 #
-# Each pixel pulls the splat towards where it would repair that pixel. In a place that one splat can explain, the
-# pulls end: the splat follows them and arrives. A score that stays large says that the photos keep disagreeing about
-# where the splat should be. The length is taken in each photo before the mean, because the pulls of two photos may cancel
-# although neither is satisfied. Within one photo the sum still has signs. A splat between two dots is pulled equally
-# to both sides. AbsGS (Ye et al. 2024) therefore adds up absolute values. The package measures both
-# ([render.output](../src/gsplat_edu/render/output.py): `means2d_grad_norms`, and `collect("absgrad")`).
+# Each pixel pulls the splat towards where it would repair that pixel. Where one splat is enough, it follows the pulls
+# until they end. A score that stays large says that pixels keep disagreeing about where the splat should be. The length
+# is taken in each photo before the mean, because the pulls of two photos may cancel although neither is satisfied.
+# Within a photo the sum has signs: a splat between two dots is pulled equally to both sides. AbsGS (Ye et al. 2024)
+# adds up absolute values instead. The package measures both ([render.output](../src/gsplat_edu/render/output.py):
+# `means2d_grad_norms` and `collect("absgrad")`).
 
 
 # %%
@@ -130,9 +130,7 @@ def pulls(gaussians, view):
 
 stage = Camera.looking_at([0, 0, -3], [0, 0, 0], 64, 64, H=64, W=64)
 dots = Gaussians.concatenated([ball((x, 0, 0), 0.12, 0.9) for x in (-0.5, 0.5)])
-dotted = SimpleNamespace(
-    camera=stage, image=(255 * render(dots, stage).image).clamp(0, 255).to(torch.uint8).numpy()
-)
+dotted = SimpleNamespace(camera=stage, image=(255 * render(dots, stage).image).to(torch.uint8).numpy())
 offsets = np.linspace(-1, 1, 41)
 walk = np.array([pulls(ball((x, 0, 0), 0.4, 0.6), dotted)[2][:2, 0].numpy() for x in offsets])
 
@@ -140,20 +138,20 @@ sums = torch.zeros(5, len(fixed.gaussians))
 for view in photos:
     _, visible, columns = pulls(fixed.gaussians, view)
     sums.index_add_(1, visible, columns)
-score, absolute, error = (sums[[0, 1]] / sums[4].clamp(min=1)).tolist() + [(sums[2] / sums[3]).tolist()]
-score, absolute, error = map(np.array, (score, absolute, error))
+score, absolute = (sums[:2] / sums[4].clamp(min=1)).numpy()
+error = (sums[2] / sums[3]).numpy()
 
 view = held_out[1]
 picture = pulls(fixed.gaussians, view)[0]
 p = (fixed.gaussians.means.detach().numpy() - view.camera.eye) @ view.camera.R.T
 u = view.camera.fx * p[:, :2] / p[:, 2:] + [view.camera.cx, view.camera.cy]
 fig, axes = plt.subplots(1, 4, figsize=(14, 3.4), layout="constrained")
-for ax, (title, image) in zip(axes, {"held-out photo": view.image, "100 splats": picture}.items(), strict=False):
-    ax.imshow(np.clip(image, 0, 255 if image.dtype == np.uint8 else 1), interpolation="nearest")
+gap = np.abs(picture - view.image / 255).mean(axis=-1)
+titles = "held-out photo", "100 splats", "error; circles: score"
+for ax, title, image in zip(axes, titles, (view.image / 255, picture.clip(0, 1), gap), strict=False):
+    ax.imshow(image, interpolation="nearest", cmap="magma")
     ax.set(title=title, xticks=[], yticks=[])
-axes[2].imshow(np.abs(picture - view.image / 255).mean(axis=-1), cmap="magma")
 axes[2].scatter(*u.T, s=4e4 * score, facecolors="none", edgecolors="cyan", linewidths=0.7)
-axes[2].set(title="error; circles: score", xticks=[], yticks=[])
 for line, label in zip(walk.T, ("length of the sum", "sum of absolute values"), strict=True):
     axes[3].plot(offsets, line, label=label)
 axes[3].set(title="a splat on its way past two dots", xlabel="centre of the splat", ylabel="pull, per NDC")
@@ -166,12 +164,12 @@ print(f"between the dots: {walk[20, 0]:.1e} signed, {walk[20, 1]:.1e} absolute")
 print(f"trained scene: {100 * cancelled:.0f} % of the pull cancels within the photos")
 print(f"score and error under the splat: rank correlation {agreement:.2f}")
 assert walk[20, 0] < 0.1 * walk[:, 0].max() and walk[20, 1] > 5 * walk[20, 0]
-assert cancelled > 0.3
+assert cancelled > 0.3 and (SHORT or agreement < 0.5)
 
 # %% [markdown]
 # The horn has become a smear of splats of the egg. Between the dots nothing pulls, although nothing is right there; and
-# in the trained scene, too, a good part of the pull cancels. Is the score nevertheless a good choice? The test is to
-# use it: split the same number of splats, chosen in different ways, and train on with the new number fixed.
+# in the trained scene, too, a good part of the pull cancels. Nor does the score measure the error: the rank correlation
+# is small. Is it nevertheless a good choice? Split the same number of splats, chosen in different ways, and train on.
 
 
 # %%
@@ -183,20 +181,24 @@ def split_rows(gaussians, rows):
 
 
 few = len(score) // 4
-choices = {"highest score": score, "absolute values": absolute, "largest error": error, "lowest score": -score}
+choices = {
+    "highest score": score,
+    "absolute values": absolute,
+    "largest error": error,
+    "lowest score": -score,
+}
 after = {}
 for name, key in choices.items():
     rows = torch.tensor(np.argsort(-key)[:few].copy())
     run = train_with("none", split_rows(fixed.gaussians, rows), iterations=ITERATIONS // 3)
     after[name] = run.held_out
     print(f"{few} splits by {name:16} {after[name]:.2f} dB")
-assert SHORT or after["highest score"] > after["lowest score"] + 0.5
+assert SHORT or min(after["highest score"], after["absolute values"]) > after["lowest score"] + 0.5
+assert SHORT or abs(after["highest score"] - after["absolute values"]) < 1.5
 
 # %% [markdown]
-# The signed score is as good as the absolute one here, and both are far better than its opposite. It isn't a measure of
-# the error: the rank correlation above is small. An error that no movement reduces is no reason to be split, and a
-# splat may be pulled hard by an error that lies beside it. (In this package, no strategy uses absolute values: on four
-# captures they were no better, says [RECIPE.md](../docs/RECIPE.md).)
+# The signed score does about as well as the absolute one, and both are far better than the lowest score. No strategy of
+# the package uses absolute values: they did not gain on all of four captures ([RECIPE.md](../docs/RECIPE.md)).
 #
 # ## A birth changes the picture
 #
@@ -216,21 +218,24 @@ assert SHORT or after["highest score"] > after["lowest score"] + 0.5
 # that $1 - (1 - o')^2 = o$. It holds at the centre only. As a function of $g$, $1 - (1 - o' g)^2$ is concave and
 # meets $o\,g$ at $g = 0$ and $g = 1$; between them it lies above, and the splat gets wider. This package does not
 # correct clones of `adc`. Its two other strategies were made so that a birth leaves the picture (nearly) alone:
-# `mcmc` also shrinks the copies, and `fast` splits along the longest axis $e$ of scale $s_e$, without a draw,
+# `mcmc` also shrinks the copies, and `fast` splits along the longest axis $e$ of scale $s_e$, without a draw
 # ([density.surgery](../src/gsplat_edu/train/density/surgery.py)):
 #
 # $$\mu' = \mu \pm \frac{s_e}{\sqrt 2}\, e, \qquad s_e' = \frac{s_e}{\sqrt 2}, \qquad o' = 1 - (1 - o)^{1/\sqrt 2} .$$
 #
-# The variance along $e$ stays: that of a child, $s_e^2 / 2$, plus that of the two centres, $s_e^2 / 2$. So does the mass
-# for small $o$, because $2 \cdot (o / \sqrt 2)(s_e / \sqrt 2) = o\, s_e$.
+# The variance along $e$ stays: that of a child, $s_e^2 / 2$, plus that of the two centres, $s_e^2 / 2$. So does the
+# mass for small $o$, because $2 \cdot (o / \sqrt 2)(s_e / \sqrt 2) = o\, s_e$.
 #
 # > **Predict.** All hundred splats of the trained scene have children at once, in each of these ways. Which picture
-# > stays closest to the one before? Does the worst one come from a random draw or from a copy?
+# > stays closest to the one before? Which changes most, that of the random draws or that of the plain copies?
 
 
 # %%
 def with_opacity(gaussians, opacities, shrink):
-    changed = {"logit_opacities": torch.logit(opacities), "log_scales": gaussians.log_scales + torch.log(shrink)}
+    changed = {
+        "logit_opacities": torch.logit(opacities),
+        "log_scales": gaussians.log_scales + torch.log(shrink),
+    }
     changed = {name: raw.to(gaussians.means) for name, raw in changed.items()}
     return Gaussians(**(gaussians.tensors() | changed))
 
@@ -239,8 +244,9 @@ def families(parents):
     """Give every Gaussian children, in five ways."""
     o, generator = parents.opacities.double(), torch.Generator().manual_seed(16)
     pair, factor = shared_shape(o, torch.full((len(o),), 2))
-    same = torch.ones_like(factor)[:, None]
-    revised, shared = with_opacity(parents, 1 - (1 - o).sqrt(), same), with_opacity(parents, pair, factor[:, None])
+    factor = factor[:, None]
+    revised = with_opacity(parents, 1 - (1 - o).sqrt(), torch.ones_like(factor))
+    shared = with_opacity(parents, pair, factor)
     return {
         "clone": [parents, parents],
         "clone, opacity revised": [revised, revised],
@@ -279,7 +285,9 @@ for ax, names in zip(axes, (list(kept)[:3], list(kept)[3:]), strict=True):
             away = (x - child.means[0, 0]) / child.scales[0, 0]
             clear *= 1 - child.opacities[0] * torch.exp(-away * away / 2)
         ax.plot(x, 1 - clear, label=name)
-    ax.set(title="alpha of a parent and of its two children", xlabel="place, standard deviations of the parent")
+    ax.set(
+        title="alpha of a parent and of its two children", xlabel="place, standard deviations of the parent"
+    )
     ax.legend(loc="lower center", fontsize=8)
 axes[0].set_ylabel("alpha")
 plt.show()
@@ -292,9 +300,9 @@ plt.show()
 # ## Deaths, and those that nothing kills
 #
 # A splat whose opacity has fallen below $0.005$ is **pruned**: that is hardly above the floor of $1/255$, below which
-# nothing is drawn, and it costs as much time as any other. But only a gradient makes a splat faint, and the gradient of an opacity carries the
-# transmittance in front of the splat as a factor. What lies behind an opaque surface, or in front of a single camera, is
-# pulled by nobody. Here 60 opaque splats are hidden in the middle of the egg at the start.
+# nothing is drawn, and it costs as much time as any other. But only a gradient makes a splat faint, and the gradient of
+# an opacity carries the transmittance in front of the splat as a factor. What lies behind an opaque surface is pulled
+# by nobody. Here 60 opaque splats are hidden in the middle of the egg at the start.
 #
 # Therefore `adc` also **resets** opacities: every 3,000 iterations all that are above $0.01$ are set to it, and Adam's
 # moments of opacity are forgotten. Light reaches everything, and each splat has to earn its opacity again.
@@ -344,7 +352,9 @@ print(f"a reset multiplies the loss by {peak / before:.1f}; it is back after {re
 fig, axes = plt.subplots(1, 2, figsize=(13, 3.6), layout="constrained")
 for name, curve in (("no resets", plain), ("resets", reset)):
     axes[0].semilogy(curve, label=name)
-axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel=f"loss, mean of {len(photos)} iterations")
+axes[0].set(
+    title="adc: what a reset costs", xlabel="iteration", ylabel=f"loss, mean of {len(photos)} iterations"
+)
 for name in ("adc", "adc, resets", "mcmc", "fast", "mcmc, no weights", "fast, no weight"):
     values = in_the_middle(buried[name].gaussians)
     axes[1].plot(np.arange(1, len(values) + 1), values, ".-", label=name)
@@ -352,7 +362,11 @@ axes[1].set(title="opacities in the middle of the egg at the end", xlabel="splat
 for ax in axes:
     ax.legend(fontsize=8)
 plt.show()
-assert recipe().adc.reset_every == 3000 and recipe().adc.reset_opacity == 0.01 and recipe(2999).adc.reset_every == 0
+assert (
+    recipe().adc.reset_every == 3000
+    and recipe().adc.reset_opacity == 0.01
+    and recipe(2999).adc.reset_every == 0
+)
 assert SHORT or (peak > 2 * before and 10 < recovery < 150)
 assert SHORT or (opaque["adc, resets"] < 0.6 * opaque["adc"] and opaque["adc"] > 40)
 assert SHORT or max(opaque["mcmc"], opaque["fast"]) < 0.4 * opaque["adc"]
@@ -380,8 +394,8 @@ budgets = {
 for name, run in budgets.items():
     print(f"{name:22} {len(run.gaussians):6d} splats, {run.held_out:.2f} dB held out")
 full_at = next((i for i, count in enumerate(capped.counts) if count == CAP), ITERATIONS)
-print(f"the cap is reached after iteration {full_at}, when the loss is {smoothed(capped.losses)[full_at]:.3f}", end=" ")
-print(f"(at the end {smoothed(capped.losses)[-1]:.3f})")
+now, end = smoothed(capped.losses)[[full_at, -1]]
+print(f"the cap is reached after iteration {full_at}, when the loss is {now:.3f}; at the end it is {end:.3f}")
 assert len(budgets["no cap"].gaussians) > 3 * CAP and len(capped.gaussians) <= CAP
 assert SHORT or full_at < ITERATIONS / 5
 assert SHORT or len(budgets["no cap"].gaussians) > 3 * len(budgets["no cap, threshold x 4"].gaussians)
@@ -389,10 +403,10 @@ assert SHORT or abs(budgets["no cap"].held_out - budgets["no cap, threshold x 4"
 assert SHORT or budgets["capped, cut"].held_out < capped.held_out - 5
 
 # %% [markdown]
-# Without a cap, the threshold decides: four times as high, it makes a fraction of the splats, for nearly the same picture. With
-# a cap, the budget is spent within the first fifth of the run, where the errors were at that time; from then on nobody
-# is born until somebody is pruned. With "cut", every splat that is split dies first, and its children stand at the end
-# of the list: that ruins a scene in which many are split at once.
+# Without a cap, the threshold decides: four times as high, it makes a fraction of the splats, for nearly the same
+# picture. With a cap, the budget is spent within the first fifth of the run, where the errors were at that time; from
+# then on nobody is born until somebody is pruned. With "cut", each split parent dies first, and its children stand at
+# the end of the list: that ruins a scene in which many are split at once.
 #
 # ## The number as given, the places as drawn
 #
@@ -434,11 +448,10 @@ for count, color in ((2, "C0"), (5, "C1"), (51, "C2")):
     for o in (0.05, 0.5, 0.95):
         each, factor = shared_shape(torch.tensor([o], dtype=torch.float64), torch.tensor([count]))
         wide, right = together(each, count, 1.0), together(each, count, factor)
-        before, unshrunk, now = o * np.sqrt(2 * np.pi), torch.trapezoid(wide, line), torch.trapezoid(right, line)
-        print(f"o = {o:4}, n = {count:2}: o' = {float(each):.4f}, s'/s = {float(factor):.4f},", end=" ")
-        print(f"integral x {float(unshrunk) / before:.3f} by opacity alone, x {float(now) / before:.9f} with the scale")
-        assert abs(now / before - 1) < 1e-6 and abs(1 - (1 - each) ** count - o) < 1e-12
-        assert unshrunk > before and factor < 1
+        alone, both = (float(torch.trapezoid(a, line)) / (o * np.sqrt(2 * np.pi)) for a in (wide, right))
+        print(f"o = {o:4}, n = {count:2}: o' = {float(each):.4f}, s'/s = {float(factor):.4f};", end=" ")
+        print(f"integral x {alone:.3f} by opacity alone, x {both:.9f} with the scale")
+        assert abs(both - 1) < 1e-6 and alone > 1 > factor and abs(1 - (1 - each) ** count - o) < 1e-12
     axes[0].plot(line[shown], wide[shown], color, label=f"n = {count}")
     axes[1].plot(line[shown], right[shown], color, label=f"n = {count}")
 for ax, title in zip(axes, ("opacity alone", "opacity and scale"), strict=False):
@@ -453,15 +466,15 @@ assert (NOISE_SHARPNESS, NOISE_THRESHOLD) == (100, 0.005)
 
 # %% [markdown]
 # The line's integral stays to rounding. An integral over the whole ellipse does not: its powers have $1/k$ where the
-# line has $1/\sqrt k$, so the shrunk copies are a little too small (exercise 2). That is why they were not perfect above.
+# line has $1/\sqrt k$, so the shrunk copies are a little too small (exercise 2).
 #
 # Samples have to explore. After each step the means get **noise**,
 #
-# $$\mu \leftarrow \mu + \gamma\, a\, \frac{1}{1 + e^{-100\,(0.005 - o)}}\; \Sigma\, n, \qquad n \text{ standard normal},$$
+# $$\mu \leftarrow \mu + \gamma\, a\, \frac{1}{1 + e^{-100\,(0.005 - o)}}\; \Sigma\, n, \quad n \text{ standard normal},$$
 #
-# with $\gamma$ the rate of the means and $a$ a factor of $5 \cdot 10^5$. The covariance keeps it inside the splat's own shape:
-# far along a wall, little across it. The gate is there because a splat that shows has been fitted, and a shift would
-# harm the picture; the shift of a splat that nobody sees costs nothing. It walks until a photo pulls it.
+# with $\gamma$ the rate of the means and $a = 5 \cdot 10^5$. The covariance keeps it inside the splat's own shape: far
+# along a wall, little across it. The gate is there because a splat that shows has been fitted, and a shift would harm
+# the picture; the shift of a splat that nobody sees costs nothing. It walks until a photo pulls it.
 #
 # And who dies? Two **weights** are added to the loss, on the mean opacity and the mean scale:
 #
@@ -472,7 +485,7 @@ assert (NOISE_SHARPNESS, NOISE_THRESHOLD) == (100, 0.005)
 # opacity and not by error, they attract newborns, and the budget ends inside the egg.
 
 # %%
-assert SHORT or opaque["mcmc, no weights"] > 2 * opaque["adc"] and opaque["mcmc, no weights"] > 5 * opaque["mcmc"]
+assert SHORT or opaque["mcmc, no weights"] > 2 * max(opaque["adc"], opaque["mcmc"])
 without = {
     "as it is": buried["mcmc"],
     "without noise": haunted("mcmc", mcmc_noise=0.0),
@@ -481,10 +494,10 @@ without = {
 for name, run in without.items():
     moved = sum(event.num_relocated for event in run.events)
     print(f"mcmc {name:16} {run.held_out:.2f} dB held out, {moved} relocations, {len(run.gaussians)} splats")
-assert SHORT or without["as it is"].held_out > 2 + max(
-    without[name].held_out for name in ("without noise", "without weights")
-)
-assert buried["mcmc"].config.mcmc.noise == 5e5 and buried["mcmc"].config.min_opacity == 0.005
+levels = [run.held_out for run in without.values()]
+assert SHORT or levels[0] > 2 + max(levels[1:])
+assert (recipe().mcmc.noise, recipe().mcmc.growth, recipe().min_opacity) == (5e5, 1.05, 0.005)
+assert recipe().mcmc.opacity_weight == recipe().mcmc.scale_weight == 0.01
 
 # %% [markdown]
 # ## Born where it is wrong, as many as planned
@@ -494,8 +507,8 @@ assert buried["mcmc"].config.mcmc.noise == 5e5 and buried["mcmc"].config.min_opa
 # ([density.fast](../src/gsplat_edu/train/density/fast.py)), joins the halves:
 #
 # - **A plan.** With $m$ splats at the start and the cap $c$, the number at iteration $t$ is
-#   $m + (c - m)\,(t - t_0) / (t_1 - t_0)$, from $t_0$, where density control begins, to $t_1$ at three fifths of the run. No
-#   threshold exists.
+#   $m + (c - m)\,(t - t_0) / (t_1 - t_0)$, from $t_0$, where density control begins, to $t_1$ at three fifths of the
+#   run. There is no threshold.
 # - **The highest scores.** Every time, the faint are pruned, and as many splats are split as the plan has room for, in
 #   the order of their scores. A death is thus a birth elsewhere: a relocation to where the error pulls.
 # - **A split that keeps the picture**, along the longest axis as above. Nothing is drawn at random.
@@ -573,37 +586,62 @@ for ax in axes[:2]:
     ax.legend(fontsize=8)
 plt.show()
 
-fig, axes = plt.subplots(1, 5, figsize=(14, 3.2), layout="constrained")
-axes[0].imshow(view.image, interpolation="nearest")
-for ax, name in zip(axes[1:], ("none", "adc", "mcmc", "fast"), strict=True):
-    with torch.no_grad():
-        ax.imshow(render(every[name][0].gaussians, view.camera).image.clamp(0, 1).numpy(), interpolation="nearest")
-for ax, title in zip(axes, ("held-out photo", "none", "adc", "mcmc", "fast"), strict=True):
-    ax.set(title=title, xticks=[], yticks=[])
-plt.show()
-full = {name: next((i for i, n in enumerate(every[name][0].counts) if n == CAP), None) for name in ("adc", "mcmc")}
-print(f"the cap is reached: adc after {full['adc']} iterations, mcmc after {full['mcmc']}")
+full = [next((i for i, n in enumerate(every[name][0].counts) if n == CAP), None) for name in ("adc", "mcmc")]
+print(f"the cap is reached: adc after {full[0]} iterations, mcmc after {full[1]}")
+lead = means["fast, density control only"] - max(means["adc"], means["adc, resets"])
+assert SHORT or (lead > 0.5 and min(means["adc"], means["mcmc"]) > means["none"] + 4)
+assert SHORT or min(means[name] - means[f"{name}, rates of 2023"] for name in ("adc", "mcmc")) > 1.5
+assert SHORT or tally(every["adc"][0].events)[0] > tally(every["fast"][0].events)[0]
+assert SHORT or (full[0] < ITERATIONS / 5 and full[1] > plan.fast.stop)
+assert SHORT or max(np.ptp([run.held_out for run in runs]) for runs in every.values()) > 0.5
 
 # %% [markdown]
+# Any strategy is far ahead of a fixed number. `adc` has more births than `fast` and is behind it: nearly all of them
+# came at once, when little was known. `fast` leads even without its small photos and falling rates. `mcmc` grows by five
+# percent at a time and reaches the cap late; it is made for runs of 30,000 iterations. And the rates matter as much as the
+# strategy: with those of 2023, made for long runs, `adc` and `mcmc` lose more than a decibel. Seeds differ by half a
+# decibel and more, so smaller differences, such as that of the resets here, say nothing.
+#
+# This is one small scene, without a sky, a lens or a wrong pose. [RECIPE.md](../docs/RECIPE.md) has what the pieces of
+# `fast` bring on real captures.
+#
 # ## The next failure
+#
+# The cap was given. Nobody asked how many splats the scene needs, and `fast` makes as many as it is told. So train
+# with a row of caps, on all photos and on a quarter of them. And train on photos of the front only.
 
 # %%
-sizes, few_photos = CAP * 2.0 ** np.arange(-2, 5 if not SHORT else 2), photos[::4]
-curves = {}
-for name, shown in (("all photos", photos), ("a quarter of the photos", few_photos)):
-    runs = [train_with("fast", shown=shown, max_gaussians=int(size)) for size in sizes]
-    curves[name] = [quality(run.gaussians, shown) for run in runs], [run.held_out for run in runs]
-    print(name, len(shown), np.round(curves[name], 2).tolist())
-fig, axes = plt.subplots(1, 2, figsize=(12, 3.8), layout="constrained")
+sizes, curves = CAP * 2.0 ** np.arange(-2, 2 if SHORT else 4), {}
+for name, seen in (("all photos", photos), ("a quarter of them", photos[::4])):
+    runs = [train_with("fast", shown=seen, max_gaussians=int(size)) for size in sizes]
+    curves[name] = np.array([[quality(run.gaussians, part) for run in runs] for part in (seen, held_out)])
+    print(f"{name} ({len(seen)}), caps {sizes.astype(int).tolist()}:", np.round(curves[name], 2).tolist())
+
+fig, axes = plt.subplots(1, 2, figsize=(12, 3.6), layout="constrained")
 for ax, (name, lines) in zip(axes, curves.items(), strict=True):
-    for line, label in zip(lines, ("photos trained on", "held-out photos"), strict=True):
-        ax.semilogx(sizes, line, "o-", label=label)
+    for values, label in zip(lines, ("photos trained on", "held-out photos"), strict=True):
+        ax.semilogx(sizes, values, "o-", label=label)
     ax.axvline(1200, color="black", linewidth=0.8, label="Gaussians in the truth")
     ax.set(title=f"fast, {name}", xlabel="cap", ylabel="PSNR, dB")
     ax.legend()
 plt.show()
-front = [v for v in photos if v.camera.eye[2] < 0]
-back = [v for v in photos if v.camera.eye[2] > 1.5]
+for seen, unseen in curves.values():
+    assert SHORT or (seen[-1] > seen[-3] + 2 and unseen[-1] - unseen[-3] < 0.5 * (seen[-1] - seen[-3]))
+assert SHORT or np.ptp(curves["a quarter of them"][1][-3:]) < 1.5
+
+front, back = ([v for v in photos if side * v.camera.eye[2] > 1.5] for side in (-1, 1))
 for strategy in ("adc", "mcmc", "fast"):
     run = train_with(strategy, shown=front)
-    print(strategy, len(front), quality(run.gaussians, front), quality(run.gaussians, back))
+    sides = [quality(run.gaussians, part) for part in (front, back)]
+    print(
+        f"{strategy:5} trained on {len(front)} photos of the front: {sides[0]:.2f} dB, of the back {sides[1]:.2f} dB"
+    )
+    assert sides[0] > sides[1] + 5
+
+# %% [markdown]
+# On the photos of the training, more is always better. The held-out photos gain less and less; with few photos, several
+# times as many splats bring nothing. The loss cannot say where to stop, because it sees only what it is
+# trained on: the right number is a fact about scene and photos together, and each recipe guesses it beforehand.
+#
+# And births follow the pulls, and pulls come from pixels. The back of the egg has start points and no photo: no
+# strategy makes anything of it. A photo that was not taken asks for nothing.
