@@ -15,9 +15,8 @@
 # # 16 - Where Gaussians come from and go
 #
 # [Chapter 09](09_train_in_3d.ipynb) learned a sphere with a rule that it took from a paper: copy a small splat that is
-# pulled, cut a large one in two, drop the faint ones. [Chapter 14](14_photos_to_scene.ipynb) used another rule
-# and did not explain it. This page explains all strategies of the package. Each of them answers a failure of the one
-# before, so each failure is measured first.
+# pulled, cut a large one in two, drop the faint ones. [Chapter 14](14_photos_to_scene.ipynb) used another rule. This
+# page explains all strategies of the package. Each answers a failure of the one before, which is measured first.
 #
 # The scene is a bumpy egg with a horn: 1,200 Gaussians, photographed from a ring of cameras. Every sixth photo is
 # held out. A training begins with 100 points on the egg and none on the horn.
@@ -50,11 +49,10 @@ SIZE, ITERATIONS, SEEDS = (64, 400, 1) if SHORT else (96, 1500, 3)
 CAP, EXTENT = 800, 3.2
 print(f"budget: {ITERATIONS} iterations, {SIZE} px, {SEEDS} seeds{' (reduced)' if SHORT else ''}")
 
-views, cloud, cloud_colors = procedural_capture(SIZE, 26, height=SIZE, splats=1200)
-held_out = views[3::6]
-photos = [view for view in views if view not in held_out]
-on_horn = (cloud[:, 0] > 0.55) & (cloud[:, 1] < -0.2)
-first = [part[~on_horn][:100] for part in (cloud, cloud_colors)]
+views, *cloud = procedural_capture(SIZE, 26, height=SIZE, splats=1200)
+held_out, photos = views[3::6], [view for i, view in enumerate(views) if i % 6 != 3]
+on_horn = (cloud[0][:, 0] > 0.55) & (cloud[0][:, 1] < -0.2)
+first = [part[~on_horn][:100] for part in cloud]
 RATES = {name: value for name, value in FOR_FAST.items() if "rate" in name}
 print(f"{len(photos)} photos to train on, {len(held_out)} held out, {len(first[0])} points; {RATES}")
 
@@ -106,9 +104,9 @@ print(f"{len(fixed.gaussians)} splats, as at the start: {fixed.held_out:.2f} dB 
 
 
 # %%
-def ball(x, scale, opacity):
+def ball(place, scale, opacity):
     logits, scales = torch.logit(torch.tensor([opacity])), torch.full((1, 3), scale).log()
-    places, quats = torch.tensor([[x, 0.0, 0.0]]), torch.tensor([[1.0, 0, 0, 0]])
+    places, quats = torch.tensor([place], dtype=torch.float32), torch.tensor([[1.0, 0, 0, 0]])
     return Gaussians(places, quats, scales, torch.full((1, 1, 3), 1.5), torch.zeros(1, 0, 3), logits)
 
 
@@ -122,10 +120,10 @@ def pulls(gaussians, view):
 
 
 stage = Camera.looking_at([0, 0, -3], [0, 0, 0], 64, 64, H=64, W=64)
-dots = Gaussians.concatenated([ball(x, 0.12, 0.9) for x in (-0.5, 0.5)])
+dots = Gaussians.concatenated([ball((x, 0, 0), 0.12, 0.9) for x in (-0.5, 0.5)])
 dotted = SimpleNamespace(camera=stage, image=(255 * render(dots, stage).image).to(torch.uint8).numpy())
 offsets = np.linspace(-1, 1, 41)
-walk = np.array([pulls(ball(float(x), 0.4, 0.6), dotted)[2][:, 0].numpy() for x in offsets])
+walk = np.array([pulls(ball((x, 0, 0), 0.4, 0.6), dotted)[2][:, 0].numpy() for x in offsets])
 
 sums, times = torch.zeros(2, 100), torch.zeros(100)
 for view in photos:
@@ -152,8 +150,8 @@ axes[3].legend()
 plt.show()
 
 cancelled = 1 - score.sum() / absolute.sum()
-print(f"between the dots: {walk[20, 0]:.1e} signed, {walk[20, 1]:.1e} absolute")
-print(f"trained scene: {100 * cancelled:.0f} % of the pull cancels within the photos")
+print(f"between the dots: {walk[20, 0]:.1e} signed, {walk[20, 1]:.1e} absolute;", end=" ")
+print(f"in the trained scene {100 * cancelled:.0f} % of the pull cancels within the photos")
 assert walk[20, 0] < 0.1 * walk[:, 0].max() and walk[20, 1] > 5 * walk[20, 0] and cancelled > 0.3
 
 # %% [markdown]
@@ -164,7 +162,6 @@ assert walk[20, 0] < 0.1 * walk[:, 0].max() and walk[20, 1] > 5 * walk[20, 0] an
 
 # %%
 def split_rows(gaussians, rows):
-    """Replace these splats by two each."""
     stay = torch.ones(len(gaussians), dtype=torch.bool)
     stay[rows] = False
     return Gaussians.concatenated([gaussians[stay], *long_axis_children(gaussians[~stay])]).map(torch.detach)
@@ -176,8 +173,8 @@ for name, key in choices.items():
     rows = torch.tensor(np.argsort(-key)[:few].copy())
     after[name] = train_with("none", split_rows(fixed.gaussians, rows), iterations=ITERATIONS // 3).held_out
     print(f"{few} splits by {name:16} {after[name]:.2f} dB")
-assert SHORT or min(after["highest score"], after["absolute values"]) > after["lowest score"] + 0.5
-assert SHORT or abs(after["highest score"] - after["absolute values"]) < 1.5
+best, other, worst = after.values()
+assert SHORT or (min(best, other) > worst + 0.5 and abs(best - other) < 1.5)
 
 # %% [markdown]
 # The signed score does about as well as the absolute one, and both are far better than the lowest score. No strategy of
@@ -221,7 +218,6 @@ def with_opacity(gaussians, opacities, shrink):
 
 
 def families(parents):
-    """Give every Gaussian children, in five ways."""
     o, generator = parents.opacities.double(), torch.Generator().manual_seed(16)
     pair, factor = shared_shape(o, torch.full((len(o),), 2))
     revised = with_opacity(parents, 1 - (1 - o).sqrt(), torch.ones(1))
@@ -235,16 +231,18 @@ def families(parents):
     }
 
 
-parents = fixed.gaussians.map(torch.detach)
-with torch.no_grad():
-    pictures = [render(parents, view.camera).image for view in held_out]
-kept = {}
+def pictures(gaussians):
+    with torch.no_grad():
+        return [render(gaussians, view.camera).image.clamp(0, 1).numpy() for view in held_out]
+
+
+parents, kept = fixed.gaussians.map(torch.detach), {}
+old = pictures(parents)
 for name, children in families(parents).items():
     grown = Gaussians.concatenated(children)
-    with torch.no_grad():
-        now = [render(grown, view.camera).image for view in held_out]
-    kept[name] = np.mean([psnr(new, old.clamp(0, 1).numpy()) for new, old in zip(now, pictures, strict=True)])
-    brighter = sum(new.mean() for new in now) / sum(old.mean() for old in pictures)
+    new = pictures(grown)
+    kept[name] = np.mean([psnr(*pair) for pair in zip(new, old, strict=True)])
+    brighter = np.mean(new) / np.mean(old)
     later = train_with("none", grown, iterations=ITERATIONS // 10).held_out
     print(f"{name:33} {kept[name]:6.2f} dB from the picture before, light x {brighter:.2f};", end=" ")
     print(f"{quality(grown):.2f} dB held out, {ITERATIONS // 10} iterations later {later:.2f}")
@@ -254,7 +252,7 @@ assert SHORT or (ways[0], ways[-1]) == ("split at random (adc)", "clone, revised
 assert SHORT or kept[ways[0]] + 2 < kept["clone"] < kept[ways[-1]] - 2
 
 x = torch.linspace(-3.5, 3.5, 141, dtype=torch.float64)
-one = ball(0.0, 1.0, 0.9).map(torch.Tensor.double)
+one = ball((0, 0, 0), 1.0, 0.9).map(torch.Tensor.double)
 fig, axes = plt.subplots(1, 2, figsize=(12, 3.6), layout="constrained", sharey=True)
 for ax, names in zip(axes, (list(kept)[:3], list(kept)[3:]), strict=True):
     ax.plot(x, 0.9 * torch.exp(-x * x / 2), "k", linewidth=3, alpha=0.4, label="parent")
@@ -288,18 +286,15 @@ plt.show()
 
 
 # %%
-def with_hidden(config, count=60):
-    start, rng = from_points(*first, config), np.random.default_rng(16)
-    direction = rng.normal(size=(count, 3))
-    place = 0.15 * direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(size=(count, 1))
-    buried = from_points(place, np.full(place.shape, 0.5), config)
-    opaque, size = torch.full((count,), 0.88), torch.full((count, 3), 0.05)
-    changed = {"logit_opacities": torch.logit(opaque), "log_scales": size.log()}
-    return Gaussians.concatenated([start, Gaussians(**(buried.tensors() | changed))])
+def haunted(strategy, **changes):
+    """Train with 60 opaque splats more, which lie in the middle of the egg."""
+    rng = np.random.default_rng(16)
+    places = [0.15 * rng.uniform() * v / np.linalg.norm(v) for v in rng.normal(size=(60, 3))]
+    start = [from_points(*first, config_of(strategy, **changes)), *(ball(v, 0.05, 0.88) for v in places)]
+    return train_with(strategy, Gaussians.concatenated(start), **changes)
 
 
 def in_the_middle(gaussians):
-    """Return the opacities around the middle of the egg, the largest first."""
     near = gaussians.means.norm(dim=1) < 0.25
     return gaussians.opacities[near].detach().sort(descending=True).values.numpy()
 
@@ -308,15 +303,11 @@ def smoothed(losses):
     return np.convolve(losses, np.ones(len(photos)) / len(photos), mode="valid")
 
 
-def haunted(strategy, **changes):
-    return train_with(strategy, with_hidden(config_of(strategy, **changes)), **changes)
-
-
 RESET = ITERATIONS // 5
 cases = {"none": {}, "adc": {}, "adc, resets": {"reset_every": RESET}, "mcmc": {}, "fast": {}}
+cases["mcmc, no weights"] = {"mcmc_opacity_weight": 0.0, "mcmc_scale_weight": 0.0}
+cases |= {"mcmc, no noise": {"mcmc_noise": 0.0}, "fast, no weight": {"fast_opacity_weight": 0.0}}
 buried = {name: haunted(name.split(",")[0], **changes) for name, changes in cases.items()}
-buried["mcmc, no weights"] = haunted("mcmc", mcmc_opacity_weight=0.0, mcmc_scale_weight=0.0)
-buried["fast, no weight"] = haunted("fast", fast_opacity_weight=0.0)
 opaque = {name: int((in_the_middle(run.gaussians) > 0.1).sum()) for name, run in buried.items()}
 for name, run in buried.items():
     print(f"{name:17} {opaque[name]:3d} opaque splats in the middle, {run.held_out:.2f} dB held out")
@@ -330,7 +321,7 @@ fig, axes = plt.subplots(1, 2, figsize=(13, 3.6), layout="constrained")
 for name, curve in (("no resets", plain), ("resets", reset)):
     axes[0].semilogy(curve, label=name)
 axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel="loss, mean of as many as photos")
-for name in ("adc", "adc, resets", "mcmc", "fast", "mcmc, no weights", "fast, no weight"):
+for name in [name for name in cases if name not in ("none", "mcmc, no noise")]:
     values = in_the_middle(buried[name].gaussians)
     axes[1].plot(np.arange(1, len(values) + 1), values, ".-", label=name)
 axes[1].set(title="opacities in the middle of the egg at the end", xlabel="splats, sorted", ylabel="opacity")
@@ -341,14 +332,15 @@ adc = recipe().adc
 assert (adc.grad_threshold, adc.percent_dense, adc.split_shrink, adc.prune_scale) == (2e-4, 0.01, 1.6, 0.1)
 assert (adc.reset_every, adc.reset_opacity, recipe(2999).adc.reset_every) == (3000, 0.01, 0)
 assert SHORT or (peak > 2 * before and 10 < recovery < 150)
-assert SHORT or (opaque["adc, resets"] < 0.6 * opaque["adc"] and opaque["adc"] > 40)
-assert SHORT or max(opaque["mcmc"], opaque["fast"]) < 0.4 * opaque["adc"]
+assert SHORT or 40 < opaque["adc"] > max(
+    1.6 * opaque["adc, resets"], 2.5 * opaque["mcmc"], 2.5 * opaque["fast"]
+)
 
 # %% [markdown]
-# Without resets, the buried splats stay to the end, opaque and useless. Resets remove most of them. They cost several
-# times the loss for dozens of iterations, each time; `recipe` leaves them out of runs under 3,000 iterations, and this
-# page asked for them. Once there has been a reset, `adc` also prunes splats larger than a tenth of the extent. The two
-# other strategies have no resets and far fewer survivors: how they do it is said below.
+# Without resets, the buried splats stay to the end, opaque and useless. Resets remove most of them. Each costs several
+# times the loss for dozens of iterations; `recipe` leaves them out of runs under 3,000 iterations, and this page asked
+# for them. After the first reset `adc` also prunes splats larger than a tenth of the extent. The two other strategies
+# have no resets and far fewer survivors: how they do it is said below.
 #
 # ## A budget
 #
@@ -357,23 +349,21 @@ assert SHORT or max(opaque["mcmc"], opaque["fast"]) < 0.4 * opaque["adc"]
 # "strongest"). The course's own setting, "cut", selects all and drops what exceeds the cap from the end.
 
 # %%
-capped = train_with("adc")
 budgets = {
-    "capped": capped,
+    "capped": train_with("adc"),
     "capped, cut": train_with("adc", over_cap="cut"),
     "no cap": train_with("adc", max_gaussians=None),
     "no cap, threshold x 4": train_with("adc", max_gaussians=None, grad_threshold=8e-4),
 }
 for name, run in budgets.items():
     print(f"{name:22} {len(run.gaussians):6d} splats, {run.held_out:.2f} dB held out")
+capped, rough, free, sparse = budgets.values()
 full_at = next((i for i, count in enumerate(capped.counts) if count == CAP), ITERATIONS)
 now, end = smoothed(capped.losses)[[full_at, -1]]
 print(f"the cap is reached after iteration {full_at}, when the loss is {now:.3f}; at the end it is {end:.3f}")
-assert len(budgets["no cap"].gaussians) > 3 * CAP and len(capped.gaussians) <= CAP
-assert SHORT or full_at < ITERATIONS / 5
-assert SHORT or len(budgets["no cap"].gaussians) > 3 * len(budgets["no cap, threshold x 4"].gaussians)
-assert SHORT or abs(budgets["no cap"].held_out - budgets["no cap, threshold x 4"].held_out) < 1.5
-assert SHORT or budgets["capped, cut"].held_out < capped.held_out - 5
+assert len(capped.gaussians) <= CAP and (SHORT or (full_at < ITERATIONS / 5 and now > 3 * end))
+assert SHORT or len(free.gaussians) > max(3 * len(sparse.gaussians), 3 * CAP)
+assert SHORT or (abs(free.held_out - sparse.held_out) < 1.5 and rough.held_out < capped.held_out - 5)
 
 # %% [markdown]
 # Without a cap, the threshold decides: four times as high, it makes a fraction of the splats, for nearly the same
@@ -410,7 +400,6 @@ assert SHORT or budgets["capped, cut"].held_out < capped.held_out - 5
 
 # %%
 def together(opacity, count, shrink):
-    """Alpha of so many equal splats in one place, along a line through their centre."""
     return 1 - (1 - opacity * torch.exp(-((line / shrink) ** 2) / 2)) ** count
 
 
@@ -443,20 +432,16 @@ assert (NOISE_SHARPNESS, NOISE_THRESHOLD) == (100, 0.005)
 #
 # They pull each splat down, whether or not a photo shows it. What no photo holds up fades to $0.005$ and is relocated:
 # that is what emptied the egg above. Without the weights, the buried splats stay opaque; and since places are drawn by
-# opacity and not by error, they attract newborns, and the budget ends inside the egg.
+# opacity and not by error, they attract newborns, and the budget ends inside the egg. Noise is needed here as well.
 
 # %%
+for name in ("mcmc", "mcmc, no noise", "mcmc, no weights"):
+    moved, level = sum(event.num_relocated for event in buried[name].events), buried[name].held_out
+    print(
+        f"{name:16} {level:.2f} dB held out, {moved} relocations, {opaque[name]} opaque splats in the middle"
+    )
+    assert SHORT or name == "mcmc" or level < buried["mcmc"].held_out - 2
 assert SHORT or opaque["mcmc, no weights"] > 2 * max(opaque["adc"], opaque["mcmc"])
-without = {
-    "as it is": buried["mcmc"],
-    "without noise": haunted("mcmc", mcmc_noise=0.0),
-    "without weights": buried["mcmc, no weights"],
-}
-for name, run in without.items():
-    moved = sum(event.num_relocated for event in run.events)
-    print(f"mcmc {name:16} {run.held_out:.2f} dB held out, {moved} relocations, {len(run.gaussians)} splats")
-levels = [run.held_out for run in without.values()]
-assert SHORT or levels[0] > 2 + max(levels[1:])
 assert (recipe().mcmc.noise, recipe().mcmc.growth, recipe().min_opacity) == (5e5, 1.05, 0.005)
 assert recipe().mcmc.opacity_weight == recipe().mcmc.scale_weight == 0.01
 
@@ -486,7 +471,7 @@ assert recipe().mcmc.opacity_weight == recipe().mcmc.scale_weight == 0.01
 
 # %%
 def tally(events):
-    """Count births and deaths; a split is one death and two births, a relocation one of each."""
+    """Births and deaths; a split is one death and two births, a relocation one of each."""
     born = died = 0
     for event in events:
         if isinstance(event, DensifyEvent):
@@ -498,34 +483,22 @@ def tally(events):
 
 
 own = {name: getattr(recipe(), name) for name in RATES}
-rows = {
-    "none": {},
-    "adc": {},
-    "adc, resets": {"reset_every": RESET},
-    "mcmc": {},
-    "fast, density control only": {"fast_start_factor": 1.0, "fast_decay": 1.0},
-    "fast": {},
-    "adc, rates of 2023": own,
-    "mcmc, rates of 2023": own,
-}
+rows = {"none": {}, "adc": {}, "adc, resets": {"reset_every": RESET}, "mcmc": {}, "fast": {}}
+rows["fast, density control only"] = {"fast_start_factor": 1.0, "fast_decay": 1.0}
+rows |= {"adc, rates of 2023": own, "mcmc, rates of 2023": own}
 every, means = {}, {}
 print(f"{'mean of ' + str(SEEDS) + ' seeds':27} held out, dB   spread   splats     born     died")
 for name, changes in rows.items():
     every[name] = [train_with(name.split(",")[0], seed=seed, **changes) for seed in range(SEEDS)]
-    results, counts = [run.held_out for run in every[name]], [tally(run.events) for run in every[name]]
-    means[name] = np.mean(results)
-    born, died = counts[0]
-    print(f"{name:27} {means[name]:13.2f} {np.ptp(results):8.2f} {len(every[name][0].gaussians):8d}", end=" ")
-    print(f"{born:8d} {died:8d}")
-    assert every[name][0].start + born - died == len(every[name][0].gaussians) <= CAP
+    results, (born, died) = [run.held_out for run in every[name]], tally(every[name][0].events)
+    means[name], count = np.mean(results), len(every[name][0].gaussians)
+    print(f"{name:27} {means[name]:13.2f} {np.ptp(results):8.2f} {count:8d} {born:8d} {died:8d}")
+    assert every[name][0].start + born - died == count <= CAP
 
-plan = every["fast"][0].config
-moments = np.arange(ITERATIONS)
-planned = planned_counts(plan, 100, CAP, moments)
-due = [event for event in every["fast"][0].events if event.iteration <= plan.fast.stop]
-assert all(event.num_gaussians <= planned[event.iteration] for event in due)
-assert len(every["fast"][0].gaussians) > 0.97 * CAP and plan.fast.stop == 3 * ITERATIONS // 5
-assert (plan.fast.opacity_weight, plan.min_opacity) == (0.002, 0.02)
+plan, events = every["fast"][0].config, every["fast"][0].events
+planned = planned_counts(plan, 100, CAP, np.arange(ITERATIONS))
+assert all(e.num_gaussians <= planned[e.iteration] for e in events) and plan.fast.stop == 0.6 * ITERATIONS
+assert (plan.fast.opacity_weight, plan.min_opacity, plan.fast.decay) == (0.002, 0.02, 0.1)
 assert (photo_factor(plan, 0), photo_factor(plan, ITERATIONS - 1)) == (4.0, 1.0)
 
 fig, axes = plt.subplots(1, 3, figsize=(14, 3.8), layout="constrained")
@@ -535,7 +508,7 @@ for name in ("none", "adc", "mcmc", "fast"):
     steps = [0] + [event.iteration for event in run.events] + [ITERATIONS - 1]
     totals = [tally(run.events[: k + 1])[0] for k in range(len(run.events))]
     axes[1].step(steps, [0, *totals, (totals or [0])[-1]], where="post", color=line.get_color(), label=name)
-axes[0].plot(moments, planned, "k:", label="the plan of fast")
+axes[0].plot(planned, "k:", label="the plan of fast")
 axes[0].set(title="who is there", xlabel="iteration", ylabel="number of splats")
 axes[1].set(title="who was ever born", xlabel="iteration", ylabel="births so far")
 for place, runs in enumerate(every.values()):
@@ -550,8 +523,8 @@ plt.show()
 full = [next((i for i, n in enumerate(every[name][0].counts) if n == CAP), None) for name in ("adc", "mcmc")]
 print(f"the cap is reached: adc after {full[0]} iterations, mcmc after {full[1]}")
 lead = means["fast, density control only"] - max(means["adc"], means["adc, resets"])
-assert SHORT or (lead > 0.5 and min(means["adc"], means["mcmc"]) > means["none"] + 4)
-assert SHORT or min(means[name] - means[f"{name}, rates of 2023"] for name in ("adc", "mcmc")) > 1.5
+lost = [means[name] - means[f"{name}, rates of 2023"] for name in ("adc", "mcmc")]
+assert SHORT or (lead > 0.5 and min(means["adc"], means["mcmc"]) > means["none"] + 4 and min(lost) > 1.5)
 assert SHORT or tally(every["adc"][0].events)[0] > tally(every["fast"][0].events)[0]
 assert SHORT or (full[0] < ITERATIONS / 5 and full[1] > plan.fast.stop)
 assert SHORT or max(np.ptp([run.held_out for run in runs]) for runs in every.values()) > 0.5
@@ -585,22 +558,22 @@ for ax, (name, lines) in zip(axes, curves.items(), strict=True):
     ax.legend()
 plt.show()
 for seen, unseen in curves.values():
-    assert SHORT or (seen[-1] > seen[-3] + 2 and unseen[-1] - unseen[-3] < 0.5 * (seen[-1] - seen[-3]))
+    assert SHORT or (min(np.diff(seen)) > 0.3 and unseen[-1] - unseen[-3] < 0.5 * (seen[-1] - seen[-3]))
 assert SHORT or np.ptp(curves["a quarter of them"][1][-3:]) < 1.5
 
 front, back = ([v for v in photos if side * v.camera.eye[2] > 1.5] for side in (-1, 1))
 for strategy in ("adc", "mcmc", "fast"):
     run = train_with(strategy, shown=front)
-    sides = [quality(run.gaussians, part) for part in (front, back)]
+    near, far = (quality(run.gaussians, part) for part in (front, back))
     print(
-        f"{strategy:5} trained on {len(front)} photos of the front: {sides[0]:.2f} dB, of the back {sides[1]:.2f} dB"
+        f"{strategy:5} trained on {len(front)} photos of the front: {near:.2f} dB there, {far:.2f} dB behind"
     )
-    assert sides[0] > sides[1] + 5
+    assert near > far + 5
 
 # %% [markdown]
-# On the photos of the training, more is always better. The held-out photos gain less and less; with few photos, several
-# times as many splats bring nothing. The loss cannot say where to stop, because it sees only what it is
-# trained on: the right number is a fact about scene and photos together, and each recipe guesses it beforehand.
+# On the photos of the training, more is always better. The held-out photos gain less and less; with few photos, four
+# times as many splats change little. The loss cannot say where to stop, because it sees only what it is trained on:
+# the right number is a fact about scene and photos together, and each recipe guesses it beforehand.
 #
 # And births follow the pulls, and pulls come from pixels. The back of the egg has start points and no photo: no
 # strategy makes anything of it. A photo that was not taken asks for nothing.
