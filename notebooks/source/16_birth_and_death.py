@@ -29,7 +29,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from gsplat_edu import Camera
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import psnr, score_views, summarize
 from gsplat_edu.ops.losses import l1_ssim
@@ -40,7 +39,7 @@ from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.config import FOR_FAST, recipe
 from gsplat_edu.train.density.mcmc import NOISE_SHARPNESS, NOISE_THRESHOLD, shared_shape
 from gsplat_edu.train.density.surgery import long_axis_children, split_children
-from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent
+from gsplat_edu.train.events import DensifyEvent, RelocateEvent
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.schedule import photo_factor, planned_counts
 
@@ -57,9 +56,8 @@ RATES = {name: value for name, value in FOR_FAST.items() if "rate" in name}
 print(f"{len(photos)} photos to train on, {len(held_out)} held out, {len(first[0])} points; {RATES}")
 
 # %% [markdown]
-# All strategies get the learning rates of the fast recipe; otherwise the comparison would be one of rates (the last
-# table says by how much). Density control acts every 25 iterations instead of every 100, because 1,500 iterations are
-# a twentieth of what the papers take.
+# All strategies get the learning rates of the fast recipe; otherwise rates would be compared (the last table says what
+# they do). Density control acts every 25 iterations, not every 100: the papers train twenty times as long.
 
 
 # %%
@@ -76,15 +74,16 @@ def train_with(strategy, start=None, shown=None, **changes):
     config, events = config_of(strategy, **changes), []
     start = from_points(*first, config) if start is None else start
     trainer = training(config, Views(shown or photos), load_backend("cpu"), Start(start, extent=EXTENT))
-    kinds = DensifyEvent, RelocateEvent, ResetEvent
-    result = trainer.run(callbacks=[lambda _, e: events.append(e) if isinstance(e, kinds) else None])
+    result = trainer.run(callbacks=[lambda _, event: events.append(event)])
+    events = [event for event in events if isinstance(event, DensifyEvent | RelocateEvent)]
     run = SimpleNamespace(gaussians=trainer.gaussians, config=config, events=events, start=len(start))
     run.losses, run.counts, run.held_out = result.losses, result.counts, quality(trainer.gaussians)
     return run
 
 
 fixed = train_with("none")
-print(f"{len(fixed.gaussians)} splats, as at the start: {fixed.held_out:.2f} dB held out")
+parents = fixed.gaussians.map(torch.detach)
+print(f"{len(parents)} splats, as at the start: {fixed.held_out:.2f} dB held out")
 
 # %% [markdown]
 # ## A fixed number is stuck
@@ -119,59 +118,42 @@ def pulls(gaussians, view):
     return output.image.detach().numpy(), output.visible, torch.stack([output.means2d_grad_norms(), absolute])
 
 
-stage = Camera.looking_at([0, 0, -3], [0, 0, 0], 64, 64, H=64, W=64)
-dots = Gaussians.concatenated([ball((x, 0, 0), 0.12, 0.9) for x in (-0.5, 0.5)])
-dotted = SimpleNamespace(camera=stage, image=(255 * render(dots, stage).image).to(torch.uint8).numpy())
-offsets = np.linspace(-1, 1, 41)
-walk = np.array([pulls(ball((x, 0, 0), 0.4, 0.6), dotted)[2][:, 0].numpy() for x in offsets])
-
 sums, times = torch.zeros(2, 100), torch.zeros(100)
 for view in photos:
-    _, visible, lengths = pulls(fixed.gaussians, view)
+    _, visible, lengths = pulls(parents, view)
     sums.index_add_(1, visible, lengths)
     times[visible] += 1
 score, absolute = (sums / times.clamp(min=1)).numpy()
 
 view = held_out[1]
-picture = pulls(fixed.gaussians, view)[0]
-p = (fixed.gaussians.means.detach().numpy() - view.camera.eye) @ view.camera.R.T
+picture = pulls(parents, view)[0]
+p = (parents.means.numpy() - view.camera.eye) @ view.camera.R.T
 u = view.camera.fx * p[:, :2] / p[:, 2:] + [view.camera.cx, view.camera.cy]
-fig, axes = plt.subplots(1, 4, figsize=(14, 3.4), layout="constrained")
+fig, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
 gap = np.abs(picture - view.image / 255).mean(axis=-1)
 titles = "held-out photo", "100 splats", "error; circles: score"
-for ax, title, image in zip(axes, titles, (view.image / 255, picture.clip(0, 1), gap), strict=False):
+for ax, title, image in zip(axes, titles, (view.image / 255, picture.clip(0, 1), gap), strict=True):
     ax.imshow(image, interpolation="nearest", cmap="magma")
     ax.set(title=title, xticks=[], yticks=[])
 axes[2].scatter(*u.T, s=4e4 * score, facecolors="none", edgecolors="cyan", linewidths=0.7)
-for line, label in zip(walk.T, ("length of the sum", "sum of absolute values"), strict=True):
-    axes[3].plot(offsets, line, label=label)
-axes[3].set(title="a splat on its way past two dots", xlabel="centre of the splat", ylabel="pull, per NDC")
-axes[3].legend()
 plt.show()
 
 cancelled = 1 - score.sum() / absolute.sum()
-print(f"between the dots: {walk[20, 0]:.1e} signed, {walk[20, 1]:.1e} absolute;", end=" ")
-print(f"in the trained scene {100 * cancelled:.0f} % of the pull cancels within the photos")
-assert walk[20, 0] < 0.1 * walk[:, 0].max() and walk[20, 1] > 5 * walk[20, 0] and cancelled > 0.3
+print(f"{100 * cancelled:.0f} % of the pull cancels within the photos")
+assert cancelled > 0.3
 
 # %% [markdown]
-# The horn has become a smear of splats of the egg. Between the dots nothing pulls, although nothing is right there; and
-# in the trained scene, too, a good part of the pull cancels. Is the score nevertheless a good choice? Split the same
-# number of splats, chosen in different ways, and train on.
-
+# The horn has become a smear of splats of the egg. A good part of the pull cancels. Is the score nevertheless a good
+# choice? Split the same number of splats, chosen in different ways, and train on.
 
 # %%
-def split_rows(gaussians, rows):
-    stay = torch.ones(len(gaussians), dtype=torch.bool)
-    stay[rows] = False
-    return Gaussians.concatenated([gaussians[stay], *long_axis_children(gaussians[~stay])]).map(torch.detach)
-
-
 few, after = len(score) // 4, {}
 choices = {"highest score": score, "absolute values": absolute, "lowest score": -score}
 for name, key in choices.items():
-    rows = torch.tensor(np.argsort(-key)[:few].copy())
-    after[name] = train_with("none", split_rows(fixed.gaussians, rows), iterations=ITERATIONS // 3).held_out
+    chosen = torch.zeros(len(parents), dtype=torch.bool)
+    chosen[np.argsort(-key)[:few].copy()] = True
+    start = Gaussians.concatenated([parents[~chosen], *long_axis_children(parents[chosen])])
+    after[name] = train_with("none", start, iterations=ITERATIONS // 3).held_out
     print(f"{few} splits by {name:16} {after[name]:.2f} dB")
 best, other, worst = after.values()
 assert SHORT or (min(best, other) > worst + 0.5 and abs(best - other) < 1.5)
@@ -236,20 +218,19 @@ def pictures(gaussians):
         return [render(gaussians, view.camera).image.clamp(0, 1).numpy() for view in held_out]
 
 
-parents, kept = fixed.gaussians.map(torch.detach), {}
-old = pictures(parents)
+kept, later, old = {}, {}, pictures(parents)
 for name, children in families(parents).items():
     grown = Gaussians.concatenated(children)
-    new = pictures(grown)
+    new, later[name] = pictures(grown), train_with("none", grown, iterations=ITERATIONS // 10).held_out
     kept[name] = np.mean([psnr(*pair) for pair in zip(new, old, strict=True)])
     brighter = np.mean(new) / np.mean(old)
-    later = train_with("none", grown, iterations=ITERATIONS // 10).held_out
     print(f"{name:33} {kept[name]:6.2f} dB from the picture before, light x {brighter:.2f};", end=" ")
-    print(f"{quality(grown):.2f} dB held out, {ITERATIONS // 10} iterations later {later:.2f}")
+    print(f"{quality(grown):.2f} dB held out, {ITERATIONS // 10} iterations later {later[name]:.2f}")
     assert name != "clone" or brighter > 1.03
 ways = sorted(kept, key=kept.get)
 assert SHORT or (ways[0], ways[-1]) == ("split at random (adc)", "clone, revised and shrunk (mcmc)")
 assert SHORT or kept[ways[0]] + 2 < kept["clone"] < kept[ways[-1]] - 2
+assert SHORT or later["split along the axis (fast)"] > later["clone"] + 0.5
 
 x = torch.linspace(-3.5, 3.5, 141, dtype=torch.float64)
 one = ball((0, 0, 0), 1.0, 0.9).map(torch.Tensor.double)
@@ -269,8 +250,8 @@ plt.show()
 
 # %% [markdown]
 # The random split does the most harm, the clone makes the scene brighter, and the shrunk copies come closest to the
-# picture before. This is the step up that chapter 09 saw after each densification. It need not be a loss for good:
-# children that stand apart can fit what one splat could not. Equal copies at one place have to come apart first.
+# picture before. This is the step up that chapter 09 saw after each densification. What a birth is worth shows later:
+# children that stand apart soon fit what one splat could not, and equal copies have to come apart first.
 #
 # ## Deaths, and those that nothing kills
 #
@@ -332,9 +313,7 @@ adc = recipe().adc
 assert (adc.grad_threshold, adc.percent_dense, adc.split_shrink, adc.prune_scale) == (2e-4, 0.01, 1.6, 0.1)
 assert (adc.reset_every, adc.reset_opacity, recipe(2999).adc.reset_every) == (3000, 0.01, 0)
 assert SHORT or (peak > 2 * before and 10 < recovery < 150)
-assert SHORT or 40 < opaque["adc"] > max(
-    1.6 * opaque["adc, resets"], 2.5 * opaque["mcmc"], 2.5 * opaque["fast"]
-)
+assert SHORT or opaque["adc"] > max(40, *(1.6 * opaque[name] for name in ("adc, resets", "mcmc", "fast")))
 
 # %% [markdown]
 # Without resets, the buried splats stay to the end, opaque and useless. Resets remove most of them. Each costs several
@@ -412,7 +391,6 @@ for count in (2, 5, 51):
         print(f"o = {o:4}, n = {count:2}: o' = {float(each):.4f}, s'/s = {float(factor):.4f};", end=" ")
         print(f"integral x {alone:.3f} by opacity alone, x {both:.9f} with the scale")
         assert abs(both - 1) < 1e-6 and alone > 1 > factor and abs(1 - (1 - each) ** count - o) < 1e-12
-assert (NOISE_SHARPNESS, NOISE_THRESHOLD) == (100, 0.005)
 
 # %% [markdown]
 # The line's integral stays to rounding. An integral over the whole ellipse does not: its powers have $1/k$ where the
@@ -437,13 +415,12 @@ assert (NOISE_SHARPNESS, NOISE_THRESHOLD) == (100, 0.005)
 # %%
 for name in ("mcmc", "mcmc, no noise", "mcmc, no weights"):
     moved, level = sum(event.num_relocated for event in buried[name].events), buried[name].held_out
-    print(
-        f"{name:16} {level:.2f} dB held out, {moved} relocations, {opaque[name]} opaque splats in the middle"
-    )
+    print(f"{name:16} {level:.2f} dB held out, {moved} relocations, {opaque[name]} opaque in the middle")
     assert SHORT or name == "mcmc" or level < buried["mcmc"].held_out - 2
 assert SHORT or opaque["mcmc, no weights"] > 2 * max(opaque["adc"], opaque["mcmc"])
-assert (recipe().mcmc.noise, recipe().mcmc.growth, recipe().min_opacity) == (5e5, 1.05, 0.005)
-assert recipe().mcmc.opacity_weight == recipe().mcmc.scale_weight == 0.01
+mcmc = recipe().mcmc
+assert (mcmc.noise, mcmc.growth, mcmc.opacity_weight, mcmc.scale_weight) == (5e5, 1.05, 0.01, 0.01)
+assert (NOISE_SHARPNESS, NOISE_THRESHOLD, recipe().min_opacity) == (100, 0.005, 0.005)
 
 # %% [markdown]
 # ## Born where it is wrong, as many as planned
@@ -453,14 +430,12 @@ assert recipe().mcmc.opacity_weight == recipe().mcmc.scale_weight == 0.01
 # ([density.fast](../src/gsplat_edu/train/density/fast.py)), joins the halves:
 #
 # - **A plan.** With $m$ splats at the start and the cap $c$, the number at iteration $t$ is
-#   $m + (c - m)\,(t - t_0) / (t_1 - t_0)$, from $t_0$, where density control begins, to $t_1$ at three fifths of the
-#   run. There is no threshold.
+#   $m + (c - m)\,(t - t_0) / (t_1 - t_0)$, from the first densification to $t_1$ at three fifths of the run.
 # - **The highest scores.** Every time, the faint are pruned, and as many splats are split as the plan has room for, in
 #   the order of their scores. A death is thus a birth elsewhere: a relocation to where the error pulls.
 # - **A split that keeps the picture**, along the longest axis as above. Nothing is drawn at random.
-# - **A weight instead of resets**: $0.002 \operatorname{mean}(o)$ until $t_1$, and pruning below $0.02$. The weight
-#   does to buried splats what it did in `mcmc`; it is weaker, and it ends with the plan, because later no death is
-#   replaced.
+# - **A weight instead of resets**: $0.002 \operatorname{mean}(o)$ until $t_1$, and pruning below $0.02$. It does what
+#   it did in `mcmc`; it is weaker, and it ends with the plan, because later no death is replaced.
 #
 # The recipe has more that is not density control: photos begin at a quarter of their size and grow, and rates fall to a
 # tenth at the end. To keep the causes apart, one row of the table below switches both off.
@@ -474,11 +449,11 @@ def tally(events):
     """Births and deaths; a split is one death and two births, a relocation one of each."""
     born = died = 0
     for event in events:
-        if isinstance(event, DensifyEvent):
+        if isinstance(event, RelocateEvent):
+            born, died = born + event.num_added + event.num_relocated, died + event.num_relocated
+        else:
             born += event.num_cloned + event.num_split_children
             died += event.num_pruned + event.num_split_children // 2
-        elif isinstance(event, RelocateEvent):
-            born, died = born + event.num_added + event.num_relocated, died + event.num_relocated
     return born, died
 
 
@@ -539,8 +514,8 @@ assert SHORT or max(np.ptp([run.held_out for run in runs]) for runs in every.val
 #
 # ## The next failure
 #
-# The cap was given. Nobody asked how many splats the scene needs, and `fast` makes as many as it is told. So train
-# with a row of caps, on all photos and on a quarter of them. And train on photos of the front only.
+# The cap was given, and `fast` makes as many splats as it is told. How many does the scene need? Train with a row of
+# caps, on all photos and on a quarter of them. And, last, on photos of the front only.
 
 # %%
 sizes, curves = CAP * 2.0 ** np.arange(-2, 2 if SHORT else 4), {}
