@@ -3,8 +3,8 @@
 #
 # Write each answer into the cell below its question; the cell behind it says whether it is right.
 #
-# **Exercise 1 (a line).** The cap of the training `capped` was reached after iteration `full_at`. Which share of all its
-# births, `early`, came before? Its changes are in `capped.events`, and `tally` counts.
+# **Exercise 1 (a line).** The cap of the training `capped` was reached after iteration `full_at`. Which share of all
+# its births, `early`, came before? Its changes are in `capped.events`, and `tally` counts.
 
 # %%
 early = tally([event for event in capped.events if event.iteration < full_at])[0] / tally(capped.events)[0]

@@ -76,9 +76,8 @@ def train_with(strategy, start=None, shown=None, **changes):
     trainer = training(config, Views(shown or photos), load_backend("cpu"), Start(start, extent=EXTENT))
     result = trainer.run(callbacks=[lambda _, event: events.append(event)])
     events = [event for event in events if isinstance(event, DensifyEvent | RelocateEvent)]
-    run = SimpleNamespace(gaussians=trainer.gaussians, config=config, events=events, start=len(start))
-    run.losses, run.counts, run.held_out = result.losses, result.counts, quality(trainer.gaussians)
-    return run
+    kept = {"gaussians": trainer.gaussians, "config": config, "events": events, "start": len(start)}
+    return SimpleNamespace(**kept, held_out=quality(trainer.gaussians), **vars(result))
 
 
 fixed = train_with("none")
@@ -147,14 +146,13 @@ assert cancelled > 0.3
 # choice? Split the same number of splats, chosen in different ways, and train on.
 
 # %%
-few, after = len(score) // 4, {}
-choices = {"highest score": score, "absolute values": absolute, "lowest score": -score}
-for name, key in choices.items():
+after = {}
+for name, key in {"highest score": score, "absolute values": absolute, "lowest score": -score}.items():
     chosen = torch.zeros(len(parents), dtype=torch.bool)
-    chosen[np.argsort(-key)[:few].copy()] = True
+    chosen[np.argsort(-key)[:25].copy()] = True
     start = Gaussians.concatenated([parents[~chosen], *long_axis_children(parents[chosen])])
     after[name] = train_with("none", start, iterations=ITERATIONS // 3).held_out
-    print(f"{few} splits by {name:16} {after[name]:.2f} dB")
+    print(f"25 splits by {name:16} {after[name]:.2f} dB")
 best, other, worst = after.values()
 assert SHORT or (min(best, other) > worst + 0.5 and abs(best - other) < 1.5)
 
@@ -171,10 +169,9 @@ assert SHORT or (min(best, other) > worst + 0.5 and abs(best - other) < 1.5)
 #
 # $$\mu' = \mu + R\,(s \odot n), \quad n \text{ standard normal}, \qquad s' = s / 1.6, \qquad o' = o .$$
 #
-# Two equal splats of the shape $g$ (1 at the centre) let through the product of what each lets through. Where the
-# parent had $\alpha = o\,g$, the two have
+# Two equal splats of the shape $g$ (1 at the centre) let through the product of what each lets through:
 #
-# $$1 - (1 - o\,g)^2 = \alpha + \alpha\,(1 - \alpha) > \alpha .$$
+# $$1 - (1 - o\,g)^2 = \alpha + \alpha\,(1 - \alpha) > \alpha = o\,g .$$
 #
 # Rota Bulò et al. 2024 ("Revising Densification in Gaussian Splatting") correct that by $o' = 1 - \sqrt{1 - o}$, so
 # that $1 - (1 - o')^2 = o$. It holds at the centre only. As a function of $g$, $1 - (1 - o' g)^2$ is concave and
@@ -261,9 +258,9 @@ plt.show()
 # by nobody. Here 60 opaque splats are hidden in the middle of the egg at the start.
 #
 # Therefore `adc` also **resets** opacities: every 3,000 iterations all that are above $0.01$ are set to it, and Adam's
-# moments of opacity are forgotten. Light reaches everything, and each splat has to earn its opacity again.
-# Adam moves a logit by about its rate, $0.1$ here, so it takes some
-# $(\operatorname{logit} 0.5 - \operatorname{logit} 0.01) / 0.1 = 46$ iterations until a splat is half opaque again.
+# moments of opacity are forgotten. Light reaches everything, and each splat has to earn its opacity again. Adam moves a
+# logit by about its rate, $0.1$ here, so half opacity takes
+# $(\operatorname{logit} 0.5 - \operatorname{logit} 0.01) / 0.1 = 46$ iterations.
 
 
 # %%
@@ -299,8 +296,8 @@ recovery = int(np.argmax(reset[RESET + 1 :] < before))
 print(f"a reset multiplies the loss by {peak / before:.1f}; it is back after {recovery} iterations")
 
 fig, axes = plt.subplots(1, 2, figsize=(13, 3.6), layout="constrained")
-for name, curve in (("no resets", plain), ("resets", reset)):
-    axes[0].semilogy(curve, label=name)
+axes[0].semilogy(plain, label="no resets")
+axes[0].semilogy(reset, label="resets")
 axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel="loss, mean of as many as photos")
 for name in [name for name in cases if name not in ("none", "mcmc, no noise")]:
     values = in_the_middle(buried[name].gaussians)
@@ -319,13 +316,13 @@ assert SHORT or opaque["adc"] > max(40, *(1.6 * opaque[name] for name in ("adc, 
 # Without resets, the buried splats stay to the end, opaque and useless. Resets remove most of them. Each costs several
 # times the loss for dozens of iterations; `recipe` leaves them out of runs under 3,000 iterations, and this page asked
 # for them. After the first reset `adc` also prunes splats larger than a tenth of the extent. The two other strategies
-# have no resets and far fewer survivors: how they do it is said below.
+# have no resets and far fewer survivors; the weights below do it.
 #
 # ## A budget
 #
-# Nothing in these rules knows when there are enough. The threshold decides, and a lower error needs ever more splats.
-# With a cap, the package clones and splits as many as there is room for, the highest scores first (`over_cap` is
-# "strongest"). The course's own setting, "cut", selects all and drops what exceeds the cap from the end.
+# Nothing in these rules knows when there are enough: the threshold decides. With a cap, the package clones and splits
+# as many as there is room for, the highest scores first (`over_cap` is "strongest"). The course's own setting, "cut",
+# selects all and drops what exceeds the cap from the end.
 
 # %%
 budgets = {
@@ -345,10 +342,9 @@ assert SHORT or len(free.gaussians) > max(3 * len(sparse.gaussians), 3 * CAP)
 assert SHORT or (abs(free.held_out - sparse.held_out) < 1.5 and rough.held_out < capped.held_out - 5)
 
 # %% [markdown]
-# Without a cap, the threshold decides: four times as high, it makes a fraction of the splats, for nearly the same
-# picture. With a cap, the budget is spent within the first fifth of the run, where the errors were at that time; from
-# then on nobody is born until somebody is pruned. With "cut", each split parent dies first, and its children stand at
-# the end of the list: that ruins a scene in which many are split at once.
+# A threshold four times as high makes a fraction of the splats, for nearly the same picture. With a cap, the budget is
+# spent within the first fifth of the run, where the errors were then; later nobody is born until somebody is pruned.
+# With "cut", each split parent dies first, and its children stand at the end of the list: most of the scene is lost.
 #
 # ## The number as given, the places as drawn
 #
@@ -358,11 +354,8 @@ assert SHORT or (abs(free.held_out - sparse.held_out) < 1.5 and rough.held_out <
 # living one ([relocation](../docs/GLOSSARY.md#relocation)), drawn in proportion to opacity. New ones are added in the
 # same way, five percent at a time, up to the cap ([density.mcmc](../src/gsplat_edu/train/density/mcmc.py)).
 #
-# What do $n$ splats in one place have to be, to look like the one of opacity $o$ and scale $s$ before? At the
-# centre, $1 - (1 - o')^n = o$, so
-#
-# $$o' = 1 - (1 - o)^{1/n} .$$
-#
+# What do $n$ splats in one place have to be, to look like the one of opacity $o$ and scale $s$ before? At the centre
+# $1 - (1 - o')^n = o$, so $o' = 1 - (1 - o)^{1/n}$.
 # That is the revised opacity for any $n$, and it is too wide for any $n$. Let $g_t = e^{-t^2/2}$ be the shape
 # along a line through the centre, and expand:
 #
@@ -376,25 +369,20 @@ assert SHORT or (abs(free.held_out - sparse.held_out) < 1.5 and rough.held_out <
 # The paper writes a double sum, over the splats that were there before the $i$-th; it collapses, because
 # $\sum_{i=k}^{n} \binom{i-1}{k-1} = \binom{n}{k}$. The terms alternate and grow, so the package stops at 51.
 
-
 # %%
-def together(opacity, count, shrink):
-    return 1 - (1 - opacity * torch.exp(-((line / shrink) ** 2) / 2)) ** count
-
-
 line = torch.linspace(-12, 12, 24001, dtype=torch.float64)
 for count in (2, 5, 51):
     for o in (0.05, 0.5, 0.95):
         each, factor = shared_shape(torch.tensor([o], dtype=torch.float64), torch.tensor([count]))
-        wide, right = together(each, count, 1.0), together(each, count, factor)
+        wide, right = (1 - (1 - each * torch.exp(-((line / f) ** 2) / 2)) ** count for f in (1, factor))
         alone, both = (float(torch.trapezoid(a, line)) / (o * np.sqrt(2 * np.pi)) for a in (wide, right))
         print(f"o = {o:4}, n = {count:2}: o' = {float(each):.4f}, s'/s = {float(factor):.4f};", end=" ")
         print(f"integral x {alone:.3f} by opacity alone, x {both:.9f} with the scale")
         assert abs(both - 1) < 1e-6 and alone > 1 > factor and abs(1 - (1 - each) ** count - o) < 1e-12
 
 # %% [markdown]
-# The line's integral stays to rounding. An integral over the whole ellipse does not: its powers have $1/k$ where the
-# line has $1/\sqrt k$, so the shrunk copies are a little too small (exercise 2).
+# The line's integral stays to rounding. That over the ellipse does not, because its powers have $1/k$ instead of
+# $1/\sqrt k$: the shrunk copies are a little too small (exercise 2).
 #
 # Samples have to explore. After each step the means get **noise**,
 #
@@ -404,19 +392,15 @@ for count in (2, 5, 51):
 # along a wall, little across it. The gate is there because a splat that shows has been fitted, and a shift would harm
 # the picture; the shift of a splat that nobody sees costs nothing. It walks until a photo pulls it.
 #
-# And who dies? Two **weights** are added to the loss, on the mean opacity and the mean scale:
-#
-# $$L + 0.01 \operatorname{mean}(o) + 0.01 \operatorname{mean}(s) .$$
-#
+# And who dies? Two **weights** are added to the loss: $L + 0.01 \operatorname{mean}(o) + 0.01 \operatorname{mean}(s)$.
 # They pull each splat down, whether or not a photo shows it. What no photo holds up fades to $0.005$ and is relocated:
 # that is what emptied the egg above. Without the weights, the buried splats stay opaque; and since places are drawn by
 # opacity and not by error, they attract newborns, and the budget ends inside the egg. Noise is needed here as well.
 
 # %%
 for name in ("mcmc", "mcmc, no noise", "mcmc, no weights"):
-    moved, level = sum(event.num_relocated for event in buried[name].events), buried[name].held_out
-    print(f"{name:16} {level:.2f} dB held out, {moved} relocations, {opaque[name]} opaque in the middle")
-    assert SHORT or name == "mcmc" or level < buried["mcmc"].held_out - 2
+    print(f"{name:16} {sum(event.num_relocated for event in buried[name].events)} relocations")
+    assert SHORT or name == "mcmc" or buried[name].held_out < buried["mcmc"].held_out - 2
 assert SHORT or opaque["mcmc, no weights"] > 2 * max(opaque["adc"], opaque["mcmc"])
 mcmc = recipe().mcmc
 assert (mcmc.noise, mcmc.growth, mcmc.opacity_weight, mcmc.scale_weight) == (5e5, 1.05, 0.01, 0.01)
@@ -437,8 +421,7 @@ assert (NOISE_SHARPNESS, NOISE_THRESHOLD, recipe().min_opacity) == (100, 0.005, 
 # - **A weight instead of resets**: $0.002 \operatorname{mean}(o)$ until $t_1$, and pruning below $0.02$. It does what
 #   it did in `mcmc`; it is weaker, and it ends with the plan, because later no death is replaced.
 #
-# The recipe has more that is not density control: photos begin at a quarter of their size and grow, and rates fall to a
-# tenth at the end. To keep the causes apart, one row of the table below switches both off.
+# The recipe has more: photos begin at a quarter of their size, and rates fall to a tenth. One row below has neither.
 #
 # > **Predict.** Same start, photos, rates, cap and iterations. Which strategy has the most births, the one that is the
 # > best on the held-out photos? And how far apart are two seeds of the same strategy?
@@ -476,23 +459,16 @@ assert all(e.num_gaussians <= planned[e.iteration] for e in events) and plan.fas
 assert (plan.fast.opacity_weight, plan.min_opacity, plan.fast.decay) == (0.002, 0.02, 0.1)
 assert (photo_factor(plan, 0), photo_factor(plan, ITERATIONS - 1)) == (4.0, 1.0)
 
-fig, axes = plt.subplots(1, 3, figsize=(14, 3.8), layout="constrained")
+fig, axes = plt.subplots(1, 2, figsize=(13, 3.8), layout="constrained")
 for name in ("none", "adc", "mcmc", "fast"):
-    run = every[name][0]
-    (line,) = axes[0].plot(run.counts, label=name)
-    steps = [0] + [event.iteration for event in run.events] + [ITERATIONS - 1]
-    totals = [tally(run.events[: k + 1])[0] for k in range(len(run.events))]
-    axes[1].step(steps, [0, *totals, (totals or [0])[-1]], where="post", color=line.get_color(), label=name)
+    axes[0].plot(every[name][0].counts, label=name)
 axes[0].plot(planned, "k:", label="the plan of fast")
 axes[0].set(title="who is there", xlabel="iteration", ylabel="number of splats")
-axes[1].set(title="who was ever born", xlabel="iteration", ylabel="births so far")
+axes[0].legend()
 for place, runs in enumerate(every.values()):
-    axes[2].plot([run.held_out for run in runs], [place] * len(runs), "k|", markersize=14)
-axes[2].set(title="held-out photos, a line for each seed", xlabel="PSNR, dB")
-axes[2].set(yticks=range(len(every)), yticklabels=list(every), ylabel="strategy")
-axes[2].invert_yaxis()
-for ax in axes[:2]:
-    ax.legend(fontsize=8)
+    axes[1].plot([run.held_out for run in runs], [place] * len(runs), "k|", markersize=14)
+axes[1].set(title="held-out photos, a line for each seed", xlabel="PSNR, dB", ylabel="strategy")
+axes[1].set(yticks=range(len(every)), yticklabels=list(every))
 plt.show()
 
 full = [next((i for i, n in enumerate(every[name][0].counts) if n == CAP), None) for name in ("adc", "mcmc")]
@@ -507,10 +483,9 @@ assert SHORT or max(np.ptp([run.held_out for run in runs]) for runs in every.val
 # %% [markdown]
 # Any strategy is far ahead of a fixed number. `adc` has more births than `fast` and is behind it: nearly all of them
 # came at once, when little was known. `fast` leads even without its small photos and falling rates. `mcmc` grows by
-# five percent at a time and reaches the cap late; it is made for 30,000 iterations. The rates matter as much as the
-# strategy: with those of 2023, made for long runs, `adc` and `mcmc` lose more than a decibel. Seeds differ by half a
-# decibel and more, so smaller differences say nothing. And this is one small scene; [RECIPE.md](../docs/RECIPE.md) has
-# what the pieces of `fast` bring on real captures.
+# five percent at a time and reaches the cap late; it is made for long runs. Rates matter as much as the strategy: with
+# those of 2023, for long runs too, `adc` and `mcmc` lose more than a decibel. Seeds differ by half a decibel and more.
+# And this is one small scene: [RECIPE.md](../docs/RECIPE.md) has what the pieces of `fast` bring on real captures.
 #
 # ## The next failure
 #
