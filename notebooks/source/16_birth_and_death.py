@@ -44,8 +44,7 @@ from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.schedule import photo_factor, planned_counts
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
-SIZE, ITERATIONS, SEEDS = (64, 400, 1) if SHORT else (96, 1500, 3)
-CAP, EXTENT = 800, 3.2
+SIZE, ITERATIONS, SEEDS, CAP = (64, 400, 1, 800) if SHORT else (96, 1500, 3, 800)
 print(f"budget: {ITERATIONS} iterations, {SIZE} px, {SEEDS} seeds{' (reduced)' if SHORT else ''}")
 
 views, *cloud = procedural_capture(SIZE, 26, height=SIZE, splats=1200)
@@ -73,7 +72,7 @@ def quality(gaussians, judged=held_out):
 def train_with(strategy, start=None, shown=None, **changes):
     config, events = config_of(strategy, **changes), []
     start = from_points(*first, config) if start is None else start
-    trainer = training(config, Views(shown or photos), load_backend("cpu"), Start(start, extent=EXTENT))
+    trainer = training(config, Views(shown or photos), load_backend("cpu"), Start(start, extent=3.2))
     result = trainer.run(callbacks=[lambda _, event: events.append(event)])
     events = [event for event in events if isinstance(event, DensifyEvent | RelocateEvent)]
     kept = {"gaussians": trainer.gaussians, "config": config, "events": events, "start": len(start)}
@@ -88,7 +87,8 @@ print(f"{len(parents)} splats, as at the start: {fixed.held_out:.2f} dB held out
 # ## A fixed number is stuck
 #
 # With a fixed set, splats only move and stretch. The loss $L$ of a photo reaches a splat at its centre $u$ on the image
-# as a sum over pixels $p$, and the *score* of a splat is the mean, over the photos $v$ that show it, of its length:
+# as a sum over pixels $p$. The *score* of a splat is the mean length of it, by [NDC](../docs/GLOSSARY.md#ndc), over the
+# photos $v$ that show it:
 #
 # $$g_v = \sum_p \frac{\partial L_v}{\partial c_p} \cdot \frac{\partial c_p}{\partial u}, \qquad
 # \text{score} = \operatorname{mean}_v |g_v| .$$
@@ -129,9 +129,9 @@ picture = pulls(parents, view)[0]
 p = (parents.means.numpy() - view.camera.eye) @ view.camera.R.T
 u = view.camera.fx * p[:, :2] / p[:, 2:] + [view.camera.cx, view.camera.cy]
 fig, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-gap = np.abs(picture - view.image / 255).mean(axis=-1)
-titles = "held-out photo", "100 splats", "error; circles: score"
-for ax, title, image in zip(axes, titles, (view.image / 255, picture.clip(0, 1), gap), strict=True):
+panels = {"held-out photo": view.image / 255, "100 splats": picture.clip(0, 1)}
+panels["error; circles: score"] = np.abs(picture - view.image / 255).mean(axis=-1)
+for ax, (title, image) in zip(axes, panels.items(), strict=True):
     ax.imshow(image, interpolation="nearest", cmap="magma")
     ax.set(title=title, xticks=[], yticks=[])
 axes[2].scatter(*u.T, s=4e4 * score, facecolors="none", edgecolors="cyan", linewidths=0.7)
@@ -272,11 +272,6 @@ def haunted(strategy, **changes):
     return train_with(strategy, Gaussians.concatenated(start), **changes)
 
 
-def in_the_middle(gaussians):
-    near = gaussians.means.norm(dim=1) < 0.25
-    return gaussians.opacities[near].detach().sort(descending=True).values.numpy()
-
-
 def smoothed(losses):
     return np.convolve(losses, np.ones(len(photos)) / len(photos), mode="valid")
 
@@ -286,8 +281,11 @@ cases = {"none": {}, "adc": {}, "adc, resets": {"reset_every": RESET}, "mcmc": {
 cases["mcmc, no weights"] = {"mcmc_opacity_weight": 0.0, "mcmc_scale_weight": 0.0}
 cases |= {"mcmc, no noise": {"mcmc_noise": 0.0}, "fast, no weight": {"fast_opacity_weight": 0.0}}
 buried = {name: haunted(name.split(",")[0], **changes) for name, changes in cases.items()}
-opaque = {name: int((in_the_middle(run.gaussians) > 0.1).sum()) for name, run in buried.items()}
+middle, opaque = {}, {}
 for name, run in buried.items():
+    near = run.gaussians.means.norm(dim=1) < 0.25
+    middle[name] = run.gaussians.opacities[near].detach().sort(descending=True).values.numpy()
+    opaque[name] = int((middle[name] > 0.1).sum())
     print(f"{name:17} {opaque[name]:3d} opaque splats in the middle, {run.held_out:.2f} dB held out")
 
 plain, reset = (smoothed(buried[name].losses) for name in ("adc", "adc, resets"))
@@ -300,8 +298,7 @@ axes[0].semilogy(plain, label="no resets")
 axes[0].semilogy(reset, label="resets")
 axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel="loss, mean of as many as photos")
 for name in [name for name in cases if name not in ("none", "mcmc, no noise")]:
-    values = in_the_middle(buried[name].gaussians)
-    axes[1].plot(np.arange(1, len(values) + 1), values, ".-", label=name)
+    axes[1].plot(np.arange(1, len(middle[name]) + 1), middle[name], ".-", label=name)
 axes[1].set(title="opacities in the middle of the egg at the end", xlabel="splats, sorted", ylabel="opacity")
 for ax in axes:
     ax.legend(fontsize=8)
@@ -384,13 +381,12 @@ for count in (2, 5, 51):
 # The line's integral stays to rounding. That over the ellipse does not, because its powers have $1/k$ instead of
 # $1/\sqrt k$: the shrunk copies are a little too small (exercise 2).
 #
-# Samples have to explore. After each step the means get **noise**,
+# Samples have to explore. After each step, **noise** moves the means, with their rate $\gamma$ and a normal $n$:
 #
-# $$\mu \leftarrow \mu + \gamma\, a\, \frac{1}{1 + e^{-100\,(0.005 - o)}}\; \Sigma\, n, \quad n \text{ normal},$$
+# $$\mu \leftarrow \mu + 5 \cdot 10^5\, \gamma\, \frac{1}{1 + e^{-100\,(0.005 - o)}}\; \Sigma\, n .$$
 #
-# with $\gamma$ the rate of the means and $a = 5 \cdot 10^5$. The covariance keeps it inside the splat's own shape: far
-# along a wall, little across it. The gate is there because a splat that shows has been fitted, and a shift would harm
-# the picture; the shift of a splat that nobody sees costs nothing. It walks until a photo pulls it.
+# The covariance keeps it inside the splat's own shape: far along a wall, little across it. The gate is there because a
+# splat that shows has been fitted, and a shift would harm the picture; that of a splat that nobody sees costs nothing.
 #
 # And who dies? Two **weights** are added to the loss: $L + 0.01 \operatorname{mean}(o) + 0.01 \operatorname{mean}(s)$.
 # They pull each splat down, whether or not a photo shows it. What no photo holds up fades to $0.005$ and is relocated:
@@ -398,9 +394,10 @@ for count in (2, 5, 51):
 # opacity and not by error, they attract newborns, and the budget ends inside the egg. Noise is needed here as well.
 
 # %%
-for name in ("mcmc", "mcmc, no noise", "mcmc, no weights"):
-    print(f"{name:16} {sum(event.num_relocated for event in buried[name].events)} relocations")
-    assert SHORT or name == "mcmc" or buried[name].held_out < buried["mcmc"].held_out - 2
+moved = {name: sum(e.num_relocated for e in buried[name].events) for name in cases if name[0] == "m"}
+print("relocations:", moved)
+crippled = max(buried[f"mcmc, no {part}"].held_out for part in ("noise", "weights"))
+assert SHORT or crippled < buried["mcmc"].held_out - 2
 assert SHORT or opaque["mcmc, no weights"] > 2 * max(opaque["adc"], opaque["mcmc"])
 mcmc = recipe().mcmc
 assert (mcmc.noise, mcmc.growth, mcmc.opacity_weight, mcmc.scale_weight) == (5e5, 1.05, 0.01, 0.01)
