@@ -104,7 +104,7 @@ print(f"{len(parents)} splats, as at the start: {fixed.held_out:.2f} dB held out
 # %%
 def ball(place, scale, opacity):
     logits, scales = torch.logit(torch.tensor([opacity])), torch.full((1, 3), scale).log()
-    places, quats = torch.tensor([place], dtype=torch.float32), torch.tensor([[1.0, 0, 0, 0]])
+    places, quats = torch.tensor(np.array([place])).float(), torch.tensor([[1.0, 0, 0, 0]])
     return Gaussians(places, quats, scales, torch.full((1, 1, 3), 1.5), torch.zeros(1, 0, 3), logits)
 
 
@@ -152,8 +152,8 @@ for name, key in {"highest score": score, "absolute values": absolute, "lowest s
     start = Gaussians.concatenated([parents[~chosen], *long_axis_children(parents[chosen])])
     after[name] = train_with("none", start, iterations=ITERATIONS // 3).held_out
     print(f"25 splits by {name:16} {after[name]:.2f} dB")
-best, other, worst = after.values()
-assert SHORT or (min(best, other) > worst + 0.5 and abs(best - other) < 1.5)
+signed, unsigned, opposite = after.values()
+assert SHORT or (min(signed, unsigned) > opposite + 0.5 and abs(signed - unsigned) < 1.5)
 
 # %% [markdown]
 # The signed score does about as well as the absolute one, and both are far better than the lowest score. No strategy of
@@ -271,8 +271,8 @@ def haunted(strategy, **changes):
     return train_with(strategy, Gaussians.concatenated(start), **changes)
 
 
-def smoothed(losses):
-    return np.convolve(losses, np.ones(len(photos)) / len(photos), mode="valid")
+def smoothed(values):
+    return np.convolve(values, np.ones(len(photos)) / len(photos), mode="valid")
 
 
 RESET = ITERATIONS // 5
@@ -295,7 +295,7 @@ print(f"a reset multiplies the loss by {peak / before:.1f}; it is back after {re
 fig, axes = plt.subplots(1, 2, figsize=(13, 3.6), layout="constrained")
 axes[0].semilogy(plain, label="no resets")
 axes[0].semilogy(reset, label="resets")
-axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel="loss, mean of as many as photos")
+axes[0].set(title="adc: what a reset costs", xlabel="iteration", ylabel="loss, running mean")
 for name in [name for name in cases if name not in ("none", "mcmc, no noise")]:
     axes[1].plot(np.arange(1, len(middle[name]) + 1), middle[name], ".-", label=name)
 axes[1].set(title="opacities in the middle of the egg at the end", xlabel="splats, sorted", ylabel="opacity")
