@@ -495,7 +495,7 @@ for name, seen in (("all photos", photos), ("a quarter of them", photos[::4])):
 fig, axes = plt.subplots(1, 2, figsize=(12, 3.6), layout="constrained")
 for ax, (name, lines) in zip(axes, curves.items(), strict=True):
     for values, label in zip(lines, ("photos trained on", "held-out photos"), strict=True):
-        ax.semilogx(sizes, values, "o-", label=label)
+        ax.semilogx(sizes, values, "o-", base=2, label=label)
     ax.axvline(1200, color="black", linewidth=0.8, label="Gaussians in the truth")
     ax.set(title=f"fast, {name}", xlabel="cap", ylabel="PSNR, dB")
     ax.legend()
