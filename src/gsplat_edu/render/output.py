@@ -1,4 +1,7 @@
-"""The result of a render, common to all backends."""
+"""The result of a render, common to all backends.
+
+Chapter: 16_birth_and_death.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Its settings are in `gsplat_edu.train.config`.
 
-Chapter: 09_train_in_3d.
+Chapters: 09_train_in_3d, 16_birth_and_death.
 """
 
 from __future__ import annotations

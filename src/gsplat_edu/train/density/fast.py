@@ -5,6 +5,8 @@ are split along their longest axis, which leaves the image nearly unchanged. Unt
 have become faint are removed, and the plan replaces them where the score is high.
 
 Its settings are in `gsplat_edu.train.config`.
+
+Chapter: 16_birth_and_death.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ Noise moves Gaussians that are still faint. Regularisers keep opacity and scale 
 die and are relocated.
 
 Source: Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo".
+
+Chapter: 16_birth_and_death.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Add, remove and sort Gaussians; the survivors keep their optimiser moments."""
+"""Add, remove and sort Gaussians; the survivors keep their optimiser moments.
+
+Chapter: 16_birth_and_death.
+"""
 
 from __future__ import annotations
 
