@@ -45,7 +45,11 @@ USE = {
 }
 """Documents for users, with their titles in the sidebar."""
 
-LEARN = {"notebooks/README.md": "The course", "docs/GLOSSARY.md": "Glossary"}
+LEARN = {
+    "notebooks/README.md": "The course",
+    "docs/GLOSSARY.md": "Glossary",
+    "docs/BIBLIOGRAPHY.md": "Bibliography",
+}
 """Documents beside the chapters."""
 
 BUILD_ON = {

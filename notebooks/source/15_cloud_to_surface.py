@@ -460,4 +460,6 @@ plt.show()
 #
 # With a capture of your own, `gsplat-edu train CAPTURE --out RUN --surface` trains with both losses of this page,
 # `gsplat-edu mesh RUN mesh.glb --texture` makes the mesh, and `--truth SCAN` measures it
-# ([Meshes](../docs/howto/mesh.md)). It began with [a point](01_points.ipynb).
+# ([Meshes](../docs/howto/mesh.md)). It began with [a point](01_points.ipynb). What every training since
+# [chapter 09](09_train_in_3d.ipynb) took for granted is left: where its Gaussians come from, and where they go
+# ([chapter 16](16_birth_and_death.ipynb)).

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import urllib.request
 
+import jupytext
 import numpy as np
 import pytest
 
@@ -55,7 +56,7 @@ def test_the_hours_of_a_track_are_those_of_its_chapters():
 def test_ten_weeks_have_every_chapter_once_and_six_lose_those_they_name():
     weeks = dict(re.findall(r"^\| (\d+) \| ([\d, ]+) \| [^|]+\|$", PAGE, re.M))
     assert list(weeks) == [str(n) for n in range(1, 11)]
-    assert ", ".join(weeks.values()).split(", ") == sorted(rows())
+    assert sorted(", ".join(weeks.values()).split(", ")) == sorted(rows())
     left_out, kept = re.search(r"\*\*six weeks\*\*, leave out ([^:]*): weeks ([^.]*)\.", PAGE).groups()
     lost = numbers(left_out)
     assert {number for week in re.findall(r"\d+", kept) for number in weeks[week].split(", ")} == set(
@@ -112,3 +113,25 @@ def test_make_course_opens_the_first_chapter(tmp_path):
         started.wait()
     assert chapter["name"] == "01_points.ipynb" and chapter["type"] == "notebook"
     assert "/lab/tree/notebooks/01_points.ipynb" in found[0]
+
+
+CITED = re.compile(r"([A-Z][\w-]+(?: Bulò)?(?: et al\.| and [A-Z]\w+)?),? \(?((?:19|20)\d\d)\b")
+
+
+def test_the_bibliography_has_the_papers_of_the_chapters_and_says_which():
+    entries = (ROOT / "docs" / "BIBLIOGRAPHY.md").read_text(encoding="utf-8").split("\n- ")[1:]
+    listed = {}
+    for entry in entries:
+        name, year, chapters = re.fullmatch(
+            r"(.*?) (\d{4})\. \[.*?\]\(https://\S+\)\.\s.*? Chapters? ([\d, ]+)\.\n?", entry, re.S
+        ).groups()
+        listed[f"{name} {year}"] = chapters.split(", ")
+    assert [key[-4:] for key in listed] == sorted(key[-4:] for key in listed)
+    found = {}
+    for source in SOURCES:
+        prose = " ".join(c.source for c in jupytext.read(source).cells if c.cell_type == "markdown")
+        for name, year in CITED.findall(" ".join(prose.split())):
+            found.setdefault(f"{name} {year}", set()).add(source.stem[:2])
+        if "Kerbl et al.'s code" in prose:
+            found.setdefault("Kerbl et al. 2023", set()).add(source.stem[:2])
+    assert {name: sorted(chapters) for name, chapters in found.items()} == listed

@@ -243,8 +243,8 @@ def test_numbers_in_the_prose_are_printed_on_the_page(source):
                 )
 
 
-def test_fifteen_chapters():
-    assert [path.stem[:2] for path in SOURCES] == [f"{n:02d}" for n in range(1, 16)]
+def test_sixteen_chapters():
+    assert [path.stem[:2] for path in SOURCES] == [f"{n:02d}" for n in range(1, 17)]
 
 
 @CHAPTERS
