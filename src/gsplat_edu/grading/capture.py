@@ -1,6 +1,6 @@
 """Assignment 6: one's own capture, trained and judged by photos that were held out.
 
-Chapter: 14_photos_to_scene.
+It follows chapter 14.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Assignment 5: which Gaussians are cloned, split and pruned, and what becomes of them.
 
-Chapter: 09_train_in_3d.
+It follows chapters 09 and 16.
 """
 
 from __future__ import annotations

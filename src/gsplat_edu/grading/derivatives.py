@@ -1,6 +1,6 @@
 """Assignment 3: links of the chain of gradients, from a pixel back to a splat's parameters.
 
-Chapters: 08_fit_an_image, 12_the_backward_pass, 13_back_to_the_parameters.
+It follows chapters 08, 12 and 13.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Assignment 1: from the world to an ellipse on the image.
 
-Chapters: 03_gaussians_in_3d, 04_splatting.
+It follows chapters 03 and 04.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Assignment 2: opacities of layers, their order, and the colour of a pixel.
 
-Chapters: 02_gaussians_in_2d, 05_sort_and_composite.
+It follows chapters 02 and 05.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Assignment 4: which tiles a splat touches, and the lists of the tiles.
 
-Chapter: 11_tiles.
+It follows chapter 11.
 """
 
 from __future__ import annotations
