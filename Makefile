@@ -18,7 +18,7 @@ SEED ?= $(shell date +%s)
 FILES ?= tests
 ROUNDS ?= 10
 
-.PHONY: help demo course test test-slow stress soak check sanitize bench notebooks site wheels clean
+.PHONY: help demo course test test-slow stress soak check sanitize bench notebooks site book wheels clean
 
 help:
 	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
@@ -32,6 +32,7 @@ help:
 	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
 	@echo "make site        build the site: chapters, documents and reference, out/site/index.html"
+	@echo "make book        build the course as EPUB, and as PDF if Chromium is installed: out/book"
 	@echo "make wheels      build and check wheels for every platform that this machine can build for: dist/; 10 minutes and more (REPEAT=1: twice, and compare)"
 	@echo "make clean       remove .venv, out and caches"
 
@@ -121,6 +122,11 @@ site:
 	@tools/set_up.sh dev
 	@echo "== site: chapters, documents and reference"
 	@$(BIN)/python course/build_site.py
+
+book:
+	@tools/set_up.sh dev
+	@echo "== book: the course as EPUB and PDF"
+	@$(BIN)/python course/build_book.py
 
 wheels:
 	@tools/set_up.sh wheels
