@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from build_site import LINK, ROOT
@@ -136,11 +137,15 @@ def printed(page: Path, out: Path) -> bool:
     return subprocess.run(command, check=False, capture_output=True).returncode == 0 and out.exists()
 
 
-def main() -> int:
-    """Build the book; return 1 if the generator warned or Chromium failed."""
+def main(words: Sequence[str] | None = None) -> int:
+    """Build the book; return 1 if the generator warned or Chromium failed.
+
+    Args:
+        words: The command's arguments; None takes those of this process.
+    """
     parser = argparse.ArgumentParser(description="Build the course as EPUB and PDF.")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "book", help="folder (default: out/book)")
-    out = parser.parse_args().out.resolve()
+    out = parser.parse_args(words).out.resolve()
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         gather(scratch / "source")
