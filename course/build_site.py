@@ -21,6 +21,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -47,10 +48,11 @@ USE = {
 
 LEARN = {
     "notebooks/README.md": "The course",
+    "notebooks/quizzes.md": "Quizzes",
     "docs/GLOSSARY.md": "Glossary",
     "docs/BIBLIOGRAPHY.md": "Bibliography",
 }
-"""Documents beside the chapters."""
+"""Documents beside the chapters; the quizzes are written here."""
 
 BUILD_ON = {
     "docs/PYTHON.md": "Python examples",
@@ -166,7 +168,7 @@ def relinked(text: str, page: Path, stage: Path) -> str:
 def gather(stage: Path) -> None:
     """Write all pages to an empty folder."""
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
-    documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if not name.endswith("/index.md")]
+    documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if (ROOT / name).exists()]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
     how_tos = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "howto").glob("*.md"))
     for page in [*documents, *records, *how_tos]:
@@ -186,6 +188,7 @@ def gather(stage: Path) -> None:
     for name in modules():
         _write(stage / "reference" / f"{name}.md", _reference(name))
     _write(stage / "reference" / "index.md", _public_api())
+    _write(stage / "notebooks" / "quizzes.md", quizzes(chapters))
     _write(stage / "docs" / "decisions" / "index.md", _records(records))
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
     _write(stage / "static" / "tokens.css", tokens_by_theme())
@@ -195,6 +198,24 @@ def gather(stage: Path) -> None:
     (stage / "static" / "tiles.png").write_bytes(_figure(*TILES))
     landing = (stage / "index.md").read_text(encoding="utf-8")
     _write(stage / "index.md", landing + _contents(chapters))
+
+
+def quizzes(chapters: list[Path]) -> str:
+    """Return the page of the questions of notebooks/quizzes.toml, with folded answers."""
+    parts = [
+        "# Quizzes\n\nFive questions for each chapter; teachers find them in `notebooks/quizzes.toml`.\n"
+    ]
+    asked = tomllib.loads((ROOT / "notebooks" / "quizzes.toml").read_text(encoding="utf-8"))
+    for page in chapters:
+        title = json.loads((ROOT / page).read_text(encoding="utf-8"))["cells"][0]["source"]
+        parts.append(f"## [{''.join(title).splitlines()[0].removeprefix('# ')}]({page.name})\n")
+        for number, one in enumerate(asked[page.name[:2]], 1):
+            options = one.get("options", [])
+            rows = [f"   - {letter}) {option}" for letter, option in zip("abc", options, strict=False)]
+            answer = f"{'abc'[one['answer']]})" if options else f"{one['answer']:g}."
+            told = f"   <details><summary>Answer</summary>\n\n   {answer} {one['why']}\n\n   </details>\n"
+            parts.append("\n".join([f"{number}. {one['ask']}\n", *rows, *([""] if rows else []), told]))
+    return "\n".join(parts)
 
 
 def fold_set_up(notebook: dict[str, Any]) -> None:

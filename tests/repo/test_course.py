@@ -6,12 +6,14 @@ import os
 import re
 import signal
 import subprocess
+import tomllib
 import urllib.request
 
 import jupytext
 import numpy as np
 import pytest
 
+import gsplat_edu
 from chapters import ROOT, SOURCES
 from waiting import PATIENCE, until
 
@@ -135,3 +137,21 @@ def test_the_bibliography_has_the_papers_of_the_chapters_and_says_which():
         if "Kerbl et al.'s code" in prose:
             found.setdefault("Kerbl et al. 2023", set()).add(source.stem[:2])
     assert {name: sorted(chapters) for name, chapters in found.items()} == listed
+
+
+def test_quizzes_have_five_questions_for_each_chapter_and_right_answers():
+    asked = tomllib.loads((ROOT / "notebooks" / "quizzes.toml").read_text(encoding="utf-8"))
+    assert list(asked) == [path.stem[:2] for path in SOURCES]
+    names = {"np": np, "DILATION": gsplat_edu.DILATION, "C0": gsplat_edu.C0}
+    places = []
+    for questions in asked.values():
+        assert len(questions) == 5
+        for one in questions:
+            assert one["ask"].endswith(("?", ".")) and one["why"].endswith(".")
+            if "options" in one:
+                assert set(one) == {"ask", "options", "answer", "why"}
+                assert len(set(one["options"])) == len(one["options"]) == 3
+                places.append(one["options"][one["answer"]] and one["answer"])
+            else:
+                assert one["answer"] == pytest.approx(eval(one["check"], names), rel=0.003), one["ask"]
+    assert all(places.count(place) > len(places) / 4 for place in range(3)), "the right option is anywhere"
