@@ -18,7 +18,7 @@ SEED ?= $(shell date +%s)
 FILES ?= tests
 ROUNDS ?= 10
 
-.PHONY: help demo course test test-slow stress soak check sanitize bench notebooks site book wheels clean
+.PHONY: help demo course test test-slow stress soak check sanitize bench notebooks site book slides wheels clean
 
 help:
 	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
@@ -33,6 +33,7 @@ help:
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
 	@echo "make site        build the site: chapters, documents and reference, out/site/index.html"
 	@echo "make book        build the course as EPUB, and as PDF if Chromium is installed: out/book"
+	@echo "make slides      build slides of each chapter: out/slides"
 	@echo "make wheels      build and check wheels for every platform that this machine can build for: dist/; 10 minutes and more (REPEAT=1: twice, and compare)"
 	@echo "make clean       remove .venv, out and caches"
 
@@ -127,6 +128,10 @@ book:
 	@tools/set_up.sh dev
 	@echo "== book: the course as EPUB and PDF"
 	@$(BIN)/python course/build_book.py
+
+slides:
+	@tools/set_up.sh dev
+	@$(BIN)/python course/build_slides.py
 
 wheels:
 	@tools/set_up.sh wheels

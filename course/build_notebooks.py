@@ -180,8 +180,12 @@ def proofs(source: Path) -> list[str]:
     return code
 
 
-def execute(notebook: nbformat.NotebookNode) -> None:
-    """Execute the cells of a notebook in place, with the root as their folder and strict about figures.
+def execute(notebook: nbformat.NotebookNode, folder: Path = ROOT) -> None:
+    """Execute the cells of a notebook in place, strict about figures.
+
+    Args:
+        notebook: The notebook.
+        folder: The kernel's folder.
 
     Raises:
         CellExecutionError: a cell raised.
@@ -194,16 +198,17 @@ def execute(notebook: nbformat.NotebookNode) -> None:
             "--IPKernelApp.log_level=40",  # errors only; otherwise it warns about its own local port
             f"--IPKernelApp.exec_lines={STRICT_FIGURES}",
         ],
-        resources={"metadata": {"path": str(ROOT)}},
+        resources={"metadata": {"path": str(folder)}},
     ).execute()
 
 
-def build(source: Path, out: Path) -> None:
+def build(source: Path, out: Path, folder: Path = ROOT) -> None:
     """Execute one chapter and the proofs of its exercises, and write it atomically.
 
     Args:
         source: The chapter, jupytext percent.
         out: Folder of the notebook.
+        folder: The kernel's folder.
 
     Raises:
         CellExecutionError: a cell or a proof raised.
@@ -213,7 +218,7 @@ def build(source: Path, out: Path) -> None:
     whole = notebook.cells
     kept = [cell for cell in whole if cell["id"].startswith("cell-")]
     notebook.cells = kept + [nbformat.v4.new_code_cell(code) for code in proofs(source)]
-    execute(notebook)
+    execute(notebook, folder)
     notebook.cells = kept + whole[len(kept) :]
     _write(notebook, source, out)
 
@@ -259,6 +264,7 @@ def main() -> int:
     )
     parser.add_argument("--assignments", action="store_true", help="write the assignments only")
     parser.add_argument("--out", type=Path, default=ROOT / "notebooks", help="folder (default: notebooks)")
+    parser.add_argument("--folder", type=Path, default=ROOT, help="the kernel's folder (default: the clone)")
     arguments = parser.parse_args()
     if arguments.assignments:
         write_assignments()
@@ -274,7 +280,10 @@ def main() -> int:
         start = time.perf_counter()
         print(f"{source.stem}: {'replacing the text' if arguments.prose else 'executing'}", flush=True)
         try:
-            (renew_prose if arguments.prose else build)(source, arguments.out)
+            if arguments.prose:
+                renew_prose(source, arguments.out)
+            else:
+                build(source, arguments.out, arguments.folder)
         except (CellExecutionError, ValueError) as error:
             print(f"build_notebooks.py: {error}", file=sys.stderr)
             return 1

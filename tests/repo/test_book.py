@@ -1,4 +1,4 @@
-"""The course as EPUB and PDF has every chapter, every figure, and an index that is right."""
+"""The course as EPUB, PDF and slides has every chapter and every figure, and an index that is right."""
 
 import json
 import re
@@ -9,7 +9,9 @@ import zipfile
 import pytest
 
 import build_book
+import build_slides
 from chapters import ROOT, SOURCES
+from waiting import awaited
 
 
 def figures():
@@ -40,6 +42,45 @@ def test_the_index_has_each_word_with_the_chapters_that_link_to_it():
         ]
         assert set(linking) <= set(re.findall(r"\[(\d\d)\]", row)), anchor  # exercises link, too
     assert rows["relocation"].startswith(": [16](notebooks/16")
+
+
+def test_slides_have_every_heading_prediction_and_figure(tmp_path):
+    assert build_slides.main(["--out", str(tmp_path)]) == 0
+    assert sorted(path.stem for path in tmp_path.iterdir()) == [source.stem for source in SOURCES]
+    shown = 0
+    for source in SOURCES:
+        page = (tmp_path / f"{source.stem}.html").read_text(encoding="utf-8")
+        text = source.read_text(encoding="utf-8")
+        assert page.count("<blockquote>") == text.count("> **Predict.**")
+        assert page.count("<h1>") == 1
+        for heading in re.findall(r"^# ## (.+)$", text, re.M):
+            assert f"<h2>{build_slides.shown(heading)}</h2>\n<p>" in page, heading
+        assert "$" not in re.sub(r"<script>.*?</script>|<annotation.*?</annotation>", "", page, flags=re.S)
+        assert "](" not in page
+        shown += page.count("<img ")
+    assert shown == figures()
+
+
+def test_a_slide_opens_with_whole_sentences_and_shows_formulas():
+    text = "$$a = 1$$\n\nOne [link](x.md) of $a^2$. Two. Three.\n\n$$b = 2$$\n\n$$c$$"
+    assert build_slides.opening(text) == "One [link](x.md) of $a^2$. Two."
+    html = build_slides.shown(build_slides.opening(text))
+    assert html.startswith("One link of <math") and html.endswith("</math>. Two.")
+    assert build_slides.equations(text).count("<math") == build_slides.EQUATIONS
+    assert build_slides.shown("`a<b` *and* **c**") == "<code>a&lt;b</code> <em>and</em> <em>c</em>"
+
+
+@pytest.mark.slow
+def test_arrow_keys_turn_the_slides(browser, tmp_path):
+    build_slides.main(["--out", str(tmp_path)])
+    tab = browser.new_page(viewport={"width": 960, "height": 600})
+    tab.goto((tmp_path / "04_splatting.html").as_uri())
+    first, second = tab.locator("section").nth(0), tab.locator("section").nth(1)
+    assert first.bounding_box()["y"] == 0
+    tab.keyboard.press("ArrowRight")
+    awaited(tab, lambda: second.bounding_box()["y"] == 0)
+    tab.keyboard.press("ArrowLeft")
+    awaited(tab, lambda: first.bounding_box()["y"] == 0)
 
 
 @pytest.mark.slow
