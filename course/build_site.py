@@ -219,13 +219,14 @@ def quizzes(chapters: list[Path]) -> str:
 
 
 def fold_set_up(notebook: dict[str, Any]) -> None:
-    """Fold the code of cells that begin with imports; their output stays visible.
+    """Fold the code of a chapter's cells that begin with imports; their output stays visible.
 
     Args:
         notebook: The notebook; its cells are changed.
     """
     for cell in notebook["cells"]:
-        if cell["cell_type"] == "code" and re.match(r"(import|from) ", "".join(cell["source"])):
+        is_chapter = cell["cell_type"] == "code" and cell["id"].startswith("cell-")
+        if is_chapter and re.match(r"(import|from) ", "".join(cell["source"])):
             cell["metadata"] = {**cell["metadata"], "tags": ["hide-input"]}
 
 

@@ -85,6 +85,11 @@ def test_no_link_is_broken_and_nothing_is_loaded_from_elsewhere(site):
     ]
 
 
+def chapters_of(out):
+    """Return the pages of the chapters."""
+    return [out / "notebooks" / f"{source.stem}.html" for source in SOURCES]
+
+
 @pytest.mark.slow
 def test_every_chapter_document_and_module_has_a_page(site):
     pages, out = site
@@ -99,7 +104,7 @@ def test_every_chapter_document_and_module_has_a_page(site):
     } <= names
     assert {f"docs/howto/{path.stem}" for path in (ROOT / "docs" / "howto").glob("*.md")} <= names
     assert len([name for name in names if name.startswith("reference/gsplat_edu")]) == len(MODULES)
-    course = [page for path, page in pages.items() if path.parent.name == "notebooks"]
+    course = [pages[path] for path in chapters_of(out)]
     assert all("img" in page.tags for page in course), "the page has figures"
     assert sum("math" in page.tags for page in course) > 5, "the page has equations"
 
@@ -217,8 +222,11 @@ def test_the_reference_begins_with_the_public_api_and_links_every_name(site):
 @pytest.mark.slow
 def test_set_up_cells_are_folded_and_others_are_not(site):
     _, out = site
-    for path in (out / "notebooks").glob("*.html"):
+    for path in chapters_of(out):
         text = path.read_text()
+        assert re.search(
+            r'<span class="n">\w+</span> <span class="o">=</span> <span class="o">\.\.\.</span>', text
+        ), path.name
         folded = re.findall(r'<details class="[^"]*hide above-input">', text)
         assert 1 <= len(folded) < text.count("cell_input"), path.name
 
@@ -247,9 +255,7 @@ def test_pictures_of_chapters_are_whole_and_large_enough_to_read(site, width, br
     """A picture that is wider than a phone keeps up to 640 px of its width, and its cell scrolls."""
     _, out = site
     page = browser.new_page(viewport={"width": width, "height": 900})
-    chapters = sorted((out / "notebooks").glob("*.html"))
-    assert len(chapters) == 15
-    for path in chapters:
+    for path in chapters_of(out):
         page.goto(path.as_uri())
         pictures = page.evaluate(
             """() => [...document.querySelectorAll(".cell_output img")].map(picture => {
