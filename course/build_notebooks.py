@@ -5,8 +5,9 @@
     python course/build_notebooks.py --prose 02           text and exercises: the outputs stay
 
 A chapter's exercises are in notebooks/solutions/NN_name.py: a markdown cell for each question, behind it a code cell
-with the solution and one that checks it. The notebook gets the question, the names and signatures of the solution, and
-the check. Behind the chapter's cells the build runs every check on the solution, and on answers that it must refuse.
+with the solution and one that checks it; an open one has another answer in a further cell. The notebook gets the
+question, the names and signatures of the solution, and the check. Behind the chapter's cells the build runs every check
+on the answers, and on others that it must refuse.
 
 An assignment's answers are in notebooks/solutions/assignments; `--assignments` writes its file without them to
 notebooks/assignments.
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import re
 import sys
 import time
 from pathlib import Path
@@ -47,11 +49,13 @@ class Exercise(NamedTuple):
         question: Markdown.
         solution: Python that defines what the question asks for.
         check: Python that raises unless the solution's names have the properties that were asked for.
+        other: Python of an answer that differs and is right as well; empty if there is none.
     """
 
     question: str
     solution: str
     check: str
+    other: str = ""
 
 
 CHECKED = '{check}\nprint("Exercise {number} is solved.")'
@@ -89,13 +93,14 @@ def exercises(source: Path) -> list[Exercise]:
     if not path.exists():
         return []
     cells = jupytext.read(path, fmt="py:percent").cells
-    if [cell.cell_type for cell in cells] != ["markdown", "code", "code"] * (len(cells) // 3):
+    kinds = "".join(cell.cell_type[0] for cell in cells)
+    if not re.fullmatch("(mccc?)*", kinds):
         raise ValueError(
             f"{path}: write a markdown cell for each question, behind it one code cell with the solution and one that "
-            "checks it"
+            "checks it; then one with another answer, if there is one"
         )
     texts = [cell.source for cell in cells]
-    return [Exercise(*three) for three in zip(texts[::3], texts[1::3], texts[2::3], strict=True)]
+    return [Exercise(*texts[found.start() : found.end()]) for found in re.finditer("mc+", kinds)]
 
 
 def stub(solution: str, value: str | None = None) -> str:
@@ -170,13 +175,13 @@ def executed(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
 
 
 def proofs(source: Path) -> list[str]:
-    """Return code that runs behind a chapter: checks refuse empty and constant answers, and accept the solutions."""
+    """Return code that runs behind a chapter: checks refuse empty and constant answers, and accept the others."""
     code = []
-    for number, (_, solution, check) in enumerate(exercises(source), 1):
+    for number, (_, solution, check, other) in enumerate(exercises(source), 1):
         for value in (None, *CONSTANTS):
             complaint = f"the check of exercise {number} accepts {value or 'the stub'} as an answer"
             code.append(REFUSED.format(code=f"{stub(solution, value)}\n{check}", complaint=complaint))
-        code += [solution, check]
+        code += [solution, check, *([other, check] if other else [])]
     return code
 
 

@@ -66,3 +66,6 @@ assert width_within(just_outside, own_limit) == width_within(just_outside, None)
 assert width_within(balls[0], own_limit) < 2 * CAMERA.W, (
     "with your bound the far splat is more than twice as wide as the image"
 )
+
+# %%
+own_limit = 3.0

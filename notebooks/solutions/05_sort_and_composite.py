@@ -61,3 +61,11 @@ apart = np.linalg.norm(two[0] - camera.eye, axis=-1)
 two_by_distance = splat_image(camera, two, np.argsort(apart))[0]
 change = np.abs(two_by_distance - splat_image(camera, two)[0]).max()
 assert change > 0.1, f"by distance, no pixel of your two splats changes by more than {change:.3f}"
+
+# %%
+two = (
+    np.array([[-0.3, 0.1, -0.9], [1.4, 0.2, -1.0]]),
+    np.tile(0.5 * np.eye(3), (2, 1, 1)),
+    np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    np.array([0.8, 0.95]),
+)

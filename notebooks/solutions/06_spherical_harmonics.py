@@ -53,3 +53,11 @@ largest_error = np.abs(picture(camera, eval_sh(3, in_8_bits, d)) - picture(camer
 print(f"largest error {largest_error:.5f}, your bound {bound:.5f}, a step of an 8-bit image {1 / 255:.5f}")
 assert 0 < largest_error <= bound, "the picture is further off than your bound says, or not rounded at all"
 assert bound < 100 * largest_error, "your bound is more than a hundred times too large"
+
+# %%
+# Each of the 45 numbers between its own least and largest value, and the bound by the largest of the steps.
+columns = sh[:, 1:].reshape(len(sh), -1)
+steps = np.ptp(columns, axis=0) / 255
+rounded = columns.min(axis=0) + steps * np.rint((columns - columns.min(axis=0)) / steps)
+in_8_bits = np.concatenate([sh[:, :1], rounded.reshape(sh[:, 1:].shape)], axis=1)
+bound = steps.max() / 2 * 15 / np.sqrt(4 * np.pi)

@@ -67,3 +67,15 @@ assert max(ranking.values()) < 100, "one of the kinds was not disturbed"
 assert all(quality_without(key, 0.1) < ranking[key] for key in ranking), "more noise has to do more harm"
 # The means suffer most: a hundredth of the scene's size is a pixel or so, and edges are where they are.
 assert min(ranking, key=ranking.get) == "means", "with the usual spreads the means are the most sensitive"
+
+
+# %%
+def quality_without(key, amount):
+    # Uniform noise of the width of the middle half.
+    values = trained.tensors()[key]
+    width = values.quantile(0.75) - values.quantile(0.25)
+    noise = torch.rand(values.shape, generator=torch.Generator().manual_seed(7)) - 0.5
+    image = render(
+        Gaussians(**trained.tensors() | {key: values + amount * width * noise}), held_out, backend="cpu"
+    )
+    return psnr(image.image.numpy().clip(0, 1), np.clip(by_kernels, 0, 1))

@@ -67,3 +67,9 @@ without_splats = -10 * np.log10(((photo - mean_colour) ** 2).mean())
 assert min(qualities.values()) > without_splats, "a fit is worse than a picture in the mean colour"
 assert list(qualities.values()) == sorted(qualities.values()), "more splats did not fit better"
 assert qualities[COUNT] < qualities[COUNT // 4] + 12, "two doublings do not bring more than a few decibels"
+
+
+# %%
+def quality_of(count):
+    start = random_splats_2d(count, height, width, np.random.default_rng(80))
+    return fit_2d(photo, start, Fit2DSettings(TRIAL + 10)).psnrs[-1]

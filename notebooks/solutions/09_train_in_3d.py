@@ -69,3 +69,17 @@ for edge, value in pulls.items():
 assert 0 < pulls[256] < pulls[128] < pulls[64], "by pixels the slope has to fall with the resolution"
 assert np.isclose(pulls[64] * 32, pulls[128] * 64, rtol=0.05), "in units of half the image it has to stay"
 assert config.adc.grad_threshold == 2e-4
+
+
+# %%
+def pull(edge):
+    # A splat along one axis only, wider, and a one-sided difference.
+    x = np.arange(edge)
+
+    def line(place):
+        return np.exp(-(((x - place) / (edge / 10)) ** 2) / 2)
+
+    def loss(u):
+        return np.abs(line(u) - line(0.52 * edge)).mean()
+
+    return (loss(edge / 2 + 1e-4 * edge) - loss(edge / 2)) / (1e-4 * edge)

@@ -77,3 +77,14 @@ assert np.ndim(opaque) == 3 and len(opaque) >= 50, (
 )
 assert np.max(opaque) <= 0, "an alpha is not larger than 1"
 assert asked(opaque) <= 0.1 * np.size(opaque), f"{100 * asked(opaque) / np.size(opaque):.0f} % are left"
+
+
+# %%
+def asked(log_alpha):
+    # The light in front of each splat at once.
+    alphas = np.where(log_alpha >= np.log(ALPHA_MIN), np.minimum(0.99, np.exp(log_alpha)), 0)
+    behind = np.cumprod(1 - alphas, axis=0)
+    return int((np.concatenate([np.ones((1, *behind.shape[1:])), behind[:-1]]) >= 1e-4).sum())
+
+
+opaque = np.full((60, 3, 5), -0.02)

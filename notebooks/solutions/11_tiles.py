@@ -65,3 +65,8 @@ for cost in (1, 30, 100, 300, 1000, 10_000):
             f"at cost {cost} and a box of {pixels} px, tiles of {chosen} px are "
             f"{price(chosen, cost, pixels) / cheapest:.2f} times as dear as the best"
         )
+
+
+# %%
+def best_tile(cost_of_entry, box):
+    return int(min(tile_edges, key=lambda tile: abs(tile - (cost_of_entry * (box - 1)) ** (1 / 3))))

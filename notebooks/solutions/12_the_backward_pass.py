@@ -58,3 +58,7 @@ assert sorted(order) == list(range(len(unlucky))), "the order names each number 
 sums = [np.float32(np.cumsum(numbers, dtype=np.float64)[-1]) for numbers in (unlucky, unlucky[order])]
 print(f"the two sums are {sums[0]:.9f} and {sums[1]:.9f}")
 assert sums[0] != sums[1], "both orders give the same float32"
+
+# %%
+unlucky = np.float32([-1, -(2**-24)] + [-(2**-58)] * 100)
+order = np.roll(np.arange(102), -2)

@@ -63,3 +63,20 @@ for factor, part in parts_missing.items():
 assert min(parts_missing.values()) > 0, "a part is positive: the derivative of J is never exactly 0 here"
 assert list(parts_missing.values()) == sorted(parts_missing.values()), "smaller splats have to miss less"
 assert parts_missing[0.04] < 0.1 * parts_missing[1.0], "a splat 25 times smaller should hardly notice"
+
+
+# %%
+def missing(factor):
+    # Another photo, and the largest component instead of the length.
+    small = near["log_scales"] + np.log(factor)
+    moved = near["means"] + np.array([0.3, 0.1, 0]) * factor
+    x, beside = changed(log_scales=small), changed(log_scales=small, means=moved)
+    u_share, conic_share, *_ = next(
+        screen_slopes([x], camera, paint([x], camera)[0] - paint([beside], camera)[0])
+    )
+    ellipse = 2 * conic_backward(conic_share, x.conic) @ x.N @ (W @ x.M).T
+    by_position, by_ellipse = (
+        mean_backward(u_share, np.zeros((2, 3)), x),
+        mean_backward(np.zeros(2), ellipse, x),
+    )
+    return np.abs(by_ellipse).max() / np.abs(by_position).max()

@@ -70,3 +70,12 @@ print(f"mean difference {off:.3f}; pull {signed:.1e}, sum of absolute values {un
 assert wrong.image.max() > 127, "the photo is dark everywhere"
 assert off > 0.02, f"the splat differs by {off:.3f} on average, which is not much"
 assert signed < 0.03 * unsigned, f"it is pulled: {signed:.1e}, where the absolute values are {unsigned:.1e}"
+
+
+# %%
+def stuck(size):
+    # A ring around the middle.
+    x = np.arange(size) - (size - 1) / 2
+    radius = np.hypot(x, x[:, None])
+    ring = (radius > 0.2 * size) & (radius < 0.27 * size)
+    return np.repeat(255 * ring[..., None], 3, axis=2).astype(np.uint8)

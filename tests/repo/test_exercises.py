@@ -37,7 +37,7 @@ def faults(exercises: list[build_notebooks.Exercise]) -> list[str]:
         return [f"the questions have to be {KINDS}, numbered from 1, but are {asked}"]
     found = []
     for kind, exercise in zip(KINDS, exercises, strict=True):
-        question, solution, check = exercise
+        question, solution, check, other = exercise
         checks = [node for node in ast.walk(ast.parse(check)) if isinstance(node, ast.Assert)]
         names = top_level_names(solution)
         read = {node.id for node in ast.walk(ast.parse(check)) if isinstance(node, ast.Name)}
@@ -57,6 +57,12 @@ def faults(exercises: list[build_notebooks.Exercise]) -> list[str]:
             found.append(f"{kind}: the check redefines what was asked for")
         if kind == "a function" and not signatures:
             found.append(f"{kind}: the solution defines no function")
+        if bool(other) != (kind == "open") or (
+            other and names & asked_for(question) - top_level_names(other)
+        ):
+            found.append(
+                f"{kind}: an open exercise has another answer, with the same names, and only an open one"
+            )
         if question.startswith("## Exercises\n") != (kind == KINDS[0]):
             found.append(f"{kind}: only the first question begins with the heading")
     return found
@@ -88,8 +94,8 @@ def test_a_prediction_that_no_cell_answers_does_not_count():
 def test_a_chapter_has_three_exercises_with_checked_solutions(source):
     exercises = build_notebooks.exercises(source)
     assert faults(exercises) == []
-    for question, solution, check in exercises:
-        assert redefinitions(f"{solution}\n{check}") == set()
+    for question, solution, check, other in exercises:
+        assert redefinitions(f"{solution}\n{check}\n{other}") == set()
         for link in LINK.findall(question):
             target = (ROOT / "notebooks" / link.partition("#")[0]).resolve()
             assert "://" in link or target.is_file(), link
@@ -99,7 +105,7 @@ def test_a_chapter_has_three_exercises_with_checked_solutions(source):
 def test_a_notebook_asks_and_checks_without_the_answer(source):
     shipped = nbformat.read(ROOT / "notebooks" / f"{source.stem}.ipynb", as_version=4).cells
     text = "\n".join(cell.source for cell in shipped if cell["id"].startswith("exercise-"))
-    for number, (question, solution, check) in enumerate(build_notebooks.exercises(source), 1):
+    for number, (question, solution, check, _) in enumerate(build_notebooks.exercises(source), 1):
         cells = {c["id"]: c for c in shipped if c["id"].startswith(f"exercise-{number}-")}
         asked, answer, checked = cells.values()
         assert asked.source == question and checked.source.startswith(check)
@@ -155,9 +161,12 @@ ASKED = [
     for cells in (
         ("## Exercises\n\n**Exercise 1 (a line).** What is `x`?", "x = 1", "assert x == 1, 'not 1'"),
         ("**Exercise 2 (a function).** Write `f()`.", "def f():\n    return 1", "assert f() == 1, 'not 1'"),
-        ("**Exercise 3 (open).** Find `y`.", "y = 1", "assert y < 2, 'too large'"),
+        ("**Exercise 3 (open).** Find `y`.", "y = 1", "assert y < 2, 'too large'", "y = 0"),
     )
 ]
+
+
+ANOTHER = "open: an open exercise has another answer, with the same names, and only an open one"
 
 
 @pytest.mark.parametrize(
@@ -173,6 +182,8 @@ ASKED = [
         ),
         (1, {"solution": "f = int"}, "a function: the solution defines no function"),
         (2, {"question": "**Exercise 3 (open).** Find one."}, "open: the question does not ask for y"),
+        (2, {"other": ""}, ANOTHER),
+        (2, {"other": "z = 0"}, ANOTHER),
     ],
 )
 def test_an_exercise_that_breaks_a_rule_is_found(number, change, what):
@@ -206,6 +217,7 @@ def written(solution, check):
         ("x = 41", "assert x is not ..., 'empty'", "accepts None as an answer"),
         ("x = 41", "assert True", "accepts the stub as an answer"),
         ("def x():\n    return 41", "assert x() < 41.5, 'large'", "accepts 0.0 as an answer"),
+        ("x = 41", "assert x == hidden, 'not it'\n# %%\nx = 40", "not it"),
     ],
 )
 def test_a_wrong_solution_and_a_check_that_accepts_anything_stop_the_build(short, solution, check, what):
