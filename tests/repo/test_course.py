@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import tomllib
+import urllib.error
 import urllib.request
 
 import jupytext
@@ -91,6 +92,17 @@ def address_or_end(program, log):
     return re.search(r"(http://127\.0\.0\.1:\d+)/lab/tree/\S*\?token=(\w+)", text)
 
 
+def answer_of(page):
+    """Read an answer in JSON; None if nobody listens: JupyterLab prints its address before it does."""
+    try:
+        with urllib.request.urlopen(page, timeout=PATIENCE) as answer:
+            return json.load(answer)
+    except urllib.error.URLError as error:
+        if isinstance(error.reason, ConnectionRefusedError):
+            return None
+        raise
+
+
 @pytest.mark.slow
 def test_make_course_opens_the_first_chapter(tmp_path):
     """JupyterLab serves the chapter on a free port to who has its token."""
@@ -108,8 +120,7 @@ def test_make_course_opens_the_first_chapter(tmp_path):
         found = until(lambda: address_or_end(started, tmp_path / "log"), "JupyterLab's address")
         address, token = found.groups()
         page = f"{address}/api/contents/notebooks/01_points.ipynb?token={token}"
-        with urllib.request.urlopen(page, timeout=PATIENCE) as answer:
-            chapter = json.load(answer)
+        chapter = until(lambda: answer_of(page), "JupyterLab's answer")
     finally:
         os.killpg(started.pid, signal.SIGKILL)
         started.wait()
