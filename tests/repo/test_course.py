@@ -60,6 +60,9 @@ def test_ten_weeks_have_every_chapter_once_and_six_lose_those_they_name():
     weeks = dict(re.findall(r"^\| (\d+) \| ([\d, ]+) \| [^|]+\|$", PAGE, re.M))
     assert list(weeks) == [str(n) for n in range(1, 11)]
     assert sorted(", ".join(weeks.values()).split(", ")) == sorted(rows())
+    least, most = re.search(r"Two hours of class a week, .* at home: (\d+) to (\d+)\.", PAGE).groups()
+    hours = [sum(rows()[number][1] for number in week.split(", ")) for week in weeks.values()]
+    assert (int(least), int(most)) == (min(hours) - 2, max(hours) - 2)
     left_out, kept = re.search(r"\*\*six weeks\*\*, leave out ([^:]*): weeks ([^.]*)\.", PAGE).groups()
     lost = numbers(left_out)
     assert {number for week in re.findall(r"\d+", kept) for number in weeks[week].split(", ")} == set(
