@@ -19,7 +19,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from build_site import LINK, ROOT
+from build_site import LINK, ROOT, write
 
 NAME = "gsplat_edu"
 TITLE = "Gaussian splatting, from a point to a scene of your photos"
@@ -98,18 +98,13 @@ def gather(stage: Path) -> None:
             text = json.dumps(notebook)
         else:
             text = within(text, page).replace("<details>", '<details open="open">')  # paper has no clicks
-        _write(stage / page, text)
-    _write(stage / "terms.md", index())
+        write(stage / page, text)
+    write(stage / "terms.md", index())
     contents = "\n".join([*(page.rpartition(".")[0] for page in PAGES), "terms"])
-    _write(stage / "index.md", f"# {TITLE}\n\n```{{toctree}}\n:maxdepth: 1\n\n{contents}\n```\n")
+    write(stage / "index.md", f"# {TITLE}\n\n```{{toctree}}\n:maxdepth: 1\n\n{contents}\n```\n")
     settings = (ROOT / "docs" / "site" / "conf.py").read_text(encoding="utf-8")
-    _write(stage / "conf.py", settings + SETTINGS)
-    _write(stage / "style" / "book.css", STYLE)
-
-
-def _write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    write(stage / "conf.py", settings + SETTINGS)
+    write(stage / "style" / "book.css", STYLE)
 
 
 def generated(builder: str, scratch: Path) -> Path | None:

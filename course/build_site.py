@@ -172,10 +172,10 @@ def gather(stage: Path) -> None:
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
     how_tos = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "howto").glob("*.md"))
     for page in [*documents, *records, *how_tos]:
-        _write(stage / page, relinked((ROOT / page).read_text(encoding="utf-8"), page, stage))
+        write(stage / page, relinked((ROOT / page).read_text(encoding="utf-8"), page, stage))
     index = stage / "docs" / "howto" / "README.md"
     pages = [page.stem for page in how_tos if page.stem != "README"]
-    _write(index, index.read_text(encoding="utf-8") + "\n" + _toctree("hidden:", pages))
+    write(index, index.read_text(encoding="utf-8") + "\n" + _toctree("hidden:", pages))
     for page in chapters:
         notebook = json.loads((ROOT / page).read_text(encoding="utf-8"))
         for cell in notebook["cells"]:
@@ -184,20 +184,20 @@ def gather(stage: Path) -> None:
         fold_set_up(notebook)
         with_figures(page.stem, notebook)
         notebook["cells"].append(_origin(page, len(notebook["cells"])))
-        _write(stage / page, json.dumps(notebook))
+        write(stage / page, json.dumps(notebook))
     for name in modules():
-        _write(stage / "reference" / f"{name}.md", _reference(name))
-    _write(stage / "reference" / "index.md", _public_api())
-    _write(stage / "notebooks" / "quizzes.md", quizzes(chapters))
-    _write(stage / "docs" / "decisions" / "index.md", _records(records))
+        write(stage / "reference" / f"{name}.md", _reference(name))
+    write(stage / "reference" / "index.md", _public_api())
+    write(stage / "notebooks" / "quizzes.md", quizzes(chapters))
+    write(stage / "docs" / "decisions" / "index.md", _records(records))
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
-    _write(stage / "static" / "tokens.css", tokens_by_theme())
+    write(stage / "static" / "tokens.css", tokens_by_theme())
     for picture in PICTURES:
         shutil.copyfile(ROOT / picture, stage / "static" / Path(picture).name)
     importlib.import_module("landing_scene").write_landing(stage / "static")
     (stage / "static" / "tiles.png").write_bytes(_figure(*TILES))
     landing = (stage / "index.md").read_text(encoding="utf-8")
-    _write(stage / "index.md", landing + _contents(chapters))
+    write(stage / "index.md", landing + _contents(chapters))
 
 
 def quizzes(chapters: list[Path]) -> str:
@@ -356,7 +356,8 @@ def _contents(chapters: list[Path]) -> str:
     )
 
 
-def _write(path: Path, text: str) -> None:
+def write(path: Path, text: str) -> None:
+    """Write a page; its folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from gsplat_edu.base.constants import DILATION
 from gsplat_edu.grading.assignment import Answer, Part
-from gsplat_edu.scene.gaussian_math import build_cov3d, quat_to_R
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussian_math import build_cov3d, project_cov3d, quat_to_R
 
 CASES = 4
 """Calls of a function."""
@@ -81,8 +82,8 @@ def _jacobian(point: np.ndarray, fx: float, fy: float) -> Answer:
 
 
 def _footprint(cov: np.ndarray, point: np.ndarray, fx: float, fy: float) -> Answer:
-    J = _jacobian(point, fx, fy)
-    return J @ cov @ J.T + DILATION * np.eye(2)
+    camera = Camera(np.eye(3), np.zeros(3), fx, fy, 0.0, 0.0, 1, 1)
+    return project_cov3d(cov, point, camera) + DILATION * np.eye(2)
 
 
 def _without_dilation(cov: np.ndarray, point: np.ndarray, fx: float, fy: float) -> Answer:
